@@ -1,0 +1,120 @@
+"""Pixel back-projection, image to volume, and its exact adjoint; both differentiable."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from .bilinear import Shapes, image_to_volume, volume_to_image
+from .geometry import Grid, Imager
+from .rays import Rays, trace
+
+# Depths that are handled at once. More would be no faster, and patches would grow with the volume.
+_DEPTHS = 16
+
+
+@partial(jax.jit, static_argnames=("method", "normalize"))
+def backproject(
+    image: Num[ArrayLike, "row column"], imager: Imager, grid: Grid, *, method: str = "linear", normalize: bool = False
+) -> Float[Array, "depth y x"]:
+    """Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction").
+
+    Differentiable once, in both modes, with respect to the image, the imager and the grid's depths.
+
+    Parameters
+    ----------
+    image
+        `sensor.shape`, of any real type; integers are read as they are, without a copy.
+    imager, grid
+        What took the image, and the voxels wanted.
+    method
+        `"linear"` interpolates between the four pixels around the chief ray, so that lens positions have
+        gradients; `"nearest"` takes the nearest pixel, as the paper does, and has no gradient there.
+    normalize
+        Divide by the summed weights, so that a uniform image gives a uniform volume; voxels that no lens sees
+        stay zero.
+
+    Returns
+    -------
+    Array
+        `(len(depths), *grid.shape)`, of the image's type if it is floating, else of the imager's.
+
+    Raises
+    ------
+    ValueError
+        If the image is not `sensor.shape`, or `method` is neither of the two.
+    """
+    if image.shape != imager.sensor.shape:
+        raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    dtype = image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else imager.sensor_distance.dtype
+
+    def some_depths(depths):
+        shapes, rays = _prepare(imager, eqx.tree_at(lambda g: g.depths, grid, depths), method, dtype)
+        volume = image_to_volume(shapes, rays, image)
+        if not normalize:
+            return volume
+        total = image_to_volume(shapes, rays, None)
+        seen = total > 0
+        return jnp.where(seen, volume / jnp.where(seen, total, 1), 0)
+
+    volume = lax.map(some_depths, _in_groups(grid.depths))
+    return volume.reshape(-1, *grid.shape)[: grid.depths.size]
+
+
+@partial(jax.jit, static_argnames=("method",))
+def backproject_adjoint(
+    volume: Float[ArrayLike, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
+) -> Float[Array, "row column"]:
+    """The exact adjoint of `backproject`: each voxel adds its value to the pixels that it is read from.
+
+    Its linear version is the image of a volume by pinholes: Eq. (2) with a point for PSF_o.
+    Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths.
+
+    Parameters
+    ----------
+    volume
+        `(len(depths), *grid.shape)`.
+    imager, grid, method
+        As for `backproject`.
+
+    Returns
+    -------
+    Array
+        `sensor.shape`, of the volume's type.
+
+    Raises
+    ------
+    ValueError
+        If the volume is not of the grid's shape, or `method` is neither of the two.
+    """
+    expected = (grid.depths.size, *grid.shape)
+    if volume.shape != expected:
+        raise ValueError(f"`volume` must be of the grid's shape {expected}, got {volume.shape}.")
+
+    def add_depths(image, group):
+        depths, volume = group
+        shapes, rays = _prepare(imager, eqx.tree_at(lambda g: g.depths, grid, depths), method, volume.dtype)
+        return image + volume_to_image(shapes, rays, volume), None
+
+    depths = _in_groups(grid.depths)
+    padding = [(0, depths.size - grid.depths.size), (0, 0), (0, 0)]
+    volume = jnp.pad(volume, padding).reshape(*depths.shape, *grid.shape)
+    return lax.scan(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), (depths, volume))[0]
+
+
+def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group some"]:
+    """Depths in groups of at most `_DEPTHS`, of one size: the last depth is repeated where they do not divide."""
+    groups = -(-depths.size // _DEPTHS)
+    size = -(-depths.size // groups)
+    return jnp.pad(depths, (0, groups * size - depths.size), mode="edge").reshape(groups, size)
+
+
+def _prepare(imager: Imager, grid: Grid, method: str, dtype) -> tuple[Shapes, Rays]:
+    if method not in ("linear", "nearest"):
+        raise ValueError(f'`method` must be "linear" or "nearest", got {method!r}.')
+    shape = (grid.depths.size, *grid.shape)
+    rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype)
+    return Shapes(imager.sensor.shape, shape, imager.field_radius), rays

@@ -1,0 +1,269 @@
+"""The bilinear form of the chief rays, and its three derivatives.
+
+Back-projection, its adjoint and its gradient are derivatives of one bilinear form,
+
+    B(volume, image, rays) = sum_j sum_q C_j(q) volume(q) image(p_j(q)),
+
+the sum over lenses j and voxels q of the envelope C, times the voxel, times the image at the chief ray's pixel:
+back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image), and the gradient with respect
+to the geometry is dB/d(rays), which JAX carries on to lens positions, distances and depths. Each is written out
+because the transpose that JAX would derive of a gather is a scatter, twenty times slower on a processor.
+
+Each runs over the lenses, one patch of voxels at a time and all depths at once, so that the memory is image +
+volume + one patch. `lax.cond` on "this lens sees a voxel" skips the others, and has a second use: XLA on a
+processor fuses a loop body into one in-place update on one core, and what a branch returns is computed apart
+from it, on all cores.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .geometry import envelope, field_limit
+from .linear import linear_call
+from .rays import Axis, Rays
+
+# Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache, and the number of
+# squares, not their size, follows the magnification, which may be traced.
+_BLOCK = 160
+
+
+class Shapes(NamedTuple):
+    """What has to be known before tracing."""
+
+    image: tuple[int, int]
+    volume: tuple[int, int, int]
+    field_radius: float
+
+
+def image_to_volume(shapes: Shapes, rays: Rays, image):
+    """dB/d(volume), differentiable by rays and image; of an image of ones, but cheaper, if `image` is None."""
+    return linear_call(_gather, _scatter, _rays_bar, shapes, rays, image)
+
+
+def volume_to_image(shapes: Shapes, rays: Rays, volume):
+    """dB/d(image), differentiable by rays and volume."""
+    return linear_call(_scatter, _gather, _rays_bar_by_volume, shapes, rays, volume)
+
+
+def _gather(shapes: Shapes, rays: Rays, image):
+    """dB/d(volume); of an image of ones, but cheaper, if `image` is None."""
+
+    def add_lens(volume, lens):
+        y, x, y_pair, x_pair = lens
+
+        def patch():
+            weight = _weights(shapes, y, x, rays.reduced_depth)
+            return (
+                weight if image is None else weight * _interpolate(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
+            )
+
+        new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
+        return lax.dynamic_update_slice(volume, new, _corner(y, x)), None
+
+    volume = jnp.zeros(shapes.volume, rays.reduced_depth.dtype)
+    return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
+
+
+def _scatter(shapes: Shapes, rays: Rays, volume):
+    """By gathering: each pixel looks for the voxels that reach it, along x and then along y."""
+    # Neighbouring rays are `spacing` apart, and a pixel is reached from less than one pixel on either side.
+    taps = jnp.floor(2 / rays.spacing.min() + 1e-3).astype(jnp.int32) + 1
+
+    def add_lens(image, lens):
+        y, x = lens
+        weighted = lambda: _weights(shapes, y, x, rays.reduced_depth) * _patch(volume, y, x)
+        patch = _if_seen(shapes, y, x, weighted)
+        columns_of, rows_of = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
+
+        def add_columns(block, image):
+            left, columns, fresh = columns_of.block(block)
+            spread = _spread_columns(patch, x, rays.spacing, columns, fresh, taps)
+
+            def add_rows(block, image):
+                top, rows, fresh = rows_of.block(block)
+                return _add_rows(image, spread, y, rays.spacing, rows, fresh, taps, (top, left))
+
+            return lax.fori_loop(0, rows_of.count, add_rows, image)
+
+        return lax.fori_loop(0, columns_of.count, add_columns, image), None
+
+    image = jnp.zeros(shapes.image, volume.dtype)
+    return lax.scan(add_lens, image, (rays.y, rays.x))[0]
+
+
+def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:
+    """dB/d(rays): sums over one axis of what a ray and its envelope change on the other."""
+
+    def add_lens(total, lens):
+        y, x, y_pair, x_pair = lens
+        patch = _patch(volume, y, x)
+        distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
+        weight, envelope_vjp = jax.vjp(
+            lambda d2, z: envelope(d2, z, shapes.field_radius), distance2, rays.reduced_depth[:, None, None]
+        )
+        if image is None:
+            sample, along_y, along_x = jnp.ones_like(patch), jnp.zeros_like(patch), jnp.zeros_like(patch)
+        else:
+            corners = _if_seen(shapes, y, x, lambda: _corners(image, y_pair, x_pair))
+            sample, along_y, along_x = _interpolate(corners, y_pair, x_pair)
+        distance2_bar, depth_bar = envelope_vjp(patch * sample)
+        by_y, by_x = patch * weight * along_y, patch * weight * along_x
+        bars = by_y.sum(2), distance2_bar.sum(2), by_x.sum(1), distance2_bar.sum(1)
+        return total + depth_bar[:, 0, 0], bars
+
+    total = jnp.zeros_like(rays.reduced_depth)
+    depth_bar, bars = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
+    constant = jax.tree.map(jnp.zeros_like, rays)
+    continuous = lambda r: (r.y.fraction, r.y.distance2, r.x.fraction, r.x.distance2, r.reduced_depth)
+    return eqx.tree_at(continuous, constant, (*bars, depth_bar))
+
+
+def _rays_bar_by_volume(shapes: Shapes, rays: Rays, volume, image) -> Rays:
+    return _rays_bar(shapes, rays, image, volume)
+
+
+class _Pair(NamedTuple):
+    """The two pixels that a ray is interpolated from: always on the sensor, and harmless where the ray is not."""
+
+    low: Int[Array, "... depth voxel"]
+    fraction: Float[Array, "... depth voxel"]
+
+
+def _pairs(shapes: Shapes, rays: Rays) -> tuple[_Pair, _Pair]:
+    def pair(axis, pixels):
+        low = jnp.clip(axis.pixel, 0, pixels - 2)
+        return _Pair(low, axis.fraction + (axis.pixel - low).astype(axis.fraction.dtype))
+
+    return pair(rays.y, shapes.image[0]), pair(rays.x, shapes.image[1])
+
+
+def _patch(volume, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
+    """The voxels that one lens may see."""
+    return lax.dynamic_slice(volume, _corner(y, x), (*y.pixel.shape, x.pixel.shape[1]))
+
+
+def _corner(y: Axis, x: Axis):
+    return jnp.zeros_like(y.start), y.start, x.start
+
+
+def _weights(shapes: Shapes, y: Axis, x: Axis, reduced_depth) -> Float[Array, "depth y x"]:
+    distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
+    return envelope(distance2, reduced_depth[:, None, None], shapes.field_radius)
+
+
+def _if_seen(shapes: Shapes, y: Axis, x: Axis, compute):
+    """`compute()`, or zeros if the lens sees no voxel on the sensor."""
+    seen = y.distance2.min() + x.distance2.min() < field_limit(shapes.field_radius) ** 2
+    zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(compute))
+    return lax.cond(seen, compute, lambda: zeros)
+
+
+def _corners(image, y: _Pair, x: _Pair):
+    """The four pixels around each ray, `(depth, y, x)` each."""
+    row, column = y.low[:, :, None], x.low[:, None, :]
+    read = lambda down, right: (
+        image.at[row + down, column + right].get(mode="promise_in_bounds").astype(y.fraction.dtype)
+    )
+    return read(0, 0), read(0, 1), read(1, 0), read(1, 1)
+
+
+def _interpolate(corners, y: _Pair, x: _Pair):
+    """The interpolated pixel and its derivatives by the row and column of the ray."""
+    upper_left, upper_right, lower_left, lower_right = corners
+    down, right = y.fraction[:, :, None], x.fraction[:, None, :]
+    upper = upper_left + right * (upper_right - upper_left)
+    lower = lower_left + right * (lower_right - lower_left)
+    along_x = (1 - down) * (upper_right - upper_left) + down * (lower_right - lower_left)
+    return upper + down * (lower - upper), lower - upper, along_x
+
+
+class _Blocks(NamedTuple):
+    """Consecutive blocks of pixels that cover all that a lens's rays reach along one axis."""
+
+    first: Int[Array, ""]
+    count: Int[Array, ""]
+    pixels: int
+
+    def block(self, number):
+        """First pixel, pixels `(block,)` and whether no earlier block had them (at the sensor's end some did)."""
+        size = min(_BLOCK, self.pixels)
+        wanted = self.first + number * size
+        start = jnp.minimum(wanted, self.pixels - size)
+        pixels = start + jnp.arange(size, dtype=jnp.int32)
+        return start, pixels, pixels >= wanted
+
+
+def _blocks(axis: Axis, pixels: int) -> _Blocks:
+    first = jnp.clip(axis.pixel.min(), 0, pixels - 1)
+    last = jnp.clip(axis.pixel.max() + 1, 0, pixels - 1)
+    return _Blocks(first, (last - first) // min(_BLOCK, pixels) + 1, pixels)
+
+
+def _taps(axis: Axis, spacing, pixels, fresh):
+    """A function of a count, and its first value: the count-th voxel that reaches each pixel, and how much of it.
+
+    Both are `(depth, pixel)`. The rays' pixels fall with the voxel's number: those that reach a pixel are neighbours.
+    """
+    reach = pixels[None, :]
+    last = axis.pixel.shape[1] - 1
+    at = lambda table, voxel: jnp.take_along_axis(table, voxel, axis=1, mode="promise_in_bounds")
+    # The first voxel whose pixel is not above this one: guessed one or two too low, as rounding allows, and corrected.
+    guess = jnp.floor((axis.origin[:, None] - (reach + 1).astype(axis.origin.dtype)) / spacing[:, None] - 0.5)
+    first = jnp.clip(guess, 0, last).astype(jnp.int32)
+    for _ in range(2):
+        first = jnp.minimum(first + (at(axis.pixel, first) > reach).astype(jnp.int32), last)
+
+    def tap(count):
+        voxel = jnp.minimum(first + count, last)
+        pixel, fraction = at(axis.pixel, voxel), at(axis.fraction, voxel)
+        part = jnp.where(pixel == reach, 1 - fraction, jnp.where(pixel == reach - 1, fraction, 0))
+        return voxel, jnp.where(fresh[None, :] & (first + count <= last), part, 0)
+
+    return tap
+
+
+def _spread_columns(patch, x: Axis, spacing, columns, fresh, taps):
+    """A patch of voxels `(depth, y, x)` spread over pixel columns, `(depth, y, column)`."""
+    tap = _taps(x, spacing, columns, fresh)
+
+    def add(count, state):
+        spread, voxel, part = state
+        return spread + part[:, None, :] * _pick(patch, voxel, axis=2), *tap(count + 1)
+
+    # The next tap is carried, so that it is computed once and not for every row.
+    empty = jnp.zeros((*patch.shape[:2], columns.size), patch.dtype)
+    return lax.fori_loop(0, taps, add, (empty, *tap(0)))[0]
+
+
+def _add_rows(image, spread, y: Axis, spacing, rows, fresh, taps, start):
+    """Add what `_spread_columns` returned to a block of the image, spread over pixel rows and summed over depths."""
+    tap = _taps(y, spacing, rows, fresh)
+
+    def add(count, state):
+        image, voxel, part = state
+        block = lax.dynamic_slice(image, start, (rows.size, spread.shape[2]))
+        picked = _pick(spread, voxel, axis=1)
+        for depth in range(spread.shape[0]):  # written out: one pass over the block
+            block = block + part[depth, :, None] * picked[depth]
+        return lax.dynamic_update_slice(image, block, start), *tap(count + 1)
+
+    return lax.fori_loop(0, taps, add, (image, *tap(0)))[0]
+
+
+def _pick(array: Float[Array, "depth y x"], index: Int[Array, "depth new"], *, axis: int):
+    """`array[d].take(index[d], axis - 1)` for each depth, in a form that keeps whole rows together."""
+    dimensions = lax.GatherDimensionNumbers(
+        offset_dims=(3 - axis,),
+        collapsed_slice_dims=(axis,),
+        start_index_map=(axis,),
+        operand_batching_dims=(0,),
+        start_indices_batching_dims=(0,),
+    )
+    sizes = [1, *array.shape[1:]]
+    sizes[axis] = 1
+    return lax.gather(array, index[..., None], dimensions, tuple(sizes), mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)

@@ -1,0 +1,250 @@
+"""Lenses, sensor and object grid, and where a lens images a point (Eqs. 1, 3).
+
+Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
+`[row, column]`, volumes are `[depth, row, column]`. The lateral frame is the sensor's: origin at its
+centre, +x along increasing column, +y along increasing row. A depth `z > 0` is measured from the front
+(plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+
+def _as_float(x) -> Array:
+    return jnp.asarray(x, dtype=float)
+
+
+def _as_float_or_none(x) -> Array | None:
+    return None if x is None else _as_float(x)
+
+
+# Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a
+# gradient, narrow enough to leave the paper's N_e lenses nearly alone (it adds 5 % to the radius to visit).
+FALLOFF = 0.1
+
+
+def chief_ray(center, point, magnification):
+    """Where the chief ray from `point` through the lens at `center` meets the sensor.
+
+    `p = c + (c - q) v/z' = s_z c - M_z q` with `M_z = v/z'` (Eq. 3) and `s_z = 1 + M_z` (Eq. 1).
+    It acts on each coordinate alone, so every argument may be one coordinate or a whole vector; all
+    broadcast. Everything in the package that needs the map calls this function.
+    """
+    return center + magnification * (center - point)
+
+
+def envelope(distance_squared, reduced_depth, field_radius):
+    """The envelope C: how much of a point's light a lens gives to its image, 1 on the lens's axis.
+
+    `cos(theta)^4` of the chief ray (Lambert's law and the foreshortened aperture; the paper cites the
+    law and gives no formula), times a falloff at the field radius that is smooth, so that lens positions
+    have gradients. The falloff is 1/2 at the field radius, where the paper takes the Strehl ratio to be
+    half its peak, and its integral over the plane is `A_e = pi field_radius^2` exactly.
+
+    Parameters
+    ----------
+    distance_squared
+        Squared lateral distance of the point from the lens's axis, mm^2.
+    reduced_depth
+        `z'`, mm; broadcasts against `distance_squared`.
+    field_radius
+        `sqrt(A_e / pi)`, mm.
+    """
+    cos_squared = reduced_depth**2 / (reduced_depth**2 + distance_squared)
+    outer = field_limit(field_radius) ** 2
+    t = jnp.clip((outer - distance_squared) / (2 * FALLOFF * field_radius**2), 0, 1)
+    return cos_squared**2 * t * t * (3 - 2 * t)
+
+
+def field_limit(field_radius):
+    """The lateral distance from a lens's axis at which the envelope becomes zero, mm."""
+    return field_radius * (1 + FALLOFF) ** 0.5
+
+
+class Sensor(eqx.Module):
+    """A camera sensor of square pixels, in the plane `z = -v` behind the lenses.
+
+    Parameters
+    ----------
+    shape
+        `(rows, columns)`, two pixels each way at least: interpolation needs neighbours.
+    pixel_pitch
+        Distance of pixel centres, mm. It is a plain number, not an array: a camera is given, not optimised.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 2 x 2 pixels, or the pitch is not positive.
+    """
+
+    shape: tuple[int, int] = eqx.field(static=True)
+    pixel_pitch: float = eqx.field(static=True, converter=float)
+
+    def __check_init__(self):
+        if len(self.shape) != 2 or min(self.shape) < 2:
+            raise ValueError(f"`shape` must be two numbers of pixels, each 2 or more, got {self.shape}.")
+        if not self.pixel_pitch > 0:
+            raise ValueError(f"`pixel_pitch` must be positive, got {self.pixel_pitch}.")
+
+    def to_pixels(self, points: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
+        """Fractional `(row, column)` of points `(x, y)`; pixel centres have whole numbers."""
+        middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
+        row = points[..., 1] / self.pixel_pitch + middle_row
+        column = points[..., 0] / self.pixel_pitch + middle_column
+        return jnp.stack([row, column], axis=-1)
+
+    def to_mm(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
+        """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
+        middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
+        x = (pixels[..., 1] - middle_column) * self.pixel_pitch
+        y = (pixels[..., 0] - middle_row) * self.pixel_pitch
+        return jnp.stack([x, y], axis=-1)
+
+
+class MicrolensArray(eqx.Module):
+    """Plano-convex microlenses on one plate, the plano side toward the object.
+
+    Parameters
+    ----------
+    centers
+        Lens vertices `(lens, 2)` in the array's own frame, mm.
+    radius_of_curvature, refractive_index, aperture_diameter, substrate_thickness
+        Of every lens and of the plate that carries them, mm. The aperture is the one before neighbours
+        clip it to its Voronoi cell.
+    thin_lens_focal_length
+        Overrides the focal length that follows from the radius, mm, for a thin-lens study.
+
+    Raises
+    ------
+    ValueError
+        If `centers` is not `(lens, 2)` or holds no lens.
+    """
+
+    centers: Float[Array, "lens 2"] = eqx.field(converter=_as_float)
+    radius_of_curvature: Float[Array, ""] = eqx.field(converter=_as_float, default=2.0)
+    refractive_index: Float[Array, ""] = eqx.field(converter=_as_float, default=1.43)
+    aperture_diameter: Float[Array, ""] = eqx.field(converter=_as_float, default=2.0)
+    substrate_thickness: Float[Array, ""] = eqx.field(converter=_as_float, default=1.0)
+    thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=_as_float_or_none, default=None)
+
+    def __check_init__(self):
+        if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
+            raise ValueError(f"`centers` must be (lens, 2) with a lens at least, got {self.centers.shape}.")
+
+    @property
+    def focal_length(self) -> Float[Array, ""]:
+        """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm."""
+        if self.thin_lens_focal_length is None:
+            return self.radius_of_curvature / (self.refractive_index - 1)
+        return self.thin_lens_focal_length
+
+
+class Imager(eqx.Module):
+    """A microlens array in front of a sensor: the one geometry of the package.
+
+    Parameters
+    ----------
+    array, sensor
+        What is imaged with.
+    sensor_distance
+        `v`, from the lens vertices to the sensor, mm.
+    field_radius
+        `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
+        of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
+    rotation
+        Of the array about the sensor's centre, radians, from +x toward +y.
+    shift
+        `(x, y)` of the array after the rotation, mm.
+
+    Raises
+    ------
+    ValueError
+        If `field_radius` is not positive.
+    """
+
+    array: MicrolensArray
+    sensor: Sensor
+    sensor_distance: Float[Array, ""] = eqx.field(converter=_as_float)
+    field_radius: float = eqx.field(static=True, converter=float)
+    rotation: Float[Array, ""] = eqx.field(converter=_as_float, default=0.0)
+    shift: Float[Array, "2"] = eqx.field(converter=_as_float, default=(0.0, 0.0))
+
+    def __check_init__(self):
+        if not self.field_radius > 0:
+            raise ValueError(f"`field_radius` must be positive, got {self.field_radius}.")
+
+    @property
+    def centers(self) -> Float[Array, "lens 2"]:
+        """Lens vertices in the sensor's frame, mm.
+
+        A rotated array is nothing but moved centres: in the sensor's frame the chief-ray map stays
+        separable in x and y, which is what makes back-projection fast.
+        """
+        cos, sin = jnp.cos(self.rotation), jnp.sin(self.rotation)
+        x, y = self.array.centers.T
+        return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
+
+    def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+        """`z' = z + t/n`: what the optics sees of a depth `z`, mm (the plate counts as `t/n` of air)."""
+        return depth + self.array.substrate_thickness / self.array.refractive_index
+
+    def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+        """Lateral magnification `M_z = v / z'` (Eq. 3)."""
+        return self.sensor_distance / self.reduced_depth(depth)
+
+    def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+        """Scale of the array's pattern on the sensor, `s_z = (z' + v) / z'` (Eq. 1)."""
+        return 1 + self.magnification(depth)
+
+    def project(self, points: Float[ArrayLike, "point 3"]) -> Float[Array, "lens point 2"]:
+        """Where each lens images each point `(x, y, z)`, mm on the sensor."""
+        magnification = self.magnification(points[:, 2])[:, None]
+        return chief_ray(self.centers[:, None, :], points[None, :, :2], magnification[None])
+
+
+class Grid(eqx.Module):
+    """Voxels of the object space, centred on the axis.
+
+    Parameters
+    ----------
+    depths
+        `(depth,)`, in any order and spacing, mm.
+    shape
+        `(rows, columns)` of each plane.
+    pitch
+        Lateral distance of voxel centres, mm. Like the field radius it decides shapes: a plain number.
+
+    Raises
+    ------
+    ValueError
+        If there is no depth, no voxel, or the pitch is not positive.
+    """
+
+    depths: Float[Array, " depth"] = eqx.field(converter=_as_float)
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: float = eqx.field(static=True, converter=float)
+
+    def __check_init__(self):
+        if self.depths.ndim != 1 or self.depths.size < 1:
+            raise ValueError(f"`depths` must be (depth,) with a depth at least, got {self.depths.shape}.")
+        if len(self.shape) != 2 or min(self.shape) < 1:
+            raise ValueError(f"`shape` must be two positive numbers of voxels, got {self.shape}.")
+        if not self.pitch > 0:
+            raise ValueError(f"`pitch` must be positive, got {self.pitch}.")
+
+    @classmethod
+    def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
+        """The grid that covers as much of the object as the sensor is large (the paper's field of view)."""
+        rows, columns = (max(1, round(n * sensor.pixel_pitch / pitch)) for n in sensor.shape)
+        return cls(depths, (rows, columns), pitch)
+
+    @property
+    def y(self) -> Float[Array, " row"]:
+        """Voxel centres along the rows' axis, mm."""
+        return (jnp.arange(self.shape[0], dtype=self.depths.dtype) - (self.shape[0] - 1) / 2) * self.pitch
+
+    @property
+    def x(self) -> Float[Array, " column"]:
+        """Voxel centres along the columns' axis, mm."""
+        return (jnp.arange(self.shape[1], dtype=self.depths.dtype) - (self.shape[1] - 1) / 2) * self.pitch

@@ -1,0 +1,6 @@
+import jax
+
+# Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -1,0 +1,60 @@
+"""A small scene and slow, literal references."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def needs(path: str) -> Path:
+    """A file of the shared data, or skip."""
+    if not (DATA / path).exists():
+        pytest.skip(f"{DATA / path} is not on this machine")
+    return DATA / path
+
+
+def scene(dtype=jnp.float64, *, shape=(96, 80), voxels=(21, 17), depths=(18.0, 20.0, 23.5), pitch=0.05):
+    """A 24-lens imager, rotated and shifted a little, and a grid whose edge is off the sensor for some lenses."""
+    rng = np.random.default_rng(0)
+    centers = rng.uniform(-0.9, 0.9, (24, 2))
+    imager = Imager(MicrolensArray(centers), Sensor(shape, 0.02), 5.8, 0.45, rotation=0.02, shift=(0.013, -0.007))
+    grid = Grid(depths, voxels, pitch)
+    cast = lambda leaf: jnp.asarray(leaf, dtype)
+    return jax.tree.map(cast, imager), jax.tree.map(cast, grid)
+
+
+def backproject_loop(image, imager, grid, method="linear"):
+    """The paper's sum as it is told: for each voxel, for each lens, find the pixel. Returns it and the weights' sum."""
+    image = np.asarray(image, np.float64)
+    volume, weights = np.zeros((grid.depths.size, *grid.shape)), np.zeros((grid.depths.size, *grid.shape))
+    cos, sin = np.cos(float(imager.rotation)), np.sin(float(imager.rotation))
+    centers = np.asarray(imager.array.centers, np.float64) @ np.array([[cos, sin], [-sin, cos]])
+    centers = centers + np.asarray(imager.shift, np.float64)
+    thickness = float(imager.array.substrate_thickness) / float(imager.array.refractive_index)
+    pixel, radius2 = imager.sensor.pixel_pitch, imager.field_radius**2
+    height, width = imager.sensor.shape
+    for d, r, c in np.ndindex(*volume.shape):
+        depth = float(grid.depths[d]) + thickness
+        q = np.array([c - (grid.shape[1] - 1) / 2, r - (grid.shape[0] - 1) / 2]) * grid.pitch
+        for center in centers:
+            x, y = center + (center - q) * float(imager.sensor_distance) / depth
+            u, v = y / pixel + (height - 1) / 2, x / pixel + (width - 1) / 2
+            if method == "nearest":
+                u, v = np.floor(u + 0.5), np.floor(v + 0.5)
+            if not (0 <= u <= height - 1 and 0 <= v <= width - 1):
+                continue
+            distance2 = np.sum((center - q) ** 2)
+            t = np.clip((1.1 * radius2 - distance2) / (0.2 * radius2), 0, 1)
+            weight = (depth**2 / (depth**2 + distance2)) ** 2 * t * t * (3 - 2 * t)
+            i, j = min(int(u), height - 2), min(int(v), width - 2)
+            a, b = u - i, v - j
+            square = image[i : i + 2, j : j + 2]
+            volume[d, r, c] += weight * (np.array([1 - a, a]) @ square @ np.array([1 - b, b]))
+            weights[d, r, c] += weight
+    return volume, weights

@@ -1,0 +1,247 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+import gs_jax
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+
+from .helpers import backproject_loop, needs, scene
+
+# Voxels that are coarser and finer than a pixel: 0.7 pixel, 3 pixels, 1/12 of a pixel apart on the sensor.
+GRIDS = {
+    "medium": dict(voxels=(21, 17), pitch=0.05),
+    "coarse": dict(voxels=(9, 8), pitch=0.21),
+    "fine": dict(voxels=(40, 33), pitch=0.006),
+}
+
+
+def image_of(sensor, dtype=jnp.float64, key=0):
+    return jax.random.uniform(jax.random.key(key), sensor.shape, dtype)
+
+
+def volume_of(grid, dtype=jnp.float64, key=1):
+    return jax.random.uniform(jax.random.key(key), (grid.depths.size, *grid.shape), dtype)
+
+
+@pytest.mark.parametrize("method", ["linear", "nearest"])
+@pytest.mark.parametrize("size", GRIDS)
+def test_it_is_the_papers_sum(size, method):
+    imager, grid = scene(**GRIDS[size])
+    image = image_of(imager.sensor)
+    expected, weights = backproject_loop(image, imager, grid, method)
+    np.testing.assert_allclose(backproject(image, imager, grid, method=method), expected, rtol=1e-11, atol=1e-12)
+    seen = weights > 0
+    normal = backproject(image, imager, grid, method=method, normalize=True)
+    np.testing.assert_allclose(normal[seen], expected[seen] / weights[seen], rtol=1e-11)
+    assert jnp.all(normal[~seen] == 0)
+
+
+def test_float32_is_as_accurate_as_float32_can_be():
+    """Full-size sensor: coordinates of 5,000 pixels in float32 are rounded to 2e-4 of a pixel unless split."""
+    rng = np.random.default_rng(3)
+    sensor = Sensor((4096, 4096), 0.0045)
+    image = jnp.asarray(rng.random(sensor.shape, dtype=np.float32))
+    centers = rng.uniform(-9, 9, (40, 2)).astype(np.float32).astype(np.float64)
+    imager = Imager(MicrolensArray(centers), sensor, 5.8, 3.0)
+    grid = Grid([18.0, 21.0], (64, 64), 0.25)
+    low = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+    exact = backproject(image.astype(jnp.float64), imager, grid)
+    error = jnp.abs(backproject(image, low(imager), low(grid)).astype(jnp.float64) - exact).max()
+    # White noise has a slope of up to 1 a pixel; a few 1e-6 pixels of 15 lenses add up to this.
+    assert error < 2e-5 * exact.max()
+
+
+@pytest.mark.parametrize("method", ["linear", "nearest"])
+@pytest.mark.parametrize("size", GRIDS)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 1e-5)])
+def test_adjoint(size, method, dtype, tolerance):
+    imager, grid = scene(dtype, **GRIDS[size])
+    image, volume = image_of(imager.sensor, dtype), volume_of(grid, dtype)
+    back = jnp.vdot(backproject(image, imager, grid, method=method), volume)
+    forth = jnp.vdot(image, backproject_adjoint(volume, imager, grid, method=method))
+    np.testing.assert_allclose(back, forth, rtol=tolerance)
+
+
+def test_adjoint_over_several_blocks_and_the_sensors_edge():
+    """Sub-images wider than a block, that end off the sensor."""
+    imager = Imager(MicrolensArray([[0.0, 0.0], [1.4, -1.2], [-3.0, 0.5]]), Sensor((700, 500), 0.0045), 5.8, 3.0)
+    grid = Grid([18.0, 21.0], (90, 111), 0.037)
+    image, volume = image_of(imager.sensor), volume_of(grid)
+    np.testing.assert_allclose(
+        jnp.vdot(backproject(image, imager, grid), volume),
+        jnp.vdot(image, backproject_adjoint(volume, imager, grid)),
+        rtol=1e-12,
+    )
+
+
+def test_adjoint_matches_the_transpose_of_a_plain_jax_version():
+    """Dense and slow, through `project`: what JAX derives by itself."""
+    imager, grid = scene(voxels=(9, 8), pitch=0.1)
+
+    def plain(image):
+        y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
+
+        def voxel(x, y, z):
+            rays = imager.project(jnp.stack([x, y, z])[None])[:, 0]
+            distance2 = jnp.sum((imager.centers - jnp.stack([x, y])) ** 2, axis=1)
+            u, v = imager.sensor.to_pixels(rays).T
+            weight = gs_jax.envelope(distance2, imager.reduced_depth(z), imager.field_radius)
+            inside = (u >= 0) & (u <= image.shape[0] - 1) & (v >= 0) & (v <= image.shape[1] - 1)
+            values = jax.scipy.ndimage.map_coordinates(image, [u, v], order=1)
+            return jnp.sum(jnp.where(inside, weight * values, 0))
+
+        return jax.vmap(lambda z: jax.vmap(jax.vmap(voxel, (0, 0, None)), (0, 0, None))(x, y, z))(grid.depths)
+
+    volume = volume_of(grid)
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        (expected,) = jax.linear_transpose(plain, image_of(imager.sensor))(volume)
+        forth = plain(image_of(imager.sensor))
+    np.testing.assert_allclose(backproject_adjoint(volume, imager, grid), expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(backproject(image_of(imager.sensor), imager, grid), forth, rtol=1e-10, atol=1e-12)
+
+
+def smooth_image(sensor):
+    """Neither flat nor rough, so that a finite difference across a pixel's edge is near the derivative."""
+    row, column = jnp.meshgrid(*(jnp.arange(n, dtype=float) for n in sensor.shape), indexing="ij")
+    return 2 + jnp.sin(row / 30) + jnp.cos(column / 40 + row / 50)
+
+
+@pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
+def test_gradients_by_everything(modes):
+    imager, grid = scene(voxels=(6, 5), pitch=0.15)
+    image = smooth_image(imager.sensor)
+
+    def values(centers, v, thickness, rotation, shift, depths, image):
+        array = MicrolensArray(centers, substrate_thickness=thickness)
+        moved = Imager(array, imager.sensor, v, imager.field_radius, rotation=rotation, shift=shift)
+        return backproject(image, moved, Grid(depths, grid.shape, grid.pitch))
+
+    arguments = (imager.array.centers, imager.sensor_distance, jnp.array(1.0), imager.rotation, imager.shift)
+    # Steps of 1e-6 mm stay within a pixel (bilinear interpolation has kinks at pixel centres) at this generic point.
+    check_grads(values, (*arguments, grid.depths, image), order=1, modes=modes, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
+def test_gradients_of_the_adjoint(modes):
+    imager, grid = scene(voxels=(6, 5), pitch=0.15)
+    volume = volume_of(grid)
+    # A smooth weight: the adjoint's pixels are as kinked as the interpolation.
+    moment = lambda imager, depths, volume: jnp.vdot(
+        smooth_image(imager.sensor), backproject_adjoint(volume, imager, Grid(depths, grid.shape, grid.pitch))
+    )
+    check_grads(moment, (imager, grid.depths, volume), order=1, modes=modes, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+def test_gradient_of_the_normalized_volume():
+    imager, grid = scene(voxels=(6, 5), pitch=0.15)
+    values = lambda imager: backproject(smooth_image(imager.sensor), imager, grid, normalize=True)
+    check_grads(values, (imager,), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_gradients_stay_finite_in_the_dark_and_where_nothing_is_seen(normalize):
+    imager, grid = scene()
+    total = lambda i: jnp.sum(backproject(jnp.zeros(i.sensor.shape), i, grid, normalize=normalize) ** 2)
+    far = Imager(MicrolensArray([[50.0, 0.0], [50.0, 0.0]]), imager.sensor, 5.8, 0.45)
+    for case in (imager, far):
+        value, gradient = jax.value_and_grad(total)(case)
+        assert value == 0
+        assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+def test_vmap_over_images_and_over_imagers():
+    imager, grid = scene()
+    images = jnp.stack([image_of(imager.sensor, key=k) for k in range(3)])
+    batch = jax.vmap(lambda image: backproject(image, imager, grid))(images)
+    np.testing.assert_allclose(batch[2], backproject(images[2], imager, grid), rtol=1e-13)
+
+    loss = lambda v, image: jnp.sum(
+        backproject(image, Imager(imager.array, imager.sensor, v, imager.field_radius), grid) ** 2
+    )
+    distances = jnp.array([5.0, 5.8])
+    gradients = jax.vmap(jax.grad(loss), (0, None))(distances, images[0])
+    np.testing.assert_allclose(gradients[1], jax.grad(loss)(distances[1], images[0]), rtol=1e-12)
+
+
+def test_second_derivatives_are_refused_in_words():
+    imager, grid = scene(voxels=(4, 3), pitch=0.2)
+    total = lambda v: jnp.sum(backproject(image_of(imager.sensor), Imager(imager.array, imager.sensor, v, 0.45), grid))
+    with pytest.raises(NotImplementedError, match="first derivatives"):
+        jax.grad(jax.grad(total))(imager.sensor_distance)
+
+
+def test_many_depths_go_in_groups():
+    """37 depths are three groups of 13, of which two are padding."""
+    imager, grid = scene(voxels=(7, 6), pitch=0.15, depths=np.linspace(18, 24, 37))
+    image, volume = image_of(imager.sensor), volume_of(grid)
+    one = Grid(grid.depths[30:31], grid.shape, grid.pitch)
+    np.testing.assert_allclose(backproject(image, imager, grid)[30], backproject(image, imager, one)[0], rtol=1e-13)
+    adjoint = backproject_adjoint(volume, imager, grid)
+    np.testing.assert_allclose(jnp.vdot(backproject(image, imager, grid), volume), jnp.vdot(image, adjoint), rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.uint8, jnp.uint16])
+def test_integers_are_read_as_they_are(dtype):
+    imager, grid = scene()
+    image = jax.random.randint(jax.random.key(0), imager.sensor.shape, 0, 255).astype(dtype)
+    np.testing.assert_allclose(
+        backproject(image, imager, grid), backproject(image.astype(jnp.float64), imager, grid), rtol=1e-13
+    )
+
+
+def test_a_changed_distance_does_not_recompile():
+    imager, grid = scene()
+    image = image_of(imager.sensor)
+    backproject(image, imager, grid)
+    before = backproject._cache_size()
+    backproject(image, Imager(imager.array, imager.sensor, 5.1, imager.field_radius), grid)
+    assert backproject._cache_size() == before
+
+
+def test_memory_is_image_and_volume_and_a_small_constant():
+    """What XLA itself plans to allocate, at full scale."""
+    centers = np.random.default_rng(0).uniform(-10, 10, (213, 2))
+    imager = Imager(MicrolensArray(centers), Sensor((5120, 5120), 0.0045), 5.8, 3.0)
+    grid = Grid(np.linspace(18, 24, 13), (555, 555), 23.04 / 555)
+    low = lambda tree: jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), tree)
+    image = jax.ShapeDtypeStruct(imager.sensor.shape, jnp.float32)
+    volume = jax.ShapeDtypeStruct((13, 555, 555), jnp.float32)
+
+    def gradient(image, imager, volume, grid):
+        return jax.grad(lambda i: jnp.vdot(backproject(image, i, grid), volume))(imager)
+
+    for function, arguments in [
+        (backproject, (image, low(imager), low(grid))),
+        (backproject_adjoint, (volume, low(imager), low(grid))),
+        (jax.jit(gradient), (image, low(imager), volume, low(grid))),
+    ]:
+        assert function.lower(*arguments).compile().memory_analysis().temp_size_in_bytes < 60 * 2**20
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda i, g: backproject(jnp.zeros((4, 4)), i, g), r"sensor's shape \(96, 80\), got \(4, 4\)"),
+        (lambda i, g: backproject(jnp.zeros((96, 80)), i, g, method="cubic"), '"linear" or "nearest", got \'cubic\''),
+        (lambda i, g: backproject_adjoint(jnp.zeros((1, 2, 3)), i, g), r"grid's shape \(3, 21, 17\), got \(1, 2, 3\)"),
+    ],
+)
+def test_wrong_arguments_are_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call(*scene())
+
+
+def test_a_ray_traced_point_is_found():
+    """An image that our model did not make; bars of the first milestone: 20 um laterally, 100 um axially."""
+    import tifffile
+
+    image = tifffile.imread(needs("oracle/dev/P1_a.tif"))
+    centers = np.loadtxt(needs("geomscope/centers.csv"), delimiter=",", skiprows=1)
+    imager = Imager(MicrolensArray(centers), Sensor(image.shape, 0.0045), 5.85, 3.0)
+    grid = Grid(np.arange(19.4, 20.61, 0.05), (81, 81), 0.01)
+    volume = backproject(jnp.asarray(image), imager, grid)
+    depth, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
+    assert abs(float(grid.depths[depth]) - 20) <= 0.1
+    assert np.hypot(float(grid.x[column]), float(grid.y[row])) <= 0.02

@@ -1,0 +1,111 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy import integrate
+
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, chief_ray, envelope
+
+from .helpers import scene
+
+
+def test_chief_ray_obeys_equations_1_and_3():
+    imager = Imager(MicrolensArray([[1.5, -2.0]], substrate_thickness=1.0), Sensor((64, 64), 0.0045), 5.8, 3.0)
+    reduced = 20 + 1 / 1.43
+    q = np.array([0.3, 0.7])
+    (((x, y),),) = imager.project(jnp.array([[*q, 20.0]]))
+    scale, magnification = (reduced + 5.8) / reduced, 5.8 / reduced
+    np.testing.assert_allclose([x, y], scale * np.array([1.5, -2.0]) - magnification * q, rtol=1e-14)
+    np.testing.assert_allclose(imager.scale(jnp.array(20.0)), scale, rtol=1e-14)
+    np.testing.assert_allclose(imager.magnification(jnp.array(20.0)), magnification, rtol=1e-14)
+
+
+def test_chief_ray_follows_snells_law_through_the_plate():
+    """An exact ray through plano face, glass and vertex; the reduced thickness is its paraxial limit."""
+    n, thickness, depth, v, lateral = 1.43, 1.0, 20.0, 5.8, 0.5
+    imager = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((64, 64), 0.0045), v, 3.0)
+    tilt = np.linspace(0, 0.1, 200_001)
+    reaches = depth * np.tan(tilt) + thickness * np.tan(np.arcsin(np.sin(tilt) / n))
+    exact = -v * np.tan(np.interp(lateral, reaches, tilt))  # at the vertex the surface is flat: the air angle again
+    image = imager.project(jnp.array([[lateral, 0.0, depth]]))[0, 0, 0]
+    # Paraxial: the next term is (t/n - t/n^3) tan^3 / 2 of lateral, 6e-6 here.
+    np.testing.assert_allclose(image, exact, rtol=1e-5)
+
+
+def test_rotation_is_from_x_toward_y_and_before_the_shift():
+    array, sensor = MicrolensArray([[2.0, 0.0]]), Sensor((64, 64), 0.0045)
+    imager = Imager(array, sensor, 5.8, 3.0, rotation=np.pi / 2, shift=(0.1, -0.2))
+    np.testing.assert_allclose(imager.centers, [[0.1, 1.8]], atol=1e-15)
+
+
+def test_pixels_have_whole_numbers_at_their_centres():
+    sensor = Sensor((5, 4), 0.0045)
+    corner = jnp.array([-1.5 * 0.0045, -2 * 0.0045])  # x of column 0, y of row 0
+    np.testing.assert_allclose(sensor.to_pixels(corner), [0, 0], atol=1e-12)
+    points = jax.random.normal(jax.random.key(0), (7, 2))
+    np.testing.assert_allclose(sensor.to_mm(sensor.to_pixels(points)), points, rtol=1e-12)
+
+
+def test_grid_is_centred():
+    grid = Grid([20.0], (4, 3), 0.1)
+    np.testing.assert_allclose(grid.y, [-0.15, -0.05, 0.05, 0.15])
+    np.testing.assert_allclose(grid.x, [-0.1, 0, 0.1], atol=1e-16)
+    over = Grid.over(Sensor((5120, 2560), 0.0045), depths=[20.0], pitch=0.0415)
+    assert over.shape == (555, 278)
+
+
+def test_envelope_integrates_to_the_effective_area():
+    """With the cosine out of the way (a distant point) the integral over the plane is pi R^2."""
+    integral, _ = integrate.quad(lambda r: 2 * np.pi * r * float(envelope(r**2, 1e9, 3.0)), 0, 4, points=[2.8, 3.15])
+    np.testing.assert_allclose(integral, np.pi * 9, rtol=1e-9)
+
+
+def test_envelope_is_cos4_inside_and_half_at_the_field_radius():
+    cos = np.cos(np.arctan(2.0 / 20.7))
+    np.testing.assert_allclose(envelope(4.0, 20.7, 3.0), cos**4, rtol=1e-12)
+    np.testing.assert_allclose(envelope(9.0, 20.7, 3.0), np.cos(np.arctan(3 / 20.7)) ** 4 / 2, rtol=1e-12)
+    assert envelope(0.0, 20.7, 3.0) == 1
+    assert envelope(1e8, 20.7, 3.0) == 0
+
+
+def test_geometry_has_gradients():
+    imager, _ = scene()
+    points = jnp.array([[0.1, 0.2, 19.0], [-0.3, 0.1, 22.0]])
+    check_grads(jax.jit(lambda i, p: i.project(p)), (imager, points), order=2)
+    check_grads(jax.jit(lambda d2, z: envelope(d2, z, 0.5)), (jnp.array([0.0, 0.2, 0.26]), jnp.array(20.0)), order=1)
+
+
+def test_gradient_is_finite_on_the_axis_and_at_coincident_lenses():
+    imager = Imager(MicrolensArray([[0.0, 0.0], [0.0, 0.0]]), Sensor((64, 64), 0.0045), 5.8, 3.0)
+    total = lambda i: (
+        jnp.sum(i.project(jnp.array([[0.0, 0.0, 20.0]])) ** 2) + jnp.sum(envelope(0.0, i.scale(20.0), 3.0))
+    )
+    assert all(jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(jax.grad(total)(imager)))
+
+
+def test_focal_length_follows_the_radius_unless_given():
+    np.testing.assert_allclose(MicrolensArray([[0.0, 0.0]]).focal_length, 2 / 0.43)
+    np.testing.assert_allclose(MicrolensArray([[0.0, 0.0]], thin_lens_focal_length=4.0).focal_length, 4)
+
+
+def test_map_is_separable():
+    center, q = jnp.array([1.0, 2.0]), jnp.array([0.3, -0.4])
+    np.testing.assert_array_equal(chief_ray(center, q, 0.28)[0], chief_ray(center[0], q[0], 0.28))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Sensor((1, 64), 0.0045), "2 or more"),
+        (lambda: Sensor((64, 64), 0.0), "`pixel_pitch` must be positive, got 0.0"),
+        (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, -1.0), "`field_radius`"),
+        (lambda: Grid([20.0], (0, 3), 0.1), "two positive numbers of voxels"),
+        (lambda: Grid([20.0], (3, 3), 0.0), "`pitch` must be positive"),
+        (lambda: Grid(np.zeros(0), (3, 3), 0.1), "a depth at least"),
+        (lambda: MicrolensArray(np.zeros((0, 2))), "a lens at least"),
+    ],
+)
+def test_wrong_shapes_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
