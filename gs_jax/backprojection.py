@@ -5,8 +5,9 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, Float, Num
 
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .geometry import Grid, Imager
@@ -18,7 +19,12 @@ _DEPTHS = 16
 
 @partial(jax.jit, static_argnames=("method", "normalize"))
 def backproject(
-    image: Num[ArrayLike, "row column"], imager: Imager, grid: Grid, *, method: str = "linear", normalize: bool = False
+    image: Num[Array | np.ndarray, "row column"],
+    imager: Imager,
+    grid: Grid,
+    *,
+    method: str = "linear",
+    normalize: bool = False,
 ) -> Float[Array, "depth y x"]:
     """Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction").
 
@@ -66,7 +72,7 @@ def backproject(
 
 @partial(jax.jit, static_argnames=("method",))
 def backproject_adjoint(
-    volume: Float[ArrayLike, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
+    volume: Float[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
 ) -> Float[Array, "row column"]:
     """The exact adjoint of `backproject`: each voxel adds its value to the pixels that it is read from.
 

@@ -88,9 +88,9 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
                 top, rows, fresh = rows_of.block(block)
                 return _add_rows(image, spread, y, rays.spacing, rows, fresh, taps, (top, left))
 
-            return lax.fori_loop(0, rows_of.count, add_rows, image)
+            return lax.fori_loop(0, rows_of.blocks, add_rows, image)
 
-        return lax.fori_loop(0, columns_of.count, add_columns, image), None
+        return lax.fori_loop(0, columns_of.blocks, add_columns, image), None
 
     image = jnp.zeros(shapes.image, volume.dtype)
     return lax.scan(add_lens, image, (rays.y, rays.x))[0]
@@ -186,7 +186,7 @@ class _Blocks(NamedTuple):
     """Consecutive blocks of pixels that cover all that a lens's rays reach along one axis."""
 
     first: Int[Array, ""]
-    count: Int[Array, ""]
+    blocks: Int[Array, ""]
     pixels: int
 
     def block(self, number):

@@ -8,6 +8,7 @@ centre, +x along increasing column, +y along increasing row. A depth `z > 0` is 
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 
@@ -87,14 +88,14 @@ class Sensor(eqx.Module):
         if not self.pixel_pitch > 0:
             raise ValueError(f"`pixel_pitch` must be positive, got {self.pixel_pitch}.")
 
-    def to_pixels(self, points: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    def to_pixels(self, points: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Fractional `(row, column)` of points `(x, y)`; pixel centres have whole numbers."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
         row = points[..., 1] / self.pixel_pitch + middle_row
         column = points[..., 0] / self.pixel_pitch + middle_column
         return jnp.stack([row, column], axis=-1)
 
-    def to_mm(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    def to_mm(self, pixels: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
         x = (pixels[..., 1] - middle_column) * self.pixel_pitch
@@ -187,7 +188,7 @@ class Imager(eqx.Module):
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """`z' = z + t/n`: what the optics sees of a depth `z`, mm (the plate counts as `t/n` of air)."""
-        return depth + self.array.substrate_thickness / self.array.refractive_index
+        return jnp.asarray(depth) + self.array.substrate_thickness / self.array.refractive_index
 
     def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Lateral magnification `M_z = v / z'` (Eq. 3)."""
@@ -197,7 +198,7 @@ class Imager(eqx.Module):
         """Scale of the array's pattern on the sensor, `s_z = (z' + v) / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)
 
-    def project(self, points: Float[ArrayLike, "point 3"]) -> Float[Array, "lens point 2"]:
+    def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array, "lens point 2"]:
         """Where each lens images each point `(x, y, z)`, mm on the sensor."""
         magnification = self.magnification(points[:, 2])[:, None]
         return chief_ray(self.centers[:, None, :], points[None, :, :2], magnification[None])
@@ -235,8 +236,12 @@ class Grid(eqx.Module):
 
     @classmethod
     def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
-        """The grid that covers as much of the object as the sensor is large (the paper's field of view)."""
-        rows, columns = (max(1, round(n * sensor.pixel_pitch / pitch)) for n in sensor.shape)
+        """The grid that covers as much of the object as the sensor is large (the paper's field of view).
+
+        Its numbers of rows and columns are odd: there is a voxel on the axis.
+        """
+        rows, columns = (2 * round((n * sensor.pixel_pitch / pitch - 1) / 2) + 1 for n in sensor.shape)
+        rows, columns = max(rows, 1), max(columns, 1)
         return cls(depths, (rows, columns), pitch)
 
     @property

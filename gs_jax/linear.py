@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import tree
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
@@ -59,9 +61,9 @@ class _Call:
     transpose: Callable
     constants_bar: Callable | None
     static: Hashable
-    constants_tree: Hashable
-    x_tree: Hashable
-    y_tree: Hashable
+    constants_tree: Any
+    x_tree: Any
+    y_tree: Any
 
     def __call__(self, *arrays):
         constants, x = self.split(arrays)
@@ -107,7 +109,7 @@ def _run(*arrays, call):
 @_linear.def_abstract_eval
 def _shapes(*arrays, call):
     shapes = jax.eval_shape(call, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
-    return [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
+    return [ShapedArray(s.shape, s.dtype) for s in shapes]
 
 
 def _jvp(primals, tangents, *, call):

@@ -52,7 +52,7 @@ def test_grid_is_centred():
     np.testing.assert_allclose(grid.y, [-0.15, -0.05, 0.05, 0.15])
     np.testing.assert_allclose(grid.x, [-0.1, 0, 0.1], atol=1e-16)
     over = Grid.over(Sensor((5120, 2560), 0.0045), depths=[20.0], pitch=0.0415)
-    assert over.shape == (555, 278)
+    assert over.shape == (555, 277)
 
 
 def test_envelope_integrates_to_the_effective_area():

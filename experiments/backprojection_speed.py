@@ -1,0 +1,370 @@
+"""How fast is back-projection? Against hand-written loops at full scale, and how its cost grows.
+
+The paper takes 18 s for an image of 5120^2 pixels, 13 depths of 555^2 voxels and 213 lenses (MATLAB, nearest pixel,
+8 threads). Here `gs_jax` runs the same job against the paper's loop and per-lens patches in parallel numba, and a
+NumPy port: the same sum, bilinear, float32, checked against each other before they are timed in turns, all on all
+cores. Compilation is timed apart.
+
+    python -m experiments.backprojection_speed [--out DIR]
+
+writes `speed.json`, `speed.md` and `speed.png`; about six minutes on two cores.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax.info import describe
+from gs_jax.layouts import random_layout
+from gs_jax.progress import Progress
+
+PAPER_S = 18.0
+FIELD_MM = 5120 * 0.0045
+
+
+class Job(NamedTuple):
+    """A size of the problem; the sensor and the grid cover the same 23 mm whatever their numbers."""
+
+    voxels: int = 555  # along a side
+    pixels: int = 5120  # along a side
+    lenses: int = 213
+    depths: int = 13
+    sensor_distance_mm: float = 4.0
+
+    def __str__(self):
+        return (
+            f"{self.depths} x {self.voxels}^2 voxels, {self.pixels}^2 pixels, {self.lenses} lenses, "
+            f"v = {self.sensor_distance_mm} mm"
+        )
+
+
+FULL = (Job(), Job(voxels=1024), Job(sensor_distance_mm=5.8))
+STUDY = {
+    "voxels": [Job(voxels=n) for n in (64, 128, 256, 555, 1024)],
+    "pixels": [Job(pixels=n) for n in (640, 1280, 2560, 5120)],
+    "lenses": [Job(lenses=n) for n in (13, 53, 213, 850)],
+    "depths": [Job(depths=n) for n in (1, 4, 13, 40)],
+}
+
+
+class Inputs(NamedTuple):
+    image: jax.Array
+    volume: jax.Array
+    imager: Imager
+    grid: Grid
+
+
+def inputs(job: Job) -> Inputs:
+    """A random image and volume, and the paper's microscope with a random layout."""
+    rng = np.random.default_rng(0)
+    plate = (20.0, 20.0)
+    centers = (
+        random_layout(213, plate, pitch=1.23, pitch_sd=0.09, seed=0)
+        if job.lenses == 213
+        else random_layout(job.lenses, plate, diameter=None, seed=0)
+    )
+    sensor = Sensor((job.pixels, job.pixels), FIELD_MM / job.pixels)
+    imager = Imager(MicrolensArray(centers), sensor, job.sensor_distance_mm, field_radius=3.0)
+    grid = Grid(np.linspace(18, 24, job.depths), (job.voxels, job.voxels), FIELD_MM / job.voxels)
+    single = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+    random = lambda *shape: jnp.asarray(rng.random(shape, dtype=np.float32))
+    return Inputs(random(*sensor.shape), random(job.depths, *grid.shape), single(imager), single(grid))
+
+
+def bilinear_form(centers, sensor_distance, s: Inputs):
+    """A number that depends on the geometry: what a design is optimised by costs about as much."""
+    moved = eqx.tree_at(lambda i: (i.array.centers, i.sensor_distance), s.imager, (centers, sensor_distance))
+    return jnp.vdot(backproject(s.image, moved, s.grid), s.volume)
+
+
+class Contestant(NamedTuple):
+    function: Callable
+    arguments: Callable[[Inputs], tuple]
+
+
+_ours = lambda s: (s.image, s.imager, s.grid)
+_whole = lambda s: (s.imager.array.centers, s.imager.sensor_distance, s)
+_by_hand = lambda s: (np.asarray(s.image), plain(s.imager, s.grid))
+CONTESTANTS = {
+    "gs_jax": Contestant(backproject, _ours),
+    "numba, the paper's loop": Contestant(paper_loop, _by_hand),
+    "numba, lens patches": Contestant(lens_patches, _by_hand),
+    "NumPy": Contestant(numpy_patches, _by_hand),
+    "gs_jax, nearest pixel": Contestant(jax.jit(partial(backproject, method="nearest")), _ours),
+    "gs_jax, normalize": Contestant(jax.jit(partial(backproject, normalize=True)), _ours),
+    "gs_jax, uint16 image": Contestant(backproject, lambda s: (_as_uint16(s.image), s.imager, s.grid)),
+    "gs_jax, adjoint": Contestant(backproject_adjoint, lambda s: (s.volume, s.imager, s.grid)),
+    "gs_jax, gradient": Contestant(jax.jit(jax.grad(bilinear_form, argnums=(0, 1))), _whole),
+    "gs_jax, value and gradient": Contestant(jax.jit(jax.value_and_grad(bilinear_form, argnums=(0, 1))), _whole),
+}
+SAME_RESULT = ("gs_jax", "numba, the paper's loop", "numba, lens patches", "NumPy")
+IN_STUDY = ("gs_jax", "gs_jax, adjoint", "numba, lens patches")
+
+
+def _as_uint16(image):
+    return (image * 65535).astype(jnp.uint16)
+
+
+def prepared(name: str, arguments: tuple) -> tuple[Callable[[], Any], float]:
+    """A contestant ready to run, and the seconds that its compilation took."""
+    function = CONTESTANTS[name].function
+    if hasattr(function, "lower"):
+        seconds, compiled = timed(lambda: function.lower(*arguments).compile())
+        return lambda: jax.block_until_ready(compiled(*arguments)), seconds
+    call = lambda: function(*arguments)
+    if function is numpy_patches:
+        return call, 0.0
+    return call, max(0.0, timed(call)[0] - timed(call)[0])  # numba compiles in the first call, once for all sizes
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    start = time.perf_counter()
+    result = call()
+    return time.perf_counter() - start, result
+
+
+def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict[str, float]) -> dict:
+    """Seconds of each contestant, run in turns so that what else the machine does meets all alike."""
+    s = inputs(job)
+    calls, results = {}, {}
+    for name in names:
+        calls[name], seconds = prepared(name, CONTESTANTS[name].arguments(s))
+        is_numba = name.startswith("numba")
+        compile_s[name] = compile_s.get(name, seconds) if is_numba else seconds
+        results[name] = calls[name]()  # warm-up
+    check(s, results)
+    results.clear()
+    times = {name: [] for name in calls}
+    for number in range(rounds):
+        for name, call in calls.items():
+            if number < 3 or np.median(times[name]) < 2.5:  # three times is enough for the very slow
+                times[name].append(timed(call)[0])
+                time.sleep(0.02)  # threads that wait for more work of the last contestant go to sleep
+    pairs = count_pairs(plain(s.imager, s.grid), s.imager.sensor.shape)
+    first = np.median(times["gs_jax"])
+    measured = {
+        name: {
+            "median_s": float(np.median(t)),
+            "min_s": min(t),
+            "rounds": len(t),
+            "compile_s": compile_s[name],
+            "pairs_per_s": pairs / float(np.median(t)),
+            "ratio": float(np.median(t) / first),
+        }
+        for name, t in times.items()
+    }
+    return {"job": str(job), **job._asdict(), "pairs": pairs, "contestants": measured}
+
+
+def check(s: Inputs, results: Mapping[str, Any]) -> None:
+    """All compute the same sum, and the adjoint is its adjoint."""
+    ours = results["gs_jax"]
+    for name in set(SAME_RESULT) & set(results):
+        error = np.abs(np.asarray(results[name]) - np.asarray(ours)).max() / np.asarray(ours).max()
+        assert error < 1e-5, f"{name} differs from gs_jax by {error:.1e} of the maximum"
+    if "gs_jax, adjoint" in results:
+        double = lambda a: np.asarray(a, np.float64)
+        back = np.vdot(double(ours), double(s.volume))
+        forth = np.vdot(double(s.image), double(results["gs_jax, adjoint"]))
+        assert abs(back - forth) < 1e-5 * abs(back), f"not adjoint: {back} and {forth}"
+
+
+def memory(name: str, job: Job) -> dict[str, float]:
+    """What a contestant adds to the memory of a fresh process that has imported everything and made the inputs.
+
+    Peak resident set while it compiles and runs twice, minus the resident set before: output, temporaries, code
+    and compiler; and the peak of the whole process. Linux only; `ru_maxrss` will not do, as a child starts with its
+    parent's.
+    """
+    s = inputs(job)
+    arguments = jax.block_until_ready(CONTESTANTS[name].arguments(s))
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    before = _status_mib("VmRSS")
+    call, _ = prepared(name, arguments)
+    result = call()
+    del result
+    call()
+    peak = _status_mib("VmHWM")
+    return {"extra_mib": peak - before, "process_mib": peak}
+
+
+def _status_mib(key: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key))
+
+
+def in_new_process(function: Callable, *arguments):
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def run(
+    jobs: Sequence[Job] = FULL,
+    study: Mapping[str, Sequence[Job]] = STUDY,
+    *,
+    names: Sequence[str] = tuple(CONTESTANTS),
+    rounds: int = 9,
+    with_memory: bool = sys.platform == "linux",
+) -> dict:
+    """Everything that `speed.json` holds; units are in the keys."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    found = {"machine": describe() | {"load average before": f"{load:.1f}"}}
+    compile_s = {}
+    once = cache(lambda job: race(job, IN_STUDY, max(3, rounds - 2), compile_s))
+    fastest = lambda job: [name for name in names if name != "NumPy" or job.sensor_distance_mm == 4.0]
+    with Progress() as progress:
+        found["jobs"] = [race(job, fastest(job), rounds, compile_s) for job in progress.track(jobs, "Full scale")]
+        if with_memory:
+            for name in progress.track(names, "Memory"):
+                found["jobs"][0]["contestants"][name] |= in_new_process(memory, name, jobs[0])
+        flat = [(axis, job) for axis, axis_jobs in study.items() for job in axis_jobs]
+        found["study"] = {axis: [] for axis in study}
+        for axis, job in progress.track(flat, "Scaling"):
+            found["study"][axis].append(once(job))
+    found["slopes"] = {
+        axis: {name: slope(axis, results, name) for name in IN_STUDY} for axis, results in found["study"].items()
+    }
+    found["bars"] = bars(found["jobs"][0])
+    return found
+
+
+def amount(axis: str, result: dict) -> int:
+    """Voxels and pixels are counted in all, not along a side."""
+    n = result[axis]
+    return {"voxels": n * n * result["depths"], "pixels": n * n}.get(axis, n)
+
+
+def slope(axis: str, results: Sequence[dict], name: str) -> float:
+    """Exponent of the cost between the two largest sizes."""
+    (x0, t0), (x1, t1) = ((amount(axis, r), r["contestants"][name]["median_s"]) for r in results[-2:])
+    return float(np.log(t1 / t0) / np.log(x1 / x0))
+
+
+def bars(result: dict) -> list[dict]:
+    """What was promised for full scale, and what was found."""
+    of = lambda name, key: result["contestants"].get(name, {}).get(key, float("nan"))
+    t = partial(of, key="median_s")
+    ours = t("gs_jax")
+    volume_mib = result["depths"] * result["voxels"] ** 2 * 4 / 2**20
+    image_mib = result["pixels"] ** 2 * 4 / 2**20
+    rows = [
+        ("time of the numba loop, in ours", t("numba, the paper's loop") / ours, ">=", 5),
+        ("our time, in that of numba lens patches", ours / t("numba, lens patches"), "<=", 2.5),
+        ("the paper's 18 s, in ours", PAPER_S / ours, ">=", 100),
+        ("adjoint, in back-projections", t("gs_jax, adjoint") / ours, "<=", 3),
+        ("gradient by centres and v, in back-projections", t("gs_jax, gradient") / ours, "<=", 4),
+        (
+            "peak memory with the image, MiB",
+            image_mib + of("gs_jax", "extra_mib"),
+            "<=",
+            image_mib + 3 * volume_mib + 300 * 1e6 / 2**20,
+        ),
+    ]
+    return [
+        {"what": what, "found": found, "sign": sign, "bar": bar, "met": bool(found >= bar if sign == ">=" else found <= bar)}
+        for what, found, sign, bar in rows
+    ]
+
+
+COLUMNS = ("", "median, ms", "fastest, ms", "in ours", "compile, s", "pairs / s", "memory added, MiB")
+
+
+def job_rows(result: dict) -> list[list[str]]:
+    pretty = lambda value, form: "" if value is None else format(value, form)
+    return [
+        [
+            name,
+            f"{1e3 * m['median_s']:.1f}",
+            f"{1e3 * m['min_s']:.1f}",
+            f"{m['ratio']:.2f}",
+            f"{m['compile_s']:.1f}",
+            f"{m['pairs_per_s']:.2e}",
+            pretty(m.get("extra_mib"), ".0f"),
+        ]
+        for name, m in result["contestants"].items()
+    ]
+
+
+def bar_rows(found: dict) -> list[list[str]]:
+    return [[b["what"], f"{b['found']:.3g}", f"{b['sign']} {b['bar']:.3g}", "yes" if b["met"] else "NO"] for b in found]
+
+
+def tables(found: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
+    """Title, columns and rows of every table."""
+    jobs = [(f"{r['job']}: {r['pairs']:.3g} pairs", COLUMNS, job_rows(r)) for r in found["jobs"]]
+    slopes = [[axis, *(f"{s[name]:.2f}" for name in IN_STUDY)] for axis, s in found["slopes"].items()]
+    return [
+        *jobs,
+        ("Against the bars", ("", "found", "bar", "met"), bar_rows(found["bars"])),
+        ("Exponent of the cost between the two largest sizes", ("in", *IN_STUDY), slopes),
+    ]
+
+
+def markdown(found: dict) -> str:
+    machine = ", ".join(f"{key} {value}" for key, value in found["machine"].items())
+    parts = ["# Speed of back-projection", f"{machine}. Warm medians; a pair is a voxel and a lens that sees it."]
+    for title, columns, rows in tables(found):
+        lines = [columns, ["---"] + ["---:"] * (len(columns) - 1), *rows]
+        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
+    """Cost against each size, the others at full scale."""
+    figure = Figure(figsize=(8, 6.4), layout="constrained")
+    for axes, (axis, results) in zip(figure.subplots(2, 2, sharey=True).flat, study.items(), strict=False):
+        x = [amount(axis, result) for result in results]
+        for name, style in zip(IN_STUDY, ("o-", "s--", "^:"), strict=True):
+            axes.loglog(x, [1e3 * r["contestants"][name]["median_s"] for r in results], style, label=name)
+        axes.set_xlabel({"voxels": "voxels, all depths", "pixels": "pixels of the image"}.get(axis, axis))
+        axes.grid(which="both", alpha=0.25)
+        axes.label_outer()
+    figure.axes[0].legend()
+    figure.supylabel("time, warm, ms")
+    return figure
+
+
+def write(found: dict, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "speed.json").write_text(json.dumps(found, indent=1) + "\n")
+    (folder / "speed.md").write_text(markdown(found))
+    picture(found["study"]).savefig(folder / "speed.png", dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/backprojection_speed"))
+    folder = parser.parse_args().out
+    found = run()
+    write(found, folder)
+    console = Console()
+    for title, columns, rows in tables(found):
+        table = Table(title=title, title_justify="left")
+        for number, column in enumerate(columns):
+            table.add_column(column, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    console.print(f"Wrote {folder}/speed.json, speed.md and speed.png.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Plain back-projection of ray-traced captures: are the points where they were?
+
+The captures were made by an independent exact ray tracer with the paper's lens centres (sensor at 5.85 mm),
+aberrations, clipped apertures and noise included; nothing of this package's model is in them. Each is reconstructed
+with its design file as it stands, uncalibrated, and the brightest voxels are compared with the truth.
+
+    python experiments/ray_traced_captures.py DATA [--out DIR]
+
+DATA holds `P1.toml`, `P1_*.tif` and the scenes' `*.json`.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from scipy.ndimage import maximum_filter
+from scipy.spatial import KDTree
+
+from gs_jax import Grid, Imager
+from gs_jax.designs import read_design
+from gs_jax.disk import make_folder, write_json
+from gs_jax.files import read_capture
+from gs_jax.progress import Progress
+from gs_jax.reconstruct import reconstruct_stack
+
+# A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
+LATERAL, AXIAL = 0.04, 0.3
+SINGLE = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
+
+
+def run(data: Path, *, singles=SINGLE, voxel_mm=0.02, step_mm=0.1, progress: Progress) -> dict:
+    """Errors of the single points, and how many of the 120 points are peaks and how many peaks are points."""
+    imager = read_design(data / "P1.toml").imager()
+    rows = [{"scene": name, **_single(data, name, imager, voxel_mm, progress)} for name in singles]
+    return {"single_points": rows, "many_points": _many(data, imager, voxel_mm, step_mm, progress)[0]}
+
+
+def _truth(data: Path, scene: str) -> np.ndarray:
+    return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
+
+
+def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: Progress) -> dict:
+    ((x, y, z, _),) = _truth(data, scene)
+    grid = Grid.over(imager.sensor, depths=z + np.arange(-0.5, 0.51, 0.05), pitch=voxel_mm)
+    volume = reconstruct_stack(read_capture(data / f"P1_{scene}.tif", imager.sensor.shape), imager, grid, progress)
+    d, r, c = np.unravel_index(int(volume.argmax()), volume.shape)
+    lateral = np.hypot(float(grid.x[c]) - x, float(grid.y[r]) - y)
+    return {"lateral_error_um": 1000 * lateral, "axial_error_um": 1000 * (float(grid.depths[d]) - z)}
+
+
+def _many(data: Path, imager: Imager, voxel_mm: float, step_mm: float, progress: Progress) -> tuple[dict, np.ndarray]:
+    truth = _truth(data, "d")[:, :3]
+    grid = Grid.over(imager.sensor, depths=np.arange(17.6, 22.41, step_mm), pitch=voxel_mm)
+    volume = reconstruct_stack(read_capture(data / "P1_d.tif", imager.sensor.shape), imager, grid, progress)
+    peaks, brightness = _peaks(volume, grid)
+    scale = np.array([LATERAL, LATERAL, AXIAL])
+    near = KDTree(truth / scale).query(peaks / scale)
+    is_point = near[0] <= 1
+    errors = np.array(
+        [
+            peaks[mine][brightness[mine].argmax()] - truth[point]
+            for point in range(len(truth))
+            if (mine := np.flatnonzero(is_point & (near[1] == point))).size
+        ]
+    )
+    brightest = np.argsort(-brightness)[: len(truth)]
+    result = {
+        "points": len(truth),
+        "points_that_are_peaks": len(errors),
+        "points_among_as_many_brightest_peaks": int(is_point[brightest].sum()),
+        "lateral_rmse_um": 1000 * float(np.sqrt((errors[:, :2] ** 2).sum(1).mean())),
+        "axial_rmse_um": 1000 * float(np.sqrt((errors[:, 2] ** 2).mean())),
+        "axial_bias_um": 1000 * float(errors[:, 2].mean()),
+    }
+    return result, volume.max(0)
+
+
+def _peaks(volume: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Local maxima `(x, y, z)`, mm, among the brightest 1e-4 of the voxels."""
+    high = volume > np.quantile(volume[::3, ::7, ::7], 1 - 1e-4)
+    d, r, c = np.nonzero(high & (maximum_filter(volume, size=5) == volume))
+    x, y, z = (np.asarray(a) for a in (grid.x, grid.y, grid.depths))
+    return np.column_stack([x[c], y[r], z[d]]), volume[d, r, c]
+
+
+def picture(data: Path, progress: Progress) -> Figure:
+    """The 120 points: maximum over the depths, and the truth."""
+    imager = read_design(data / "P1.toml").imager()
+    _, projection = _many(data, imager, 0.02, 0.1, progress)
+    truth = _truth(data, "d")
+    half = projection.shape[0] * 0.02 / 2
+    figure = Figure(figsize=(11, 5.4), layout="constrained")
+    for axis, lim, title in zip(figure.subplots(1, 2), (half, 2.5), ("whole field", "its middle"), strict=True):
+        top = np.percentile(projection, 99.95)
+        axis.imshow(projection, cmap="magma", extent=(-half, half, half, -half), vmin=0.1 * top, vmax=top)
+        axis.scatter(truth[:, 0], truth[:, 1], s=120 if lim < half else 20, facecolors="none", edgecolors="w", lw=0.6)
+        axis.set(xlim=(-lim, lim), ylim=(lim, -lim), xlabel="x, mm", ylabel="y, mm")
+        axis.set_title(f"120 points, maximum over 17.6 to 22.4 mm: {title}")
+    return figure
+
+
+def main() -> None:
+    """Tables on the terminal; JSON and picture in the folder."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("out/ray_traced_captures"))
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    with Progress() as progress:
+        result = run(arguments.data, progress=progress)
+        picture(arguments.data, progress).savefig(out / "points.png", dpi=90)
+    write_json(out / "result.json", result)
+    table = Table("scene", "lateral error, um", "axial error, um", title="Single points")
+    for row in result["single_points"]:
+        table.add_row(row["scene"], f"{row['lateral_error_um']:.0f}", f"{row['axial_error_um']:+.0f}")
+    Console().print(table)
+    Console().print_json(data=result["many_points"])
+
+
+if __name__ == "__main__":
+    main()

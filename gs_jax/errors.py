@@ -1,0 +1,28 @@
+"""The one exception that a user's mistake raises."""
+
+import re
+import reprlib
+
+# C0 and C1 controls and Unicode's own line ends: a file name or a key may hold any of them.
+_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
+
+
+class InputError(ValueError):
+    """Wrong input from a user, explained in one line.
+
+    The line names the file, the key or argument, what was found and what is allowed. The command line
+    prints it and exits with status 2. A fault of the program itself never becomes an `InputError`.
+
+    Parameters
+    ----------
+    message
+        The explanation. Line ends and other control characters in it become blanks.
+    """
+
+    def __init__(self, message: str):
+        super().__init__(_CONTROLS.sub(" ", message).strip())
+
+
+def shown(value: object) -> str:
+    """What was found, short enough for a one-line message: `repr`, cut in length and depth."""
+    return reprlib.repr(value)

@@ -1,0 +1,28 @@
+"""What this installation is and runs on."""
+
+import os
+import platform
+
+import jax
+import jaxlib
+import psutil
+
+from . import __version__
+
+
+def describe() -> dict[str, str]:
+    """Versions, devices and memory, name to value."""
+    return {
+        "gs-jax": __version__,
+        "python": platform.python_version(),
+        "jax": f"{jax.__version__}, jaxlib {jaxlib.__version__}",
+        "system": f"{platform.system()} {platform.machine()}",
+        "devices": ", ".join(f"{d.device_kind} ({d.platform} {d.id})" for d in jax.devices()),
+        "cores": str(os.cpu_count()),
+        "memory": f"{memory_bytes() / 2**30:.1f} GiB",
+    }
+
+
+def memory_bytes() -> int:
+    """Physical memory of the machine."""
+    return psutil.virtual_memory().total

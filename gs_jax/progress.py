@@ -1,0 +1,34 @@
+"""Progress bars on a terminal; nothing in a pipe."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress as Bars, TextColumn, TimeElapsedColumn
+
+
+class Progress:
+    """A context in which long work shows how far it is, on standard error."""
+
+    def __init__(self):
+        console = Console(stderr=True)
+        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+        self._bars = Bars(*columns, console=console, disable=not console.is_terminal)
+
+    def __enter__(self) -> "Progress":
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._bars.stop()
+
+    def track(self, items, description: str) -> Iterator:
+        """The items, one by one, with a bar."""
+        return self._bars.track(items, description=description)
+
+    @contextmanager
+    def step(self, description: str) -> Iterator[None]:
+        """Work of unknown length."""
+        task = self._bars.add_task(description, total=None)
+        yield
+        self._bars.update(task, total=1, completed=1)

@@ -1,0 +1,58 @@
+"""From a capture to a stack, as the command line does it."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float32, Shaped
+
+from .backprojection import backproject
+from .errors import InputError
+from .geometry import Grid, Imager
+from .info import memory_bytes
+from .progress import Progress
+
+# Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
+_PLANES = 16
+
+
+def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) -> Grid:
+    """The voxels to reconstruct: the field of view, as large as the sensor.
+
+    Parameters
+    ----------
+    imager
+        What took the capture.
+    depths
+        In mm.
+    pitch
+        Of the voxels laterally, mm. By default a pixel as seen at the middle depth, rounded to 0.1 um.
+
+    Raises
+    ------
+    InputError
+        If the volume would not fit into the memory.
+    """
+    if pitch is None:
+        middle = float(imager.magnification(np.median(depths)))
+        pitch = round(imager.sensor.pixel_pitch / middle, 4)
+    grid = Grid.over(imager.sensor, depths=jnp.array(depths), pitch=pitch)
+    size = 4 * len(depths) * grid.shape[0] * grid.shape[1]
+    # The volume, the copy that is being computed, and room for the image.
+    if 2.5 * size > (memory := memory_bytes()):
+        shape = " x ".join(map(str, (len(depths), *grid.shape)))
+        raise InputError(
+            f"--voxel-um, --depths: found {pitch * 1000:g} um and {len(depths)} depths, a volume of {shape} voxels or "
+            f"{size / 2**30:.3g} GiB, allowed: {memory / 2.5 / 2**30:.3g} GiB on this machine."
+        )
+    return grid
+
+
+def reconstruct_stack(
+    image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, progress: Progress
+) -> Float32[np.ndarray, "depth y x"]:
+    """`backproject`, some planes at a time."""
+    image = jnp.asarray(image)
+    volume = np.empty((grid.depths.size, *grid.shape), np.float32)
+    for first in progress.track(range(0, grid.depths.size, _PLANES), "Back-projecting"):
+        planes = Grid(grid.depths[first : first + _PLANES], grid.shape, grid.pitch)
+        volume[first : first + _PLANES] = backproject(image, imager, planes)
+    return volume

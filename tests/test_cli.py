@@ -1,0 +1,210 @@
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tifffile
+
+from gs_jax.__main__ import main
+from gs_jax.volumes import read_volume
+
+from .helpers import needs
+
+DESIGN = """
+name = "small"
+[sensor]
+pixel_pitch_um = 20.0
+shape = [96, 80]
+[lens]
+radius_of_curvature_mm = 2.0
+refractive_index = 1.43
+aperture_diameter_mm = 0.4
+[array]
+size_mm = [2.0, 2.0]
+substrate_thickness_mm = 1.0
+centers_mm = [[0.0, 0.0], [0.3, 0.1], [-0.25, 0.2], [0.05, -0.4]]
+[imaging]
+sensor_distance_mm = 5.8
+working_distance_mm = [18.0, 30.0]
+wavelength_nm = 520.0
+field_radius_mm = 0.5
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder to work in, with a design and a capture."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "design.toml").write_text(DESIGN)
+    tifffile.imwrite(tmp_path / "capture.tif", np.full((96, 80), 7, np.uint16))
+    return tmp_path
+
+
+def run(monkeypatch, capsys, *arguments):
+    """Exit status, standard output and standard error of one command."""
+    monkeypatch.setattr(sys, "argv", ["gs-jax", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    out, err = capsys.readouterr()
+    return stop.value.code, out, err
+
+
+RECONSTRUCT = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:0.5")
+
+
+@pytest.mark.parametrize("name", ["volume.ome.tif", "volume.zarr"])
+def test_reconstruct(folder, monkeypatch, capsys, name):
+    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, "--voxel-um", "50", "-o", name)
+    assert (status, err) == (0, "")
+    assert "9 x 39 x 33 voxels (z, y, x), 50 um laterally, 9 depths from 18 to 22 mm" in out
+    volume, grid = read_volume(folder / name)
+    assert volume.shape == (9, 39, 33) and grid.pitch == pytest.approx(0.05)
+    np.testing.assert_allclose(grid.depths, np.arange(18, 22.1, 0.5))
+    assert volume.max() > 7  # several lenses see the middle
+    assert sorted(p.name for p in folder.iterdir()) == ["capture.tif", "design.toml", name]
+
+
+def test_the_default_voxel_is_a_pixel_seen_at_the_middle_depth(folder, monkeypatch, capsys):
+    _, out, _ = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    expected = 20 * (20 + 1 / 1.43) / 5.8
+    assert f"{expected:.1f} um" in out
+
+
+def test_depths_include_the_stop_only_when_it_falls_on_the_step(folder, monkeypatch, capsys):
+    for text, count in (("18:18.3:0.1", 4), ("18:18.25:0.1", 3), ("20:20:1", 1)):
+        status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], text, "-o", "v.tif")
+        assert status == 0 and out.startswith(f"v.tif: {count} x ")
+
+
+def test_layout(folder, monkeypatch, capsys):
+    arguments = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "--seed", 3, "-o", "c.csv")
+    status, out, _ = run(monkeypatch, capsys, *arguments)
+    assert status == 0
+    pitch, spread = map(float, re.search(r"pitch ([\d.]+) mm, SD ([\d.]+) mm, 100.0 %", out).groups())  # pyright: ignore[reportOptionalMemberAccess]
+    assert abs(pitch - 1.23) <= 0.02 and abs(spread - 0.09) <= 0.02
+    lines = (folder / "c.csv").read_text().splitlines()
+    assert lines[0] == "x_mm,y_mm" and len(lines) == 201
+    assert np.abs(np.loadtxt(lines[1:], delimiter=",")).max() <= 10
+
+
+def test_info(monkeypatch, capsys):
+    status, out, _ = run(monkeypatch, capsys, "info")
+    assert status == 0
+    for name in ("gs-jax", "python", "jax", "devices", "memory"):
+        assert re.search(rf"^{name} +\S", out, re.MULTILINE)
+
+
+WRONG_ARGUMENTS = [
+    ((), "Missing command"),
+    (("recontruct",), "recontruct"),
+    (("reconstruct",), "CAPTURE"),
+    (("reconstruct", "capture.tif"), "DESIGN"),
+    (("reconstruct", "capture.tif", "design.toml", "-o", "v.tif"), "--depths"),
+    (RECONSTRUCT, "--output"),
+    ((*RECONSTRUCT, "-o", "v.jpg"), "v.jpg: found the suffix '.jpg', allowed: .tif"),
+    ((*RECONSTRUCT, "-o", "nowhere/v.tif"), "nowhere"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0"), "found '0', allowed: 0.01 to 1e+06 um"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "-3"), "found '-3'"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "nan"), "found 'nan'"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "fine"), "found 'fine'"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0.01"), "--voxel-um, --depths: found 0.01 um and 9 depths"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--method", "magic"), "'magic' is not"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--colour"), "--colour"),
+    ((*RECONSTRUCT, "-o", "v.tif", "surplus"), "surplus"),
+    *(
+        ((*RECONSTRUCT[:4], depths, "-o", "v.tif"), f"found {depths!r}")
+        for depths in ("", "18", "18:22", "18:22:0", "18:22:-1", "22:18:1", "0:5:1", "-5:5:1", "a:b:c", "18:nan:1",
+                       "18:inf:1", "18:22:1e-9", "18:22:1:1", "18,22,1")
+    ),
+    (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
+    (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
+    (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "design.toml: found the suffix"),
+    (("reconstruct", "capture.tif", "capture.tif", *RECONSTRUCT[3:], "-o", "v.tif"), "capture.tif"),
+    (("layout", "--count", "0", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
+    (("layout", "--count", "2.5", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
+    (("layout", "--count", "200", "--size-mm", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--size-mm"),
+    (("layout", "--count", "200", "--size-mm", "20", "-1", "--pitch-mm", "1.2", "-o", "c.csv"), "found '-1'"),
+    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "9", "-o", "c.csv"), "`pitch` must"),
+    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.txt"), "c.txt"),
+    (("layout", "--count", "9", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "`count` must be"),
+    (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1", "--seed", "-1", "-o", "c.csv"), "--seed"),
+    (("demo", "--out", "design.toml"), "design.toml"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "words"), WRONG_ARGUMENTS)
+def test_wrong_arguments_give_one_line_and_status_2(folder, monkeypatch, capsys, arguments, words):
+    status, out, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2
+    assert out == ""
+    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err
+    assert sorted(p.name for p in folder.iterdir()) == ["capture.tif", "design.toml"]
+
+
+WRONG_FILES = [
+    ("design.toml", DESIGN.replace("5.8", '"5.8"'), "imaging.sensor_distance_mm"),
+    ("design.toml", DESIGN.replace("pixel_pitch_um", "pixel_pitch_mm"), "sensor.pixel_pitch_um"),
+    ("design.toml", DESIGN.replace("[lens]", "[lense]"), "lens"),
+    ("design.toml", DESIGN.replace("[96, 80]", "[96, 81]"), "capture.tif"),
+    ("design.toml", DESIGN.replace("[0.3, 0.1]", "[0.3, nan]"), "array.centers_mm"),
+    ("capture.tif", "not an image", "capture.tif"),
+    ("capture.tif", "", "capture.tif"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "words"), WRONG_FILES)
+def test_wrong_files_give_one_line_and_status_2(folder, monkeypatch, capsys, name, content, words):
+    (folder / name).write_text(content)
+    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    assert (status, out) == (2, "")
+    assert re.fullmatch(r"gs-jax: [^\n]+\n", err) and words in err
+    assert not (folder / "v.tif").exists()
+
+
+def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
+    def fault(*_):
+        raise ValueError("not the user's")
+
+    monkeypatch.setattr("gs_jax.__main__.read_capture", fault)
+    monkeypatch.setattr(sys, "argv", ["gs-jax", *RECONSTRUCT, "-o", "v.tif"])
+    with pytest.raises(ValueError, match="not the user's"):
+        main()
+
+
+def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gs_jax.__main__.reconstruct_stack", interrupt)
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    assert (status, err.strip()) == (1, "gs-jax: interrupted")
+    assert not (folder / "v.tif").exists()
+
+
+def test_as_a_process(folder):
+    """The real thing: quiet in a pipe, status 2 and one line for a wrong design."""
+    command = [sys.executable, "-m", "gs_jax", *RECONSTRUCT, "-o", "v.ome.tif"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == "" and done.stdout.startswith("v.ome.tif: 9 x ")
+    (folder / "design.toml").write_text("name = 3")
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys):
+    """The first milestone: the point within 20 um laterally and 100 um axially, in a file to scale."""
+    capture, design = needs("oracle/dev/P1_a.tif"), needs("oracle/dev/P1.toml")
+    output = tmp_path / "v.ome.tif"
+    arguments = ("--depths", "19.5:20.5:0.05", "--voxel-um", "20", "-o", output)
+    status, _, err = run(monkeypatch, capsys, "reconstruct", capture, design, *arguments)
+    assert (status, err) == (0, "")
+    with tifffile.TiffFile(output) as file:
+        assert file.is_ome and file.series[0].axes == "ZYX" and file.series[0].dtype == np.float32
+        pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]  # pyright: ignore[reportArgumentType]
+    assert pixels["PhysicalSizeX"] == pytest.approx(20) and pixels["PhysicalSizeXUnit"] in ("µm", "\u03bcm")
+    assert pixels["PhysicalSizeZ"] == pytest.approx(50)
+    volume, grid = read_volume(output)
+    z, y, x = np.unravel_index(int(volume.argmax()), volume.shape)
+    assert abs(float(grid.depths[z]) - 20) <= 0.1
+    assert np.hypot(float(grid.x[x]), float(grid.y[y])) <= 0.02

@@ -1,0 +1,392 @@
+import copy
+import datetime
+import math
+import os
+import re
+import tomllib
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import HealthCheck, given, settings, strategies as st
+from pydantic import ValidationError
+
+from gs_jax.designs import Design, read_design, write_design
+from gs_jax.errors import InputError
+
+from .helpers import needs
+
+BASE = {
+    "name": "small",
+    "sensor": {"pixel_pitch_um": 4.5, "shape": [400, 300]},
+    "lens": {"radius_of_curvature_mm": 2.0, "refractive_index": 1.43, "aperture_diameter_mm": 2.0},
+    "array": {
+        "size_mm": [3.0, 4.0],
+        "substrate_thickness_mm": 1.0,
+        "centers_mm": [[-1.0, -0.5], [0.5, 1.25], [1.0, -1.0]],
+    },
+    "imaging": {
+        "sensor_distance_mm": 5.8,
+        "working_distance_mm": [18.0, 30.0],
+        "wavelength_nm": 520.0,
+        "field_radius_mm": 3.0,
+    },
+}
+MISSING = object()
+
+
+def edited(changes):
+    """The base with keys set, or removed where the value is MISSING."""
+    data = copy.deepcopy(BASE)
+    for dotted, value in changes.items():
+        *tables, key = dotted.split(".")
+        table = data
+        for name in tables:
+            table = table.setdefault(name, {})
+        if value is MISSING:
+            table.pop(key, None)
+        else:
+            table[key] = value
+    return data
+
+
+def written(folder, changes=None, name="design.toml"):
+    path = folder / name
+    path.write_text(tomli_w.dumps(edited(changes or {})))
+    return path
+
+
+def message_of(path, *words):
+    """The line of the InputError that reading raises; it names the file and all the words."""
+    before = sorted(os.listdir(path.parent))
+    with pytest.raises(InputError) as caught:
+        read_design(path)
+    message = str(caught.value)
+    assert message.isprintable() and len(message) < 1000
+    for word in (path.name, *words):
+        assert word in message, f"{word!r} is not in {message!r}"
+    assert sorted(os.listdir(path.parent)) == before
+    return message
+
+
+# Each: what is changed, the words that the line must have besides the file's name.
+WRONG = [
+    ({"name": MISSING}, ["`name`", "nothing", "a string"]),
+    ({"name": 3}, ["`name`", "found 3", "a string"]),
+    ({"sensor": MISSING}, ["`sensor`", "nothing", "a table"]),
+    ({"sensor": 3.0}, ["`sensor`", "3.0", "a table"]),
+    ({"lens": [1, 2]}, ["`lens`", "[1, 2]", "a table"]),
+    ({"lens.radius_of_curvature_mm": MISSING}, ["`lens.radius_of_curvature_mm`", "nothing", "mm"]),
+    ({"lens.radius_of_curvature_mm": "2 mm"}, ["`lens.radius_of_curvature_mm`", "'2 mm'", "a number of mm"]),
+    ({"lens.radius_of_curvature_mm": True}, ["`lens.radius_of_curvature_mm`", "True", "a number"]),
+    ({"lens.radius_of_curvature_mm": math.nan}, ["`lens.radius_of_curvature_mm`", "nan", "a number"]),
+    ({"lens.radius_of_curvature_mm": math.inf}, ["`lens.radius_of_curvature_mm`", "inf"]),
+    ({"lens.radius_of_curvature_mm": -2.0}, ["`lens.radius_of_curvature_mm`", "-2.0", "from 1e-6"]),
+    ({"lens.radius_of_curvature_mm": 10**400}, ["`lens.radius_of_curvature_mm`", "a number"]),
+    ({"lens.radius_of_curvature_mm": datetime.date(2026, 1, 1)}, ["`lens.radius_of_curvature_mm`", "2026"]),
+    ({"lens.aperture_diameter_mm": 0.0}, ["`lens.aperture_diameter_mm`", "0.0", "from 1e-6"]),
+    ({"lens.aperture_diameter_mm": 4.1}, ["`lens.aperture_diameter_mm`", "4.1", "at most 4.0 mm"]),
+    ({"lens.refractive_index": 1.0}, ["`lens.refractive_index`", "1.0", "above 1"]),
+    ({"lens.refractive_index": 1}, ["`lens.refractive_index`", "above 1"]),
+    ({"lens.focal_length_mm": 0.0}, ["`lens.focal_length_mm`", "0.0", "mm"]),
+    ({"lens.radius_mm": 2.0}, ["`lens.radius_mm`", "does not exist"]),
+    ({"lens.wavelength_nm": 2.0}, ["`lens.wavelength_nm`", "`imaging.wavelength_nm`"]),
+    (
+        {"sensor.pixel_pitch_um": MISSING, "sensor.pixel_pitch_mm": 0.0045},
+        ["`sensor.pixel_pitch_mm`", "`pixel_pitch_um`"],
+    ),
+    ({"sensor.pixel_pitch_um": [4.5]}, ["`sensor.pixel_pitch_um`", "[4.5]", "micrometres"]),
+    ({"sensor.shape": MISSING}, ["`sensor.shape`", "nothing", "[rows, columns]"]),
+    ({"sensor.shape": 400}, ["`sensor.shape`", "400", "[rows, columns]"]),
+    ({"sensor.shape": [400]}, ["`sensor.shape", "[rows, columns]"]),
+    ({"sensor.shape": [400, 300, 3]}, ["`sensor.shape`", "[400, 300, 3]", "[rows, columns]"]),
+    ({"sensor.shape": [400.0, 300.0]}, ["`sensor.shape[0]`", "400.0", "whole numbers"]),
+    ({"sensor.shape": [0, 300]}, ["`sensor.shape[0]`", "found 0", "from 2 to 65536"]),
+    ({"sensor.shape": [400, -300]}, ["`sensor.shape[1]`", "-300", "from 2 to 65536"]),
+    ({"sensor.shape": [400, 10**9]}, ["`sensor.shape[1]`", "1000000000", "65536"]),
+    ({"sensor.shape": {"rows": 400}}, ["`sensor.shape`", "rows", "[rows, columns]"]),
+    ({"array.size_mm": [3.0, -4.0]}, ["`array.size_mm[1]`", "-4.0", "[x, y] in mm"]),
+    ({"array.size_mm": []}, ["`array.size_mm", "[x, y] in mm"]),
+    ({"array.substrate_thickness_mm": -1.0}, ["`array.substrate_thickness_mm`", "-1.0", "from 0"]),
+    ({"array.centers_mm": MISSING}, ["`array.centers_mm`", "nothing", "`centers_file`"]),
+    ({"array.centers_mm": []}, ["`array.centers_mm`", "[]", "1 to 100000"]),
+    ({"array.centers_mm": [1.0, 2.0]}, ["`array.centers_mm[0]`", "1.0", "[x, y] in mm"]),
+    ({"array.centers_mm": [[0.0, 0.0, 0.0]]}, ["`array.centers_mm[0]`", "[0.0, 0.0, 0.0]", "[x, y] in mm"]),
+    ({"array.centers_mm": [[0.0, math.nan]]}, ["`array.centers_mm[0][1]`", "nan"]),
+    ({"array.centers_mm": [[0.0, "1"]]}, ["`array.centers_mm[0][1]`", "'1'"]),
+    ({"array.centers_mm": [[0.0, 0.0], [0.0, 2.1]]}, ["`array.centers_mm`", "lens 2", "2.1", "|y| up to 2.0 mm"]),
+    ({"array.centers_mm": [[0.0, 0.0], [1.0, 0.0], [1.0, 0.0009]]}, ["`array.centers_mm`", "lens", "0.001 mm"]),
+    ({"array.centers_mm": [[1.0, 0.0]] * 5}, ["`array.centers_mm`", "lens", "0.001 mm"]),
+    ({"array.centers_file": "no.csv"}, ["`array.centers_file`", "`array.centers_mm`", "one of them"]),
+    ({"array.centers_mm": MISSING, "array.centers_files": "a.csv"}, ["`array.centers_files`", "`centers_file`"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": 3}, ["`array.centers_file`", "found 3", "CSV"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": ""}, ["`array.centers_file`", "''", "CSV"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": "no.csv"}, ["`array.centers_file`", "no.csv", "No such file"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": "."}, ["`array.centers_file`", "a folder"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": "a\0b\n"}, ["`array.centers_file`", "null"]),
+    ({"array.centers_mm": MISSING, "array.centers_file": "a" * 300}, ["`array.centers_file`", "name too long"]),
+    ({"array.size_mm": [30.0, 30.0], "array.centers_mm": [[-9.0, 0.0]]}, ["`array.centers_mm`", "lens 1", "sensor"]),
+    (
+        {"imaging.working_distance_mm": [30.0, 18.0]},
+        ["`imaging.working_distance_mm`", "[30.0, 18.0]", "near below far"],
+    ),
+    ({"imaging.working_distance_mm": [18.0, 18.0]}, ["`imaging.working_distance_mm`", "near below far"]),
+    ({"imaging.working_distance_mm": [0.0, 18.0]}, ["`imaging.working_distance_mm[0]`", "0.0", "in mm"]),
+    ({"imaging.working_distance_mm": 18.0}, ["`imaging.working_distance_mm`", "18.0", "[near, far]"]),
+    ({"imaging.sensor_distance_mm": 0.0}, ["`imaging.sensor_distance_mm`", "0.0", "mm"]),
+    ({"imaging.sensor_distance_mm": 1e300}, ["`imaging.sensor_distance_mm`", "1e+300", "1e4"]),
+    ({"imaging.wavelength_nm": -520.0}, ["`imaging.wavelength_nm`", "-520.0", "nanometres"]),
+    ({"imaging.wavelength_um": 0.52}, ["`imaging.wavelength_um`", "`wavelength_nm`"]),
+    ({"imaging.field_radius_mm": 0}, ["`imaging.field_radius_mm`", "found 0", "mm"]),
+    ({"calibration.rotation_deg": "1"}, ["`calibration.rotation_deg`", "'1'", "degrees"]),
+    ({"calibration.rotation_rad": 1.0}, ["`calibration.rotation_rad`", "`rotation_deg`"]),
+    ({"calibration.shift_mm": [1.0]}, ["`calibration.shift_mm", "[x, y] in mm"]),
+    ({"calibration.shift_mm": [9.0, 0.0]}, ["`array.centers_mm`", "lens", "beside the sensor"]),
+    ({"calibration": 3}, ["`calibration`", "found 3", "a table"]),
+    ({"provenance": "me"}, ["`provenance`", "'me'", "a table"]),
+    ({"sensors": {"shape": [4, 4]}}, ["`sensors`", "`sensor`"]),
+    ({"zebra": 1}, ["`zebra`", "`sensor`", "`lens`"]),
+    ({"bad\n\x1b[31mkey": 1}, ["does not exist"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"), WRONG, ids=[" ".join(changes)[:40] + str(i) for i, (changes, _) in enumerate(WRONG)]
+)
+def test_wrong_design(tmp_path, changes, words):
+    message_of(written(tmp_path, changes), *words)
+
+
+TEXTS = {
+    "syntax": (b"name = \n", ["TOML", "line 1"]),
+    "duplicate": (b'name = "a"\nname = "b"\n', ["TOML", "line 2"]),
+    "nested": (b"a = " + b"[" * 100_000, ["TOML"]),
+    "digits": (b"a = " + b"1" * 10_000, ["TOML"]),
+    "date": (b"a = 2026-13-45\n", ["TOML"]),
+    "latin": (b'name = "\xe9"\n', ["UTF-8", "offset 8"]),
+    "binary": (bytes(range(256)), ["UTF-8"]),
+    "empty": (b"", ["`name`", "`sensor`", "more problems"]),
+    "tables": (b"[[sensor]]\nshape = [3, 4]\n", ["`sensor`", "a table"]),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), TEXTS.values(), ids=TEXTS)
+def test_wrong_text(tmp_path, text, words):
+    path = tmp_path / "design.toml"
+    path.write_bytes(text)
+    message_of(path, *words)
+
+
+CENTERS = {
+    "empty": (b"", ["header", "x_mm,y_mm"]),
+    "header only": (b"x_mm,y_mm\n", ["`array.centers_mm`", "[]"]),
+    "no header": (b"1,2\n3,4\n", ["header", "'1,2'", "x_mm,y_mm"]),
+    "unit": (b"x_um,y_um\n1,2\n", ["header", "x_um,y_um", "x_mm,y_mm"]),
+    "spaced": (b"x_mm, y_mm\n1,2\n", ["header", "x_mm,y_mm"]),
+    "semicolons": (b"x_mm;y_mm\n1;2\n", ["header", "x_mm;y_mm"]),
+    "ragged": (b"x_mm,y_mm\n1,2\n3\n", ["line 3", "found 1 values"]),
+    "wide": (b"x_mm,y_mm\n1,2,3\n", ["line 2", "found 3 values"]),
+    "word": (b"x_mm,y_mm\n1,two\n", ["line 2", "y_mm", "'two'", "finite number"]),
+    "nan": (b"x_mm,y_mm\nnan,2\n", ["line 2", "x_mm", "'nan'", "finite number"]),
+    "underscore": (b"x_mm,y_mm\n1_0,2\n", ["line 2", "x_mm", "'1_0'"]),
+    "latin": (b"x_mm,y_mm\n\xe9,2\n", ["UTF-8"]),
+    "wide character": ("x_mm,y_mm\n1,2\n".encode("utf-16"), ["UTF-8"]),
+    "field": (b"x_mm,y_mm\n" + b"1" * 200_000, ["line", "field limit"]),
+    "rows": (b"x_mm,y_mm\n" + b"1,2\n" * 100_001, ["more than 100000 rows"]),
+    "outside": (b"x_mm,y_mm\n0,0\n9,9\n", ["lens 2", "plate"]),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), CENTERS.values(), ids=CENTERS)
+def test_wrong_centers_file(tmp_path, text, words):
+    (tmp_path / "c.csv").write_bytes(text)
+    path = written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"})
+    message = message_of(path, *words)
+    assert "c.csv" in message or "`array.centers_mm`" in message
+
+
+def test_wrong_path(tmp_path):
+    message_of(tmp_path / "none.toml", "No such file")
+    (tmp_path / "folder.toml").mkdir()
+    message_of(tmp_path / "folder.toml", "a folder")
+    os.mkfifo(tmp_path / "pipe.toml")
+    message_of(tmp_path / "pipe.toml", "not a regular file")
+    assert "null" in str(pytest.raises(InputError, read_design, "a\0b").value)
+
+
+def test_unreadable(tmp_path, monkeypatch):
+    path = written(tmp_path)
+
+    def denied(*args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("builtins.open", denied)  # the tests may run as root, whom no mode stops
+    with pytest.raises(InputError, match="design.toml.*Permission denied"):
+        read_design(path)
+
+
+def test_too_large(tmp_path):
+    path = tmp_path / "large.toml"
+    with path.open("wb") as file:
+        file.truncate(2**26 + 1)
+    message_of(path, str(2**26))
+
+
+def test_many_coincident_lenses_are_refused_quickly(tmp_path):
+    (tmp_path / "c.csv").write_text("x_mm,y_mm\n" + "0.5,0.5\n" * 100_000)
+    path = written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"})
+    message_of(path, "0.001 mm")
+
+
+def test_problems_are_joined_in_one_line(tmp_path):
+    changes = {"name": MISSING, "lens.refractive_index": 0.5, "imaging.field_radius_mm": "3", "sensor.shape": [1, 1]}
+    assert message_of(written(tmp_path, changes)).count("; ") == 3
+
+
+def test_values_reach_the_geometry_in_mm(tmp_path):
+    changes = {"lens.focal_length_mm": 4.0, "calibration.rotation_deg": 90, "calibration.shift_mm": [0.25, -0.5]}
+    imager = read_design(written(tmp_path, changes)).imager()
+    assert imager.sensor.pixel_pitch == pytest.approx(0.0045, rel=1e-15) and imager.sensor.shape == (400, 300)
+    assert float(imager.array.focal_length) == 4.0 and imager.field_radius == 3.0
+    assert float(imager.sensor_distance) == 5.8 and float(imager.array.substrate_thickness) == 1.0
+    x, y = np.array(BASE["array"]["centers_mm"]).T
+    np.testing.assert_allclose(imager.centers, np.stack([-y + 0.25, x - 0.5], 1), atol=1e-15)
+    assert imager.centers.dtype == jnp.float64
+
+
+def test_reach_is_the_radius_of_the_sub_image(tmp_path):
+    near, field = 18.0, 3.0
+    radius = 5.8 / (near + 1.0 / 1.43) * field
+    edge = 300 * 0.0045 / 2
+    for x, fine in ((edge + radius - 1e-6, True), (edge + radius + 1e-6, False)):
+        path = written(tmp_path, {"array.centers_mm": [[x, 0.0]], "array.size_mm": [5.0, 5.0]})
+        if fine:
+            read_design(path)
+        else:
+            message_of(path, "beside the sensor")
+
+
+def test_least_is_enough_and_integers_are_numbers(tmp_path):
+    design = read_design(written(tmp_path, {"lens.radius_of_curvature_mm": 2, "array.centers_mm": [[0, 1]]}))
+    assert design.lens.focal_length_mm is None and design.provenance == {}
+    assert design.calibration.rotation_deg == 0.0 and design.calibration.shift_mm == (0.0, 0.0)
+    assert type(design.lens.radius_of_curvature_mm) is float and design.array.centers_mm == ((0.0, 1.0),)
+    with pytest.raises(ValidationError):
+        design.name = "other"
+
+
+def test_the_authors_array():
+    path = needs("oracle/dev/P1.toml")
+    design = read_design(path)
+    assert len(design.array.centers_mm) == 213 and design.array.centers_mm[1] == (-9.34, -7.77)
+    assert design.imager().sensor.shape == (5120, 5120)
+
+
+def test_centers_file_is_relative_and_is_written_inline(tmp_path, monkeypatch):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "c.csv").write_bytes(b"\xef\xbb\xbfx_mm,y_mm\r\n0.1,-0.2\r\n\r\n1e-1,1.5\r\n")
+    path = written(tmp_path / "sub", {"array.centers_mm": MISSING, "array.centers_file": "../c.csv"})
+    monkeypatch.chdir(tmp_path)
+    design = read_design(Path("sub/design.toml"))
+    assert design.array.centers_mm == ((0.1, -0.2), (0.1, 1.5))
+    write_design(path, design)
+    assert "centers_file" not in path.read_text() and "    [0.1, -0.2],\n" in path.read_text()
+    assert read_design(path) == design
+
+
+VALUES = st.recursive(
+    st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text() | st.dates(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    name=st.text(),
+    radius=st.floats(1.0, 1e4),
+    shift=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    x=st.floats(-0.9, 0.49),
+    provenance=st.dictionaries(st.text(), VALUES, max_size=3),
+)
+def test_round_trip(tmp_path, name, radius, shift, x, provenance):
+    changes = {"lens.radius_of_curvature_mm": radius, "calibration.shift_mm": shift, "provenance": provenance}
+    centers = [[x, -1.0], [0.5, 1.25]]
+    design = Design.model_validate(edited(changes | {"name": name, "array.centers_mm": centers}))
+    write_design(tmp_path / "a.toml", design)
+    assert read_design(tmp_path / "a.toml") == design
+    assert os.listdir(tmp_path) == ["a.toml"]
+
+
+def test_strings_that_look_like_arrays_survive(tmp_path):
+    provenance = {"a": "[\n    1,\n    2,\n]", "b": ["x,y", "[1, 2]"], "c": [["a", 1], [1, 2], [[1, 2], 3]], "d": [1]}
+    design = Design.model_validate(edited({"provenance": provenance}))
+    write_design(tmp_path / "a.toml", design)
+    assert read_design(tmp_path / "a.toml").provenance == provenance
+
+
+def test_write_refuses_before_writing(tmp_path):
+    design = Design.model_validate(BASE)
+    for path, words in ((tmp_path / "a.json", ".toml"), (tmp_path / "none" / "a.toml", "there is no folder")):
+        with pytest.raises(InputError, match=re.escape(words)):
+            write_design(path, design)
+    assert os.listdir(tmp_path) == []
+
+
+def parses_or_refuses(path):
+    try:
+        design = read_design(path)
+    except InputError as error:
+        assert str(error).isprintable() and path.name in str(error)
+    else:
+        assert isinstance(design, Design) and design.imager().centers.shape[1] == 2
+
+
+FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@FUZZ
+@given(text=st.binary(max_size=200) | st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass")))
+def test_random_bytes(tmp_path, text):
+    path = tmp_path / "a.toml"
+    path.write_bytes(text)
+    parses_or_refuses(path)
+
+
+@FUZZ
+@given(data=st.data())
+def test_mutated_design(tmp_path, data):
+    """Bytes of a valid file changed, cut out or doubled, or a value replaced by any other."""
+    path = tmp_path / "a.toml"
+    if data.draw(st.booleans()):
+        text = bytearray(tomli_w.dumps(BASE | {"calibration": {"shift_mm": [0.1, 0.1]}}).encode())
+        for _ in range(data.draw(st.integers(1, 3))):
+            at = data.draw(st.integers(0, len(text) - 1))
+            text[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+        path.write_bytes(text)
+    else:
+        keys = [f"{table}.{key}" for table in BASE if table != "name" for key in BASE[table]]
+        path.write_text(tomli_w.dumps(edited({data.draw(st.sampled_from(keys)): data.draw(VALUES)})))
+    parses_or_refuses(path)
+
+
+@FUZZ
+@given(data=st.data())
+def test_mutated_centers(tmp_path, data):
+    text = bytearray(b"x_mm,y_mm\n-1.0,0.5\n0.25,1.0\n")
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        text[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+    (tmp_path / "c.csv").write_bytes(text)
+    parses_or_refuses(written(tmp_path, {"array.centers_mm": MISSING, "array.centers_file": "c.csv"}))
+
+
+def test_the_written_file_is_the_contracts(tmp_path):
+    write_design(
+        tmp_path / "a.toml", Design.model_validate(edited({"provenance": {"made": datetime.date(2026, 1, 1)}}))
+    )
+    text = (tmp_path / "a.toml").read_text()
+    assert "shape = [400, 300]\n" in text and "working_distance_mm = [18.0, 30.0]\n" in text
+    assert tomllib.loads(text) == edited({"provenance": {"made": datetime.date(2026, 1, 1)}})
