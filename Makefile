@@ -18,7 +18,7 @@ test-all: .venv/dev
 lint: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 .venv/core: pyproject.toml
 	$(PYTHON) -m venv .venv

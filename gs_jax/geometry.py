@@ -6,6 +6,8 @@ centre, +x along increasing column, +y along increasing row. A depth `z > 0` is 
 (plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
 
+import operator
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 def _as_float(x) -> Array:
     return jnp.asarray(x, dtype=float)
+
+
+def _as_shape(x) -> tuple[int, int]:
+    rows, columns = map(operator.index, x)
+    return rows, columns
 
 
 def _as_float_or_none(x) -> Array | None:
@@ -79,11 +86,11 @@ class Sensor(eqx.Module):
         If there are fewer than 2 x 2 pixels, or the pitch is not positive.
     """
 
-    shape: tuple[int, int] = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
     pixel_pitch: float = eqx.field(static=True, converter=float)
 
     def __check_init__(self):
-        if len(self.shape) != 2 or min(self.shape) < 2:
+        if min(self.shape) < 2:
             raise ValueError(f"`shape` must be two numbers of pixels, each 2 or more, got {self.shape}.")
         if not self.pixel_pitch > 0:
             raise ValueError(f"`pixel_pitch` must be positive, got {self.pixel_pitch}.")
@@ -223,13 +230,13 @@ class Grid(eqx.Module):
     """
 
     depths: Float[Array, " depth"] = eqx.field(converter=_as_float)
-    shape: tuple[int, int] = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
     pitch: float = eqx.field(static=True, converter=float)
 
     def __check_init__(self):
         if self.depths.ndim != 1 or self.depths.size < 1:
             raise ValueError(f"`depths` must be (depth,) with a depth at least, got {self.depths.shape}.")
-        if len(self.shape) != 2 or min(self.shape) < 1:
+        if min(self.shape) < 1:
             raise ValueError(f"`shape` must be two positive numbers of voxels, got {self.shape}.")
         if not self.pitch > 0:
             raise ValueError(f"`pitch` must be positive, got {self.pitch}.")

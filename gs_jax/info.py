@@ -2,9 +2,9 @@
 
 import os
 import platform
+from importlib.metadata import version
 
 import jax
-import jaxlib
 import psutil
 
 from . import __version__
@@ -15,7 +15,7 @@ def describe() -> dict[str, str]:
     return {
         "gs-jax": __version__,
         "python": platform.python_version(),
-        "jax": f"{jax.__version__}, jaxlib {jaxlib.__version__}",
+        "jax": f"{jax.__version__}, jaxlib {version('jaxlib')}",
         "system": f"{platform.system()} {platform.machine()}",
         "devices": ", ".join(f"{d.device_kind} ({d.platform} {d.id})" for d in jax.devices()),
         "cores": str(os.cpu_count()),

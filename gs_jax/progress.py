@@ -1,6 +1,6 @@
 """Progress bars on a terminal; nothing in a pipe."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -22,7 +22,7 @@ class Progress:
     def __exit__(self, *_) -> None:
         self._bars.stop()
 
-    def track(self, items, description: str) -> Iterator:
+    def track(self, items: Iterable, description: str) -> Iterable:
         """The items, one by one, with a bar."""
         return self._bars.track(items, description=description)
 
