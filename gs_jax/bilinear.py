@@ -236,9 +236,8 @@ def _spread_columns(patch, x: Axis, spacing, columns, fresh, taps):
         return spread + part[:, None, :] * _pick(patch, voxel, axis=2), *tap(count + 1)
 
     # The next tap is carried, so that it is computed once and not for every row.
-    voxel, part = tap(0)
-    first = part[:, None, :] * _pick(patch, voxel, axis=2)
-    return lax.fori_loop(1, taps, add, (first, *tap(1)))[0]
+    empty = jnp.zeros((*patch.shape[:2], columns.size), patch.dtype)
+    return lax.fori_loop(0, taps, add, (empty, *tap(0)))[0]
 
 
 def _add_rows(image, spread, y: Axis, spacing, rows, fresh, taps, start):
