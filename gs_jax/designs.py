@@ -118,6 +118,7 @@ class Design(_Table):
             aperture_diameter=lens.aperture_diameter_mm,
             substrate_thickness=self.array.substrate_thickness_mm,
             thin_lens_focal_length=lens.focal_length_mm,
+            size=self.array.size_mm,
         )
         return Imager(
             array,

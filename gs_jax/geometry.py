@@ -6,6 +6,7 @@ centre, +x along increasing column, +y along increasing row. A depth `z > 0` is 
 (plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
 
+import math
 import operator
 
 import equinox as eqx
@@ -16,6 +17,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 def _as_float(x) -> Array:
     return jnp.asarray(x, dtype=float)
+
+
+def _as_size(x) -> tuple[float, float]:
+    width, height = map(float, x)
+    return width, height
 
 
 def _as_shape(x) -> tuple[int, int]:
@@ -122,6 +128,8 @@ class MicrolensArray(eqx.Module):
         clip it to its Voronoi cell.
     thin_lens_focal_length
         Overrides the focal length that follows from the radius, mm, for a thin-lens study.
+    size
+        `(x, y)` of the plate, centred, mm: where the outer lenses end. By default they are as wide as their discs.
 
     Raises
     ------
@@ -135,6 +143,7 @@ class MicrolensArray(eqx.Module):
     aperture_diameter: Float[Array, ""] = eqx.field(converter=_as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=_as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=_as_float_or_none, default=None)
+    size: tuple[float, float] = eqx.field(static=True, converter=_as_size, default=(math.inf, math.inf))
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
