@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 
-def _as_float(x) -> Array:
+def as_float(x) -> Array:
     return jnp.asarray(x, dtype=float)
 
 
@@ -30,7 +30,7 @@ def _as_shape(x) -> tuple[int, int]:
 
 
 def _as_float_or_none(x) -> Array | None:
-    return None if x is None else _as_float(x)
+    return None if x is None else as_float(x)
 
 
 # Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a
@@ -137,11 +137,11 @@ class MicrolensArray(eqx.Module):
         If `centers` is not `(lens, 2)` or holds no lens.
     """
 
-    centers: Float[Array, "lens 2"] = eqx.field(converter=_as_float)
-    radius_of_curvature: Float[Array, ""] = eqx.field(converter=_as_float, default=2.0)
-    refractive_index: Float[Array, ""] = eqx.field(converter=_as_float, default=1.43)
-    aperture_diameter: Float[Array, ""] = eqx.field(converter=_as_float, default=2.0)
-    substrate_thickness: Float[Array, ""] = eqx.field(converter=_as_float, default=1.0)
+    centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
+    radius_of_curvature: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
+    refractive_index: Float[Array, ""] = eqx.field(converter=as_float, default=1.43)
+    aperture_diameter: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
+    substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=_as_float_or_none, default=None)
     size: tuple[float, float] = eqx.field(static=True, converter=_as_size, default=(math.inf, math.inf))
 
@@ -182,10 +182,10 @@ class Imager(eqx.Module):
 
     array: MicrolensArray
     sensor: Sensor
-    sensor_distance: Float[Array, ""] = eqx.field(converter=_as_float)
+    sensor_distance: Float[Array, ""] = eqx.field(converter=as_float)
     field_radius: float = eqx.field(static=True, converter=float)
-    rotation: Float[Array, ""] = eqx.field(converter=_as_float, default=0.0)
-    shift: Float[Array, "2"] = eqx.field(converter=_as_float, default=(0.0, 0.0))
+    rotation: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
+    shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
 
     def __check_init__(self):
         if not self.field_radius > 0:
@@ -238,7 +238,7 @@ class Grid(eqx.Module):
         If there is no depth, no voxel, or the pitch is not positive.
     """
 
-    depths: Float[Array, " depth"] = eqx.field(converter=_as_float)
+    depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
     pitch: float = eqx.field(static=True, converter=float)
 
