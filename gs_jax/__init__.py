@@ -2,6 +2,7 @@
 
 from ._version import __version__ as __version__
 from .backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
+from .forward import forward as forward
 from .geometry import (
     Grid as Grid,
     Imager as Imager,
