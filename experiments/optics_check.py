@@ -1,0 +1,318 @@
+"""The exact rays and the PSF of one lens unit against an independent ray tracer, and against ray-traced captures.
+
+Optiland (a general ray tracer) sends rays through the same plane, plate and sphere. Compared are where they land,
+their optical paths, and what follows: spot size, wavefront error and Strehl ratio against field and depth, with the
+third-order theory beside them. With a folder of ray-traced captures, the spots that each lens makes of a single
+point are compared with our PSF in place, size and brightness.
+
+    python -m experiments.optics_check [DATA] [--out DIR]
+
+DATA holds `P1.toml`, `P2.toml`, `P1_a.tif`, `P2_a.tif`, `P1_i_*.tif` and the scenes' `*.json`.
+"""
+
+import argparse
+import json
+import warnings
+from functools import partial
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from scipy.optimize import minimize
+from scipy.spatial import KDTree
+
+from gs_jax import Imager, MicrolensArray, Sensor, envelope
+from gs_jax.aberrations import independent_rms, seidel
+from gs_jax.aperture import aperture_area
+from gs_jax.designs import read_design
+from gs_jax.disk import make_folder, write_json
+from gs_jax.files import read_capture
+from gs_jax.psf import geometric_psf, psf, strehl
+from gs_jax.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
+
+WAVELENGTH = 520e-6
+# Radius of the disc as large as the mean Voronoi cell of the paper's array, mm.
+RADIUS = 0.65
+FIELDS, DEPTHS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0), (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
+SPOTS = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
+Rays = tuple[Float[np.ndarray, "ray 2"], Float[np.ndarray, "ray 2"], Float[np.ndarray, " ray"]]
+
+
+def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2"], field: float) -> Rays:
+    """Landing points, slopes and optical paths of the rays through `points` of the convex surface, by Optiland.
+
+    The object is `field` beside the axis along x. Where a ray has to enter the plate is found by repeated tracing.
+    """
+    with warnings.catch_warnings():
+        # Optiland's just-in-time compiler warns about itself.
+        warnings.simplefilter("ignore")
+        from optiland.materials import IdealMaterial
+        from optiland.optic.optic import Optic
+        from optiland.rays.real_rays import RealRays
+
+        array, optic = imager.array, Optic()
+        glass = IdealMaterial(n=float(array.refractive_index))
+        optic.surfaces.add(index=0, thickness=depth)
+        optic.surfaces.add(index=1, thickness=float(array.substrate_thickness), material=glass, is_stop=True)
+        optic.surfaces.add(index=2, thickness=float(imager.sensor_distance), radius=-float(array.radius_of_curvature))
+        optic.surfaces.add(index=3)
+        optic.wavelengths.add(1000 * WAVELENGTH, is_primary=True)
+        entry, one = np.array(points, float), np.ones(len(points))
+        for _ in range(30):
+            x, y = entry.T - [[field], [0]]
+            length = np.sqrt(x**2 + y**2 + depth**2)
+            cosines = (x / length, y / length, depth / length)
+            rays = RealRays(field * one, 0 * one, -depth * one, *cosines, one, 1000 * WAVELENGTH * one)
+            optic.surfaces.trace(rays)
+            slopes = np.column_stack([rays.L, rays.M]) / rays.N[:, None]
+            result = np.column_stack([rays.x, rays.y]), slopes, np.asarray(rays.opd)
+            miss = points - np.column_stack([optic.surfaces.x[2], optic.surfaces.y[2]])
+            if np.abs(miss).max() < 1e-13:
+                return result
+            entry += miss
+        raise RuntimeError("no rays through the points")
+
+
+def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) -> dict:
+    """Ours and Optiland's rays of one object point: largest differences, and what both say of the spot."""
+    points, weights = map(np.asarray, pupil_disc(radius, 16))
+    theirs, slopes, path = optiland_rays(imager, depth, np.vstack([[0, 0], points]), field)
+    ours = unit_rays(imager, depth, points, (field, 0.0))
+    error = _on_sphere(theirs, slopes, path, float(imager.sensor_distance))
+    mean, mine, off = weights @ theirs[1:], np.asarray(ours.landing), (field, 0.0)
+    return {
+        "depth_mm": depth,
+        "field_mm": field,
+        "landing_difference_nm": 1e6 * float(np.abs(mine - theirs[1:]).max()),
+        "path_difference_waves": float(np.abs(np.asarray(ours.path) - path[1:] + path[0]).max()) / WAVELENGTH,
+        "spot_rms_um": 1000 * float(np.sqrt(weights @ ((mine - weights @ mine) ** 2).sum(1))),
+        "spot_rms_optiland_um": 1000 * float(np.sqrt(weights @ ((theirs[1:] - mean) ** 2).sum(1))),
+        "wavefront_rms_waves": float(wavefront_rms(imager, depth, field=off, radius=radius)) / WAVELENGTH,
+        "wavefront_rms_optiland_waves": _rms(error, points, weights) / WAVELENGTH,
+        "wavefront_rms_third_order_waves": _third_order(imager, depth, field, radius) / WAVELENGTH,
+        "strehl": float(strehl(imager, depth, wavelength=WAVELENGTH, field=off, radius=radius)),
+        "strehl_optiland": _strehl(imager, (theirs, slopes, path), points, weights),
+    }
+
+
+def _on_sphere(landing: np.ndarray, slopes: np.ndarray, path: np.ndarray, v: float) -> np.ndarray:
+    """Path to the sphere through the vertex about the end of the first ray, less that of the first ray."""
+    cosines = np.column_stack([slopes, np.ones(len(slopes))]) / np.sqrt(1 + (slopes**2).sum(1, keepdims=True))
+    offset = np.column_stack([landing - landing[0], np.zeros(len(landing))])
+    along = (offset * cosines).sum(1)
+    back = along + np.sqrt(along**2 - (offset**2).sum(1) + v**2 + (landing[0] ** 2).sum())
+    return ((path - back) - (path - back)[0])[1:]
+
+
+def _rms(error: np.ndarray, points: np.ndarray, weights: np.ndarray) -> float:
+    modes = np.column_stack([np.ones(len(points)), points])
+    root = np.sqrt(weights)[:, None]
+    fit, *_ = np.linalg.lstsq(root * modes, root[:, 0] * error, rcond=None)
+    return float(np.sqrt(weights @ (error - modes @ fit) ** 2))
+
+
+def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray) -> float:
+    """Highest `|sum exp(2 pi i (L + |P - B|) / wavelength)|^2` over points P of the sensor: Huygens' principle.
+
+    B are the points of the lens, L the paths to them. Nothing of our pupil is in it.
+    """
+    landing, slopes, path = (part[1:] for part in rays)
+    v, radius = float(imager.sensor_distance), float(imager.array.radius_of_curvature)
+    behind = v + radius - np.sqrt(radius**2 - (points**2).sum(1))
+    to_lens = path - behind * np.sqrt(1 + (slopes**2).sum(1))
+
+    def dark(place):
+        total = to_lens + np.sqrt(behind**2 + ((points - place) ** 2).sum(1))
+        return -(np.abs(weights @ np.exp(2j * np.pi * (total - total[0]) / WAVELENGTH)) ** 2)
+
+    middle = np.median(landing, axis=0)
+    x, y = np.arange(-0.06, 0.06, 5e-4), np.arange(-0.002, 0.0021, 1e-3)
+    _, start = min((dark(middle + (a, b)), (middle[0] + a, middle[1] + b)) for a in x for b in y)
+    return float(-minimize(dark, start, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}).fun)
+
+
+def _third_order(imager: Imager, depth: float, field: float, radius: float) -> float:
+    array, reduced = imager.array, imager.reduced_depth(depth)
+    lens = (array.focal_length, array.refractive_index, radius)
+    error = seidel(*lens, reduced, field, imager.sensor_distance)
+    return float(independent_rms(error))
+
+
+def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: float = 3.0) -> list[dict]:
+    """Each spot of a single point in a capture beside our PSF: lenses within `reach` of the point, mm.
+
+    Places are centroids over the window less the chief ray of the geometry; sizes hold half of the window's light.
+    """
+    imager = read_design(data / f"{design}.toml").imager()
+    image = 10 * (read_capture(data / f"{design}_{scene}.tif", imager.sensor.shape).astype(float) - 16)
+    ((x, y, z, _),) = json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"]
+    centers, areas = np.asarray(imager.centers), np.asarray(aperture_area(imager.array))
+    pixels = np.asarray(imager.sensor.to_pixels(imager.project(np.array([[x, y, z]]))[:, 0]))
+    rows = []
+    for lens in np.flatnonzero(np.hypot(*(centers - (x, y)).T) < reach):
+        row, column = np.round(pixels[lens]).astype(int)
+        if not (half <= min(row, column) and max(row, column) < min(image.shape) - half):
+            continue
+        window = image[row - half : row + half + 1, column - half : column + half + 1]
+        field, offset = np.array([x, y]) - centers[lens], pixels[lens] - (row, column)
+        near = [k for k in KDTree(centers).query_ball_point(centers[lens], 2.0) if k != lens]
+        ours = _model(imager, z, field, offset, _padded(centers[near] - centers[lens]), half)
+        distance2 = float(field @ field)
+        given = envelope(distance2, float(imager.reduced_depth(z)), imager.field_radius)
+        rows.append(
+            {
+                "field_mm": distance2**0.5,
+                "expected_light": float(areas[lens] * given),
+                "light": float(window.sum()),
+                "capture": _measures(window, offset),
+                **{name: _measures(spot, offset) for name, spot in ours.items()},
+                "pictures": [window / window.sum(), ours["rays"], ours["diffraction"]],
+            }
+        )
+    return rows
+
+
+@partial(jax.jit, static_argnames="half")
+def _model(imager, depth, field, offset, edges, half: int) -> dict:
+    arguments = dict(size=2 * half + 1, field=field, offset=offset, edges=edges)
+    # Lenses reach to 1 mm: 4 samples would fold the edge of their halo back into the window.
+    return {
+        "rays": geometric_psf(imager, depth, **arguments),
+        "diffraction": psf(imager, depth, wavelength=WAVELENGTH, samples=6, **arguments),
+    }
+
+
+def _padded(neighbours: np.ndarray, count: int = 16) -> np.ndarray:
+    """Half-way points, always as many, so that all lenses share one compiled function: far edges cut nothing."""
+    return np.vstack([neighbours / 2, np.full((count, 2), 10.0)])[:count]
+
+
+def _measures(image, offset: np.ndarray) -> dict:
+    """Centroid from the chief ray, of all and of the core, and radius of half the light, pixels.
+
+    The core is 5 x 5 pixels about the brightest; a spot out of focus has none.
+    """
+    image = np.asarray(image, float)
+    image = image / image.sum()
+    grid = np.indices(image.shape) - image.shape[0] // 2
+    centroid = (grid * image).sum((1, 2))
+    radii = np.hypot(*(grid - centroid[:, None, None])).ravel()
+    order = np.argsort(radii)
+    half_light = np.interp(0.5, np.cumsum(image.ravel()[order]), radii[order])
+    peak = np.unravel_index(np.argmax(image), image.shape)
+    core = np.abs(grid - grid[(slice(None), *peak)][:, None, None]).max(0) <= 2
+    middle = (grid * image * core).sum((1, 2)) / (image * core).sum()
+    return {"centroid_px": centroid - offset, "core_px": middle - offset, "half_light_px": half_light}
+
+
+def summary(rows: list[dict]) -> dict:
+    """Differences over all spots of a scene."""
+    median_and_max = lambda values: [float(np.median(values)), float(values.max())]
+    all_of = lambda name, key: np.array([row[name][key] for row in rows])
+    ratio = np.array([row["light"] / row["expected_light"] for row in rows if row["field_mm"] < 2.5])
+    result: dict = {"spots": len(rows), "light_over_area_and_envelope_relative_sd": float(ratio.std() / ratio.mean())}
+    for place in ("centroid_px", "core_px"):
+        captured = all_of("capture", place)
+        result[f"map_to_{place}"] = median_and_max(np.hypot(*captured.T))
+        for name in ("rays", "diffraction"):
+            result[f"{name}_to_{place}"] = median_and_max(np.hypot(*(captured - all_of(name, place)).T))
+    for name in ("rays", "diffraction"):
+        sizes = all_of(name, "half_light_px") / all_of("capture", "half_light_px")
+        result[f"{name}_half_light_ratio"] = median_and_max(sizes)
+    return result
+
+
+def run(fields=FIELDS, depths=DEPTHS) -> dict:
+    """Against Optiland, with the sensor at our best focus for 20 mm: over the field, and over the depth on the axis."""
+    imager = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0)
+    v = best_focus(imager, 20.0, radius=RADIUS)
+    imager = eqx.tree_at(lambda i: i.sensor_distance, imager, v)
+    return {
+        "sensor_distance_mm": float(v),
+        "pupil_radius_mm": RADIUS,
+        "field": [compare(imager, 20.0, h) for h in fields],
+        "depth": [compare(imager, z, 0.0) for z in depths],
+    }
+
+
+def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0)) -> list[dict]:
+    """Eq. (9) against the PSF's peak, on the axis, for a point at 20 mm at the best focus of each aperture."""
+    imager, rows = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0), []
+    for radius in radii:
+        focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=radius))
+        waves = float(wavefront_rms(focused, 20.0, radius=radius)) / WAVELENGTH
+        peak = float(strehl(focused, 20.0, wavelength=WAVELENGTH, radius=radius))
+        equation = float(np.exp(-((2 * np.pi * waves) ** 2)))
+        rows.append({"pupil_radius_mm": radius, "wavefront_rms_waves": waves, "strehl": peak, "equation_9": equation})
+    return rows
+
+
+def curves(result: dict) -> Figure:
+    """Wavefront error and Strehl ratio over field and depth."""
+    axes = (figure := Figure(figsize=(10, 6.5), layout="constrained")).subplots(2, 2)
+    for column, (name, label) in enumerate([("field", "field, mm"), ("depth", "depth, mm")]):
+        at = lambda key, name=name: [row[key] for row in result[name]]
+        x = at(f"{name}_mm")
+        rms, ratio = axes[:, column]
+        rms.plot(x, at("wavefront_rms_waves"), "-", label="exact rays, gs_jax")
+        rms.plot(x, at("wavefront_rms_optiland_waves"), "k+", ms=9, label="Optiland")
+        rms.plot(x, at("wavefront_rms_third_order_waves"), ":", label="third order")
+        rms.set(xlabel=label, ylabel="RMS wavefront error, waves", ylim=(0, None))
+        ratio.plot(x, at("strehl"), "-", label="PSF, gs_jax")
+        ratio.plot(x, at("strehl_optiland"), "k+", ms=9, label="Optiland's rays")
+        ratio.plot(x, np.exp(-((2 * np.pi * np.array(at("wavefront_rms_waves"))) ** 2)), ":", label="Eq. (9)")
+        ratio.set(xlabel=label, ylabel="Strehl ratio", ylim=(0, None))
+        rms.legend()
+        ratio.legend()
+    return figure
+
+
+def gallery(rows: list[dict], count: int = 5) -> Figure:
+    """Spots from the point's nearest lens outward: capture, our rays, our diffraction."""
+    ordered = sorted(rows, key=lambda row: row["field_mm"])
+    rows = [ordered[round(i)] for i in np.linspace(0, len(rows) - 1, count)]
+    figure = Figure(figsize=(2.2 * count, 6.8), layout="constrained")
+    for column, row in enumerate(rows):
+        for line, (name, picture) in enumerate(zip(("capture", "rays", "diffraction"), row["pictures"], strict=True)):
+            axis = figure.add_subplot(3, count, line * count + column + 1)
+            axis.imshow(np.sqrt(np.maximum(np.asarray(picture), 0)), cmap="magma")
+            axis.set(xticks=[], yticks=[], title=f"{name}, {row['field_mm']:.1f} mm" if line == 0 else name)
+    return figure
+
+
+def main() -> None:
+    """Tables on the terminal; JSON and pictures in the folder."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path, nargs="?")
+    parser.add_argument("--out", type=Path, default=Path("out/optics_check"))
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    with jax.enable_x64(True):  # paths to 1e-11 waves
+        result = run() | {"breakdown": breakdown()}
+    curves(result).savefig(out / "curves.png", dpi=90)
+    table = Table("depth, mm", "field, mm", "largest difference to Optiland: landing, nm", "path, waves")
+    for row in result["field"] + result["depth"]:
+        numbers = (row[k] for k in ("depth_mm", "field_mm", "landing_difference_nm", "path_difference_waves"))
+        table.add_row(*(f"{number:.3g}" for number in numbers))
+    Console().print(table)
+    table = Table("pupil radius, mm", "wavefront error, waves RMS", "Strehl ratio of the PSF", "Eq. (9)")
+    for row in result["breakdown"]:
+        table.add_row(*(f"{number:.3g}" for number in row.values()))
+    Console().print(table)
+    if arguments.data is not None:
+        found = {f"P1_{scene}": spots(arguments.data, scene) for scene in SPOTS}
+        found["P2_a"] = spots(arguments.data, "a", "P2")
+        for name in ("P1_i_20_c", "P1_i_18_px", "P2_a"):
+            gallery(found[name]).savefig(out / f"spots_{name}.png", dpi=90)
+        result["captures"] = {name: summary(rows) for name, rows in found.items()}
+        Console().print_json(data=result["captures"])
+    write_json(out / "result.json", result)
+
+
+if __name__ == "__main__":
+    main()

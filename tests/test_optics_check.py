@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from experiments.optics_check import breakdown, compare, curves, run, spots, summary
+from gs_jax import Imager, MicrolensArray, Sensor
+
+from .helpers import needs
+
+
+@pytest.mark.parametrize("field", [0.0, 3.0])
+def test_optiland_has_the_same_rays(field):
+    """Off the paper's lens too; a pupil that reaches to 1 mm."""
+    pytest.importorskip("optiland")
+    array = MicrolensArray([[0.0, 0.0]], radius_of_curvature=2.2, refractive_index=1.5, substrate_thickness=0.7)
+    row = compare(Imager(array, Sensor((3, 3), 0.0045), 4.9, 3.0), 17.0, field, radius=0.8)
+    # Identical formulas but for rounding: 1e-14 of 25 mm, and 1e-9 mm in the search for the entry point.
+    assert row["landing_difference_nm"] < 1e-3
+    assert row["path_difference_waves"] < 1e-6
+    np.testing.assert_allclose(row["spot_rms_um"], row["spot_rms_optiland_um"], rtol=1e-9)
+    np.testing.assert_allclose(row["wavefront_rms_waves"], row["wavefront_rms_optiland_waves"], rtol=1e-7)
+
+
+def test_strehl_ratio_beside_huygens_sum_over_optilands_rays():
+    pytest.importorskip("optiland")
+    result = run(fields=(0.0, 2.0), depths=(20.0,))
+    for row in result["field"] + result["depth"]:
+        # The sum has no obliquity: slopes of 0.2 change amplitudes by 2 to 4 %.
+        np.testing.assert_allclose(row["strehl"], row["strehl_optiland"], rtol=0.05)
+    assert len(curves(result).axes) == 4
+
+
+@pytest.mark.parametrize(("design", "place", "size_tolerance"), [("P1", "core_px", 0.15), ("P2", "centroid_px", 0.02)])
+def test_ray_traced_spots_are_where_we_say_and_as_large(design, place, size_tolerance):
+    """In focus the core, out of focus the whole disc: much of a halo is below a count of the camera."""
+    needs("geomscope/centers.csv")
+    data = needs(f"oracle/dev/{design}_a.tif").parent
+    found = summary(spots(data, "a", design, reach=1.6))
+    assert found["spots"] >= 3
+    # Shot noise: tenths of a pixel at most.
+    assert found[f"rays_to_{place}"][1] < 0.3
+    np.testing.assert_allclose(found["rays_half_light_ratio"], 1, atol=size_tolerance)
+    assert found["light_over_area_and_envelope_relative_sd"] < 0.03
+
+
+def test_equation_9_breaks_down():
+    small, large = breakdown(radii=(0.4, 0.65))
+    # Up to 0.1 waves it leaves out 2 %; at 0.3 it is not even the right size.
+    assert small["wavefront_rms_waves"] < 0.1 and abs(small["equation_9"] / small["strehl"] - 1) < 0.02
+    assert large["wavefront_rms_waves"] > 0.25 and large["equation_9"] < 0.5 * large["strehl"]

@@ -1,0 +1,175 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.optimize import minimize_scalar
+
+from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
+from gs_jax.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
+
+WAVELENGTH = 520e-6
+FIELDS = [(0.0, 0.0), (1.0, -0.4), (0.0, 3.0)]
+
+
+def unit(v=5.8, dtype=jnp.float64, **lens):
+    imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((64, 64), 0.0045), v, 3.0)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), imager)
+
+
+def some_points(radius=0.9, count=40):
+    rng = np.random.default_rng(0)
+    angle, length = rng.uniform(0, 2 * np.pi, count), radius * np.sqrt(rng.uniform(0, 1, count))
+    return np.column_stack([length * np.cos(angle), length * np.sin(angle)])
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize(("depth", "thickness"), [(20.0, 1.0), (3.0, 2.5)])
+def test_fermat_and_snell(field, depth, thickness):
+    """The path through a point of the lens is least over the plane, and has Snell's slopes at the sphere."""
+    imager = unit(substrate_thickness=thickness)
+    n, radius, v = 1.43, 2.0, 5.8
+    sphere = lambda p: jnp.sqrt(radius**2 - jnp.sum(p**2)) - radius
+    leg = lambda a, b: jnp.sqrt(jnp.sum((a - b) ** 2))
+    at = lambda p, z: jnp.append(p, z)
+
+    def path(entry, point, end):
+        surface = at(point, sphere(point))
+        start, plane = at(jnp.array(field), -thickness - depth), at(entry, -thickness)
+        return leg(start, plane) + n * leg(plane, surface) + leg(surface, at(end, v))
+
+    def least(point, end):
+        """Newton's steps on Fermat's principle at the plane."""
+        newton = lambda _, a: a - jnp.linalg.solve(jax.hessian(path)(a, point, end), jax.grad(path)(a, point, end))
+        return jax.lax.fori_loop(0, 8, newton, point)
+
+    @jax.jit
+    @jax.vmap
+    def total_and_slope(point, end):
+        entry = least(point, end)
+        return path(entry, point, end), jax.grad(path, 1)(entry, point, end)
+
+    points = jnp.asarray(np.vstack([[0, 0], some_points()]))
+    rays = unit_rays(imager, depth, points, field)
+    total, slope = total_and_slope(points, rays.landing)
+    assert jnp.all(rays.valid)
+    # Fermat at the sphere: the path does not change when the point moves on it.
+    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    # Paths of 30 mm in float64.
+    np.testing.assert_allclose(rays.path, total - total[0], atol=1e-13)
+
+
+def test_paraxial_rays_follow_the_shared_geometry():
+    imager = unit()
+    field, points = 1e-4 * jnp.array([3.0, -2.0]), 1e-4 * some_points()
+    landing = unit_rays(imager, 20.0, points, field).landing
+    reduced = imager.reduced_depth(20.0)
+    vergence = 1 / imager.array.focal_length - 1 / reduced
+    expected = chief_ray(jnp.zeros((1, 2)), field[None], 5.8 / reduced) + points * (1 - 5.8 * vergence)
+    # What is left out is of the third order in the slopes: 1e-12.
+    np.testing.assert_allclose(landing, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+def test_the_paths_slope_is_the_rays(field, lens):
+    """Hamilton: moving the sensor and its point changes the path by the direction cosines."""
+    point = np.array([0.3, -0.5])
+
+    def path_less_projection(v):
+        ray = unit_rays(unit(v, **lens), 20.0, point, field)
+        chief = unit_rays(unit(v, **lens), 20.0, np.zeros(2), field)
+        return ray.path, jnp.sqrt(1 + jnp.sum(ray.tangent**2)) - jnp.sqrt(1 + jnp.sum(chief.tangent**2))
+
+    (_, slope), (derivative, _) = jax.jvp(path_less_projection, (jnp.array(5.8),), (jnp.array(1.0),))
+    np.testing.assert_allclose(derivative, slope, rtol=1e-10)
+
+
+def test_an_ideal_lens_has_two_spheres():
+    """In focus no wavefront; beside it the difference of two spheres."""
+    f, z = 4.65, 20.0 + 1 / 1.43
+    image = 1 / (1 / f - 1 / z)
+    points = some_points()
+    field = np.array([1.0, -2.0])
+    in_focus = wavefront(unit(image, thin_lens_focal_length=f), 20.0, points, field)
+    np.testing.assert_allclose(in_focus, 0, atol=1e-14)
+
+    v = 5.0
+    bundle = np.append(-field / z * image, image)
+    sphere = np.append(-field / z * v, v)
+    surface = np.column_stack([points, np.zeros(len(points))])
+    direction = (bundle - surface) / np.linalg.norm(bundle - surface, axis=1, keepdims=True)
+    from_center = surface - sphere
+    # From the lens along the ray to the sphere through the vertex about the end of the chief ray.
+    b = (from_center * direction).sum(1)
+    to_sphere = -b - np.sqrt(b**2 - (from_center**2).sum(1) + (sphere**2).sum())
+    expected = np.linalg.norm(bundle) - np.linalg.norm(bundle - surface, axis=1) + to_sphere
+    moved = wavefront(unit(v, thin_lens_focal_length=f), 20.0, points, field)
+    np.testing.assert_allclose(moved, expected, atol=1e-13)
+
+
+def test_an_ideal_lens_collimates_from_its_focus():
+    rays = unit_rays(unit(thin_lens_focal_length=4.65), 4.65 - 1 / 1.43, some_points(), (0.5, 0.0))
+    np.testing.assert_allclose(rays.tangent, np.broadcast_to([-0.5 / 4.65, 0], (40, 2)), atol=1e-14)
+
+
+@pytest.mark.parametrize("v", [4.0, 5.8])
+@pytest.mark.parametrize("field", FIELDS)
+def test_float32_keeps_a_wavefront_of_30_waves_to_a_thousandth(v, field):
+    points = some_points(0.65)
+    exact = wavefront(unit(v), 20.0, points, field)
+    low = wavefront(unit(v, jnp.float32), 20.0, points, field)
+    assert low.dtype == jnp.float32
+    # Differences of paths, not paths: 25 mm in float32 alone would be wrong by 2e-3 waves in each of its sums.
+    np.testing.assert_allclose(low, exact, rtol=0, atol=5e-4 * WAVELENGTH)
+
+
+def test_best_focus_of_a_thin_lens_is_the_image():
+    v = best_focus(unit(thin_lens_focal_length=4.65), 20.0, radius=0.3)
+    np.testing.assert_allclose(v, 1 / (1 / 4.65 - 1 / (20 + 1 / 1.43)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_best_focus_is_the_least_wavefront_error(field):
+    error = jax.jit(lambda v: wavefront_rms(unit(v), 20.0, field=field, radius=0.65))
+    least = minimize_scalar(lambda v: float(error(v)), bounds=(4.5, 6.5), method="bounded", options={"xatol": 1e-9})
+    # A minimum is flat: half the digits. With the error off the axis, the Gauss-Newton steps end at 1e-5.
+    np.testing.assert_allclose(best_focus(unit(4.0), 20.0, field=field, radius=0.65), least.x, rtol=1e-5)
+
+
+def test_disc_averages():
+    points, weights = pupil_disc(0.7)
+    x, y = points.T
+    np.testing.assert_allclose(weights.sum(), 1, rtol=1e-14)
+    # <x^2> = r^2/4, <x^4 y^2> = r^6/64 over a disc.
+    np.testing.assert_allclose(jnp.sum(weights * x**2), 0.7**2 / 4, rtol=1e-13)
+    np.testing.assert_allclose(jnp.sum(weights * x**4 * y**2), 0.7**6 / 64, rtol=1e-13)
+
+
+def test_no_ray_through_what_is_no_lens():
+    """Beside the sphere, or where the light is reflected totally: no value, and gradients that are finite."""
+    points = np.array([[2.5, 0.0], [2.0, 0.0], [1.9, 0.0], [0.5, 0.0]])
+    rays = unit_rays(unit(), 20.0, points)
+    assert rays.valid.tolist() == [False, False, False, True]
+    assert np.isnan(wavefront(unit(), 20.0, points)).tolist() == [True, True, True, False]
+    total = lambda imager, points: jnp.sum(unit_rays(imager, 20.0, points).path)
+    gradients = jax.jit(jax.grad(total, (0, 1)))(unit(), jnp.asarray(points))
+    assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
+
+
+@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+@pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
+def test_gradients(lens, modes):
+    points = jnp.asarray(some_points(0.8, 3)).at[0].set(0)
+    values = jax.jit(lambda *arguments: (*unit_rays(*arguments)[:3], wavefront(*arguments)))
+    # At the vertex and on the axis too; steps of 1e-5 of a smooth function leave 1e-9.
+    for field in (jnp.zeros(2), jnp.array([1.0, 2.0])):
+        arguments = (unit(**lens), jnp.array(20.0), points, field)
+        check_grads(values, arguments, order=1, modes=modes, eps=1e-5, atol=1e-7, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
+def test_gradients_of_the_best_focus(modes):
+    focus = jax.jit(lambda imager, depth, radius: best_focus(imager, depth, radius=radius))
+    check_grads(focus, (unit(), jnp.array(20.0), jnp.array(0.65)), order=1, modes=modes, eps=1e-5, atol=1e-6, rtol=1e-6)
