@@ -8,18 +8,25 @@ import sys
 from pathlib import Path
 
 import click
+import jax
+import numpy as np
+from rich.console import Console
 
 from . import __version__
+from .camera import Camera, expose
 from .coverage import coverage, nearest_neighbour_distances
+from .datasheet import datasheet, summary, tables
 from .designs import read_design, write_centers
-from .disk import check_output
+from .disk import check_output, write_json
 from .errors import InputError
-from .files import read_capture
+from .files import CAPTURE_SUFFIXES, read_capture, read_points, write_capture
+from .findings import findings
 from .info import describe
 from .layouts import random_layout
 from .progress import Progress
 from .reconstruct import reconstruct_stack, voxel_grid
-from .volumes import VOLUME_SUFFIXES, write_volume
+from .simulate import PSFS, simulate_points, simulate_volume
+from .volumes import VOLUME_SUFFIXES, read_volume, write_volume
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MOST_DEPTHS = 10_000
@@ -118,6 +125,38 @@ def reconstruct(capture: Path, design: Path, depths: list[float], voxel_um: floa
 
 
 @commands.command()
+@click.argument("design", type=Path)
+@click.argument("scene", type=Path)
+@click.option("--psf", type=click.Choice(list(PSFS)), default="diffraction", show_default=True)
+@click.option("--peak-electrons", type=_Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
+@click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
+@click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
+def simulate(design: Path, scene: Path, psf: str, peak_electrons: float, noise: bool, seed: int, output: Path):
+    """Simulate the capture of SCENE by the microscope of the file DESIGN.
+
+    SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
+    lit boxes. The camera has 16 bits of 10 electrons, an offset of 16 and 2 electrons of read noise.
+    """
+    check_output(output, CAPTURE_SUFFIXES)
+    microscope = read_design(design)
+    imager, wavelength = microscope.imager(), microscope.imaging.wavelength_nm * 1e-6
+    with Progress() as progress:
+        if scene.suffix.lower() == ".csv":
+            image = simulate_points(read_points(scene), imager, wavelength=wavelength, kind=psf, progress=progress)
+        else:
+            volume, grid = read_volume(scene)
+            image = simulate_volume(volume, imager, grid, wavelength=wavelength, kind=psf, progress=progress)
+        if noise:
+            with progress.step("Exposing"):
+                image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))
+        with progress.step("Writing"):
+            write_capture(output, image)
+    size = " x ".join(map(str, image.shape))
+    click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}")
+
+
+@commands.command()
 @click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
 @click.option("--size-mm", type=_MM, nargs=2, required=True, help="Size of the plate, X Y.")
 @click.option("--pitch-mm", type=_MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
@@ -133,6 +172,30 @@ def layout(count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_m
     covered = coverage(centers, size_mm, diameter=diameter_mm)
     spread = f"pitch {distances.mean():.3f} mm, SD {distances.std():.3f} mm, " if count > 1 else ""
     click.echo(f"{output}: {count} lenses, {spread}{100 * covered:.1f} % of the plate covered")
+
+
+@commands.command()
+@click.argument("design", type=Path)
+@click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
+@click.option("--depths", type=_Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
+@click.option("--confusion-um", type=_UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
+def metrics(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
+    """Show what the microscope of the file DESIGN promises (the paper's Eqs. 1-11), and what is out of focus."""
+    if output:
+        check_output(output, [".json"])
+    confusion = confusion_um and confusion_um / 1000
+    microscope = read_design(design)
+    sheet = datasheet(microscope, depths, confusion=confusion)
+    if output:
+        write_json(output, sheet)
+    click.echo(summary(microscope, sheet))
+    console = Console()
+    for table in tables(sheet):
+        console.print()
+        console.print(table)
+    click.echo()
+    for sentence in findings(microscope, sheet, confusion=confusion):
+        click.echo(f"- {sentence}")
 
 
 @commands.command()

@@ -4,26 +4,26 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw, ImageFont
 
-from .backprojection import backproject_adjoint
 from .builtin import geomscope
+from .camera import Camera, expose
 from .coverage import nearest_neighbour_distances
 from .designs import write_design
 from .disk import atomic_write, make_folder, write_text
 from .files import read_capture, write_capture
 from .geometry import Grid
+from .phantoms import letters, rasterize
 from .progress import Progress
 from .reconstruct import reconstruct_stack
+from .simulate import simulate_volume
 from .volumes import write_volume
 
 # What is written at which depth (mm), and where its middle is (mm).
 _WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))
-_LETTER_MM = 3.5
-_PEAK_ELECTRONS = 5000
+_LETTER_MM = 2.5
+_PEAK_ELECTRONS = 10_000
 _DEPTHS = np.arange(17.0, 23.01, 0.5)
 _VOXEL_MM = 0.0415
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
@@ -47,10 +47,13 @@ def run(folder: Path, progress: Progress) -> Path:
         design = geomscope()
         write_design(folder / "design.toml", design)
     imager = design.imager()
-    with progress.step("Imaging the scene"):
-        scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in _WORDS], pitch=_SCENE_MM)
-        scene = _scene(scene_grid)
-        write_capture(folder / "capture.tif", _expose(backproject_adjoint(scene, imager, scene_grid)))
+    scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in _WORDS], pitch=_SCENE_MM)
+    scene = np.asarray(rasterize(_scene(), scene_grid))
+    wavelength = design.imaging.wavelength_nm * 1e-6
+    light = simulate_volume(scene, imager, scene_grid, wavelength=wavelength, progress=progress)
+    with progress.step("Exposing"):
+        counts = expose(light, Camera(), jax.random.key(0), peak_electrons=_PEAK_ELECTRONS)
+        write_capture(folder / "capture.tif", counts)
     image = read_capture(folder / "capture.tif", imager.sensor.shape)
     grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
     started = time.perf_counter()
@@ -64,25 +67,10 @@ def run(folder: Path, progress: Progress) -> Path:
     return folder / "report.md"
 
 
-def _scene(grid: Grid) -> jax.Array:
-    """Each word on its plane."""
-    planes = []
-    font = ImageFont.load_default(size=round(_LETTER_MM / grid.pitch))
-    rows, columns = grid.shape
-    for _, word, (x, y) in _WORDS:
-        plane = Image.new("L", (columns, rows))
-        middle = (x / grid.pitch + columns / 2, y / grid.pitch + rows / 2)
-        ImageDraw.Draw(plane).text(middle, word, fill=255, font=font, anchor="mm")
-        planes.append(np.asarray(plane, np.float32) / 255)
-    return jnp.array(planes)
-
-
-def _expose(image: jax.Array) -> np.ndarray:
-    """What a camera makes of it: shot noise, two electrons of read noise, an offset of 16, 16 bits."""
-    rng = np.random.default_rng(0)
-    electrons = np.asarray(image) * (_PEAK_ELECTRONS / float(image.max()))
-    noisy = rng.poisson(electrons) + rng.normal(16, 2, electrons.shape)
-    return np.clip(noisy, 0, 65535).round().astype(np.uint16)
+def _scene() -> np.ndarray:
+    """Emitters: each word on its plane, in its place."""
+    words = [letters(word, depth=z, height=_LETTER_MM, pitch=_SCENE_MM) + (x, y, 0, 0) for z, word, (x, y) in _WORDS]
+    return np.concatenate(words)
 
 
 def _picture(image, scene, volume, imager, grid: Grid) -> Figure:
@@ -130,10 +118,10 @@ light from other depths.
 | file | what |
 |---|---|
 | `design.toml` | the microscope |
-| `capture.tif` | the camera's image, 16 bits, with shot and read noise |
+| `capture.tif` | the camera's image, 16 bits, with diffraction, shot and read noise |
 | `volume.ome.tif` | the reconstructed stack, to scale in Fiji and napari |
 | `picture.png` | the picture above |
 
-The capture comes from the package's own ray model (every lens a pinhole), sampled finer than the voxels: a
-demonstration, not a proof of quality.
+The capture comes from the package's own forward model (exact wavefront and diffraction of a lens on its axis, the
+same for all lenses and fields), on a finer grid than the voxels: a demonstration, not a proof of quality.
 """

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import tifffile
 
+from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.volumes import read_volume
+from gs_jax.files import read_capture
+from gs_jax.volumes import read_volume, write_volume
 
 from .helpers import needs
 
@@ -77,6 +79,37 @@ def test_depths_include_the_stop_only_when_it_falls_on_the_step(folder, monkeypa
         assert status == 0 and out.startswith(f"v.tif: {count} x ")
 
 
+POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"
+
+
+def test_simulate_points(folder, monkeypatch, capsys):
+    (folder / "points.csv").write_text(POINTS)
+    command = ("simulate", "design.toml", "points.csv", "-o", "c.tif")
+    status, out, err = run(monkeypatch, capsys, *command)
+    assert (status, err) == (0, "") and out.startswith("c.tif: 96 x 80 pixels, uint16, from 1")
+    first = read_capture(folder / "c.tif", (96, 80))
+    assert abs(int(first.max()) - 1016) < 150  # 10,000 electrons, 10 a count, an offset of 16
+    run(monkeypatch, capsys, *command)
+    np.testing.assert_array_equal(read_capture(folder / "c.tif"), first)
+    run(monkeypatch, capsys, *command, "--seed", "1")
+    assert (read_capture(folder / "c.tif") != first).any()
+
+
+def test_simulate_a_volume_and_reconstruct_it(folder, monkeypatch, capsys):
+    grid = Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
+    voxels = np.zeros((3, 9, 9), np.float32)
+    voxels[1, 6, 3] = 1
+    write_volume(folder / "scene.zarr", voxels, grid)
+    simulate = ("simulate", "design.toml", "scene.zarr", "--psf", "gaussian", "--no-noise", "-o", "capture.tif")
+    status, out, _ = run(monkeypatch, capsys, *simulate)
+    assert status == 0 and "float32, from 0 to" in out
+    options = ("--depths", "20:20:1", "--voxel-um", "50", "-o", "v.tif")
+    run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
+    volume, found = read_volume(folder / "v.tif")
+    _, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
+    assert abs(float(found.y[row]) - 0.1) < 0.06 and abs(float(found.x[column]) + 0.05) < 0.06  # a voxel
+
+
 def test_layout(folder, monkeypatch, capsys):
     arguments = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "--seed", 3, "-o", "c.csv")
     status, out, _ = run(monkeypatch, capsys, *arguments)
@@ -130,6 +163,13 @@ WRONG_ARGUMENTS = [
     (("layout", "--count", "9", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "`count` must be"),
     (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1", "--seed", "-1", "-o", "c.csv"), "--seed"),
     (("demo", "--out", "design.toml"), "design.toml"),
+    (("simulate", "design.toml", "-o", "c.tif"), "SCENE"),
+    (("simulate", "design.toml", "missing.csv", "-o", "c.tif"), "missing.csv"),
+    (("simulate", "design.toml", "capture.tif", "-o", "c.tif"), "capture.tif"),
+    (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "design.toml: found the suffix"),
+    (("simulate", "design.toml", "missing.csv", "-o", "c.jpg"), "c.jpg: found the suffix"),
+    (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--psf", "round"), "'round' is not"),
+    (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
 ]  # fmt: skip
 
 
@@ -208,3 +248,17 @@ def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys
     z, y, x = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(grid.depths[z]) - 20) <= 0.1
     assert np.hypot(float(grid.x[x]), float(grid.y[y])) <= 0.02
+
+
+@pytest.mark.slow
+def test_demo(tmp_path, monkeypatch, capsys):
+    status, out, err = run(monkeypatch, capsys, "demo", "--out", tmp_path / "demo")
+    assert (status, err) == (0, "") and "report.md" in out
+    made = {p.name for p in (tmp_path / "demo").iterdir()}
+    assert made == {"design.toml", "capture.tif", "volume.ome.tif", "picture.png", "report.md"}
+    volume, grid = read_volume(tmp_path / "demo" / "volume.ome.tif")
+    # Each word is brightest on its own plane: at 18, 20 and 22 mm.
+    for depth, (x, y) in ((18, (-4, -5)), (20, (0, 0)), (22, (4, 5))):
+        near = np.ix_(abs(np.asarray(grid.y) - y) < 1.5, abs(np.asarray(grid.x) - x) < 4)
+        sharpness = [np.square(plane[near]).mean() for plane in volume]
+        assert abs(float(grid.depths[int(np.argmax(sharpness))]) - depth) <= 0.5

@@ -1,0 +1,116 @@
+"""The forward model: what it costs, and how far the paper's zones are from the exact sum.
+
+Cost: `gs_jax.forward` at full scale (5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at
+each depth) and with more or fewer depths, lenses and pixels. Zones: Eq. (2) takes the envelope C from the centre of
+the zone that a voxel lies in, `gs_jax.forward` from the voxel; nothing else differs. The zone of a lens is its
+Voronoi cell, so the departure follows from the envelope alone.
+
+    python -m experiments.forward_model [--out DIR]
+
+writes `forward.json` and `forward.png`; about three minutes on two cores.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial import KDTree
+
+from experiments.backprojection_speed import Inputs, Job, inputs, timed
+from gs_jax import Imager, forward
+from gs_jax.builtin import geomscope
+from gs_jax.disk import make_folder, write_json
+from gs_jax.geometry import envelope
+from gs_jax.info import describe
+from gs_jax.progress import Progress
+
+STUDY = {
+    "depths": [Job(depths=n) for n in (1, 4, 13, 40)],
+    "lenses": [Job(lenses=n) for n in (13, 53, 213, 850)],
+    "pixels": [Job(pixels=n) for n in (640, 1280, 2560, 5120)],
+}
+PSF_PIXELS = 65
+
+
+def cost(job: Job, rounds: int = 3) -> dict[str, float]:
+    """Warm median, compile time and what XLA allocates beside the arguments."""
+    s: Inputs = inputs(job)
+    psf = jnp.full((job.depths, PSF_PIXELS, PSF_PIXELS), PSF_PIXELS**-2.0, jnp.float32)
+    arguments = s.volume, s.imager, s.grid, psf
+    compile_s, compiled = timed(lambda: forward.lower(*arguments).compile())
+    call = lambda: jax.block_until_ready(compiled(*arguments))
+    call()
+    memory = compiled.memory_analysis()
+    return {
+        "median_s": float(np.median([timed(call)[0] for _ in range(rounds)])),
+        "compile_s": compile_s,
+        "mib": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20,
+    }
+
+
+def zone_departure(imager: Imager, depth: float, size: tuple[float, float], points: int = 20_000) -> dict[str, float]:
+    """How much light of a point the zones put at wrong lenses: sum |C_zone - C| / sum C, over random points."""
+    rng = np.random.default_rng(0)
+    centers = np.asarray(imager.centers)
+    place = rng.uniform(-0.5, 0.5, (points, 2)) * size
+    zone = KDTree(centers).query(place)[1]
+    # Zones' centroids, by the points themselves.
+    middle = np.stack([np.bincount(zone, q, len(centers)) for q in place.T], -1) / np.bincount(zone)[:, None]
+    reduced = imager.reduced_depth(depth)
+    light = lambda q: np.asarray(envelope(_squared(q, centers), reduced, imager.field_radius))
+    exact = light(place)
+    departure = np.abs(light(middle[zone]) - exact).sum(1) / exact.sum(1)
+    return {"depth_mm": depth, "mean": float(departure.mean()), "worst": float(departure.max())}
+
+
+def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return ((a[:, None] - b[None]) ** 2).sum(-1)
+
+
+def run(study: Mapping[str, Sequence[Job]] = STUDY, *, progress: Progress) -> dict:
+    """Everything that `forward.json` holds; units are in the keys."""
+    jobs = dict.fromkeys(job for axis in study.values() for job in axis)
+    costs = {job: cost(job) for job in progress.track(list(jobs), "Forward model")}
+    design = geomscope()
+    return {
+        "machine": describe(),
+        "cost": {axis: [job._asdict() | costs[job] for job in jobs] for axis, jobs in study.items()},
+        "zones": zone_departure(design.imager(), 20.0, design.array.size_mm),
+    }
+
+
+def picture(found: dict) -> Figure:
+    """Time against each number, the others at full scale."""
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axes, (axis, rows) in zip(figure.subplots(1, 3, sharey=True), found["cost"].items(), strict=True):
+        axes.loglog([row[axis] for row in rows], [row["median_s"] for row in rows], "o-")
+        axes.set_xlabel("pixels along a side" if axis == "pixels" else axis)
+        axes.grid(which="both", alpha=0.25)
+    figure.axes[0].set_ylabel("time, s")
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/forward_model"))
+    out = make_folder(parser.parse_args().out)
+    with Progress() as progress:
+        found = run(progress=progress)
+    write_json(out / "forward.json", found)
+    picture(found).savefig(out / "forward.png", dpi=100)
+    for axis, rows in found["cost"].items():
+        table = Table(axis, "time, s", "compile, s", "memory, MiB")
+        for row in rows:
+            table.add_row(str(row[axis]), f"{row['median_s']:.2f}", f"{row['compile_s']:.1f}", f"{row['mib']:.0f}")
+        Console().print(table)
+    Console().print(found["zones"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""What is wrong with a design, in words: its datasheet against what its formulas assume."""
+
+from typing import Any
+
+import numpy as np
+
+from . import aberrations, theory
+from .datasheet import confusion_of
+from .designs import Design
+
+# Eq. 9 holds below this RMS wavefront error, in waves.
+_STREHL_DOMAIN = 0.1
+
+
+def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None = None) -> list[str]:
+    """What violates what, in short sentences; empty if nothing does.
+
+    Parameters
+    ----------
+    design, sheet
+        A microscope and its datasheet.
+    confusion
+        As for `datasheet`.
+
+    Raises
+    ------
+    InputError
+        As `datasheet`.
+    """
+    confusion = confusion_of(design, confusion)
+    checks = (_focus(design, sheet, confusion), _strehl(design, sheet), _pixels(design, sheet), _pitch(sheet))
+    return [sentence for check in (*checks, _occupancy(sheet)) for sentence in check]
+
+
+def _focus(design: Design, sheet: dict[str, Any], confusion: float) -> list[str]:
+    v, blurs = design.imaging.sensor_distance_mm, sheet["blur_um"]
+    outside = [i for i, blur in enumerate(blurs) if blur > confusion * 1000]
+    if not outside:
+        return []
+    limit = f"the circle of confusion, {_length(confusion)}"
+    return [
+        *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
+        f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
+        _sharp_range(design, sheet, confusion),
+    ]
+
+
+def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
+    depth, image, blur = sheet["depth_mm"][i], sheet["focus_distance_mm"][i], sheet["blur_um"][i] / 1000
+    patch = f"blur {_length(blur)} on the sensor, {_length(blur / sheet['magnification'][i])} in the object"
+    if image is None:
+        return f"At {depth:g} mm no real image forms: {patch}."
+    side = "behind" if image > v else "before"
+    return f"At {depth:g} mm the image forms {_length(abs(image - v))} {side} the sensor: {patch}."
+
+
+def _sharp_range(design: Design, sheet: dict[str, Any], confusion: float) -> str:
+    v, f, f_number = design.imaging.sensor_distance_mm, sheet["focal_length_mm"], sheet["f_number"]
+    if v <= f:
+        return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
+    reduced, plate = theory.depth_in_focus(f, v), _plate(design)
+    near = max(float(theory.near_limit(f, f_number, reduced, confusion)) - plate, 0)
+    far = float(theory.far_limit(f, f_number, reduced, confusion)) - plate
+    working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
+    if far <= 0:
+        return f"The sensor at {v:g} mm is so far that only points within the plate are in focus; {working}."
+    return f"In focus are {near:.4g} to {far:.4g} mm; {working}."
+
+
+def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
+    imaging = design.imaging
+    wavelength, v, f = imaging.wavelength_nm * 1e-6, imaging.sensor_distance_mm, sheet["focal_length_mm"]
+    pupil = f / sheet["f_number"] / 2
+    reduced = np.array(sheet["depth_mm"]) + _plate(design)
+    lens = (f, design.lens.refractive_index, pupil, reduced)
+    error = aberrations.seidel(*lens, 0.0, v)
+    waves = np.asarray(aberrations.linear_rms(error)) / wavelength
+    if waves.max() <= _STREHL_DOMAIN:
+        return []
+    half = np.asarray(aberrations.linear_field_radius(*lens, v, wavelength)) * 1000
+    found = [
+        f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
+        "the Strehl ratios only say that the image is far from diffraction-limited.",
+        f"By Eqs. 9 and 10 the Strehl ratio halves {_span(half)} um beside the axis, "
+        f"not at the field radius of {_length(sheet['field_radius_mm'])}.",
+    ]
+    spherical, paraxial = np.asarray(error.spherical), sheet["focus_distance_mm"]
+    if (
+        paraxial[0] is not None
+        and np.asarray(aberrations.balanced_rms(error).spherical)[0] > _STREHL_DOMAIN * wavelength
+    ):
+        sharpest = 1 / (1 / paraxial[0] + 2 * spherical[0] / pupil**2)
+        found.append(
+            "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "
+            f"{sheet['depth_mm'][0]:g} mm toward the lens, by up to {_length(paraxial[0] - sharpest)}."
+        )
+    return found
+
+
+def _pixels(design: Design, sheet: dict[str, Any]) -> list[str]:
+    pixel = design.sensor.pixel_pitch_um
+    spot = design.imaging.wavelength_nm / 2000 / sheet["numerical_aperture"]
+    if spot >= pixel:
+        return []
+    return [f"Pixels limit the lateral resolution: the diffraction spot is {spot:.2g} um, a pixel {pixel:g} um."]
+
+
+def _pitch(sheet: dict[str, Any]) -> list[str]:
+    aperture, f, pitch = sheet["numerical_aperture"], sheet["focal_length_mm"], sheet["pitch_mm"]
+    if pitch is None or abs(pitch / (2 * f * aperture) - 1) < 0.05:
+        return []
+    return [
+        f"The numerical aperture of {aperture:.3f} is that of the clear diameter, {2 * f * aperture:.3g} mm; the paper "
+        f"takes the pitch, {pitch:.3g} mm, for the diameter, which gives {pitch / (2 * f):.3f}."
+    ]
+
+
+def _occupancy(sheet: dict[str, Any]) -> list[str]:
+    worst = int(np.argmax(sheet["occupancy"]))
+    depth, occupancy = sheet["depth_mm"][worst], sheet["occupancy"][worst]
+    if occupancy <= 1:
+        return []
+    return [f"At {depth:g} mm the occupancy is {occupancy:.2g}: sub-images of an object that fills the field overlap."]
+
+
+def _plate(design: Design) -> float:
+    return design.array.substrate_thickness_mm / design.lens.refractive_index
+
+
+def _length(mm: float) -> str:
+    return f"{_two_digits(mm)} mm" if mm >= 1 else f"{_two_digits(mm * 1000)} um"
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = _two_digits(values.min()), _two_digits(values.max())
+    return low if low == high else f"{low} to {high}"
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"

@@ -1,0 +1,118 @@
+"""From a scene to the image on the sensor, as the command line does it."""
+
+import math
+from functools import partial
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .aperture import clear_diameter
+from .errors import InputError
+from .forward import forward
+from .geometry import Grid, Imager, Sensor
+from .info import memory_bytes
+from .progress import Progress
+from .psf import gaussian_psf, geometric_psf, psf
+from .stamps import STEPS, forward_points, stamps
+from .unit import unit_rays
+
+PSFS = {"diffraction": psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
+# Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.
+_MARGIN, _FARTHEST = 16, 128
+# Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
+_STEP = 0.1
+
+
+def simulate_volume(
+    volume: Float[Array | np.ndarray, "depth y x"],
+    imager: Imager,
+    grid: Grid,
+    *,
+    wavelength: float,
+    kind: str = "diffraction",
+    progress: Progress,
+) -> Float[np.ndarray, "row column"]:
+    """The image of a volume whose voxels are evenly lit boxes, one plane after the other.
+
+    Voxels are divided until they are half a pixel on the sensor or less: the image has no dots, and what is left of
+    their raster is a ripple of 3 % at most.
+
+    Parameters
+    ----------
+    volume
+        `(len(depths), *grid.shape)`, not negative.
+    imager, grid
+        As for `forward`.
+    wavelength
+        mm.
+    kind
+        Of the PSF: a key of `PSFS`.
+
+    Raises
+    ------
+    InputError
+        If a voxel is negative, a divided plane would not fit into the memory, or the blur is too wide.
+    """
+    volume = np.asarray(volume, np.float32)
+    finest = float(imager.magnification(grid.depths).max()) * grid.pitch / imager.sensor.pixel_pitch
+    parts = math.ceil(2 * finest)
+    rows, columns = (n * parts for n in grid.shape)
+    if 16 * rows * columns > (memory := memory_bytes()):
+        raise InputError(
+            f"found planes of {grid.shape} voxels of {grid.pitch * 1000:g} um, which divided to half a pixel take "
+            f"{16 * rows * columns / 2**30:.3g} GiB, allowed: {memory / 2**30:.3g} GiB on this machine."
+        )
+    if np.min(volume) < 0:
+        raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
+    kernel = _kernel(imager, np.asarray(grid.depths), wavelength, kind)
+    image = jnp.zeros(imager.sensor.shape, jnp.float32)
+    for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
+        if not plane.any():
+            continue
+        fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
+        one = Grid(depth[None], (rows, columns), grid.pitch / parts)
+        image += forward(fine[None], imager, one, kernel(depth)[None])
+    return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
+
+
+def simulate_points(
+    points: Float[np.ndarray, "point 4"],
+    imager: Imager,
+    *,
+    wavelength: float,
+    kind: str = "diffraction",
+    progress: Progress,
+) -> Float[np.ndarray, "row column"]:
+    """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate_volume`."""
+    if not len(points):
+        return np.zeros(imager.sensor.shape, np.float32)
+    near, far = points[:, 2].min(), points[:, 2].max()
+    depths = np.unique(points[:, 2])
+    if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
+        depths = np.linspace(near, far, count)
+    sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS)
+    kernel = _kernel(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, wavelength, kind, STEPS)
+    fine = np.stack([kernel(depth) for depth in progress.track(depths, "Point spread functions")])
+    return forward_points(points, imager, stamps(depths, fine), progress)
+
+
+def _kernel(imager: Imager, depths, wavelength: float, kind: str, steps: int = 1):
+    """The PSF of a depth, in a window that holds the rays of all of them; `steps` windows' pixels make a pixel."""
+    radius = clear_diameter(imager.array) / 2
+    edge = radius * jnp.array([[1.0, 0.0]])
+    reaches = [float(jnp.abs(unit_rays(imager, depth, edge).landing).max()) for depth in (min(depths), max(depths))]
+    pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
+    if not pixels <= _FARTHEST:
+        depth = (min(depths), max(depths))[int(np.argmax(reaches))]
+        raise InputError(
+            f"found an object at {depth:g} mm, blurred over {pixels:.3g} pixels of the sensor each way, "
+            f"allowed: {_FARTHEST}."
+        )
+    size = steps * (2 * math.ceil(pixels + _MARGIN) + 1)
+    make = PSFS[kind]
+    if kind == "diffraction":  # as fine as the aperture diffracts
+        sharp = 2 * radius * imager.sensor.pixel_pitch / (wavelength * imager.sensor_distance)
+        make = partial(make, samples=math.ceil(sharp))
+    return lambda depth: make(imager, depth, wavelength=wavelength, size=size, radius=radius)

@@ -1,0 +1,206 @@
+import io
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from rich.console import Console
+
+from gs_jax import Imager, MicrolensArray, theory
+from gs_jax.aperture import clear_diameter, pitch
+from gs_jax.builtin import geomscope
+from gs_jax.datasheet import datasheet, performance, summary, tables
+from gs_jax.designs import read_design
+from gs_jax.findings import findings
+
+from .helpers import scene
+from .test_cli import run
+
+LISTS = (
+    "depth_mm magnification scale lateral_resolution_um axial_resolution_um depth_of_field_mm near_limit_mm "
+    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um"
+).split()
+SCALARS = "f_number numerical_aperture focal_length_mm pitch_mm pitch_sd_mm field_radius_mm coverage".split()
+
+
+@pytest.fixture(scope="module")
+def table1():
+    return read_design(Path(__file__).parents[1] / "design" / "geomscope-table1.toml")
+
+
+def changed(design, table, **values):
+    return design.model_copy(update={table: getattr(design, table).model_copy(update=values)})
+
+
+def test_the_keys_and_their_types(table1):
+    sheet = datasheet(table1)
+    assert list(sheet) == LISTS + SCALARS
+    assert all(len(sheet[key]) == 7 for key in LISTS)
+    assert (sheet["depth_mm"][0], sheet["depth_mm"][-1]) == (18.0, 30.0)
+    assert json.loads(json.dumps(sheet, allow_nan=False)) == sheet
+
+
+def test_the_papers_design(table1):
+    """Table 1 and thin-lens figures at 20 mm, with the clear diameter for the diameter."""
+    sheet = datasheet(table1, [18.0, 20.0, 30.0])
+    np.testing.assert_allclose(sheet["focal_length_mm"], 4.65, rtol=1e-3)
+    np.testing.assert_allclose([sheet["pitch_mm"], sheet["pitch_sd_mm"]], [1.23, 0.09], atol=0.005)
+    np.testing.assert_allclose([sheet["magnification"][0], sheet["magnification"][-1]], [0.214, 0.130], atol=0.001)
+    np.testing.assert_allclose(np.subtract(sheet["scale"], sheet["magnification"]), 1, rtol=1e-5)
+    # 200 lenses share 400 mm^2.
+    np.testing.assert_allclose(sheet["focal_length_mm"] / sheet["f_number"], np.sqrt(8 / np.pi), rtol=1e-3)
+    np.testing.assert_allclose(sheet["focus_distance_mm"][1], 6.00, atol=0.005)
+    np.testing.assert_allclose(sheet["blur_um"][1], 532, atol=1)
+    np.testing.assert_allclose(sheet["lenses_per_point"], 14.1372, rtol=1e-5)
+
+
+def test_limits_are_depths_from_the_plate(table1):
+    sheet, f, plate = datasheet(table1, [20.0], confusion=0.018), 2 / 0.43, 1 / 1.43
+    arguments = (f, sheet["f_number"], 20 + plate, 0.018)
+    np.testing.assert_allclose(sheet["near_limit_mm"], theory.near_limit(*arguments) - plate, rtol=1e-5)
+    np.testing.assert_allclose(sheet["far_limit_mm"], theory.far_limit(*arguments) - plate, rtol=1e-5)
+    # Both rounded to six digits.
+    width = sheet["far_limit_mm"][0] - sheet["near_limit_mm"][0]
+    np.testing.assert_allclose(sheet["depth_of_field_mm"], width, rtol=1e-4)
+
+
+def test_the_clear_diameter_is_that_of_the_array(table1):
+    sheet, array = datasheet(table1), table1.imager().array
+    np.testing.assert_allclose(sheet["focal_length_mm"] / sheet["f_number"], clear_diameter(array), rtol=1e-5)
+    mean, deviation = pitch(array.centers)
+    np.testing.assert_allclose([sheet["pitch_mm"], sheet["pitch_sd_mm"]], [mean, deviation], rtol=1e-5)
+
+
+def test_infinity_is_none(table1):
+    sheet = datasheet(table1, [3.0, 200.0], confusion=0.1)
+    assert sheet["focus_distance_mm"][0] is None
+    assert sheet["far_limit_mm"][1] is None and sheet["depth_of_field_mm"][1] is None
+    assert any(sentence.startswith("At 3 mm no real image forms") for sentence in findings(table1, sheet))
+    single = changed(table1, "array", centers_mm=((0.0, 0.0),))
+    assert datasheet(single)["pitch_mm"] is None
+
+
+def test_the_two_tables_fit_a_terminal(table1):
+    console = Console(width=80, record=True, file=io.StringIO())
+    for table in tables(datasheet(table1)):
+        console.print(table)
+    text = console.export_text()
+    assert "…" not in text and "magnifi-" in text and "531.8" in text
+    assert "1.23 mm" in summary(table1, datasheet(table1))
+
+
+def test_what_is_wrong_with_the_printed_design(table1):
+    text = "\n".join(findings(table1, datasheet(table1, [20.0])))
+    for words in [
+        "At 20 mm the image forms 2 mm behind the sensor: blur 530 um on the sensor, 2.8 mm in the object.",
+        "1 of 1 depths are out of focus: blurred by more than the circle of confusion, 9 um.",
+        "The sensor at 4 mm is not behind the focal plane at 4.651 mm: no depth is in focus.",
+        "13 waves RMS, and Eq. 9 holds below about 0.1",
+        "the diffraction spot is 1.5 um, a pixel 4.5 um",
+        "takes the pitch, 1.23 mm, for the diameter, which gives 0.132",
+    ]:
+        assert words in text
+    assert "occupancy" not in text
+
+
+def test_what_is_wrong_with_the_design_in_focus(table1):
+    design = changed(table1, "imaging", sensor_distance_mm=5.8)
+    text = "\n".join(findings(design, datasheet(design)))
+    assert "At 30 mm the image forms 320 um before the sensor" in text
+    assert "In focus are 22.26 to 23.33 mm; the working distance is 18 to 30 mm." in text
+    assert "At 18 mm the occupancy is 1.4" in text
+    # Traced rays are sharpest 0.15 to 0.25 mm before the thin lens's image; the least variance is farther.
+    assert "draws the sharpest image of 18 mm toward the lens, by up to 460 um" in text
+
+
+def test_nothing_is_wrong_with_a_small_lens_in_focus(table1):
+    """A thousandth of the aperture's area: a pinhole that is as wide as the pitch."""
+    design = changed(table1, "lens", aperture_diameter_mm=0.06)
+    design = changed(design, "imaging", sensor_distance_mm=6.0, field_radius_mm=1.0)
+    sheet = datasheet(design, [20.0])
+    sentences = findings(design, sheet)
+    assert len(sentences) == 1 and "takes the pitch" in sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (dict(depths=[]), r"`depths` must be one or more positive lengths, mm, got \[\]"),
+        (dict(depths=[20.0, -1.0]), "`depths` must be"),
+        (dict(confusion=0.0), "`confusion` must be positive and finite"),
+    ],
+)
+def test_wrong_arguments_are_named(table1, arguments, words):
+    with pytest.raises(ValueError, match=words):
+        datasheet(table1, **arguments)
+
+
+def test_an_infinite_plate_has_no_density():
+    imager, grid = scene()
+    with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
+        performance(imager, grid.depths, diameter=1.0, field_radius=1.0, wavelength=520e-6, confusion=0.009)
+
+
+def test_gradients_by_everything_that_is_continuous():
+    imager, grid = scene()
+    array = imager.array
+
+    @jax.jit
+    def values(centers, radius, index, diameter, thickness, v, depths, field_radius, um):
+        moved = MicrolensArray(
+            centers,
+            radius_of_curvature=radius,
+            refractive_index=index,
+            aperture_diameter=diameter,
+            substrate_thickness=thickness,
+            size=(2.0, 2.0),
+        )
+        result = performance(
+            Imager(moved, imager.sensor, v, 1.0),
+            depths,
+            diameter=clear_diameter(moved),
+            field_radius=field_radius,
+            wavelength=um * 1e-3,
+            confusion=um * 1e-2,
+        )
+        return result.scale, *jax.tree.leaves(result), jnp.log(result.lateral_resolution), pitch(centers)
+
+    one = jnp.array
+    arguments = (array.centers, one(2.0), one(1.43), one(0.5), one(1.0), one(5.8), grid.depths, one(0.4), one(0.52))
+    # Blurs and resolutions are 1e-2 mm: the tolerance is a millionth of a wave's worth of it.
+    check_grads(values, arguments, order=1, eps=1e-7, atol=1e-6, rtol=1e-5)
+
+
+def test_the_built_in_design_matches_its_file():
+    """The command's figures and the API's are the same."""
+    sheet = datasheet(geomscope(), [20.0])
+    np.testing.assert_allclose(sheet["blur_um"], 53, atol=0.5)
+
+
+def test_the_command(tmp_path, monkeypatch, capsys, table1):
+    design = Path(__file__).parents[1] / "design" / "geomscope-table1.toml"
+    output = tmp_path / "sheet.json"
+    options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
+    status, out, err = run(monkeypatch, capsys, "metrics", design, *options)
+    assert (status, err) == (0, "")
+    assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], confusion=0.018)
+    assert "- At 20 mm the image forms 2 mm behind the sensor" in out and "the circle of confusion, 18 um" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--json", "sheet.txt"], "sheet.txt"),
+        (["--depths", "20"], "allowed: START:STOP:STEP"),
+        (["--confusion-um", "0"], "allowed: 0.01 to 1e"),
+    ],
+)
+def test_wrong_options_are_one_line(tmp_path, monkeypatch, capsys, options, words):
+    monkeypatch.chdir(tmp_path)
+    design = Path(__file__).parents[1] / "design" / "geomscope.toml"
+    status, out, err = run(monkeypatch, capsys, "metrics", design.resolve(), *options)
+    assert (status, out, err.count("\n")) == (2, "", 1) and words in err
+    assert not list(tmp_path.iterdir())

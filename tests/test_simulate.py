@@ -1,0 +1,71 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
+from gs_jax.errors import InputError
+from gs_jax.progress import Progress
+from gs_jax.simulate import PSFS, simulate_points, simulate_volume
+
+WAVELENGTH = 520e-6
+
+
+def imager(sensor_distance=5.8, pixel=0.01):
+    array = MicrolensArray([[0.0, 0.0], [0.2, 0.1]], aperture_diameter=0.3, size=(2.0, 2.0))
+    return Imager(array, Sensor((96, 80), pixel), sensor_distance, 0.6)
+
+
+@pytest.mark.parametrize("kind", PSFS)
+def test_a_point_is_a_small_voxel(kind):
+    out_of_focus = imager(sensor_distance=4.8)  # a pixel is small beside the blur
+    options: dict[str, Any] = dict(wavelength=WAVELENGTH, kind=kind, progress=Progress())
+    grid = Grid([19.0, 21.0], (5, 5), 0.01)
+    volume = np.zeros((2, 5, 5), np.float32)
+    volume[1, 3, 1] = 2
+    point = np.array([[float(grid.x[1]), float(grid.y[3]), 21.0, 2.0]])
+    from_points = simulate_points(point, out_of_focus, **options)
+    from_volume = simulate_volume(volume, out_of_focus, grid, **options)
+    np.testing.assert_allclose(from_points.sum(), from_volume.sum(), rtol=1e-2)  # diffraction beyond the windows
+    for index in np.indices(from_points.shape):
+        middle = lambda image: (index * image).sum() / image.sum()  # noqa: B023
+        assert abs(middle(from_points) - middle(from_volume)) < 0.1  # the steps of a stamp
+    # The volume's point is shared by four pixels first.
+    np.testing.assert_allclose(from_points.max(), from_volume.max(), rtol=0.3)
+
+
+def test_a_coarse_volume_has_no_dots():
+    """Voxels three pixels apart on the sensor make an image as even as an even object does."""
+    grid = Grid([20.0], (9, 9), 0.12)
+    image = simulate_volume(np.ones((1, 9, 9), np.float32), imager(), grid, wavelength=WAVELENGTH, progress=Progress())
+    middle = image[40:56, 34:46]
+    np.testing.assert_allclose(middle, middle.mean(), rtol=0.05)  # the envelope falls by 2 %, the raster's ripple by 3
+
+
+def test_dark_scenes_are_dark():
+    options: dict[str, Any] = dict(wavelength=WAVELENGTH, progress=Progress())
+    grid = Grid([20.0], (5, 5), 0.05)
+    assert not simulate_volume(np.zeros((1, 5, 5), np.float32), imager(), grid, **options).any()
+    assert not simulate_points(np.zeros((0, 4)), imager(), **options).any()
+    far_beside = np.array([[50.0, 0.0, 20.0, 1.0]])
+    assert not simulate_points(far_beside, imager(), **options).any()
+
+
+def test_many_depths_share_stamps():
+    """Between the depths of the stamps the PSF is interpolated: the image of a column of points stays smooth."""
+    z = np.linspace(20, 20.5, 40)
+    points = np.column_stack([np.zeros_like(z), np.zeros_like(z), z, np.ones_like(z)])
+    options: dict[str, Any] = dict(wavelength=WAVELENGTH, kind="geometric", progress=Progress())
+    together = simulate_points(points, imager(), **options)
+    apart = np.sum([simulate_points(point[None], imager(), **options) for point in points[::4]], axis=0)
+    np.testing.assert_allclose(
+        together / together.sum(), apart / apart.sum(), atol=0.05 * together.max() / together.sum()
+    )
+
+
+def test_what_cannot_be_simulated_is_refused():
+    options: dict[str, Any] = dict(wavelength=WAVELENGTH, progress=Progress())
+    with pytest.raises(InputError, match="blurred over .* pixels of the sensor each way, allowed: 128"):
+        simulate_points(np.array([[0.0, 0.0, 0.05, 1.0]]), imager(pixel=0.002), **options)
+    with pytest.raises(InputError, match="found a voxel of -1, allowed: 0 or more"):
+        simulate_volume(-np.ones((1, 3, 3), np.float32), imager(), Grid([20.0], (3, 3), 0.05), **options)
