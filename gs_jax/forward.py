@@ -37,7 +37,7 @@ def forward(
     imager, grid
         As for `backproject`.
     psf
-        PSF_o at each depth, as `gs_jax.psf.psf` makes it: `(len(depths), size, size)`, odd size, on the sensor's pixels.
+        PSF_o at each depth on the sensor's pixels, as `gs_jax.psf.psf` makes it: `(len(depths), size, size)`, odd size.
         By default a point, which makes this the adjoint of `backproject`.
 
     Returns
