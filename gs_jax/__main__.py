@@ -19,14 +19,14 @@ from .datasheet import datasheet, summary, tables
 from .designs import read_design, write_centers
 from .disk import check_output, write_json
 from .errors import InputError
-from .files import CAPTURE_SUFFIXES, read_capture, read_points, write_capture
+from .files import CAPTURE_SUFFIXES, read_capture, write_capture
 from .findings import findings
 from .info import describe
 from .layouts import random_layout
 from .progress import Progress
 from .reconstruct import reconstruct_stack, voxel_grid
-from .simulate import PSFS, simulate_points, simulate_volume
-from .volumes import VOLUME_SUFFIXES, read_volume, write_volume
+from .simulate import PSFS, simulate_scene
+from .volumes import VOLUME_SUFFIXES, write_volume
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MOST_DEPTHS = 10_000
@@ -139,14 +139,11 @@ def simulate(design: Path, scene: Path, psf: str, peak_electrons: float, noise: 
     lit boxes. The camera has 16 bits of 10 electrons, an offset of 16 and 2 electrons of read noise.
     """
     check_output(output, CAPTURE_SUFFIXES)
+    if not noise and output.suffix.lower() == ".png":
+        raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
     microscope = read_design(design)
-    imager, wavelength = microscope.imager(), microscope.imaging.wavelength_nm * 1e-6
     with Progress() as progress:
-        if scene.suffix.lower() == ".csv":
-            image = simulate_points(read_points(scene), imager, wavelength=wavelength, kind=psf, progress=progress)
-        else:
-            volume, grid = read_volume(scene)
-            image = simulate_volume(volume, imager, grid, wavelength=wavelength, kind=psf, progress=progress)
+        image = simulate_scene(scene, microscope, kind=psf, progress=progress)
         if noise:
             with progress.step("Exposing"):
                 image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))

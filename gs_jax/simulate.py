@@ -2,6 +2,8 @@
 
 import math
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .aperture import clear_diameter
+from .designs import Design
 from .errors import InputError
+from .files import read_points
 from .forward import forward
 from .geometry import Grid, Imager, Sensor
 from .info import memory_bytes
@@ -17,12 +21,37 @@ from .progress import Progress
 from .psf import gaussian_psf, geometric_psf, psf
 from .stamps import STEPS, forward_points, stamps
 from .unit import unit_rays
+from .volumes import read_volume
 
 PSFS = {"diffraction": psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
 # Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.
 _MARGIN, _FARTHEST = 16, 128
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
+
+
+def simulate_scene(
+    path: Path, design: Design, *, kind: str = "diffraction", progress: Progress
+) -> Float[np.ndarray, "row column"]:
+    """The image of a file: points if it is a CSV, else a volume.
+
+    Raises
+    ------
+    InputError
+        As `read_points`, `read_volume` and the two functions below; it names the file.
+    """
+    imager, wavelength = design.imager(), design.imaging.wavelength_nm * 1e-6
+    options: dict[str, Any] = dict(wavelength=wavelength, kind=kind, progress=progress)
+    if path.suffix.lower() == ".csv":
+        points = read_points(path)
+        simulate = lambda: simulate_points(points, imager, **options)
+    else:
+        volume, grid = read_volume(path)
+        simulate = lambda: simulate_volume(volume, imager, grid, **options)
+    try:
+        return simulate()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def simulate_volume(

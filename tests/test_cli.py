@@ -95,6 +95,27 @@ def test_simulate_points(folder, monkeypatch, capsys):
     assert (read_capture(folder / "c.tif") != first).any()
 
 
+WRONG_SCENES = [
+    ("x,y,z\n1,2,3\n", "found the header 'x,y,z'"),
+    ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm: found -20.0, allowed: a depth above 0"),
+    ("x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), WRONG_SCENES)
+def test_wrong_scenes_give_one_line_and_status_2(folder, monkeypatch, capsys, content, words):
+    (folder / "points.csv").write_text(content)
+    status, out, err = run(monkeypatch, capsys, "simulate", "design.toml", "points.csv", "-o", "c.tif")
+    assert (status, out) == (2, "") and not (folder / "c.tif").exists()
+    assert re.fullmatch(r"gs-jax: points\.csv[^\n]+\n", err) and words in err
+
+
+def test_a_negative_voxel_names_the_file(folder, monkeypatch, capsys):
+    write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
+    status, _, err = run(monkeypatch, capsys, "simulate", "design.toml", "scene.ome.tif", "-o", "c.tif")
+    assert (status, err) == (2, "gs-jax: scene.ome.tif: found a voxel of -1, allowed: 0 or more.\n")
+
+
 def test_simulate_a_volume_and_reconstruct_it(folder, monkeypatch, capsys):
     grid = Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
     voxels = np.zeros((3, 9, 9), np.float32)
@@ -168,6 +189,7 @@ WRONG_ARGUMENTS = [
     (("simulate", "design.toml", "capture.tif", "-o", "c.tif"), "capture.tif"),
     (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "design.toml: found the suffix"),
     (("simulate", "design.toml", "missing.csv", "-o", "c.jpg"), "c.jpg: found the suffix"),
+    (("simulate", "design.toml", "missing.csv", "-o", "c.png", "--no-noise"), "c.png: found .png for --no-noise"),
     (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--psf", "round"), "'round' is not"),
     (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
 ]  # fmt: skip
