@@ -228,7 +228,7 @@ def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
     def fault(*_):
         raise ValueError("not the user's")
 
-    monkeypatch.setattr("gs_jax.__main__.read_capture", fault)
+    monkeypatch.setattr("gs_jax.cli.reconstruct.read_capture", fault)
     monkeypatch.setattr(sys, "argv", ["gs-jax", *RECONSTRUCT, "-o", "v.tif"])
     with pytest.raises(ValueError, match="not the user's"):
         main()
@@ -238,7 +238,7 @@ def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gs_jax.__main__.reconstruct_stack", interrupt)
+    monkeypatch.setattr("gs_jax.cli.reconstruct.reconstruct_stack", interrupt)
     status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
     assert (status, err.strip()) == (1, "gs-jax: interrupted")
     assert not (folder / "v.tif").exists()

@@ -1,0 +1,1 @@
+"""The commands, one file each; `gs_jax.__main__` lists them."""

@@ -1,0 +1,18 @@
+"""`gs-jax demo`: the whole pipeline on the built-in design."""
+
+from pathlib import Path
+
+import click
+
+from ..progress import Progress
+
+
+@click.command()
+@click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
+def demo(out: Path):
+    """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with a report."""
+    from ..demo import run  # Matplotlib takes a second to import
+
+    with Progress() as progress:
+        report = run(out, progress)
+    click.echo(f"{report}: what was made, and what it shows")

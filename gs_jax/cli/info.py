@@ -1,0 +1,12 @@
+"""`gs-jax info`: what it runs on."""
+
+import click
+
+from ..info import describe
+
+
+@click.command()
+def info():
+    """Show versions, devices and memory."""
+    for name, value in describe().items():
+        click.echo(f"{name:<12} {value}")

@@ -1,0 +1,36 @@
+"""`gs-jax metrics`: what a design promises."""
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from ..datasheet import datasheet, summary, tables
+from ..designs import read_design
+from ..disk import check_output, write_json
+from ..findings import findings
+from .options import UM, Depths
+
+
+@click.command()
+@click.argument("design", type=Path)
+@click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
+@click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
+def metrics(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
+    """Show what the microscope of the file DESIGN promises (the paper's Eqs. 1-11), and what is out of focus."""
+    if output:
+        check_output(output, [".json"])
+    confusion = confusion_um and confusion_um / 1000
+    microscope = read_design(design)
+    sheet = datasheet(microscope, depths, confusion=confusion)
+    if output:
+        write_json(output, sheet)
+    click.echo(summary(microscope, sheet))
+    console = Console()
+    for table in tables(sheet):
+        console.print()
+        console.print(table)
+    click.echo()
+    for sentence in findings(microscope, sheet, confusion=confusion):
+        click.echo(f"- {sentence}")

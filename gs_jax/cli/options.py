@@ -1,0 +1,58 @@
+"""Kinds of arguments that several commands take."""
+
+import math
+
+import click
+
+# Far more planes than any sensor resolves; a mistyped step asks for millions.
+_MOST_DEPTHS = 10_000
+
+
+class Number(click.ParamType):
+    """A number within bounds."""
+
+    name = "number"
+
+    def __init__(self, *, least: float, most: float, unit: str):
+        self.least, self.most, self.unit = least, most, unit
+
+    def convert(self, value, param, ctx):
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not self.least <= number <= self.most:
+            self.fail(f"found {value!r}, allowed: {self.least:g} to {self.most:g} {self.unit}.", param, ctx)
+        return number
+
+
+class Depths(click.ParamType):
+    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step."""
+
+    name = "start:stop:step"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, list):
+            return value
+        try:
+            start, stop, step = map(float, value.split(":"))
+        except ValueError:
+            self.fail(f"found {value!r}, allowed: START:STOP:STEP, three numbers of mm such as 18:22:0.25.", param, ctx)
+        if not all(map(math.isfinite, (start, stop, step))) or not 0 < start <= stop or not step > 0:
+            self.fail(f"found {value!r}, allowed: 0 < START <= STOP and STEP > 0, in mm.", param, ctx)
+        # A step that misses STOP by rounding alone falls on it.
+        count = (stop - start) / step + 1 + 1e-6
+        if count > _MOST_DEPTHS + 1:
+            self.fail(f"found {value!r}, {count:.3g} depths, allowed: at most {_MOST_DEPTHS}.", param, ctx)
+        return [round(start + i * step, 9) for i in range(int(count))]
+
+
+MM = Number(least=1e-3, most=1e4, unit="mm")
+UM = Number(least=1e-2, most=1e6, unit="um")
+
+
+def depth_range(depths: list[float]) -> str:
+    """The depths in words."""
+    if len(depths) == 1:
+        return f"at {depths[0]:g} mm"
+    return f"{len(depths)} depths from {depths[0]:g} to {depths[-1]:g} mm"

@@ -1,0 +1,45 @@
+"""`gs-jax simulate`: a scene to a capture."""
+
+from pathlib import Path
+
+import click
+import jax
+import numpy as np
+
+from ..camera import Camera, expose
+from ..designs import read_design
+from ..disk import check_output
+from ..errors import InputError
+from ..files import CAPTURE_SUFFIXES, write_capture
+from ..progress import Progress
+from ..simulate import PSFS, simulate_scene
+from .options import Number
+
+
+@click.command()
+@click.argument("design", type=Path)
+@click.argument("scene", type=Path)
+@click.option("--psf", type=click.Choice(list(PSFS)), default="diffraction", show_default=True)
+@click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
+@click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
+@click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
+def simulate(design: Path, scene: Path, psf: str, peak_electrons: float, noise: bool, seed: int, output: Path):
+    """Simulate the capture of SCENE by the microscope of the file DESIGN.
+
+    SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
+    lit boxes. The camera has 16 bits of 10 electrons, an offset of 16 and 2 electrons of read noise.
+    """
+    check_output(output, CAPTURE_SUFFIXES)
+    if not noise and output.suffix.lower() == ".png":
+        raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
+    microscope = read_design(design)
+    with Progress() as progress:
+        image = simulate_scene(scene, microscope, kind=psf, progress=progress)
+        if noise:
+            with progress.step("Exposing"):
+                image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))
+        with progress.step("Writing"):
+            write_capture(output, image)
+    size = " x ".join(map(str, image.shape))
+    click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}")

@@ -1,0 +1,113 @@
+"""How good a reconstruction is: images against the truth, and points against the truth. Host code."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
+
+Volume = Float[Array | np.ndarray, "depth y x"]
+Points = Float[Array | np.ndarray, "point _"]
+
+
+class Quality(NamedTuple):
+    """Scores of a volume: PSNR in dB, SSIM (mean over planes), MSE, and the gain fitted before."""
+
+    psnr_db: float
+    ssim: float
+    mse: float
+    gain: float
+
+
+def quality(estimate: Volume, truth: Volume) -> Quality:
+    """PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best.
+
+    Reconstructions have no absolute scale, so the estimate is first multiplied by
+    `max(<estimate, truth> / <estimate, estimate>, 0)`, the gain of least MSE; an estimate of zeros stays zero. The
+    data range is the truth's largest value. SSIM is taken plane by plane (7 x 7 window, uniform, as in scikit-image)
+    and averaged. On sparse volumes all-zero scores well: put it beside every other.
+
+    Parameters
+    ----------
+    estimate, truth
+        Of one shape, planes of 7 x 7 at least. The truth is not negative.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or the truth is nowhere positive.
+    """
+    a, b = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
+    if a.shape != b.shape:
+        raise ValueError(f"`estimate` must be of the truth's shape {b.shape}, got {a.shape}.")
+    if not (peak := b.max()) > 0:
+        raise ValueError(f"`truth` must be positive somewhere, got {peak} as its largest value.")
+    energy = np.vdot(a, a)
+    gain = max(float(np.vdot(a, b) / energy), 0.0) if energy > 0 else 0.0
+    a = gain * a
+    similar = [structural_similarity(x, y, data_range=peak) for x, y in zip(a, b, strict=True)]
+    psnr = peak_signal_noise_ratio(b, a, data_range=peak) if (a != b).any() else np.inf
+    return Quality(float(psnr), float(np.mean(similar)), float(mean_squared_error(a, b)), gain)
+
+
+class Localization(NamedTuple):
+    """Scores of points, and which found point is which true one: `pairs` is `(pair, 2)`, found and true.
+
+    The errors are root mean squares over the pairs, mm: lateral over the distance in the plane, axial over z; NaN
+    without a pair.
+    """
+
+    precision: float
+    recall: float
+    f1: float
+    lateral_rmse: float
+    axial_rmse: float
+    pairs: np.ndarray
+
+
+def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: float = 0.4) -> Localization:
+    """Match found points with true ones, each at most once, and score them.
+
+    A pair may be `lateral` mm apart in the plane and `axial` mm in depth. As many pairs as possible are made, and
+    among these matchings the closest, by the distance in units of the two limits.
+
+    Parameters
+    ----------
+    found, truth
+        `(point, 3 or more)`, x, y, z first, mm; either may be empty. Nothing found where nothing is scores 1.
+    """
+    a, b = (np.asarray(p, np.float64)[:, :3] for p in (found, truth))
+    pairs = _matching(a, b, lateral, axial)
+    precision = len(pairs) / len(a) if len(a) else float(not len(b))
+    recall = len(pairs) / len(b) if len(b) else float(not len(a))
+    f1 = 2 * len(pairs) / (len(a) + len(b)) if len(a) + len(b) else 1.0
+    error = a[pairs[:, 0]] - b[pairs[:, 1]]
+    rms = lambda squares: float(np.sqrt(squares.mean())) if len(pairs) else float("nan")
+    return Localization(precision, recall, f1, rms((error[:, :2] ** 2).sum(1)), rms(error[:, 2] ** 2), pairs)
+
+
+def _matching(a: np.ndarray, b: np.ndarray, lateral: float, axial: float) -> np.ndarray:
+    """Pairs within the limits, group by group of points that are near each other: the groups are small."""
+    near = KDTree(a[:, :2]).query_ball_tree(KDTree(b[:, :2]), lateral) if len(a) and len(b) else []
+    links = [(i, j) for i, some in enumerate(near) for j in some if abs(a[i, 2] - b[j, 2]) <= axial]
+    if not links:
+        return np.zeros((0, 2), int)
+    i, j = np.array(links).T
+    size = len(a) + len(b)
+    group = connected_components(coo_array((np.ones(len(i)), (i, j + len(a))), (size, size)), directed=False)[1][i]
+    pairs = []
+    for number in np.unique(group):
+        rows, row = np.unique(i[group == number], return_inverse=True)
+        columns, column = np.unique(j[group == number], return_inverse=True)
+        error = (a[rows[row]] - b[columns[column]]) / (lateral, lateral, axial)
+        # Two links cost 4 at most, so an impossible pair is never worth what it saves.
+        cost = np.full((len(rows), len(columns)), 4.0 * (min(len(rows), len(columns)) + 1))
+        cost[row, column] = (error**2).sum(1)
+        best = linear_sum_assignment(cost)
+        possible = cost[best] <= 2 + 1e-9
+        pairs.append(np.column_stack([rows[best[0]], columns[best[1]]])[possible])
+    return np.concatenate(pairs)
