@@ -10,8 +10,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 
-Volume = Float[Array | np.ndarray, "depth y x"]
-Points = Float[Array | np.ndarray, "point _"]
+# Axes without names: the two arguments of a score need not have the same.
+Volume = Float[Array | np.ndarray, "_ _ _"]
+Points = Float[Array | np.ndarray, "_ _"]
 
 
 class Quality(NamedTuple):

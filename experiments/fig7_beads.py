@@ -1,0 +1,108 @@
+"""Fig. 7: fluorescent beads in a slab, from the capture to points in 3-D.
+
+The paper embeds 5 um beads in a slab about 2.5 mm thick. Ours are balls filled with emitters, brighter and dimmer,
+imaged with the diffraction PSF and exposed with shot and read noise; the reconstruction knows neither. With DATA, the
+120 points of an independent ray tracer go the same way.
+
+    python -m experiments.fig7_beads [DATA] [--out DIR]
+
+DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is taken.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from skimage.measure import block_reduce
+
+from experiments.point_density import scores
+from gs_jax import Grid
+from gs_jax.builtin import geomscope
+from gs_jax.camera import Camera, expose
+from gs_jax.designs import Design, read_design
+from gs_jax.disk import make_folder, write_json
+from gs_jax.files import read_capture
+from gs_jax.locate import find_points
+from gs_jax.phantoms import beads
+from gs_jax.progress import Progress
+from gs_jax.simulate import simulate_points
+
+# mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
+SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002
+# Of each square of so many pixels the brightest is shown: spots are a pixel or two wide.
+SHOWN = 32
+
+
+def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> dict:
+    """Truth, capture, found points and scores of each scene."""
+    scenes = {"beads, simulated": _beads(design, count, progress)}
+    if data is not None:
+        truth = np.array(json.loads((data / "d.json").read_text())["points_x_y_z_flux"])
+        scenes["points, ray-traced"] = truth, read_capture(data / "P1_d.tif", design.imager().sensor.shape)
+    grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, 0.25), pitch=0.03)
+    results = {}
+    for name, (truth, capture) in scenes.items():
+        found = find_points(capture, design.imager(), grid, progress=progress)
+        score = {"points": len(truth), "found": len(found)} | scores([(found, truth)])
+        results[name] = {"truth": truth, "capture": capture, "found": found, "scores": score}
+    return results
+
+
+def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
+    """Middles of the beads with their light, and a capture."""
+    emitters = beads(count, SIZE, SLAB, pitch=APART)
+    each = emitters.reshape(count, -1, 4)
+    each[..., 3] *= np.random.default_rng(0).uniform(0.3, 1.7, (count, 1)) / each[0, :, 3].sum()
+    wavelength = design.imaging.wavelength_nm * 1e-6
+    image = simulate_points(emitters, design.imager(), wavelength=wavelength, progress=progress)
+    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
+    return np.column_stack([each[..., :3].mean(1), each[..., 3].sum(1)]), capture
+
+
+def picture(results: dict) -> Figure:
+    """A row for each scene: the capture, and the points found (dots) and true (rings) from the front and the side."""
+    figure = Figure(figsize=(11, 3.6 * len(results)), layout="constrained")
+    rows = figure.subplots(len(results), 3, squeeze=False)
+    for axes, (name, result) in zip(rows, results.items(), strict=True):
+        capture, found, truth = result["capture"], result["found"], result["truth"]
+        brightest = block_reduce(capture, SHOWN, np.max)
+        extent = (0, SHOWN * brightest.shape[1], SHOWN * len(brightest), 0)
+        axes[0].imshow(brightest, cmap="magma", extent=extent, vmin=capture.min(), vmax=np.quantile(brightest, 0.99))
+        axes[0].set(title=f"{name}: capture", xlabel="column", ylabel="row")
+        for axis, (i, j) in zip(axes[1:], ((0, 1), (0, 2)), strict=True):
+            rings = dict(facecolors="none", edgecolors="tab:gray", lw=0.7)
+            axis.scatter(truth[:, i], truth[:, j], s=40, label="truth", **rings)
+            dots = axis.scatter(found[:, i], found[:, j], s=6, c=found[:, 2], cmap="viridis", label="found")
+            axis.set(xlabel="x, mm", ylabel="xyz"[j] + ", mm")
+            axis.invert_yaxis()
+            figure.colorbar(dots, ax=axis, label="depth, mm")
+        axes[1].set_aspect("equal")
+        axes[1].set_title(f"{len(found)} found of {len(truth)}, F1 {result['scores']['f1']:.3f}")
+        axes[2].legend(loc="upper right")
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path, nargs="?")
+    parser.add_argument("--out", type=Path, default=Path("out/fig7_beads"))
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
+    with Progress() as progress:
+        results = run(design, arguments.data, progress=progress)
+    write_json(out / "fig7.json", {name: result["scores"] for name, result in results.items()})
+    picture(results).savefig(out / "fig7.png", dpi=72)
+    table = Table("", "points", "found", "F1", "precision", "recall", "lateral, um", "axial, um")
+    for name, result in results.items():
+        table.add_row(name, *(f"{value:.4g}" for value in result["scores"].values()))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

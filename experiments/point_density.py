@@ -1,0 +1,124 @@
+"""How many points a capture may show: the F1 score of particle clustering against their density.
+
+Points at random over 20 x 20 mm and 18 to 22 mm, of intensities 0.5 to 1.5, are imaged with the diffraction PSF by
+`simulate_points`, which places them finer than any voxel, and exposed with shot and read noise. Each capture goes to
+`find_points` with the same settings. For comparison: the brightest peaks of the plain back-projection, as many as there
+are points, which a user cannot know. The simulation has no haze and no lens with its own aperture, so it is optimistic;
+the ray-traced captures of `fig4_suppression` have both.
+
+    python -m experiments.point_density [DESIGN.toml] [--out DIR]
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from skimage.feature import peak_local_max
+
+from gs_jax import Grid, Imager
+from gs_jax.builtin import geomscope
+from gs_jax.camera import Camera, expose
+from gs_jax.designs import Design, read_design
+from gs_jax.disk import make_folder, write_json
+from gs_jax.locate import find_points
+from gs_jax.metrics import localization
+from gs_jax.phantoms import random_points
+from gs_jax.progress import Progress
+from gs_jax.reconstruct import reconstruct_stack
+from gs_jax.simulate import simulate_points
+
+# Points, and captures of so many.
+SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}
+SIZE, DEPTHS = (20.0, 20.0), (18.0, 22.0)
+
+
+def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, step=0.25, progress: Progress) -> list:
+    """Scores of both methods for each number of points, each from all of its captures together."""
+    imager = design.imager()
+    grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0] - 1, DEPTHS[1] + 1.001, step), pitch=voxel)
+    rows = []
+    for count, seeds in (SCENES if scenes is None else scenes).items():
+        found = {"gs_jax": [], "brightest peaks": []}
+        for seed in range(seeds):
+            truth, capture = scene(count, seed, design, progress)
+            found["gs_jax"].append((find_points(capture, imager, grid, progress=progress), truth))
+            found["brightest peaks"].append((brightest_peaks(capture, imager, grid, count, progress), truth))
+        rows.append({"points": count, "captures": seeds} | {name: scores(pairs) for name, pairs in found.items()})
+    return rows
+
+
+def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
+    """Points and a capture of them."""
+    truth = random_points(count, SIZE, DEPTHS, seed=seed)
+    truth[:, 3] = np.random.default_rng(seed).uniform(0.5, 1.5, count)
+    wavelength = design.imaging.wavelength_nm * 1e-6
+    image = simulate_points(truth, design.imager(), wavelength=wavelength, progress=progress)
+    return truth, np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=10_000))
+
+
+def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int, progress: Progress) -> np.ndarray:
+    """The highest local maxima of the plain back-projection, `(x, y, z, value)`."""
+    volume = reconstruct_stack(capture, imager, grid, progress)
+    depth, row, column = peak_local_max(volume, min_distance=1, num_peaks=count, exclude_border=False).T
+    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
+    return np.column_stack([x[column], y[row], z[depth], volume[depth, row, column]])
+
+
+def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
+    """Scores over several captures: their points put side by side, out of reach of each other."""
+    apart = [np.array([1000.0 * number, 0, 0, 0]) for number in range(len(pairs))]
+    found, truth = (np.concatenate([pair[i] + a for pair, a in zip(pairs, apart, strict=True)]) for i in (0, 1))
+    score = localization(found, truth)
+    return {
+        "f1": score.f1,
+        "precision": score.precision,
+        "recall": score.recall,
+        "lateral_rmse_um": 1000 * score.lateral_rmse,
+        "axial_rmse_um": 1000 * score.axial_rmse,
+    }
+
+
+def picture(rows: list) -> Figure:
+    """F1 and errors against the number of points."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    score, error = figure.subplots(1, 2)
+    count = [row["points"] for row in rows]
+    for name, style in (("gs_jax", "o-"), ("brightest peaks", "s--")):
+        label = {"gs_jax": "find_points", "brightest peaks": "as many brightest peaks"}[name]
+        score.plot(count, [row[name]["f1"] for row in rows], style, label=label)
+    error.plot(count, [row["gs_jax"]["lateral_rmse_um"] for row in rows], "o-", label="lateral")
+    error.plot(count, [row["gs_jax"]["axial_rmse_um"] for row in rows], "s--", label="axial")
+    area = f"points in {SIZE[0]:g} x {SIZE[1]:g} x {DEPTHS[1] - DEPTHS[0]:g} mm"
+    score.set(xscale="log", xlabel=area, ylabel="F1", ylim=(0, 1.05), title="points found")
+    error.set(xscale="log", yscale="log", xlabel=area, ylabel="RMS error, um", title="find_points")
+    for axes in (score, error):
+        axes.grid(alpha=0.3)
+        axes.legend()
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("design", type=Path, nargs="?")
+    parser.add_argument("--out", type=Path, default=Path("out/point_density"))
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    design = read_design(arguments.design) if arguments.design else geomscope()
+    with Progress() as progress:
+        rows = run(design, progress=progress)
+    write_json(out / "point_density.json", rows)
+    picture(rows).savefig(out / "point_density.png", dpi=110)
+    table = Table("points", "captures", "F1", "precision", "recall", "lateral, um", "axial, um", "F1 of peaks")
+    for row in rows:
+        numbers = row["gs_jax"].values()
+        peaks = row["brightest peaks"]["f1"]
+        table.add_row(str(row["points"]), str(row["captures"]), *(f"{n:.3f}" for n in numbers), f"{peaks:.3f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
