@@ -1,0 +1,62 @@
+"""`gs-jax train`: the weights of a network."""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import click
+import numpy as np
+
+from ..disk import check_output, write_json
+from ..progress import Progress
+from ..training import multislice_recipe, paper_recipe, read_checkpoint, start, train as run, write_checkpoint
+from ..training_data import stacks
+from ..unet import PRETRAINED, write_weights
+
+# Those of the weights that come with the package.
+STEPS = {"paper": 2000, "multislice": 4000}
+_EVERY = 50
+_STACKS = 96
+_DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
+
+
+@click.command()
+@click.option("--network", type=click.Choice(PRETRAINED), default="multislice", show_default=True)
+@click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
+@click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
+def train(network: str, steps: int | None, seed: int, resume: bool, output: Path):
+    """Train a network for background suppression: the paper's, or ours, which looks at seven slices.
+
+    Beside WEIGHTS.npz it keeps WEIGHTS.checkpoint, which an interrupt leaves there, and WEIGHTS.json, the losses; for
+    ours also the folder WEIGHTS-stacks, the simulated captures that it is trained on (0.4 GB; it may be deleted).
+    """
+    check_output(output, [".npz"])
+    steps = steps or STEPS[network]
+    checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
+    check_output(history, [".json"])
+    if network == "paper":
+        recipe = paper_recipe()
+    else:
+        with Progress() as progress:
+            recipe = multislice_recipe(stacks(output.with_name(f"{output.stem}-stacks"), _STACKS, seed, progress))
+    begin = partial(read_checkpoint, checkpoint) if resume else start
+    state = begin(recipe, steps=steps, seed=seed)
+    recent = lambda state: float(np.mean(state.losses[max(int(state.step) - _EVERY, 0) : int(state.step)]))
+
+    with click.progressbar(
+        length=steps, label="Training", file=sys.stderr, item_show_func=lambda loss: f"loss {loss}"
+    ) as bar:
+        bar.update(int(state.step))
+
+        def each(state):
+            done = int(state.step)
+            if done % _EVERY == 0 or done == steps:
+                write_checkpoint(checkpoint, state)
+                write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
+            bar.update(1, f"{recent(state):.4f}")
+
+        state = run(recipe, state, each=each)
+    write_weights(output, state.network)
+    click.echo(f"{output}: {network} network, {steps} steps, loss {recent(state):.4f}")

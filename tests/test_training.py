@@ -1,0 +1,219 @@
+import sys
+
+import jax
+import numpy as np
+import optax
+import pytest
+from click.testing import CliRunner
+
+from gs_jax import training_data
+from gs_jax.cli.train import train as command
+from gs_jax.errors import InputError
+from gs_jax.progress import Progress
+from gs_jax.training import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks
+from gs_jax.unet import UNet, read_weights
+
+
+def toy(offsets=(0,), batch=lambda rng: paper_batch(rng, 16)) -> Recipe:
+    network = lambda key: UNet(offsets, (4, 8), standardized=False, key=key)
+    return Recipe(network, lambda steps: optax.rmsprop(optax.cosine_decay_schedule(3e-3, steps)), batch)
+
+
+def assert_equal(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_the_loss_falls():
+    losses = train(toy(), start(toy(), steps=40, seed=1)).losses
+    assert np.isfinite(losses).all()
+    assert losses[-10:].mean() < 0.5 * losses[:5].mean()
+
+
+def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
+    """Bit for bit: weights, the optimizer's memory and losses, through a file."""
+    whole = train(toy(), start(toy(), steps=8, seed=2))
+
+    class Interrupt(Exception): ...
+
+    def each(state):
+        if state.step == 5:
+            write_checkpoint(tmp_path / "c", state)
+            raise Interrupt
+
+    with pytest.raises(Interrupt):
+        train(toy(), start(toy(), steps=8, seed=2), each=each)
+    state = read_checkpoint(tmp_path / "c", toy(), steps=8, seed=2)
+    assert state.step == 5 and np.isnan(state.losses[5:]).all()
+    assert_equal(train(toy(), state), whole)
+
+
+def test_seeds_make_a_difference():
+    states = [train(toy(), start(toy(), steps=2, seed=seed)) for seed in (0, 0, 1)]
+    assert_equal(states[0], states[1])
+    assert not np.array_equal(states[0].losses, states[2].losses)
+
+
+def test_checkpoints_of_another_training_are_refused(tmp_path):
+    path = tmp_path / "c"
+    write_checkpoint(path, start(toy(), steps=8, seed=2))
+    with pytest.raises(InputError, match=r"found a training of seed 2, allowed: .* 3"):
+        read_checkpoint(path, toy(), steps=8, seed=3)
+    for recipe, steps in ((toy(), 9), (toy((-1, 0, 1)), 8)):
+        with pytest.raises(InputError, match=f"checkpoint of this network and of {steps} steps"):
+            read_checkpoint(path, recipe, steps=steps, seed=2)
+    path.write_bytes(b"garbage")
+    with pytest.raises(InputError, match="not a whole and valid checkpoint"):
+        read_checkpoint(path, toy(), steps=8, seed=2)
+
+
+def test_the_papers_slices():
+    batch = paper_batch(np.random.default_rng(0), 64)
+    assert batch.slices.shape == (10, 1, 64, 64) and batch.truth.shape == (10, 64, 64)
+    slices, truth = batch.slices[:, 0], batch.truth
+    # Where nothing is drawn and nothing shines over, what is left is the noise of 5 %; the median is over such places.
+    dark = slices[truth == 0]
+    assert np.percentile(dark, 5) == pytest.approx(-1.64 * 0.05, abs=0.03)
+    # A polygon is sharp in its slice, and shines over to the others.
+    number = int(truth.sum((1, 2)).argmax())
+    beside = slices[number - 1 if number else 1]
+    shape = (truth[number] > 0) & (truth[number - 1 if number else 1] == 0)
+    assert beside[shape].mean() > beside[truth[number] == 0].mean()
+    assert 0 <= truth.min() and truth.max() <= 1
+
+
+def test_nothing_drawn_is_no_division_by_zero(monkeypatch):
+    monkeypatch.setattr(training_data, "_drawn", lambda size, *_: np.zeros((size, size), np.float32))
+    batch = paper_batch(np.random.default_rng(0), 16)
+    assert np.isfinite(batch.slices).all() and not batch.truth.any()
+
+
+@pytest.mark.parametrize("kind", training_data._DRAW)
+def test_every_kind_of_object_is_drawn(kind):
+    plane = training_data._drawn(120, np.random.default_rng(3), 20, (kind,))
+    assert plane.shape == (120, 120) and 0 < np.count_nonzero(plane) < plane.size
+    assert plane.min() == 0 and plane.max() <= 10
+
+
+def test_an_inclined_page_is_shared_out_to_all_planes():
+    page = np.ones((60, 60), np.float32)
+    scene = training_data._inclined(page, np.random.default_rng(0))
+    np.testing.assert_allclose(scene.sum(0), page, rtol=1e-6)
+    assert (scene.sum((1, 2)) > 0).all()
+
+
+def test_the_truth_lies_where_the_scene_does():
+    scene = np.zeros((2, 8, 6), np.float32)
+    scene[0, 2:4, 4:6] = 1
+    found = training_data._shared_out(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
+    expected = np.zeros((3, 4, 3))
+    expected[1:, 1, 2] = 0.75, 0.25
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def ramp(planes=5, size=40) -> Stack:
+    """A stack whose truth is its volume, different everywhere."""
+    volume = np.arange(planes * size * size).reshape(planes, size, size) / (planes * size * size)
+    return Stack(volume.astype(np.float16), volume.astype(np.float16))
+
+
+def test_patches_keep_slices_and_truth_together():
+    offsets = (-4, 0, 1)
+    batch = patches([ramp(), ramp()], offsets, np.random.default_rng(0), size=16, count=6)
+    assert batch.slices.shape == (6, 3, 16, 16)
+    np.testing.assert_array_equal(batch.slices[:, 1], batch.truth)
+    # Depths are in order, the outermost repeated.
+    assert (batch.slices[:, 0] <= batch.truth).all() and (batch.slices[:, 2] >= batch.truth).all()
+    assert np.isfinite(batch.slices).all()
+
+
+def test_an_empty_stack_gives_patches():
+    dark = Stack(*np.zeros((2, 4, 20, 20), np.float16))
+    assert not patches([dark], (0,), np.random.default_rng(0), size=8, count=2).slices.any()
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Microscopes of few pixels."""
+    monkeypatch.setattr(training_data, "PIXELS", 128)
+    monkeypatch.setattr(training_data, "SIZES", ((0.045, 0.2),))
+    monkeypatch.setattr(training_data, "_REACH", 4)
+
+
+def test_a_simulated_stack_shows_its_scene(tiny):
+    one, again, other = simulated_stack(0, 0), simulated_stack(0, 0), simulated_stack(0, 1)
+    assert_equal(one, again)
+    assert not np.array_equal(one.volume, other.volume)
+    assert len(one.volume) == PLANES and one.volume.shape == one.truth.shape
+    for stack in (one, other):
+        volume, truth = (np.asarray(each, np.float64).ravel() for each in stack)
+        assert np.isfinite(volume).all() and truth.min() >= 0
+        # The slope of the volume by the truth is one by construction; float16 keeps three digits.
+        assert np.polyfit(truth, volume, 1)[0] == pytest.approx(1, abs=0.01)
+
+
+def test_some_stacks_are_nothing_but_noise(tiny):
+    stack = simulated_stack(0, 15)
+    assert not stack.truth.any() and np.asarray(stack.volume, np.float32).std() > 0
+
+
+def test_stacks_are_kept(tiny, tmp_path):
+    folder = tmp_path / "stacks"
+    made = stacks(folder, 2, 5, Progress())
+    for a, b in zip(stacks(folder, 2, 5, Progress()), made, strict=True):
+        assert_equal(a, b)
+    (folder / "5-1.npz").write_bytes(b"garbage")
+    with pytest.raises(InputError, match=r"5-1\.npz"):
+        stacks(folder, 2, 5, Progress())
+
+
+@pytest.fixture
+def toy_command(monkeypatch):
+    module = sys.modules["gs_jax.cli.train"]
+    monkeypatch.setattr(module, "paper_recipe", toy)
+    monkeypatch.setattr(module, "_EVERY", 2)
+
+    def invoke(*arguments):
+        return CliRunner().invoke(command, ["--network", "paper", *map(str, arguments)])
+
+    return invoke
+
+
+def test_the_command_writes_weights_losses_and_a_checkpoint(toy_command, tmp_path):
+    path = tmp_path / "w.npz"
+    result = toy_command("--steps", 5, "-o", path)
+    assert result.exit_code == 0, result.output
+    assert "5 steps" in result.output
+    assert read_weights(path).widths == (4, 8)
+    assert {each.name for each in tmp_path.iterdir()} == {"w.npz", "w.json", "w.checkpoint"}
+    history = (tmp_path / "w.json").read_text()
+    assert history.count(".") >= 5
+
+
+def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, monkeypatch):
+    whole, broken = tmp_path / "whole.npz", tmp_path / "broken.npz"
+    assert toy_command("--steps", 5, "-o", whole).exit_code == 0
+    calls = []
+
+    def batch(rng):
+        calls.append(rng)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return paper_batch(rng, 16)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sys.modules["gs_jax.cli.train"], "paper_recipe", lambda: toy(batch=batch))
+        assert toy_command("--steps", 5, "-o", broken).exit_code == 1
+    assert not broken.exists() and broken.with_suffix(".checkpoint").exists()
+    assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0
+    assert_equal(read_weights(broken), read_weights(whole))
+    assert broken.with_suffix(".json").read_text() == whole.with_suffix(".json").read_text()
+
+
+def test_wrong_arguments_write_nothing(toy_command, tmp_path):
+    result = toy_command("--steps", 5, "-o", tmp_path / "w.txt")
+    assert isinstance(result.exception, InputError) and "allowed: .npz" in str(result.exception)
+    result = toy_command("--steps", 5, "--resume", "-o", tmp_path / "w.npz")
+    assert isinstance(result.exception, InputError) and "w.checkpoint" in str(result.exception)
+    assert not list(tmp_path.iterdir())
