@@ -11,7 +11,6 @@ writes `speed.json`, `speed.md` and `speed.png`; about six minutes on two cores.
 """
 
 import argparse
-import gc
 import os
 import sys
 import time
@@ -36,6 +35,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backprojec
 from gs_jax.disk import make_folder, write_json
 from gs_jax.info import describe
 from gs_jax.layouts import random_layout
+from gs_jax.measure import peak_mib, status_mib, timed
 from gs_jax.progress import Progress
 
 PAPER_S = 18.0
@@ -140,12 +140,6 @@ def prepared(name: str, arguments: tuple) -> tuple[Callable[[], Any], float]:
     return call, max(0.0, timed(call)[0] - timed(call)[0])  # numba compiles in the first call, once for all sizes
 
 
-def timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    start = time.perf_counter()
-    result = call()
-    return time.perf_counter() - start, result
-
-
 def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
     """Seconds of each contestant in a steady state, in turns so that what else the machine does meets all alike."""
     s = inputs(job)
@@ -202,20 +196,15 @@ def memory(name: str, job: Job) -> dict[str, float]:
     """
     s = inputs(job)
     arguments = jax.block_until_ready(CONTESTANTS[name].arguments(s))
-    gc.collect()
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-    before = _status_mib("VmRSS")
-    call, _ = prepared(name, arguments)
-    result = call()
-    del result
-    call()
-    peak = _status_mib("VmHWM")
-    return {"extra_mib": peak - before, "process_mib": peak}
 
+    def work():
+        call, _ = prepared(name, arguments)
+        result = call()
+        del result
+        call()
 
-def _status_mib(key: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key))
+    extra, _ = peak_mib(work)
+    return {"extra_mib": extra, "process_mib": status_mib("VmHWM")}
 
 
 def in_new_process(function: Callable, *arguments):

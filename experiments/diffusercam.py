@@ -1,0 +1,173 @@
+"""A hand through a diffuser: the solvers on a real image and a measured point spread function.
+
+The data are those of Waller Lab's DiffuserCam tutorial (1200 x 1600 pixels). As there, the mean of the PSF's dark
+corner is taken off both, pixels are averaged by 4 x 4 (once also not at all), and total variation weighs 1e-4 of the
+image's norm. With the Python of an environment that has LenslessPiCam, its ADMM runs on the same data for as many
+steps, in turns with ours.
+
+    python experiments/diffusercam.py DATA [--peer PYTHON] [--out DIR]
+
+writes `diffusercam.json` and `diffusercam.png`; about three minutes on two cores.
+"""
+
+import argparse
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tifffile
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from gs_jax.admm import admm_convolution
+from gs_jax.convolution import Convolution
+from gs_jax.disk import make_folder, write_json
+from gs_jax.fista import fista
+from gs_jax.info import describe
+from gs_jax.measure import timed
+from gs_jax.progress import Progress
+from gs_jax.richardson_lucy import richardson_lucy
+from gs_jax.total_variation import differences, total_variation
+
+TV = 1e-4
+Image = Float[Array, "row column"]
+
+
+def read(folder: Path, factor: int) -> tuple[np.ndarray, np.ndarray]:
+    """PSF and image, without background, averaged over squares, each of norm 1."""
+    raw = [tifffile.imread(folder / f"{name}.tif").astype(np.float32) for name in ("psf_sample", "rawdata_hand_sample")]
+    dark = raw[0][5:15, 5:15].mean()
+    rows, columns = (n // factor for n in raw[0].shape)
+    small = [(a - dark).reshape(rows, factor, columns, factor).mean((1, 3)) for a in raw]
+    psf, image = (a / np.linalg.norm(a) for a in small)
+    return psf, image
+
+
+def solve(psf: Image, image: Image, *, method: str, steps: int):
+    """The estimate and the costs of one method."""
+    rows, columns = image.shape
+    system = Convolution.of(psf[None], (rows, columns))
+    if method == "ADMM":
+        return admm_convolution(system, image, steps=steps, tv=TV)
+    # Noise in the dark would be negative light.
+    solver = {"Richardson-Lucy": partial(richardson_lucy, accelerate=True), "FISTA": fista}[method]
+    return solver(system.operator, image, steps=steps)
+
+
+@jax.jit
+def objective(psf: Image, image: Image, scene: Image) -> Float[Array, ""]:
+    """What ADMM minimises: half the squared residual, and total variation."""
+    rows, columns = image.shape
+    residual = Convolution.of(psf[None], (rows, columns))(scene[None]) - image
+    return jnp.vdot(residual, residual) / 2 + TV * total_variation(differences(scene[None], wrap=True), isotropic=False)
+
+
+def ours(psf: np.ndarray, image: np.ndarray, method: str, steps: int):
+    """A warm call, and what it takes to compile it."""
+    run = jax.jit(partial(solve, method=method, steps=steps))
+    compile_s, call = timed(lambda: run.lower(jnp.asarray(psf), jnp.asarray(image)).compile())
+    return compile_s, lambda: jax.block_until_ready(call(jnp.asarray(psf), jnp.asarray(image)))
+
+
+def theirs(python: str, psf: np.ndarray, image: np.ndarray, steps: int) -> tuple[float, np.ndarray]:
+    """Seconds a step of LenslessPiCam, and its scene."""
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(given, psf=psf, image=image)
+        script = str(Path(__file__).with_name("diffusercam_peer.py"))
+        subprocess.run([python, script, str(given), str(found), str(steps)], check=True, capture_output=True)
+        result = np.load(found)
+        return float(result["seconds"]), result["scene"]
+
+
+def run(
+    folder: Path,
+    *,
+    factors: Sequence[int] = (4, 1),
+    steps: int = 100,
+    rounds: int = 3,
+    peer: str | None,
+    progress: Progress,
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """What `diffusercam.json` holds, and the pictures by title. Full size takes a fifth of the steps."""
+    rows, pictures = [], {}
+    for factor in factors:
+        psf, image = read(folder, factor)
+        some = steps if factor > 1 else max(steps // 5, 1)
+        if factor > 1:
+            pictures["raw image"] = image
+        for method in ("ADMM", "Richardson-Lucy", "FISTA"):
+            with progress.step(f"{method}, 1/{factor}"):
+                compile_s, call = ours(psf, image, method, some)
+                spent, found = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
+            scene = np.asarray(found["gs_jax"].x[0])
+            common = {"factor": factor, "pixels": image.size, "steps": some, "method": method}
+            place = Convolution.of(psf[None], image.shape).place
+            for name, seconds in spent.items():
+                x = scene if name == "gs_jax" else found[name]
+                cost = float(objective(*map(jnp.asarray, (psf, image, x)))) if method != "Richardson-Lucy" else None
+                times = {"ms_a_step": 1000 * float(np.median(seconds)), "fastest_ms_a_step": 1000 * min(seconds)}
+                rows.append(common | {"code": name, **times, "final_cost": cost})
+                if name == "gs_jax":
+                    rows[-1]["compile_s"] = compile_s
+                size = "full size" if factor == 1 else f"1/{factor}"
+                pictures[f"{method}, {name}, {size}"] = x[place]
+    return {"machine": describe(), "tv": TV, "rows": rows}, pictures
+
+
+def _rounds(call, peer, psf, image, steps, count):
+    """Seconds a step in each round, ours and theirs in turns, and the results."""
+    found = {"gs_jax": call()}
+    seconds: dict[str, list[float]] = {"gs_jax": []}
+    for _ in range(count):
+        seconds["gs_jax"].append(timed(call)[0] / steps)
+        if peer:
+            spent, found["LenslessPiCam"] = theirs(peer, psf, image, steps)
+            seconds.setdefault("LenslessPiCam", []).append(spent)
+    return seconds, found
+
+
+def picture(pictures: dict[str, np.ndarray]) -> Figure:
+    """The hand as each sees it, from zero to its 99.9th percentile."""
+    columns = min(4, len(pictures))
+    rows = -(-len(pictures) // columns)
+    figure = Figure(figsize=(3.2 * columns, 2.7 * rows), layout="constrained")
+    for axis in (axes := figure.subplots(rows, columns, squeeze=False)).flat[len(pictures) :]:
+        axis.set_axis_off()
+    for axis, (title, image) in zip(axes.flat, pictures.items(), strict=False):
+        axis.imshow(image, cmap="gray", vmin=0, vmax=np.percentile(image, 99.9))
+        axis.set_title(title, fontsize=9)
+        axis.tick_params(labelsize=7)
+    figure.supxlabel("column, pixels", fontsize=9)
+    figure.supylabel("row, pixels", fontsize=9)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--peer", help="Python of an environment with LenslessPiCam (its NumPy solver runs).")
+    parser.add_argument("--out", type=Path, default=Path("out/diffusercam"))
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    with Progress() as progress:
+        found, pictures = run(arguments.data, peer=arguments.peer, progress=progress)
+    write_json(out / "diffusercam.json", found)
+    picture(pictures).savefig(out / "diffusercam.png", dpi=90)
+    table = Table("factor", "method", "code", "steps", "ms a step", "fastest", "final cost")
+    for row in found["rows"]:
+        cost = "" if row["final_cost"] is None else f"{row['final_cost']:.3e}"
+        times = f"{row['ms_a_step']:.1f}", f"{row['fastest_ms_a_step']:.1f}"
+        table.add_row(str(row["factor"]), row["method"], row["code"], str(row["steps"]), *times, cost)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

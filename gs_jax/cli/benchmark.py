@@ -1,0 +1,24 @@
+"""`gs-jax benchmark`: the paper's Fig. 9."""
+
+from pathlib import Path
+
+import click
+
+from ..disk import make_folder
+from ..progress import Progress
+
+
+@click.command()
+@click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
+def benchmark(out: Path):
+    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
+    from ..benchmark import run  # it and Matplotlib take seconds to import
+    from ..benchmark_report import write
+
+    folder = make_folder(out)
+    with Progress() as progress:
+        records, left_out = run(progress=progress)
+    write(records, left_out, folder)
+    for missing in left_out:
+        click.echo(f"left out: {missing['method']} at {missing['pairs']:.1e} pairs: {missing['reason']}")
+    click.echo(f"{folder}: benchmark.json, .csv, .md and .png")

@@ -1,0 +1,132 @@
+import csv
+import json
+import math
+
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from gs_jax import benchmark, benchmark_report
+from gs_jax.benchmark import METHODS, obstacle, paper_clusters, run, slopes
+from gs_jax.benchmark_scenes import Case, bench, peaks, scores, spots
+from gs_jax.methods import forward_operator, reconstruct
+from gs_jax.progress import Progress
+
+from .helpers import scene
+
+KEYS = {"method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"}
+
+
+@pytest.fixture(scope="module")
+def found():
+    """In this process: starting one for each method takes seconds."""
+
+    class Here:
+        def __init__(self, *_, **__): ...
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_): ...
+        def submit(self, function, *arguments):
+            result = function(*arguments)
+            return type("Done", (), {"result": lambda _: result})()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "ProcessPoolExecutor", Here)
+        patch.setattr(benchmark, "_REPEATS", 2)
+        names = ("backproject", "backproject + paper's clusters", "richardson-lucy", "richardson-lucy, dense")
+        return run((16, 24), methods=names, seeds=(0,), progress=Progress())
+
+
+def test_records_and_files(found, tmp_path):
+    records, left_out = found
+    assert len(records) == 2 * 5 and not left_out
+    assert all(set(record) == KEYS for record in records)
+    assert {r["pairs"] for r in records} == {16.0**4, 24.0**4}
+    benchmark_report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
+    assert json.loads((tmp_path / "benchmark.json").read_text()) == records
+    with (tmp_path / "benchmark.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(records)
+    text = (tmp_path / "benchmark.md").read_text()
+    assert "| richardson-lucy, dense |" in text and "| m | 1.0e+00 | too slow |" in text
+    assert (tmp_path / "benchmark.png").stat().st_size > 10_000
+
+
+def test_the_matrix_is_the_operator(found):
+    """Dense and matrix-free Richardson-Lucy of one image: the same iteration, in float32."""
+    by = {(r["method"], r["pairs"]): r for r in found[0]}
+    for pairs in (16.0**4, 24.0**4):
+        dense, free = by["richardson-lucy, dense", pairs], by["richardson-lucy", pairs]
+        assert abs(dense["psnr_db"] - free["psnr_db"]) < 0.01
+
+
+def test_the_floor_scores_as_zeros_do():
+    at = bench(16)
+    particles = np.array([[0.0, 0, 20, 1]])
+    c = Case(np.zeros((16, 16), np.float32), particles, spots(particles, at.grid, at.width))
+    floor, best = scores(np.zeros_like(c.truth), c, at), scores(c.truth, c, at)
+    assert floor["f1"] == 0 and floor["mse"] == pytest.approx((c.truth**2).mean())
+    assert best["f1"] == 1 and best["psnr_db"] == math.inf
+
+
+def test_spots_and_their_peaks():
+    _, grid = scene(voxels=(30, 24), pitch=0.1)
+    points = np.array([[0.35, -0.45, 20.0, 2.0], [-0.55, 0.85, 18.1, 1.0]])
+    volume = spots(points, grid, 0.12)
+    found = peaks(volume + 7, grid)  # above any background
+    np.testing.assert_allclose(found[:, :3], [[0.35, -0.45, 20.0], [-0.55, 0.85, 18.0]], atol=1e-6)  # float32
+    # The sum of a Gaussian's samples is its integral when they lie closer than its standard deviation, to 1e-5 here.
+    np.testing.assert_allclose(volume[1].sum() * 0.01, 2 * 2 * np.pi * 0.12**2, rtol=1e-5)
+    assert peaks(np.zeros_like(volume), grid).shape == peaks(-volume, grid)[:0].shape == (0, 4)
+    weak = spots(points * np.array([1, 1, 1, 0.25]) + np.array([0.4, 0, 0, 0]), grid, 0.12)
+    assert len(peaks(volume + weak, grid)) == 3  # 0.5 of the largest counts, 0.25 of it does not
+    assert len(peaks(volume + 0.5 * weak, grid)) == 2
+
+
+def test_clusters_of_noise_are_left_out():
+    _, grid = scene(voxels=(40, 36), pitch=0.1, depths=(20.0,))
+    noise = 0.02 * np.random.default_rng(0).standard_normal((1, 40, 36)).astype(np.float32)
+    # A maximum among 1440 Gaussian values exceeds five deviations once in 2000 times.
+    assert not len(paper_clusters(noise, grid))
+    points = np.array([[0.35, -0.45, 20.0, 2.0], [-0.55, 0.85, 20.0, 1.0]])
+    found = paper_clusters(spots(points, grid, 0.12) + noise, grid)
+    np.testing.assert_allclose(found[:, :2], points[:, :2], atol=0.051)  # half a voxel
+
+
+def test_slopes_are_those_of_the_papers_range():
+    records = [{"method": "m", "pairs": p, "seconds": p**0.5} for p in (1e6, 1e8, 1e9)]
+    beyond = {"method": "m", "pairs": 1e12, "seconds": 1.0}
+    assert slopes([*records, beyond])["m"] == pytest.approx(0.5)
+
+
+def test_what_is_too_large_or_too_slow_is_left_out_in_words():
+    reason = obstacle("richardson-lucy, dense", 2000, None, 60.0)
+    assert reason is not None and "GiB, allowed:" in reason
+    last = {"seconds": 10.0, "pairs": 1e6}
+    assert obstacle("backproject", 100, last, 60.0) == "would take 100 s an image, allowed: 60 s"
+    assert obstacle("backproject", 100, last, 200.0) is None
+    assert set(METHODS) > {"backproject", "list-rl", "admm, dense"}
+
+
+def test_every_method_reconstructs_and_a_wrong_one_is_named():
+    imager, grid = scene(voxels=(9, 8), pitch=0.1, depths=(18.0, 20.0))
+    psf = jnp.zeros((2, 3, 3)).at[:, 1, 1].set(1.0)
+    truth = jnp.zeros((2, 9, 8)).at[1, 4, 3].set(1.0)
+    A = forward_operator(imager, grid, psf)
+    assert isinstance(A, lx.AbstractLinearOperator)
+    for method in ("backproject", "list-rl", "richardson-lucy", "fista", "admm"):
+        volume = reconstruct(A.mv(truth), imager, grid, psf, method=method, steps=10)
+        assert int(volume.argmax()) == int(truth.argmax()), method
+    with pytest.raises(ValueError, match="one of backproject, list-rl, .*, got 'magic'"):
+        reconstruct(A.mv(truth), imager, grid, psf, method="magic")
+
+
+def test_command(found, tmp_path, monkeypatch):
+    from gs_jax.cli.benchmark import benchmark as command
+
+    monkeypatch.setattr(benchmark, "run", lambda progress: found)
+    result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
+    assert result.exit_code == 0 and "benchmark.json" in result.output
+    assert len(json.loads((tmp_path / "new" / "benchmark.json").read_text())) == len(found[0])
