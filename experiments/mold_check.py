@@ -1,0 +1,155 @@
+"""From the paper's array to a part: what the facets of its mold cost, and whether they are where the lenses should be.
+
+The array and its mold are made for several chord errors, written as STL, read back and measured: volume, places and
+radii of the lenses, and the wavefront error of the facets. Without the authors' centres our built-in layout is used.
+
+    python -m experiments.mold_check [--out DIR]
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from gs_jax import MicrolensArray
+from gs_jax.builtin import geomscope
+from gs_jax.caps import facet_surface
+from gs_jax.designs import Design, read_design
+from gs_jax.disk import make_folder, write_json
+from gs_jax.mesh_files import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
+from gs_jax.mold_checks import array_volume, mold_volume
+from gs_jax.mold_preview import draw_solid
+from gs_jax.mold_verify import quality, verify
+from gs_jax.progress import Progress
+
+CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
+CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+def run(design: Design, chords_um: Sequence[float] = CHORDS_UM, progress: Progress | None = None) -> list[dict]:
+    """One record a chord error."""
+    items = chords_um if progress is None else progress.track(chords_um, "Chord errors")
+    return [measure(design, chord_um) for chord_um in items]
+
+
+def measure(design: Design, chord_um: float) -> dict:
+    """The array and the mold at one chord error, through a file and back."""
+    array, shape = design.imager().array, MoldShape(label=design.name)
+    started = time.perf_counter()
+    part = array_solid(array, chord_um / 1000)
+    made = time.perf_counter() - started
+    mold = mold_solid(array, part, shape)
+    with tempfile.TemporaryDirectory() as folder:
+        meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (part, mold)]
+    volumes = [mesh.solid().volume() for mesh in meshes]
+    block = float(np.prod(np.diff(mold_block(array, shape), axis=0)))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
+    cast = cast_solid(array, part, shape).volume()
+    imaging = design.imaging
+    numbers = quality(
+        verify(meshes[1], array),
+        array,
+        wavelength=imaging.wavelength_nm * 1e-6,
+        sensor_distance=imaging.sensor_distance_mm,
+    )
+    return {
+        "chord_um": chord_um,
+        "facets": len(meshes[0].facets),
+        "seconds": made,
+        "array_volume_error": volumes[0] / array_volume(array) - 1,
+        "mold_volume_error": volumes[1] / mold_volume(array, shape) - 1,
+        "block_filled_error": (volumes[1] + volumes[0] + engraved) / block - 1,
+        "cast_is_array_error": cast / part.volume() - 1,
+        **numbers,
+    }
+
+
+def _through_file(solid, path: Path) -> Mesh:
+    write_mesh(path, printable(solid), "part")
+    return read_mesh(path)
+
+
+def draw(design: Design, records: list[dict]) -> Figure:
+    """The mold, facets of a few lenses, and what facets cost."""
+    array = design.imager().array
+    figure = Figure(figsize=(15, 4.6), layout="constrained")
+    view = figure.add_subplot(1, 3, 1, projection="3d")
+    shape = MoldShape(label=design.name)
+    draw_solid(view, mold_solid(array, array_solid(array, 4e-3), shape), from_below=False)
+    view.set_title(f"mold of {len(array.centers)} lenses")
+    _draw_facets(figure.add_subplot(1, 3, 2), array)
+    axes = figure.add_subplot(1, 3, 3)
+    _draw_cost(axes, records)
+    return figure
+
+
+def _draw_facets(axes, array: MicrolensArray) -> None:
+    surface = facet_surface(array, 2e-3)
+    x, y, height = surface.vertices.T
+    shown = np.abs(surface.vertices[surface.facets, :2]).max(axis=(1, 2)) < 2.2
+    image = axes.tripcolor(x, y, surface.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
+    axes.triplot(x, y, surface.facets[shown], color="white", linewidth=0.25)
+    axes.set(xlim=(-1.8, 1.8), ylim=(1.8, -1.8), aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    axes.set_title("facets within 2 um of the lenses")
+    axes.figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
+
+
+def _draw_cost(axes, records: list[dict]) -> None:
+    chord = [record["chord_um"] for record in records]
+    strehl = [record["strehl_of_facets_median"] for record in records]
+    axes.semilogx(chord, strehl, "o-", color="tab:blue")
+    axes.axhline(0.8, color="gray", linewidth=0.8, linestyle="--")
+    axes.set(xlabel="chord error, um", ylabel="Strehl ratio of the facets alone", ylim=(0, 1.02))
+    axes.set_title("what facets cost")
+    right = axes.twinx()
+    right.semilogy(chord, [record["facets"] for record in records], "s--", color="tab:orange")
+    right.set_ylabel("facets", color="tab:orange")
+    axes.set_xticks(chord, [f"{value:g}" for value in chord])
+    axes.set_xticks([], minor=True)
+
+
+COLUMNS = {
+    "chord_um": ("chord error, um", "{:g}"),
+    "facets": ("facets", "{:,}"),
+    "array_volume_error": ("array's volume, off", "{:.1e}"),
+    "mold_volume_error": ("mold's volume, off", "{:.1e}"),
+    "block_filled_error": ("block filled, off", "{:.1e}"),
+    "center_deviation_max_um": ("centres within, um", "{:.1e}"),
+    "radius_deviation_max_percent": ("radii within, %", "{:.4f}"),
+    "surface_error_rms_um": ("surface, um RMS", "{:.4f}"),
+    "wavefront_error_rms_waves": ("waves RMS", "{:.4f}"),
+    "strehl_of_facets_median": ("Strehl ratio", "{:.3f}"),
+}
+
+
+def rows(records: list[dict]) -> list[list[str]]:
+    return [[form.format(record[key]) for key, (_, form) in COLUMNS.items()] for record in records]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/mold"))
+    out = make_folder(parser.parse_args().out)
+    design = read_design(CENTERS) if CENTERS.exists() else geomscope()
+    with Progress() as progress:
+        records = run(design, progress=progress)
+    write_json(out / "mold.json", records)
+    draw(design, records).savefig(out / "mold.png", dpi=110)
+    titles = [title for title, _ in COLUMNS.values()]
+    lines = [titles, ["---:"] * len(titles), *rows(records)]
+    (out / "mold.md").write_text("".join(f"| {' | '.join(line)} |\n" for line in lines))
+    table = Table(*titles)
+    for row in rows(records):
+        table.add_row(*row)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

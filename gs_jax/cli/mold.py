@@ -1,0 +1,82 @@
+"""`gs-jax mold`: a design to a part."""
+
+import math
+from pathlib import Path
+
+import click
+
+from ..designs import read_design
+from ..mold import MoldShape
+from ..mold_report import Order, make_part, words
+from ..progress import Progress
+from .options import Number
+
+
+@click.command()
+@click.argument("design", type=Path)
+@click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
+@click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
+@click.option(
+    "--chord-um",
+    type=Number(least=1e-3, most=1e3, unit="um"),
+    default=0.5,
+    show_default=True,
+    help="Largest distance between a facet and its lens.",
+)
+@click.option(
+    "--shrinkage-percent",
+    type=Number(least=0.0, most=20.0, unit="%"),
+    default=0.0,
+    show_default=True,
+    help="Of the cast material; the part is made larger by as much.",
+)
+@click.option(
+    "--draft-deg",
+    type=Number(least=0.0, most=30.0, unit="degrees"),
+    default=0.0,
+    show_default=True,
+    help="Of the walls' inner faces. Silicone needs none.",
+)
+@click.option(
+    "--headroom-mm",
+    type=Number(least=0.0, most=100.0, unit="mm"),
+    default=0.0,
+    show_default=True,
+    help="How much higher the walls are than the array is thick; 0 to cast flush under a glass plate.",
+)
+@click.option(
+    "--resolution-um",
+    type=Number(least=1e-2, most=1e3, unit="um"),
+    default=25.0,
+    show_default=True,
+    help="Smallest feature that the printer makes.",
+)
+@click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
+def mold(
+    design: Path,
+    output: Path,
+    positive: bool,
+    chord_um: float,
+    shrinkage_percent: float,
+    draft_deg: float,
+    headroom_mm: float,
+    resolution_um: float,
+    label: bool,
+):
+    """Make the negative mold of the array of the file DESIGN, to print and to cast the array in.
+
+    Units are mm. The array lies in the mold as it faces the sensor: x and y are the design's, lenses look toward -z.
+    A picture (.png) and a report (.json, .txt) of the same name are written beside it; what was written is read back
+    and measured.
+    """
+    microscope = read_design(design)
+    shape = MoldShape(
+        draft=math.radians(draft_deg),
+        headroom=headroom_mm,
+        shrinkage=shrinkage_percent / 100,
+        label=microscope.name if label else "",
+    )
+    order = Order(positive=positive, shape=shape, chord=chord_um / 1000, resolution=resolution_um / 1000)
+    with Progress() as progress:
+        report = make_part(microscope, output, order, progress)
+    click.echo(words(report), nl=False)

@@ -1,0 +1,210 @@
+"""STL and 3MF as other programs read them, and what is measured in them."""
+
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from gs_jax import MicrolensArray
+from gs_jax.errors import InputError
+from gs_jax.mesh_files import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold import MoldShape, array_solid, engravings, mold_block, mold_solid
+from gs_jax.mold_checks import array_volume, check_solid
+from gs_jax.mold_report import judge
+from gs_jax.mold_verify import quality, verify
+
+from .test_mold import CHORD, lenses, random_lenses
+
+
+def corners_in_stl(path):
+    """The facets of a binary STL file by its definition: 80 bytes, their number, then 50 bytes each."""
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<I", data, 80)
+    assert len(data) == 84 + 50 * count
+    rows = np.frombuffer(data, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]), offset=84)
+    return rows["normal"].astype(float), rows["corners"].astype(float)
+
+
+def volume_of(corners):
+    return np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+
+
+def test_stl_holds_the_solid(tmp_path):
+    part = array_solid(random_lenses(), CHORD)
+    write_mesh(tmp_path / "a.stl", printable(part), "small array")
+    assert (tmp_path / "a.stl").read_bytes()[:80].rstrip() == b"gs_jax, unit: mm, small array"
+    normal, corners = corners_in_stl(tmp_path / "a.stl")
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    assert area.min() > 0
+    # Facets 1e-4 mm wide in coordinates that are rounded by 1e-7 mm.
+    np.testing.assert_allclose(normal, cross / area[:, None], atol=2e-3)
+    # float32 coordinates: random errors, 1e-7 each, over a thousand facets.
+    np.testing.assert_allclose(volume_of(corners), part.volume(), rtol=1e-7)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".3mf", ".STL"])
+def test_another_reader_finds_it_watertight(tmp_path, suffix):
+    array = random_lenses()
+    path = tmp_path / f"a{suffix}"
+    write_mesh(path, printable(array_solid(array, 2e-4)), 'a <b> & "c"')
+    mesh = trimesh.load_mesh(path)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
+    # The bar, at a finer chord error than the default: small lenses have more rim.
+    np.testing.assert_allclose(mesh.volume, array_volume(array), rtol=1e-4)
+
+
+def test_3mf_says_millimetres(tmp_path):
+    write_mesh(tmp_path / "a.3mf", printable(array_solid(random_lenses(), CHORD)), "a")
+    with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
+        assert b'unit="millimeter"' in archive.read("3D/3dmodel.model")[:2000]
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".3mf"])
+def test_what_is_written_is_read_back(tmp_path, suffix):
+    mesh = printable(array_solid(random_lenses(), CHORD))
+    write_mesh(tmp_path / f"a{suffix}", mesh, "a")
+    again = read_mesh(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(np.float32(again.vertices), mesh.vertices)
+    np.testing.assert_array_equal(np.sort(again.facets, axis=0), np.sort(mesh.facets, axis=0))
+
+
+def test_mold_array_and_marks_fill_the_block(tmp_path):
+    array, shape = random_lenses(), MoldShape(label="fill")
+    part = array_solid(array, CHORD)
+    write_mesh(tmp_path / "array.stl", printable(part), "array")
+    write_mesh(tmp_path / "mold.stl", printable(mold_solid(array, part, shape)), "mold")
+    filled = sum(volume_of(corners_in_stl(tmp_path / name)[1]) for name in ("array.stl", "mold.stl"))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
+    # The bar is 1e-5; the rounding to float32 leaves less.
+    np.testing.assert_allclose(filled + engraved, np.prod(np.diff(mold_block(array, shape), axis=0)), rtol=1e-6)
+
+
+def test_vertices_that_float32_cannot_tell_apart_are_merged():
+    """A tetrahedron with one corner cut off by 1e-9 mm: in float32, 8 mm from the origin, it is whole again."""
+    top = np.array([[0, 0, 8.0], [1e-9, 0, 8.0], [0, 1e-9, 8.0]])
+    corners = np.concatenate([[[4.0, 4, 0], [-4.0, 4, 0], [0, -4.0, 0]], top]) + 8
+    facets = np.array([[0, 2, 1], [3, 4, 5], [0, 1, 5], [0, 5, 4], [1, 2, 3], [1, 3, 5], [2, 0, 4], [2, 4, 3]])
+    cut = Mesh(corners, facets)
+    assert not cut.solid().is_empty()
+    mesh = printable(cut.solid())
+    assert len(mesh.vertices) == 4 and len(mesh.facets) == 4
+    assert all(finding.level == "ok" for finding in check_solid(mesh, 8 * 8 / 2 * 8 / 3, "tetrahedron"))
+
+
+def test_what_is_no_solid_is_found():
+    mesh = printable(array_solid(random_lenses(), CHORD))
+    levels = lambda mesh, volume: {f.check: f.level for f in check_solid(mesh, volume, "part")}
+    volume = mesh.solid().volume()
+    assert set(levels(mesh, volume).values()) == {"ok"}
+    assert levels(mesh, volume * 1.001)["volume"] == "error"
+    torn = Mesh(mesh.vertices, mesh.facets[1:])
+    assert levels(torn, volume)["watertight"] == levels(torn, volume)["manifold"] == "error"
+    apart = mesh.vertices + np.array([9, 0, 0], np.float32)
+    two = Mesh(np.concatenate([mesh.vertices, apart]), np.concatenate([mesh.facets, mesh.facets + len(apart)]))
+    assert levels(two, 2 * volume)["genus"] == "error"
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a", "a.stl.txt"])
+def test_another_suffix_is_refused(tmp_path, name):
+    mesh = printable(array_solid(random_lenses(), CHORD))
+    with pytest.raises(InputError, match="allowed: .stl, .3mf"):
+        write_mesh(tmp_path / name, mesh, "a")
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match="allowed: .stl, .3mf"):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "name, data", [("a.stl", b"\0" * 84), ("a.stl", b"junk"), ("a.3mf", b"PK junk"), ("a.stl", b"")]
+)
+def test_a_broken_file_is_refused(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=name):
+        read_mesh(tmp_path / name)
+
+
+def test_nothing_is_left_of_a_file_that_could_not_be_written(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        write_mesh(tmp_path / "missing" / "a.stl", printable(array_solid(random_lenses(), CHORD)), "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [None, MoldShape(shrinkage=0.03, label="x")])
+def test_lenses_are_where_they_should_be(tmp_path, shape):
+    array = random_lenses()
+    part = array_solid(array, 5e-4)
+    solid = part if shape is None else mold_solid(array, part, shape)
+    write_mesh(tmp_path / "a.stl", printable(solid), "a")
+    found = verify(read_mesh(tmp_path / "a.stl"), array, scale=1.0 if shape is None else shape.scale)
+    # The bars are 1 um and 0.1 %. What is left is float32 and, in the radius, the lift of the vertices: 0.3 um of 2 mm.
+    np.testing.assert_allclose(found.center, np.asarray(array.centers), atol=1e-5)
+    np.testing.assert_allclose(found.radius, 2.0, rtol=3e-4)
+    assert np.nanmax(np.abs(found.offset)) < 2e-4 and found.misfit.max() < 1e-6
+
+
+def test_lenses_that_are_not_where_they_should_be_are_found():
+    """A part made of other centres and another radius than it is measured against."""
+    array = random_lenses()
+    moved = np.asarray(array.centers) + np.random.default_rng(2).uniform(-2e-3, 2e-3, (12, 2))
+    moved = np.clip(moved, (-2.5, -2.0), (2.5, 2.0))
+    # The same rims and sag as a sphere of another radius would have are not kept: the plate's plane is where it was.
+    other = lenses(moved, (5.0, 4.0), radius=2.001, thickness=1.0)
+    found = verify(printable(array_solid(other, 5e-4)), array)
+    np.testing.assert_allclose(found.center, moved, atol=1e-4)
+    np.testing.assert_allclose(found.radius, 2.001, atol=1e-3)
+    measured = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+    assert measured["center_deviation_max_um"] == pytest.approx(
+        1000 * np.linalg.norm(moved - np.asarray(array.centers), axis=1).max(), abs=0.1
+    )
+    assert judge(measured, chord=5e-4, radius=2.0)[0].level == "error"
+
+
+def test_facets_cost_light_as_the_square_of_their_depth():
+    """An equilateral facet `rho^2 / (2 R)` deep is `1 - r^2 / rho^2` of it deep at `r` from its middle: 0.19 RMS."""
+    array = lenses([[0, 0]], (2.4, 2.4))
+    measured = {}
+    for chord in (2e-4, 4e-4):
+        found = verify(printable(array_solid(array, chord)), array)
+        measured[chord] = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+    rms = {chord: numbers["surface_error_rms_um"] / 1000 for chord, numbers in measured.items()}
+    # Not all facets are equilateral, or as deep as they may be.
+    for chord, found in rms.items():
+        assert 0.7 * 0.194 < found / chord < 1.1 * 0.194
+    np.testing.assert_allclose(rms[4e-4] / rms[2e-4], 2, rtol=0.1)
+    numbers = measured[2e-4]
+    waves = 0.43 * numbers["surface_error_rms_um"] / 0.52
+    assert numbers["wavefront_error_rms_waves"] == pytest.approx(waves, rel=1e-6)
+    assert numbers["strehl_of_facets_median"] == pytest.approx(np.exp(-((2 * np.pi * waves) ** 2)), rel=1e-6)
+    # A surface within lambda / 14 is Marechal's: 0.075 waves for 0.8 by the exponential formula.
+    assert numbers["surface_error_for_strehl_0.8_um"] == pytest.approx(0.0752 * 0.52 / 0.43, rel=1e-3)
+
+
+def test_a_file_without_lenses_is_refused():
+    block = trimesh.creation.box((5, 4, 1))
+    with pytest.raises(ValueError, match="no facet within"):
+        verify(Mesh(block.vertices, block.faces), random_lenses())
+
+
+def test_a_lens_that_is_not_there_is_said():
+    array = lenses([[-1.0, 0], [1.0, 0]], (5.0, 4.0))
+    one = lenses([[-1.0, 0]], (5.0, 4.0))
+    found = verify(printable(array_solid(one, CHORD)), array)
+    assert np.isnan(found.radius).tolist() == [False, True]
+    measured = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+    assert measured["lenses_not_measured"] == [2] and measured["lenses_measured"] == 1
+    assert any(finding.check == "lenses not measured" for finding in judge(measured, chord=CHORD, radius=2.0))
+
+
+def test_the_variance_of_an_equilateral_facet():
+    """What the test above takes as known, by sampling."""
+    weights = np.random.default_rng(0).dirichlet([1, 1, 1], 200_000)
+    corners = np.array([[1, 0], [-0.5, 3**0.5 / 2], [-0.5, -(3**0.5) / 2]])
+    assert (((weights @ corners) ** 2).sum(axis=1)).std() == pytest.approx(0.194, abs=2e-3)
+
+
+def test_float32_arrays_are_measured_alike():
+    array = MicrolensArray(np.array([[0.1, 0.2]], np.float32), size=(3.0, 3.0))
+    assert verify(printable(array_solid(array, CHORD)), array).vertices[0] > 50
