@@ -12,8 +12,12 @@ from .cli.demo import demo
 from .cli.info import info
 from .cli.layout import layout
 from .cli.metrics import metrics
+from .cli.mold import mold
+from .cli.optimize import optimize
+from .cli.pareto import pareto
 from .cli.reconstruct import reconstruct
 from .cli.simulate import simulate
+from .cli.train import train
 from .errors import InputError
 
 
@@ -42,7 +46,7 @@ def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
 
 
-for _command in (reconstruct, simulate, metrics, layout, demo, info):
+for _command in (reconstruct, simulate, metrics, layout, optimize, pareto, mold, train, demo, info):
     commands.add_command(_command)
 
 

@@ -137,11 +137,11 @@ def _disc_within(normal, height, radius):
     tie = (height[None] == height[:, None]) & (order[None] < order[:, None])
     hidden = jnp.any(~crossing & (cos > 0) & ((height[None] < height[:, None]) | tie), axis=1)
     edge = ~hidden & (low < high)
-    wedges = _wedge(jnp.where(edge, high, 0), height, radius) - _wedge(jnp.where(edge, low, 0), height, radius)
+    wedges = wedge(jnp.where(edge, high, 0), height, radius) - wedge(jnp.where(edge, low, 0), height, radius)
     return jnp.sum(wedges)
 
 
-def _wedge(end, height, radius):
+def wedge(end, height, radius):
     """Area that a disc shares with the triangle from its centre to a line at `height`, from the foot to `end`."""
     half_chord = safe_sqrt(radius**2 - height**2)
     inside = jnp.clip(end, -half_chord, half_chord)

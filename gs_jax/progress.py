@@ -1,6 +1,6 @@
 """Progress bars on a terminal; nothing in a pipe."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -32,3 +32,9 @@ class Progress:
         task = self._bars.add_task(description, total=None)
         yield
         self._bars.update(task, total=1, completed=1)
+
+    @contextmanager
+    def counter(self, description: str, total: int) -> Iterator[Callable[[], None]]:
+        """Work of `total` parts; what it yields is called after each."""
+        task = self._bars.add_task(description, total=total)
+        yield lambda: self._bars.advance(task)

@@ -1,4 +1,4 @@
-"""From a capture to a stack, as the command line does it."""
+"""From a capture to a volume, as the command line does it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +8,14 @@ from .backprojection import backproject
 from .errors import InputError
 from .geometry import Grid, Imager
 from .info import memory_bytes
+from .methods import reconstruct
 from .progress import Progress
+from .simulate import psf_of_depth
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16
+# Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
+_DARKEST = 1
 
 
 def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) -> Grid:
@@ -56,3 +60,43 @@ def reconstruct_stack(
         planes = Grid(grid.depths[first : first + _PLANES], grid.shape, grid.pitch)
         volume[first : first + _PLANES] = backproject(image, imager, planes)
     return volume
+
+
+def reconstruct_iteratively(
+    image: Shaped[Array | np.ndarray, "row column"],
+    imager: Imager,
+    grid: Grid,
+    *,
+    method: str,
+    steps: int,
+    wavelength: float,
+    progress: Progress,
+) -> Float32[np.ndarray, "depth y x"]:
+    """A volume by one of `methods.METHODS`, from the light above the camera's offset.
+
+    The offset is the image's darkest percent. PSF_o is that of the rays, without diffraction.
+
+    Parameters
+    ----------
+    image, imager, grid
+        As for `backproject`.
+    method, steps
+        As for `methods.reconstruct`.
+    wavelength
+        mm.
+
+    Raises
+    ------
+    InputError
+        If a depth of the grid is blurred over more than 128 pixels.
+    """
+    light = jnp.asarray(image, jnp.float32)
+    light = jnp.maximum(light - jnp.percentile(light, _DARKEST), 0)
+    if method == "list-rl":
+        psf = jnp.zeros((grid.depths.size, 1, 1))
+    else:
+        kernel = psf_of_depth(imager, np.asarray(grid.depths), wavelength, "geometric")
+        psf = jnp.stack([kernel(z) for z in progress.track(np.asarray(grid.depths), "Point spread functions")])
+    with progress.counter("Iterating", steps) as advance:
+        volume = reconstruct(light, imager, grid, psf, method=method, steps=steps, callback=lambda *_: advance())
+        return np.asarray(volume, np.float32)

@@ -95,7 +95,7 @@ def simulate_volume(
         )
     if np.min(volume) < 0:
         raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
-    kernel = _kernel(imager, np.asarray(grid.depths), wavelength, kind)
+    kernel = psf_of_depth(imager, np.asarray(grid.depths), wavelength, kind)
     image = jnp.zeros(imager.sensor.shape, jnp.float32)
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
@@ -122,13 +122,32 @@ def simulate_points(
     if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
         depths = np.linspace(near, far, count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS)
-    kernel = _kernel(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, wavelength, kind, STEPS)
+    kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, wavelength, kind, STEPS)
     fine = np.stack([kernel(depth) for depth in progress.track(depths, "Point spread functions")])
     return forward_points(points, imager, stamps(depths, fine), progress)
 
 
-def _kernel(imager: Imager, depths, wavelength: float, kind: str, steps: int = 1):
-    """The PSF of a depth, in a window that holds the rays of all of them; `steps` windows' pixels make a pixel."""
+def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: int = 1):
+    """Function from a depth to its PSF, in a window that holds the rays of all depths.
+
+    Parameters
+    ----------
+    imager
+        Its mean clear aperture is taken.
+    depths
+        Between the nearest and the farthest of them, mm.
+    wavelength
+        mm.
+    kind
+        Of the PSF: a key of `PSFS`.
+    steps
+        As many pixels of the sensor as make a pixel that is meant: the margins of the window grow with them.
+
+    Raises
+    ------
+    InputError
+        If the rays reach farther than 128 pixels.
+    """
     radius = clear_diameter(imager.array) / 2
     edge = radius * jnp.array([[1.0, 0.0]])
     reaches = [float(jnp.abs(unit_rays(imager, depth, edge).landing).max()) for depth in (min(depths), max(depths))]

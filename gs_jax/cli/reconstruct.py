@@ -1,14 +1,20 @@
-"""`gs-jax reconstruct`: a capture to a volume."""
+"""`gs-jax reconstruct`: a capture to a volume, or to points."""
 
 from pathlib import Path
 
 import click
+import numpy as np
 
 from ..designs import read_design
 from ..disk import check_output
-from ..files import read_capture
+from ..errors import InputError
+from ..files import read_capture, write_points
+from ..locate import find_points
+from ..methods import METHODS
+from ..phantoms import rasterize
 from ..progress import Progress
-from ..reconstruct import reconstruct_stack, voxel_grid
+from ..reconstruct import reconstruct_iteratively, reconstruct_stack, voxel_grid
+from ..unet import pretrained, suppress as without_background
 from ..volumes import VOLUME_SUFFIXES, write_volume
 from .options import UM, Depths, depth_range
 
@@ -18,21 +24,63 @@ from .options import UM, Depths, depth_range
 @click.argument("design", type=Path)
 @click.option("--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included.")
 @click.option("--voxel-um", type=UM, help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth]")
-@click.option("--method", type=click.Choice(["backproject"]), default="backproject", show_default=True)
+@click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
+@click.option("--steps", type=click.IntRange(1, 100_000), default=20, show_default=True, help="Of the other methods.")
+@click.option(
+    "--suppress",
+    type=click.Choice(["none", "cluster", "unet"]),
+    default="none",
+    show_default=True,
+    help="Background suppression: cluster for sparse points, unet for anything.",
+)
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
-def reconstruct(capture: Path, design: Path, depths: list[float], voxel_um: float | None, method: str, output: Path):
+@click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+def reconstruct(
+    capture: Path,
+    design: Path,
+    depths: list[float],
+    voxel_um: float | None,
+    method: str,
+    steps: int,
+    suppress: str,
+    output: Path,
+    points: Path | None,
+):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
 
     CAPTURE is a grey TIFF, PNG or .npy of the sensor's size; the volume is written to scale, for Fiji and napari.
     """
     check_output(output, VOLUME_SUFFIXES)
-    imager = read_design(design).imager()
+    if points:
+        check_output(points, [".csv"])
+    if suppress != "none" and method != "backproject":
+        raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
+    microscope = read_design(design)
+    imager = microscope.imager()
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000)
     image = read_capture(capture, imager.sensor.shape)
+    found = np.zeros((0, 4))
     with Progress() as progress:
-        volume = reconstruct_stack(image, imager, grid, progress)
+        if points or suppress == "cluster":
+            found = find_points(image, imager, grid, progress=progress)
+        if suppress == "cluster":
+            volume = np.asarray(rasterize(found, grid), np.float32)
+        elif method == "backproject":
+            volume = reconstruct_stack(image, imager, grid, progress)
+        else:
+            wavelength = microscope.imaging.wavelength_nm * 1e-6
+            volume = reconstruct_iteratively(
+                image, imager, grid, method=method, steps=steps, wavelength=wavelength, progress=progress
+            )
+        if suppress == "unet":
+            with progress.step("Suppressing the background"):
+                volume = without_background(volume, pretrained())
         with progress.step("Writing"):
             write_volume(output, volume, grid)
+            if points:
+                write_points(points, found)
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
+    if points or suppress == "cluster":
+        click.echo(f"{points or output}: {len(found)} points")

@@ -1,0 +1,172 @@
+"""The Cramer-Rao bound of `gs_jax.fisher` against maximum likelihood on noisy images of a single point.
+
+Two layouts of 23 lenses: Poisson discs, and the same after gradient descent on the bound in z (least distance and plate
+kept). For each and for several brightnesses, 500 noisy images of a point at random subpixel places are drawn (Poisson
+light and background, Gaussian read noise), and x, y, z and brightness found by Fisher scoring on the likelihood. If the
+bound is right, the ratio of the error to it is 1, and the better layout is better by as much as the bounds say.
+
+    python -m experiments.cramer_rao [--out DIR]
+
+writes `cramer_rao.json` and `cramer_rao.png`; about two minutes on two cores.
+"""
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax.camera import poisson
+from gs_jax.coverage import nearest_neighbour_distances
+from gs_jax.disk import make_folder, write_json
+from gs_jax.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
+from gs_jax.layouts import poisson_disc_layout
+from gs_jax.progress import Progress
+
+PLATE, DISTANCE, DEPTH = (5.0, 5.0), 1.0, 20.0
+SIZE = 15
+OPTIONS: dict[str, Any] = dict(spot=0.008, background=5.0, read_noise=2.0, size=SIZE)
+STEPS = 12
+
+
+def imager(centers: Float[Array | np.ndarray, "lens 2"]) -> Imager:
+    return Imager(MicrolensArray(centers), Sensor((1400, 1400), 0.0045), 5.8, 2.5)
+
+
+def improved(centers: Float[np.ndarray, "lens 2"], steps: int) -> Float[np.ndarray, "lens 2"]:
+    """Centres that lower the bound in z of points near the axis, as far apart as they were at least."""
+    points = np.array([(x, y, DEPTH) for x in (-0.3, 0, 0.3) for y in (-0.3, 0, 0.3)])
+    first, second = np.triu_indices(len(centers), 1)
+    half, solver = jnp.array(PLATE) / 2, optax.adam(0.03)
+
+    def objective(c):
+        near = DISTANCE - jnp.sqrt(jnp.sum((c[first] - c[second]) ** 2, axis=1))
+        return jnp.log(localization_bound(imager(c), points, photons=1000.0, **OPTIONS)[2]) + 30 * jnp.sum(
+            jnp.maximum(near + 0.02, 0) ** 2
+        )
+
+    @jax.jit
+    def step(c, state):
+        change, state = solver.update(jax.grad(objective)(c), state)
+        return jnp.clip(c + change, -half, half), state
+
+    c, best = jnp.asarray(centers), centers
+    state = solver.init(c)
+    for _ in range(steps):
+        c, state = step(c, state)
+        if nearest_neighbour_distances(np.asarray(c)).min() >= DISTANCE:
+            best = np.asarray(c)
+    return best
+
+
+@partial(jax.jit, static_argnames="draws")
+def errors(
+    camera: Imager, key: PRNGKeyArray, *, photons: Float[Array, ""], draws: int
+) -> tuple[Float[Array, "draw 3"], Float[Array, "draw 3"]]:
+    """Errors of maximum likelihood in x, y, z, and the bound at each point, mm."""
+    variance = OPTIONS["read_noise"] ** 2
+
+    def one(key):
+        place, light, read, start = jax.random.split(key, 4)
+        # One pixel in the object: every phase of the images on their pixels.
+        pixel = camera.sensor.pixel_pitch / camera.magnification(DEPTH)
+        lateral = pixel * jax.random.uniform(place, (2,), minval=-0.5, maxval=0.5)
+        truth = jnp.concatenate([lateral, jnp.array([DEPTH, 0.0])])
+        corners, on_sensor = windows(truth[:3], camera, SIZE)
+        images = lambda p: (
+            mean_images(p, camera, photons=photons, spot=OPTIONS["spot"], corners=corners, size=SIZE)
+            + OPTIONS["background"]
+        )
+        data = poisson(light, images(truth)) + jnp.sqrt(variance) * jax.random.normal(read, on_sensor.shape)
+
+        def scoring(p, _):
+            mean, slopes = images(p), jax.jacfwd(images)(p)
+            weight = on_sensor / (mean + variance)
+            information = jnp.einsum("lrci,lrcj,lrc->ij", slopes, slopes, weight) + jnp.diag(jnp.array(PRIOR) ** -2)
+            score = jnp.einsum("lrci,lrc->i", slopes, weight * (data - mean))
+            unit = jnp.diag(information) ** -0.5
+            step = unit * jnp.linalg.solve(unit[:, None] * information * unit[None], unit * score)
+            return p + jnp.clip(step, -0.1, 0.1), None
+
+        # Started beside the truth, by ten pixels' worth of depth and a pixel: finding the peak is not the matter here.
+        beside = jnp.array([pixel, pixel, 0.05, 0.2]) * jax.random.normal(start, (4,)) / 2
+        found, _ = jax.lax.scan(scoring, truth + beside, length=STEPS)
+        bound = cramer_rao(truth[None, :3], camera, photons=photons, **OPTIONS)[0]
+        return (found - truth)[:3], bound
+
+    return jax.lax.map(one, jax.random.split(key, draws), batch_size=50)
+
+
+def run(
+    photons: Sequence[float] = (100, 300, 1000, 3000, 10_000),
+    draws: int = 500,
+    steps: int = 150,
+    *,
+    progress: Progress,
+) -> dict:
+    """Everything that `cramer_rao.json` holds; units are in the keys."""
+    before = next(
+        c for c in (poisson_disc_layout(PLATE, min_distance=DISTANCE, seed=s) for s in range(1000)) if len(c) == 23
+    )
+    layouts = {"random": before, "improved": improved(before, steps)}
+    rows = []
+    for (name, centers), count in progress.track([(x, n) for x in layouts.items() for n in photons], "Locating"):
+        wrong, bound = errors(imager(centers), jax.random.key(1), photons=jnp.array(float(count)), draws=draws)
+        rms = lambda x: np.sqrt(np.mean(np.asarray(x) ** 2, axis=0))
+        found = {"bound_um": 1000 * rms(bound), "error_um": 1000 * rms(wrong), "ratio": rms(wrong) / rms(bound)}
+        rows.append({"layout": name, "photons": count} | {key: value.tolist() for key, value in found.items()})
+    return {
+        "draws": draws,
+        "rows": rows,
+        "centers_mm": {name: centers.tolist() for name, centers in layouts.items()},
+        "least_distance_mm": {name: float(nearest_neighbour_distances(c).min()) for name, c in layouts.items()},
+    }
+
+
+def picture(found: dict) -> Figure:
+    """Errors and bounds against photons, along x and z; the layouts."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    *plots, right = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1))
+    for color, name in zip(("C0", "C3"), found["centers_mm"], strict=True):
+        rows = [row for row in found["rows"] if row["layout"] == name]
+        for axes, axis, label in zip(plots, (0, 2), "xz", strict=True):
+            photons = [row["photons"] for row in rows]
+            axes.loglog(photons, [row["bound_um"][axis] for row in rows], color=color, label=f"{name}, bound")
+            axes.loglog(photons, [row["error_um"][axis] for row in rows], "o", color=color, label=f"{name}, found")
+            axes.set(xlabel="photons of a lens on its axis", ylabel=f"error in {label}, RMS, um")
+            axes.grid(which="both", alpha=0.25)
+        right.plot(*np.transpose(found["centers_mm"][name]), "o", color=color, label=name, fillstyle="none")
+    plots[0].legend()
+    right.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(-2.7, 2.7), ylim=(-2.7, 2.7))
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/cramer_rao"))
+    out = make_folder(parser.parse_args().out)
+    # Second derivatives of a bright point's likelihood differ from each other by more than float32 resolves.
+    jax.config.update("jax_enable_x64", True)
+    with Progress() as progress:
+        found = run(progress=progress)
+    write_json(out / "cramer_rao.json", found)
+    picture(found).savefig(out / "cramer_rao.png", dpi=100)
+    table = Table("layout", "photons", "bound x, y, z, um", "error x, y, z, um", "ratio x, y, z")
+    for row in found["rows"]:
+        triples = (" ".join(f"{x:.3g}" for x in row[key]) for key in ("bound_um", "error_um", "ratio"))
+        table.add_row(row["layout"], str(row["photons"]), *triples)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""What the end-to-end gradient costs at full scale, in forward passes with back-projection.
+
+5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at each depth. The gradient is that of
+the misfit after `forward` and `backproject`, with respect to every leaf of the imager. Both are timed in turns, so
+that the ratio holds on a busy machine too; memory is what XLA plans beside the arguments.
+
+    python -m experiments.full_gradient [--out DIR] [--rounds N]
+
+writes `full_gradient.json`; about two minutes on two cores.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from experiments.backprojection_speed import Inputs, Job, inputs, timed
+from experiments.forward_model import PSF_PIXELS
+from gs_jax import backproject, forward
+from gs_jax.disk import make_folder, write_json
+from gs_jax.end_to_end import misfit_db
+from gs_jax.info import describe
+from gs_jax.progress import Progress
+
+
+def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:
+    """Everything that `full_gradient.json` holds; units are in the keys."""
+    job = Job() if job is None else job
+    s: Inputs = inputs(job)
+    psf = jnp.full((job.depths, PSF_PIXELS, PSF_PIXELS), PSF_PIXELS**-2.0, jnp.float32)
+
+    def value(imager, volume):
+        return misfit_db(backproject(forward(volume, imager, s.grid, psf), imager, s.grid), volume)
+
+    compiled, compile_s, mib = {}, {}, {}
+    for name, function in {"value": value, "gradient": jax.grad(value)}.items():
+        compile_s[name], compiled[name] = timed(lambda f=function: jax.jit(f).lower(s.imager, s.volume).compile())
+        memory = compiled[name].memory_analysis()
+        mib[name] = (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20
+    seconds: dict[str, list[float]] = {name: [] for name in compiled}
+    for number in progress.track(range(rounds + 1), "Timing"):
+        for name, call in compiled.items():
+            taken, _ = timed(lambda call=call: jax.block_until_ready(call(s.imager, s.volume)))
+            if number:  # the first is warm-up
+                seconds[name].append(taken)
+    return {
+        "machine": describe(),
+        "job": job._asdict(),
+        "seconds": seconds,
+        "ratio": float(np.median(np.divide(seconds["gradient"], seconds["value"]))),
+        "compile_seconds": compile_s,
+        "mib": mib,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/full_gradient"))
+    parser.add_argument("--rounds", type=int, default=3)
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    with Progress() as progress:
+        found = run(rounds=arguments.rounds, progress=progress)
+    write_json(out / "full_gradient.json", found)
+    Console().print({key: found[key] for key in ("seconds", "ratio", "mib")})
+
+
+if __name__ == "__main__":
+    main()

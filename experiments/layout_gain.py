@@ -1,0 +1,248 @@
+"""What a lens layout alone can gain: optimised layouts against the best of 200 random ones, and a hexagonal one.
+
+The prescription, the plate, the number of lenses and their least distance are fixed; only the centres move. For each of
+five seeds 200 Poisson-disc layouts are scored by the end-to-end loss, and the best one is the competitor. The best 16
+are starts: Adam lowers the shortage of lenses over the object (`gs_jax.comb.lens_shortage`), and the same loss on the
+same scenes picks one of the 16. The controls are hexagonal lattices of as many lenses, which nothing optimised: at the
+least distance, and spread as wide as the plate allows. All are then judged by PSNR on 30 held-out scenes that the
+loss's model did not render (`experiments.layout_scenes`). The reconstruction is the same for all: normalised
+back-projection less its local background (`gs_jax.end_to_end.reconstruct`), and as a second method ten steps of
+Richardson-Lucy on the same pixel-voxel lists.
+
+Occupancy is Eq. (11)'s, for an object that fills the field. By default the object is smaller, and its sub-images hardly
+overlap; with `--crowded` it is as wide as the field, lenses are nearer to each other, and ghosts
+(`gs_jax.comb.sidelobes`) count as much as shortage. The JSON has both the occupancy and the lenses per lit pixel.
+
+    python -m experiments.layout_gain [--out DIR] [--seeds N] [--crowded]
+
+writes `layout_gain.json` and `layout_gain.png`; about a quarter of an hour on two cores.
+"""
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from experiments.layout_scenes import METHODS, Centers, Study, judge, loss, overlap, psf_of
+from gs_jax.comb import lens_shortage, sidelobes
+from gs_jax.coverage import nearest_neighbour_distances
+from gs_jax.disk import make_folder, write_json
+from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
+from gs_jax.progress import Progress
+from gs_jax.psf import gaussian_psf, psf
+from gs_jax.theory import occupancy
+
+# Sub-images that overlap: lenses nearer to each other, and an object as wide as the field of a lens.
+CROWDED = Study(distance=0.65, field=4.4, pixels=640, ghosts=1.0)
+NAMES = ("best", "ours", "hexagonal", "spread")
+PAIRS = (("ours", "best"), ("hexagonal", "best"), ("spread", "best"), ("ours", "hexagonal"), ("ours", "spread"))
+
+
+def candidates(study: Study, seed: int) -> Float[np.ndarray, "layout lens 2"]:
+    """Random layouts of one number of lenses, the commonest."""
+    draw = lambda n: poisson_disc_layout(study.plate, min_distance=study.distance, seed=int(n))
+    layouts = lambda rng: map(draw, rng.integers(2**31, size=10**5))
+    first = layouts(np.random.default_rng(0))
+    number = int(stats.mode([len(next(first)) for _ in range(200)]).mode)
+    found = (layout for layout in layouts(np.random.default_rng(1000 + seed)) if len(layout) == number)
+    return np.stack([next(found) for _ in range(study.candidates)])
+
+
+def hexagonal(study: Study, seed: int, count: int, pitch: float) -> Float[np.ndarray, "lens 2"]:
+    """The control: of a lattice that is turned and shifted at random, the lenses nearest to the axis.
+
+    Raises
+    ------
+    ValueError
+        If the plate has no room for so many.
+    """
+    rng = np.random.default_rng(2000 + seed)
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    # Wider by a millionth, so that rounding leaves the least distance.
+    lattice = hexagonal_layout((20.0, 20.0), pitch=pitch * (1 + 1e-6)) @ turn + rng.uniform(-0.5, 0.5, 2) * pitch
+    on_plate = lattice[(np.abs(lattice) <= np.array(study.plate) / 2).all(1)]
+    if len(on_plate) < count:
+        raise ValueError(f"There is room for {len(on_plate)} lenses at a pitch of {pitch} mm, not for {count}.")
+    return on_plate[np.argsort(np.hypot(*on_plate.T))[:count]]
+
+
+def spread(study: Study, seed: int, count: int) -> Float[np.ndarray, "lens 2"]:
+    """The other control: the same at the widest pitch, in steps of 1 %, that leaves room for all lenses."""
+    for share in np.arange(1.2, 1.0, -0.01):
+        try:
+            return hexagonal(study, seed, count, study.distance * share)
+        except ValueError:
+            continue
+    return hexagonal(study, seed, count, study.distance)
+
+
+def too_near(centers: Centers, distance: float) -> Float[Array, ""]:
+    """What pairs lack of a half per cent more than the least distance, squared and summed, mm^2."""
+    first, second = np.triu_indices(len(centers), 1)
+    squared = jnp.sum((centers[first] - centers[second]) ** 2, axis=1)
+    return jnp.sum(jnp.maximum(1.005 * distance - jnp.sqrt(squared + 1e-12), 0) ** 2)
+
+
+def apart(centers: Centers, study: Study) -> Float[np.ndarray, "lens 2"]:
+    """Centres moved until every pair keeps the least distance, on the plate."""
+    centers, half = np.array(centers, np.float64), np.array(study.plate) / 2
+    push = jax.jit(jax.grad(lambda c: too_near(c, study.distance)))
+    for _ in range(1000):
+        centers = np.clip(centers, -half, half)
+        if nearest_neighbour_distances(centers).min() >= study.distance:
+            return centers
+        centers -= 0.2 * np.asarray(push(jnp.asarray(centers)), np.float64)
+    raise RuntimeError(f"Lenses came nearer than {study.distance} mm, and there is no room to part them.")
+
+
+def optimise(starts: Float[np.ndarray, "start lens 2"], study: Study) -> Float[np.ndarray, "start lens 2"]:
+    """Adam on the study's objective, with the least distance as a penalty and then exactly."""
+    return np.stack([apart(c, study) for c in _descended(jnp.asarray(starts), study)])
+
+
+@partial(jax.jit, static_argnames="study")
+def _descended(starts: Array, study: Study) -> Array:
+    half, side = jnp.array(study.plate) / 2, (np.arange(study.places) + 0.5) / study.places - 0.5
+    points = np.array([(study.field * x, study.field * y, z) for x in side for y in side for z in study.depths])
+    rng = np.random.default_rng(0)
+    sources, targets = (points[rng.choice(len(points), n, replace=False)] for n in (8, 200))
+    own: dict[str, Any] = {"width": 5 * study.pixel, "lateral": 0.1, "axial": 0.3}
+
+    def objective(c):
+        imager = study.imager(c)
+        total = jnp.log(lens_shortage(imager, points)) + 100 * too_near(c, study.distance)
+        if study.ghosts:
+            # Teeth five pixels wide: narrower ones meet so rarely that there is no slope to follow.
+            total += study.ghosts * jnp.log(sidelobes(imager, sources, targets, **own).rms)
+        return total
+
+    solver = optax.adam(optax.cosine_decay_schedule(study.rate, study.steps))
+
+    def step(state, _):
+        centers, memory = state
+        change, memory = solver.update(jax.grad(objective)(centers), memory)
+        return (jnp.clip(centers + change, -half, half), memory), None
+
+    return jax.vmap(lambda c: jax.lax.scan(step, (c, solver.init(c)), length=study.steps)[0][0])(starts)
+
+
+def run(study: Study = Study(), seeds: int = 5, *, progress: Progress) -> dict:
+    """Everything that `layout_gain.json` holds; units are in the keys."""
+    fine_psfs, psfs = psf_of(psf, study, study.fine_grid()), psf_of(gaussian_psf, study, study.grid())
+    rows = []
+    for seed in range(seeds):
+        layouts, key = candidates(study, seed), jax.random.key(10_000 + seed)
+        score = lambda c, key=key: float(loss(jnp.asarray(c), key, psfs, study))
+        losses = [score(c) for c in progress.track(layouts, f"Seed {seed}: scoring")]
+        optimised = optimise(layouts[np.argsort(losses)[: study.starts]], study)
+        our_losses = [score(c) for c in optimised]
+        lattices = hexagonal(study, seed, layouts.shape[1], study.distance), spread(study, seed, layouts.shape[1])
+        found = (layouts[int(np.argmin(losses))], optimised[int(np.argmin(our_losses))], *lattices)
+        chosen: dict[str, Centers] = dict(zip(NAMES, found, strict=True))
+        scores, empty = judge(chosen, study, fine_psfs, progress)
+        row = {"seed": seed, "random_loss_db": losses, "ours_loss_db": our_losses}
+        row |= {"hexagonal_loss_db": [score(c) for c in lattices]}
+        least = {name: float(nearest_neighbour_distances(c).min()) for name, c in chosen.items()}
+        row |= {"scores": scores, "empty_psnr_db": empty, "least_distance_mm": least}
+        row |= {"lenses_per_lit_pixel": {name: overlap(c, study) for name, c in chosen.items()}}
+        row |= {"centers_mm": {name: np.asarray(c).tolist() for name, c in chosen.items()}}
+        rows.append(row)
+    lenses = len(rows[0]["centers_mm"]["ours"])
+    per_point = float(lenses / np.prod(study.plate) * np.pi * study.field_radius**2)
+    magnification = study.imager(np.zeros((1, 2))).magnification(study.middle)
+    return {
+        "study": study._asdict(),
+        "lenses": lenses,
+        "lenses_per_point": per_point,
+        "occupancy": float(occupancy(per_point, magnification)),
+        "gains_db": gains(rows) if seeds > 1 else {},
+        "seeds": rows,
+    }
+
+
+def gains(rows: list[dict]) -> dict[str, dict[str, float | list[float]]]:
+    """Gains in PSNR by both methods: over the best of the random layouts, and of ours over the controls."""
+    found = {}
+    for method in METHODS:
+        psnr = {name: [row["scores"][name][f"{method}_psnr_db"] for row in rows] for name in NAMES}
+        for one, other in PAIRS:
+            found[f"{method}: {one} over {other}"] = gain(psnr[one], psnr[other])
+    return found
+
+
+def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float | list[float]]:
+    """Mean gain, and its 95 % interval by Student's t over the seeds' means.
+
+    The scenes are the same for every layout, so a pair differs by its layouts alone.
+    """
+    means = np.mean(np.subtract(ours, others), axis=1)
+    half = stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / len(means) ** 0.5
+    return {
+        "mean": float(means.mean()),
+        "interval": [float(means.mean() + s * half) for s in (-1, 1)],
+        "of_seeds": means.tolist(),
+    }
+
+
+def picture(found: dict) -> Figure:
+    """Losses of the random layouts, the hexagonal ones and ours; one seed's layouts."""
+    figure = Figure(figsize=(15, 3.8), layout="constrained")
+    left, *right = figure.subplots(1, 5, width_ratios=(1.6, 1, 1, 1, 1))
+    colors = "C0", "C3", "C2", "C4"
+    titles = "best of the random", "optimised", "hexagonal", "hexagonal, spread"
+    for row in found["seeds"]:
+        random, ours, at = row["random_loss_db"], row["ours_loss_db"], row["seed"]
+        left.plot(random, np.full(len(random), at), "|", color="0.5")
+        left.plot(ours, np.full(len(ours), at), "|", color="C3")
+        losses = min(random), min(ours), *row["hexagonal_loss_db"]
+        for x, color, marker, title in zip(losses, colors, "oDhH", titles, strict=True):
+            left.plot(x, at, marker, color=color, label=title)
+    left.set(xlabel="loss, dB (better to the left)", ylabel="seed", yticks=[row["seed"] for row in found["seeds"]])
+    left.set_ylim(-0.5, len(found["seeds"]) + 0.5)  # room for the legend
+    left.legend(*[x[:4] for x in left.get_legend_handles_labels()], loc="upper center", ncols=2, fontsize=8)
+    half, row = found["study"]["field"] / 2, found["seeds"][0]
+    for axes, name, color, title in zip(right, NAMES, colors, titles, strict=True):
+        score = np.mean(row["scores"][name]["backproject_psnr_db"])
+        axes.plot(*np.transpose(row["centers_mm"][name]), "o", color=color)
+        axes.plot(*np.array([(-1, -1, 1, 1, -1), (-1, 1, 1, -1, -1)]) * half, "k:")
+        x, y = (side / 2 for side in found["study"]["plate"])
+        axes.set(xlabel="x, mm", ylabel="y, mm", title=f"{title}\n{score:.2f} dB", aspect="equal")
+        axes.set(xlim=(-1.05 * x, 1.05 * x), ylim=(-1.05 * y, 1.05 * y))
+    figure.supxlabel("dotted: the object", fontsize=9, x=0.65)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/layout_gain"))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--crowded", action="store_true", help="sub-images that overlap")
+    arguments = parser.parse_args()
+    out = make_folder(arguments.out)
+    with Progress() as progress:
+        found = run(CROWDED if arguments.crowded else Study(), arguments.seeds, progress=progress)
+    write_json(out / "layout_gain.json", found)
+    picture(found).savefig(out / "layout_gain.png", dpi=100)
+    table = Table("seed", "random: loss, dB", *(f"{name}, dB" for name in NAMES), *(f"{n}: PSNR, dB" for n in NAMES))
+    for row in found["seeds"]:
+        losses = row["random_loss_db"]
+        numbers = [min(losses), min(row["ours_loss_db"]), *row["hexagonal_loss_db"]]
+        numbers += [np.mean(row["scores"][name]["backproject_psnr_db"]) for name in NAMES]
+        spread = f"{np.mean(losses):.2f} +- {np.std(losses):.2f}"
+        table.add_row(str(row["seed"]), spread, *(f"{x:.2f}" for x in numbers))
+    Console(width=160).print(table, found["gains_db"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""What layouts of lenses are judged on: the system of `experiments.layout_gain`, its scenes, and their scores.
+
+The held-out scenes are not rendered by the model that a reconstruction or a loss uses: voxels three times finer, blobs
+between them and 0.1 mm off the reconstructed depths, the diffraction PSF instead of a Gaussian, and a camera's noise
+and counts.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
+from gs_jax.camera import Camera, electrons, expose
+from gs_jax.end_to_end import random_scene, reconstruct, reconstruction_loss
+from gs_jax.metrics import quality
+from gs_jax.progress import Progress
+from gs_jax.richardson_lucy import list_richardson_lucy
+
+WAVELENGTH = 520e-6
+# Standard deviation of a blob and of the local background, mm.
+WIDTH, BACKGROUND = 0.06, 0.2
+ELECTRONS, READ_NOISE = 1000.0, 2.0
+# Finer voxels and planes of the held-out scenes.
+FINER, OFF_PLANE = 3, (-0.1, 0.0, 0.1)
+METHODS = ("backproject", "list_rl")
+
+Centers = Float[Array | np.ndarray, "lens 2"]
+Scores = dict[str, list[float]]
+
+
+class Study(NamedTuple):
+    """Sizes in mm; `field` is the width of the object, which is in the middle; `ghosts` weighs that term."""
+
+    plate: tuple[float, float] = (5.0, 5.0)
+    distance: float = 1.0
+    pixels: int = 512
+    pixel: float = 0.01125
+    field_radius: float = 2.2
+    field: float = 3.0
+    voxel: float = 0.05
+    depths: tuple[float, ...] = (12.0, 14.0, 16.5)
+    density: float = 0.008
+    candidates: int = 200
+    scored_on: int = 3
+    starts: int = 16
+    places: int = 15
+    steps: int = 300
+    rate: float = 0.03
+    ghosts: float = 0.0
+    held_out: int = 30
+
+    @property
+    def middle(self) -> float:
+        return self.depths[len(self.depths) // 2]
+
+    def imager(self, centers) -> Imager:
+        # Focused at 14 mm. Apertures are smaller than the least distance, so no layout clips them: all have one PSF.
+        array = MicrolensArray(centers, radius_of_curvature=1.8, aperture_diameter=0.5)
+        return Imager(array, Sensor((self.pixels, self.pixels), self.pixel), 5.8, self.field_radius)
+
+    def grid(self) -> Grid:
+        count = round(self.field / self.voxel)
+        return Grid(self.depths, (count, count), self.voxel)
+
+    def fine_grid(self) -> Grid:
+        depths = np.add.outer(self.depths, OFF_PLANE).ravel()
+        return Grid(depths, tuple(FINER * n for n in self.grid().shape), self.voxel / FINER)
+
+
+def psf_of(make: Callable[..., Array], study: Study, grid: Grid) -> Float[Array, "depth row column"]:
+    """One PSF a depth; it does not depend on the layout."""
+    imager = study.imager(np.zeros((1, 2)))
+    return jnp.stack([make(imager, depth, wavelength=WAVELENGTH, size=33) for depth in grid.depths])
+
+
+@partial(jax.jit, static_argnames="study")
+def loss(centers: Centers, key: PRNGKeyArray, psfs: Array, study: Study) -> Float[Array, ""]:
+    """The end-to-end loss, dB: PSFs as given, voxels as reconstructed."""
+    return reconstruction_loss(
+        study.imager(centers),
+        key,
+        grid=study.grid(),
+        psf=psfs,
+        scenes=study.scored_on,
+        density=study.density,
+        width=WIDTH,
+        electrons=ELECTRONS,
+        read_noise=READ_NOISE,
+        background_width=BACKGROUND,
+    )
+
+
+def held_out(study: Study, key: PRNGKeyArray) -> tuple[Array, Array]:
+    """A scene on fine voxels, and the truth on those of the reconstruction."""
+    fine, grid = study.fine_grid(), study.grid()
+    part = FINER**2 * len(OFF_PLANE)
+    scene = random_scene(key, fine, density=study.density / part, width=WIDTH)
+    binned = scene.reshape(len(grid.depths), len(OFF_PLANE), grid.shape[0], FINER, grid.shape[1], FINER)
+    return scene / FINER**2, binned.mean((3, 5)).sum(1)
+
+
+@partial(jax.jit, static_argnames="study")
+def _imaged(scene, centers, psfs, study):
+    return jnp.maximum(ELECTRONS * forward(scene, study.imager(centers), study.fine_grid(), psfs), 0)
+
+
+@partial(jax.jit, static_argnames=("study", "method"))
+def _reconstructed(image, centers, study, method):
+    if method == "backproject":
+        return reconstruct(image, study.imager(centers), study.grid(), background_width=BACKGROUND)
+    return list_richardson_lucy(image, study.imager(centers), study.grid(), steps=10).x
+
+
+def judge(
+    layouts: Mapping[str, Centers], study: Study, psfs: Array, progress: Progress
+) -> tuple[dict[str, Scores], list[float]]:
+    """PSNR and SSIM of every layout on every held-out scene, by both methods; and what an empty volume would score."""
+    camera = Camera(read_noise=READ_NOISE)
+    columns = [f"{method}_{what}" for method in METHODS for what in ("psnr_db", "ssim")]
+    scores: dict[str, Scores] = {name: {column: [] for column in columns} for name in layouts}
+    empty = []
+    keys = jax.random.split(jax.random.key(2**20), (study.held_out, 2))
+    for scene_key, noise_key in progress.track(list(keys), "Held-out scenes"):
+        scene, truth = held_out(study, scene_key)
+        empty.append(quality(jnp.zeros_like(truth), truth).psnr_db)
+        for name, centers in layouts.items():
+            clean = _imaged(scene, jnp.asarray(centers), psfs, study)
+            # One exposure for all layouts: the brightest pixel has as many electrons as the scene gives it.
+            image = electrons(expose(clean, camera, noise_key, peak_electrons=clean.max()), camera)
+            for method in METHODS:
+                score = quality(_reconstructed(image, jnp.asarray(centers), study, method), truth)
+                scores[name][f"{method}_psnr_db"].append(score.psnr_db)
+                scores[name][f"{method}_ssim"].append(score.ssim)
+    return scores, empty
+
+
+@partial(jax.jit, static_argnames="study")
+def _lit(centers, study):
+    grid = study.grid()
+    middle = Grid([study.middle], grid.shape, grid.pitch)
+    one = lambda center: forward(jnp.ones((1, *grid.shape)), study.imager(center[None]), middle) > 0.05
+    return jax.lax.map(lambda center: one(center).astype(int), centers).sum(0)
+
+
+def overlap(centers: Centers, study: Study) -> float:
+    """How many lenses share a lit pixel, on average over lit pixels, for an object that fills the middle plane."""
+    count = _lit(jnp.asarray(centers), study)
+    return float(count.sum() / (count > 0).sum())

@@ -1,0 +1,136 @@
+"""How sharp a prescription is at every depth: the optimised design against the paper's, refocused.
+
+A prescription is v, R, D and the pitch. It was optimised for the width of exact rays' spots; here one point on the
+axis is imaged with the diffraction PSF, on a sensor's pixels, and back-projected on voxels much finer than the spot.
+That PSF is the one on the lens's axis; spots beside the axis are judged by themselves, by the same diffraction
+integral.
+
+    python -m experiments.prescription [--out DIR]
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from experiments.profiles import fwhm
+from gs_jax import Grid, Imager, Sensor, backproject
+from gs_jax.aperture import clear_diameter
+from gs_jax.designs import Design, read_design
+from gs_jax.disk import atomic_write, make_folder, write_json
+from gs_jax.progress import Progress
+from gs_jax.psf import psf
+from gs_jax.simulate import simulate_points
+
+FOLDER = Path(__file__).parents[1] / "design"
+DESIGNS = ("geomscope", "geomscope-optimized")
+DEPTHS = (18.0, 20.0, 23.0)
+# Where a lens is judged beside its axis, mm.
+FIELDS = (0.0, 1.5, 2.5)
+# Voxels of the reconstruction, its half width, and lines whose contrast is told, mm and cycles/mm: lines of 40 um.
+VOXEL, HALF, LINES = 0.004, 0.4, 12.5
+# Pixels of the sensor and of the PSF's window: room for 3 mm of lenses, and for a blur of 0.7 mm.
+PIXELS, WINDOW = 2048, 161
+
+
+def run(names: Sequence[str] = DESIGNS, depths: Sequence[float] = DEPTHS, *, progress: Progress) -> dict[str, Any]:
+    """For each design a list with one record a depth; lengths in um, seen in the object."""
+    found: dict[str, Any] = {}
+    for name in names:
+        design = read_design(FOLDER / f"{name}.toml")
+        imager = _cropped(design.imager())
+        found[name] = [_at(design, imager, z, progress) for z in progress.track(depths, name)]
+    return found
+
+
+def _cropped(imager: Imager) -> Imager:
+    """The middle of the sensor: a point on the axis lights no more."""
+    return eqx.tree_at(lambda i: i.sensor, imager, Sensor((PIXELS, PIXELS), imager.sensor.pixel_pitch))
+
+
+def _at(design: Design, imager: Imager, depth: float, progress: Progress) -> dict[str, float]:
+    wavelength = design.imaging.wavelength_nm * 1e-6
+    image = simulate_points(np.array([[0, 0, depth, 1.0]]), imager, wavelength=wavelength, progress=progress)
+    side = 2 * round(HALF / VOXEL) + 1
+    grid = Grid([depth], (side, side), VOXEL)
+    spot = np.asarray(backproject(image, imager, grid), np.float64)[0]
+    axis = np.asarray(grid.x, np.float64)
+    row, column = np.unravel_index(int(spot.argmax()), spot.shape)
+    found = {
+        "depth_mm": depth,
+        "fwhm_um": 500 * (fwhm(axis, spot[row]) + fwhm(axis, spot[:, column])),
+        "half_of_light_um": 1000 * encircled(spot, VOXEL, 0.5),
+        "most_of_light_um": 1000 * encircled(spot, VOXEL, 0.8),
+        "contrast_of_40_um_lines": contrast(spot, axis),
+    }
+    return found | {f"most_of_light_field_{h:g}_mm_um": _unit(imager, depth, h, wavelength) for h in FIELDS}
+
+
+def _unit(imager: Imager, depth: float, height: float, wavelength: float) -> float:
+    """Radius of 80 % of one lens's light, seen in the object, um."""
+    radius = clear_diameter(imager.array) / 2
+    sharp = float(2 * radius * imager.sensor.pixel_pitch / (wavelength * imager.sensor_distance))
+    options: dict[str, Any] = dict(wavelength=wavelength, size=WINDOW, field=(height, 0.0), radius=radius)
+    pixels = psf(imager, depth, samples=int(np.ceil(sharp)), **options)
+    pitch = imager.sensor.pixel_pitch / float(imager.magnification(depth))
+    return 1000 * encircled(np.asarray(pixels, np.float64), pitch, 0.8)
+
+
+def encircled(spot: np.ndarray, pitch: float, share: float) -> float:
+    """Radius about the centroid that holds a share of the light."""
+    row, column = np.indices(spot.shape)
+    total = spot.sum()
+    middle = (spot * row).sum() / total, (spot * column).sum() / total
+    radius = np.hypot(row - middle[0], column - middle[1]).ravel()
+    order = np.argsort(radius)
+    return float(np.interp(share, np.cumsum(spot.ravel()[order]) / total, radius[order])) * pitch
+
+
+def contrast(spot: np.ndarray, axis: np.ndarray) -> float:
+    """Modulation that is left of lines as wide as their gaps, their fundamental, along x."""
+    return float(np.abs(spot.sum(0) @ np.exp(2j * np.pi * LINES * axis)) / spot.sum())
+
+
+def picture(found: dict[str, Any]) -> Figure:
+    """Widths and contrast against depth, a colour for each design."""
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    panels = {
+        "fwhm_um": "width at half height, um",
+        "most_of_light_um": "radius of 80 % of the light, um",
+        "contrast_of_40_um_lines": "contrast of 40 um lines",
+    }
+    for axes, (key, label) in zip(figure.subplots(1, 3), panels.items(), strict=True):
+        for number, (name, records) in enumerate(found.items()):
+            depths = [record["depth_mm"] for record in records]
+            axes.plot(depths, [record[key] for record in records], "o-", color=f"C{number}", label=name)
+        axes.set(xlabel="depth, mm", ylabel=label, ylim=(0, None))
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.suptitle("Back-projected point on the axis, diffraction PSF", fontsize=10)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/prescription"))
+    out = make_folder(parser.parse_args().out)
+    with Progress() as progress:
+        found = run(progress=progress)
+    write_json(out / "prescription.json", found)
+    with atomic_write(out / "prescription.png") as path:
+        picture(found).savefig(path, format="png", dpi=110)
+    for name, records in found.items():
+        table = Table(*records[0], title=name, title_justify="left", box=None, pad_edge=False)
+        for record in records:
+            table.add_row(*(f"{value:.3g}" for value in record.values()))
+        Console(width=160).print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""`gs-jax optimize`: a better design."""
+
+from pathlib import Path
+
+import click
+import jax
+from rich.console import Console
+
+from ..checkpoint import checkpoint_path
+from ..codesign import optimise
+from ..designs import read_design
+from ..progress import Progress
+from ..study import read_study
+
+
+@click.command()
+@click.argument("design", type=Path)
+@click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
+@click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")
+def optimize(design: Path, study: Path, resume: bool, output: Path):
+    """Search for a better microscope than that of the file DESIGN, and show before and after.
+
+    Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).
+    """
+    from ..outcome import before_and_after, check_outputs, write_outcome  # Matplotlib takes a second to import
+
+    check_outputs(output)
+    # Searches end within a billionth of the minimum; single precision stops far from it.
+    jax.config.update("jax_enable_x64", True)
+    question, parent, checkpoint = read_study(study), read_design(design), checkpoint_path(output)
+    with Progress() as progress:
+        outcome = optimise(parent, question, progress=progress, checkpoint=checkpoint, resume=resume)
+    write_outcome(output, question, outcome, parent=str(design), source=str(study))
+    checkpoint.unlink(missing_ok=True)
+    Console().print(before_and_after(question, outcome))
+    for end in outcome.log.ends:
+        click.echo(f"stage {end['stage'] + 1}, start {end['start']}: {end['reason']} ({end['steps']} steps)")
+    click.echo(f"{output}: {outcome.design.name}, from {parent.name} in {outcome.seconds:.0f} s")

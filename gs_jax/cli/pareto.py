@@ -1,0 +1,41 @@
+"""`gs-jax pareto`: what one thing costs in another."""
+
+from pathlib import Path
+
+import click
+import jax
+from rich.console import Console
+from rich.table import Table
+
+from ..designs import read_design
+from ..disk import atomic_write, make_folder, write_json
+from ..progress import Progress
+from ..study import parent_path, read_study
+
+
+@click.command()
+@click.argument("study", type=Path)
+@click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
+def pareto(study: Path, out: Path):
+    """Show the trade-off that the file STUDY asks for: its one goal against one or two moving limits.
+
+    The folder gets pareto.json, the designs' numbers, and pareto.png.
+    """
+    from ..pareto import as_json, picture, sweep  # Matplotlib takes a second to import
+
+    # Searches end within a billionth of the minimum; single precision stops far from it.
+    jax.config.update("jax_enable_x64", True)
+    question = read_study(study)
+    design = read_design(parent_path(study, question))
+    make_folder(out)
+    with Progress() as progress:
+        front = sweep(design, question, progress=progress)
+    write_json(out / "pareto.json", as_json(front))
+    with atomic_write(out / "pareto.png") as path:
+        picture(front).savefig(path, format="png", dpi=110)
+    table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
+    for row, point, best in zip(front.values, front.points, front.best, strict=True):
+        status = "" if best else "dominated" if point.feasible else "misses a target"
+        table.add_row(*(f"{x:.4g}" for x in row), status)
+    Console().print(table)
+    click.echo(f"{out / 'pareto.png'}: {front.best.sum()} of {len(front.points)} points on the front")

@@ -1,0 +1,138 @@
+"""Solvers for co-design, step by step: what stops can go on later, exactly.
+
+Optimistix has the algorithms. Its solvers run here one step at a time from the host, so that progress can be shown
+and the state saved; a run that is interrupted and resumed takes the same steps, bit for bit, as one that is not.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from .study import StageTable
+
+# A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
+# of a key that is new in every step, for what is random.
+Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
+
+CONVERGED = "converged: neither the cost nor the parameters change any more"
+MET = "all targets are met"
+LIMIT = "stopped at the limit of {} steps"
+NOT_FINITE = "stopped: the cost or a parameter is not finite"
+
+
+class State(NamedTuple):
+    """Where a solver is: everything that its next step depends on, arrays only."""
+
+    free: PyTree[Array]
+    solver: PyTree[Array]
+    cost: Float[Array, ""]
+    step: Int[Array, ""]
+
+
+class Stepper(NamedTuple):
+    """A solver as steps; both functions take what does not change within a run as their second argument.
+
+    `begin`: the state at free parameters. `advance`: the state one step later, and whether it has converged.
+    """
+
+    begin: Callable[[PyTree, PyTree], State]
+    advance: Callable[[State, PyTree], tuple[State, Array]]
+
+
+def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: StageTable, key: Key[Array, ""]) -> Stepper:
+    """A solver of least squares, `cost = |residual|^2 / 2`, compiled once for any start.
+
+    Parameters
+    ----------
+    residual
+        One number for each thing that is wanted.
+    free, given
+        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds.
+    stage
+        Which solver. Adam is for a residual that is random: it gets a new key in each step, and never converges.
+    key
+        The steps' keys follow from it.
+    """
+    tolerance = 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6
+    solver: Any = _solver(stage, tolerance)
+    cost = lambda free, args: jnp.sum(residual(free, *args) ** 2) / 2
+    least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+    target = (lambda free, args: residual(free, *args)) if least_squares else cost
+    args = given, key
+    function = eqx.filter_closure_convert(lambda free, args: (target(free, args), None), free, args)
+    out, _ = eqx.filter_eval_shape(function, free, args)
+    options: dict[str, Any] = {}
+    init = lambda free, args: solver.init(function, free, args, options, out, None, frozenset())
+    static = eqx.filter(init(free, args), eqx.is_array, inverse=True)
+
+    @jax.jit
+    def begin(free: PyTree, given: PyTree) -> State:
+        arrays = eqx.filter(init(free, (given, key)), eqx.is_array)
+        return State(free, arrays, cost(free, (given, key)), jnp.zeros((), int))
+
+    @jax.jit
+    def advance(state: State, given: PyTree) -> tuple[State, Array]:
+        args = given, jax.random.fold_in(key, state.step)
+        inner = eqx.combine(state.solver, static)
+        with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
+            new, inner, _ = solver.step(function, state.free, args, options, inner, frozenset())
+        done, result = solver.terminate(function, new, args, options, inner, frozenset())
+        done = (done | (result != optx.RESULTS.successful)) & (stage.solver != "adam")
+        return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1), done
+
+    return Stepper(begin, advance)
+
+
+def run(
+    steps: Stepper,
+    state: State,
+    given: PyTree,
+    *,
+    limit: int,
+    enough: float = 0.0,
+    each: Callable[[State], None] = lambda state: None,
+) -> tuple[State, str]:
+    """Steps until something says stop; the reason in words.
+
+    Parameters
+    ----------
+    state
+        From `steps.begin`, or where it stopped before.
+    limit
+        Steps, counted from the start.
+    enough
+        A cost that is low enough to stop.
+    each
+        Called after every step.
+    """
+    done = False
+    while True:
+        if not all(np.isfinite(x).all() for x in jax.tree.leaves((state.cost, state.free))):
+            return state, NOT_FINITE
+        if float(state.cost) < enough:
+            return state, MET
+        if done:
+            return state, CONVERGED
+        if int(state.step) >= limit:
+            return state, LIMIT.format(limit)
+        state, done = steps.advance(state, given)
+        each(state)
+
+
+def _solver(stage: StageTable, tolerance: float):
+    match stage.solver:
+        case "levenberg-marquardt":
+            return optx.LevenbergMarquardt(tolerance, tolerance)
+        case "bfgs":
+            return optx.BFGS(tolerance, tolerance)
+        case "lbfgs":
+            return optx.LBFGS(tolerance, tolerance)
+        case "adam":
+            return optx.OptaxMinimiser(optax.adam(stage.learning_rate), tolerance, tolerance)

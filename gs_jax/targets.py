@@ -1,0 +1,103 @@
+"""Terms against what is wanted of them: residuals for a solver, and rows of a table for people."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from .objectives import TERMS
+from .parameters import Candidate
+from .study import TermTable
+
+# The worst of a term's entries, smoothly: their mean's power.
+_POWER = 8
+_LEAST_TOLERANCE = 1e-3
+
+SIGNS = {"at_most": "<=", "at_least": ">=", "equal": "=", "minimise": "min", "maximise": "max"}
+
+
+class Row(NamedTuple):
+    """A term of a design: its lowest and highest entry, and whether it meets its target (None without one)."""
+
+    low: float
+    high: float
+    met: bool | None
+
+
+def evaluate(name: str, candidate: Candidate, key: Key[Array, ""]) -> Float[Array, " entry"]:
+    """The entries of a term in its own unit."""
+    entries = _entries(name, candidate, key)
+    return jnp.exp(entries) if TERMS[name].log else entries
+
+
+def residual(
+    table: TermTable, target: Float[Array, ""], candidate: Candidate, key: Key[Array, ""], *, margin: float
+) -> Float[Array, " entry"]:
+    """What a term lacks, relative to its target: zero where a limit holds, so that its square is smooth.
+
+    `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal; times
+    the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the place of
+    `x/t - 1`. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power 1/8.
+
+    Parameters
+    ----------
+    table
+        Kind and weight.
+    target
+        In the term's unit. It may be traced, unlike the table's own.
+    margin
+        By which a limit is tightened.
+    """
+    entries = _entries(table.name, candidate, key)
+    ratio = 1 + entries - jnp.log(target) if TERMS[table.name].log else entries / target
+    missing = _missing(table.kind, ratio, margin)
+    return missing * (table.weight / math.sqrt(missing.size))
+
+
+def _missing(kind: str, ratio: Float[Array, " entry"], margin: float) -> Float[Array, " _"]:
+    match kind:
+        case "at_most":
+            return jnp.log1p(jax.nn.relu(ratio - (1 - margin)))
+        case "at_least":
+            return jax.nn.relu(1 + margin - ratio)
+        case "equal":
+            return ratio - 1
+        case "minimise":
+            return _power_mean(ratio)
+        case _:
+            positive = ratio > 0
+            return _power_mean(jnp.where(positive, 1 / jnp.where(positive, ratio, 1), 1e6))
+
+
+def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
+    """Of numbers that are not negative; zero, without a slope, where all are zero."""
+    largest = jax.lax.stop_gradient(jnp.max(x))
+    largest = jnp.where(largest > 0, largest, 1)
+    mean = jnp.mean((x / largest) ** _POWER)
+    positive = mean > 0
+    return jnp.where(positive, largest * jnp.where(positive, mean, 1) ** (1 / _POWER), 0)[None]
+
+
+def _entries(name, candidate, key):
+    term = TERMS[name]
+    found = term.function(candidate, key) if term.random else term.function(candidate)
+    return jnp.ravel(found)
+
+
+def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:
+    """What a term says of a design. An equality holds to the study's usual margin, 0.1 %."""
+    low, high = float(np.min(entries)), float(np.max(entries))
+    target = table.target
+    off = max(abs(low - target), abs(high - target)) / target
+    met = {"at_most": high <= target, "at_least": low >= target, "equal": off <= _LEAST_TOLERANCE}.get(table.kind)
+    return Row(low, high, met)
+
+
+def worst_of(table: TermTable, entries: Float[Array, " entry"]) -> Float[Array, ""]:
+    """The entry that counts."""
+    if table.kind == "equal":
+        return entries[jnp.argmax(jnp.abs(entries - table.target))]
+    return jnp.min(entries) if table.kind in ("at_least", "maximise") else jnp.max(entries)

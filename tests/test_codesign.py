@@ -1,0 +1,153 @@
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gs_jax import codesign
+from gs_jax.builtin import geomscope
+from gs_jax.checkpoint import read_checkpoint
+from gs_jax.codesign import optimise, problem_of, random_start
+from gs_jax.designs import read_design
+from gs_jax.errors import InputError
+from gs_jax.outcome import before_and_after, check_outputs, write_outcome
+from gs_jax.parameters import start_values
+from gs_jax.progress import Progress
+from gs_jax.study import Study
+
+TERMS = [
+    {"name": "lateral_resolution_um", "at_most": 40.0},
+    {"name": "focus_offset", "at_most": 0.5},
+    {"name": "occupancy", "at_most": 0.5},
+    {"name": "lenses_per_point", "at_least": 12.0},
+]
+FREE = {"sensor_distance_mm": [2.0, 6.0], "radius_of_curvature_mm": [1.0, 3.0], "pitch_mm": [1.0, 1.5]}
+LM = {"solver": "levenberg-marquardt"}
+
+
+def study(**changes):
+    base = {"depths_mm": (18.0, 23.0), "depth_count": 3, "free": FREE, "terms": TERMS, "stages": [LM]}
+    return Study.model_validate(base | changes)
+
+
+@pytest.fixture(scope="module")
+def table1():
+    return geomscope(sensor_distance_mm=4.0)
+
+
+@pytest.fixture(scope="module")
+def outcome(table1):
+    with Progress() as progress:
+        return optimise(table1, study(starts=2), progress=progress)
+
+
+def test_from_table_1_to_the_targets(table1, outcome):
+    assert [row.met for row in outcome.before] == [True, False, False, True]
+    assert all(row.met for row in outcome.after)
+    assert {end["reason"] for end in outcome.log.ends} == {"all targets are met"}
+    assert outcome.design.imaging.working_distance_mm == (18.0, 23.0)
+    # What is judged is what is written: f and v in focus within the range, by the thin lens's formula.
+    imager = outcome.design.imager()
+    in_focus = 1 / (1 / imager.array.focal_length - 1 / imager.sensor_distance) - imager.reduced_depth(0.0)
+    assert 18 < in_focus < 23
+
+
+def test_only_what_is_free_changes(table1, outcome):
+    old, new = table1.model_dump(), outcome.design.model_dump()
+    assert old["sensor"] == new["sensor"]
+    assert old["lens"]["aperture_diameter_mm"] == new["lens"]["aperture_diameter_mm"]
+    scale = np.array(new["array"]["size_mm"]) / old["array"]["size_mm"]
+    # Written to 1e-4 mm.
+    np.testing.assert_allclose(new["array"]["centers_mm"], scale * old["array"]["centers_mm"], atol=2e-4)
+
+
+def test_files(table1, outcome, tmp_path):
+    path = tmp_path / "new.toml"
+    check_outputs(path)
+    paths = write_outcome(path, study(starts=2), outcome, parent="a/table1.toml", source="b/study.toml")
+    assert [p.name for p in paths] == ["new.toml", "new.json", "new.png"] and all(p.exists() for p in paths)
+    written = read_design(path)
+    assert written.provenance["parent"] == "table1.toml" and written.provenance["study"] == "study.toml"
+    assert written.provenance["objectives"]["occupancy"][1] <= 0.5
+    numbers = json.loads(paths[1].read_text())
+    assert [term["met_after"] for term in numbers["terms"]] == [True] * 4
+    assert len(numbers["starts"]) == 2 and numbers["steps"][0]["step"] == 1
+    assert before_and_after(study(starts=2), outcome).row_count == 4
+
+
+def interrupted(table1, question, path, monkeypatch, *, writes):
+    """A search that is stopped after some checkpoints."""
+    count, write = [0], codesign.write_checkpoint
+
+    def counted(*arguments):
+        write(*arguments)
+        count[0] += 1
+        if count[0] == writes:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(codesign, "write_checkpoint", counted)
+    with pytest.raises(KeyboardInterrupt), Progress() as progress:
+        optimise(table1, question, progress=progress, checkpoint=path, every=0.0)
+    monkeypatch.setattr(codesign, "write_checkpoint", write)
+
+
+def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch):
+    """Bit for bit, in the second start of the first stage and in the second stage."""
+    stages = [LM | {"steps": 4}, {"solver": "adam", "steps": 5, "learning_rate": 0.01}]
+    question = study(starts=2, stages=stages)
+    with Progress() as progress:
+        whole = optimise(table1, question, progress=progress)
+    for writes in (6, 10):
+        path = tmp_path / f"{writes}.checkpoint"
+        interrupted(table1, question, path, monkeypatch, writes=writes)
+        assert len(read_checkpoint(path, question, table1)[0].steps) == writes
+        with Progress() as progress:
+            resumed = optimise(table1, question, progress=progress, checkpoint=path, resume=True)
+        assert resumed.design == whole.design and resumed.log == whole.log
+
+
+def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
+    path = tmp_path / "a.checkpoint"
+    with Progress() as progress:
+        with pytest.raises(InputError, match="cannot be read"):
+            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
+        path.write_bytes(b"{}\n")
+        with pytest.raises(InputError, match="no checkpoint of a search"):
+            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
+        interrupted(table1, study(), path, monkeypatch, writes=1)
+        with pytest.raises(InputError, match="of another study or design"):
+            optimise(table1, study(seed=1), progress=progress, checkpoint=path, resume=True)
+
+
+def test_random_starts(table1):
+    problem = problem_of(table1, study())
+    values = start_values(problem.parent)
+    assert random_start(problem, values, 0) == values
+    first, second = (random_start(problem, values, start) for start in (1, 2))
+    assert all(FREE[name][0] < first[name] < FREE[name][1] and first[name] != second[name] for name in FREE)
+    assert first["centers_mm"] is values["centers_mm"]
+    assert random_start(problem, values, 1) == first
+
+
+def test_lens_centres_can_be_free():
+    """Two lenses of three are too near; the mean spacing has a target that moves them, within the plate."""
+    design = geomscope()
+    centers = ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))
+    design = design.model_copy(update={"array": design.array.model_copy(update={"centers_mm": centers})})
+    question = study(free={"centers_mm": [-4.0, 4.0]}, terms=[{"name": "spacing_mm", "at_least": 2.0}])
+    with Progress() as progress:
+        found = optimise(design, question, progress=progress)
+    assert not found.before[0].met and found.after[0].met
+    assert np.abs(found.design.array.centers_mm).max() < 4
+
+
+def test_a_thin_lens_has_no_radius_to_free(table1):
+    thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
+    with pytest.raises(InputError, match="free.radius_of_curvature_mm"), Progress() as progress:
+        optimise(thin, study(), progress=progress)
+
+
+def test_no_start_that_ends_anywhere(table1, monkeypatch):
+    monkeypatch.setattr(codesign, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
+    with pytest.raises(InputError, match="no start came to a finite cost"), Progress() as progress:
+        optimise(table1, study(), progress=progress)

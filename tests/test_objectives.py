@@ -1,0 +1,157 @@
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax.builtin import geomscope
+from gs_jax.coverage import largest_hole, nearest_neighbour_distances
+from gs_jax.datasheet import datasheet
+from gs_jax.objectives import TERMS, encircled_radius, psf_width
+from gs_jax.parameters import candidate, parent_of, start_values
+from gs_jax.psf import psf
+
+# Off the raster of places, where a hole has a kink.
+CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))
+CONTINUOUS = [name for name, term in TERMS.items() if not term.random]
+
+
+@jax.jit
+def everything(candidate):
+    """All terms at once: compiled once."""
+    return {name: TERMS[name].function(candidate) for name in CONTINUOUS}
+
+
+def small_design(centers=CENTERS):
+    design = geomscope()
+    array = design.array.model_copy(update={"centers_mm": centers, "size_mm": (4.0, 4.0)})
+    return design.model_copy(update={"array": array})
+
+
+@pytest.fixture(scope="module")
+def design():
+    return geomscope()
+
+
+@pytest.fixture(scope="module")
+def focused(design):
+    return candidate(parent_of(design, depths_mm=(18.0, 23.0), confusion=0.018), {})
+
+
+@pytest.fixture(scope="module")
+def terms(focused):
+    return everything(focused)
+
+
+def test_the_papers_metrics_are_those_of_the_datasheet(design, focused, terms):
+    """The same formulas by two ways: six digits are what a datasheet has."""
+    sheet = datasheet(design, focused.depths.tolist(), confusion=0.018)
+    shown = {"lateral_resolution_um": "lateral_resolution_um", "axial_resolution_um": "axial_resolution_um"}
+    shown |= {"occupancy": "occupancy", "coverage": "coverage"}
+    for name, key in shown.items():
+        np.testing.assert_allclose(terms[name], sheet[key], rtol=1e-5)
+    np.testing.assert_allclose(terms["lenses_per_point"], sheet["lenses_per_point"][0], rtol=1e-5)
+    object_blur = np.array(sheet["blur_um"]) / sheet["magnification"]
+    np.testing.assert_allclose(terms["blur_um"], object_blur, rtol=1e-4)
+    middle = datasheet(design, [20.5], confusion=0.018)
+    np.testing.assert_allclose(terms["depth_of_field_mm"], middle["depth_of_field_mm"][0], rtol=1e-5)
+
+
+def test_focus_is_one_at_the_ends_and_zero_between(focused):
+    f = focused.imager.array.focal_length
+    at = lambda z: eqx.tree_at(
+        lambda c: c.imager.sensor_distance, focused, 1 / (1 / f - 1 / focused.imager.reduced_depth(z))
+    )
+    near, far = focused.reduced[0], focused.reduced[-1]
+    middle = 2 * near * far / (near + far) - focused.imager.reduced_depth(0.0)
+    offset = TERMS["focus_offset"].function
+    np.testing.assert_allclose([offset(at(18.0)), offset(at(23.0)), offset(at(middle))], [1, 1, 0], atol=1e-9)
+    # Focus beyond infinity is only farther off.
+    assert offset(eqx.tree_at(lambda c: c.imager.sensor_distance, focused, 0.9 * f)) > 10
+
+
+def ideal(focused, sensor_distance, diameter):
+    """A thin lens without aberrations or field."""
+    where = lambda c: (c.imager.array.thin_lens_focal_length, c.imager.sensor_distance, c.clear_diameter)
+    f = focused.imager.array.focal_length
+    is_none = lambda x: x is None
+    return eqx.tree_at(where, focused, (f, jnp.array(sensor_distance), jnp.array(diameter)), is_leaf=is_none)
+
+
+def test_width_of_an_ideal_lens_out_of_focus(focused):
+    """A thin lens's patch is an even disc: variance along an axis radius^2 / 4. Beside it, the pixel and the Airy disc.
+
+    80 % of its rays lie within the root of 0.8 of its radius; the quadrature has 8 rings, so a tenth of a ring's share.
+    """
+    lens = ideal(focused, 5.0, 1.0)
+    radius = 1000 * np.asarray(TERMS["blur_um"].function(lens)) / 2 / 1000
+    pixel = 4.5 / np.asarray(lens.magnification)
+    airy = 0.5145 * 0.52 * 5.0 / 0.5 / np.asarray(lens.magnification)
+    expected = np.sqrt((radius**2 / 4 + pixel**2 / 12) * 8 * np.log(2) + airy**2)
+    np.testing.assert_allclose(jax.jit(psf_width)(lens), expected, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(encircled_radius)(lens), np.sqrt(0.8) * radius, rtol=0.03)
+
+
+def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
+    """A Gaussian of the same variance against the PSF's own width. Two pixels make the spot: it is no Gaussian, 15 %.
+
+    A small lens (0.4 mm) has no aberrations to speak of on its axis: pixel and diffraction make the spot.
+    """
+    f, small = focused.imager.array.focal_length, 0.4
+    v = 1 / (1 / f - 1 / focused.imager.reduced_depth(20.5))
+    where = lambda c: (c.imager.sensor_distance, c.clear_diameter)
+    lens = eqx.tree_at(where, focused, (v, jnp.array(small)))
+    spot = psf(lens.imager, 20.5, wavelength=520e-6, size=31, radius=small / 2, samples=4)
+    line = np.asarray(spot.sum(0))
+    above = np.interp(line.max() / 2, line[:16], np.arange(16))
+    width = 2 * (15 - above) * 4.5 / float(lens.imager.magnification(20.5))
+    axis = dataclasses.replace(lens.imager, field_radius=0.01)
+    middle = eqx.tree_at(lambda c: (c.imager, c.depths), lens, (axis, jnp.array([20.5])))
+    np.testing.assert_allclose(jax.jit(psf_width)(middle)[0], width, rtol=0.15)
+
+
+def test_manufacture(design, focused, terms):
+    centers = np.array(design.array.centers_mm)
+    np.testing.assert_allclose(terms["spacing_mm"], nearest_neighbour_distances(centers), rtol=1e-9)
+    # Places are half a millimetre apart: a hole is missed by a quarter of it at most, and never overstated.
+    hole, exact = float(terms["hole_mm"].max()), largest_hole(centers, (20.0, 20.0))
+    assert exact - 0.3 < hole <= exact * (1 + 1e-9)
+    np.testing.assert_allclose(terms["sag_mm"], 2 - np.sqrt(3), rtol=1e-12)
+    slope = np.degrees(np.arcsin(np.asarray(focused.clear_diameter) / 4))
+    np.testing.assert_allclose(terms["edge_slope_deg"], slope, rtol=1e-9)
+
+
+def small_parent(depth_count):
+    return parent_of(small_design(), depths_mm=(18.0, 23.0), depth_count=depth_count, lenses_move=True)
+
+
+@pytest.mark.slow
+def test_terms_have_gradients():
+    """Finite differences of 1e-5 in float64 are good to 1e-6 of the curvature; kinks are elsewhere."""
+    parent = small_parent(2)
+    values = start_values(parent) | {"sensor_distance_mm": jnp.array(5.7), "aperture_diameter_mm": jnp.array(1.1)}
+    check_grads(jax.jit(lambda values: everything(candidate(parent, values))), (values,), order=1, eps=1e-5, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_gradients_are_finite_where_lenses_coincide_and_rays_are_lost():
+    """Two lenses in one place; a lens so steep that its rim reflects totally."""
+    parent = small_parent(2)
+    centers = parent.imager.array.centers.at[1].set(parent.imager.array.centers[0])
+    steep = {"radius_of_curvature_mm": jnp.array(0.5), "aperture_diameter_mm": jnp.array(1.9), "centers_mm": centers}
+    values = start_values(parent) | steep
+    sums = lambda values: {name: jnp.sum(x) for name, x in everything(candidate(parent, values)).items()}
+    found, slopes = jax.jit(lambda values: (sums(values), jax.jacrev(sums)(values)))(values)
+    finite = lambda name: all(np.isfinite(x).all() for x in (found[name], *slopes[name].values()))
+    assert [name for name in CONTINUOUS if not finite(name)] == []
+
+
+def test_in_single_precision(focused):
+    single, double = everything(jax.tree.map(lambda x: x.astype(jnp.float32), focused)), everything(focused)
+    assert all(x.dtype == jnp.float32 for x in single.values())
+    # 1e-7 of relative rounding, and of the differences that a defocus or a web is of numbers ten times as large.
+    for name in CONTINUOUS:
+        np.testing.assert_allclose(single[name], double[name], rtol=2e-3, atol=1e-3, err_msg=name)

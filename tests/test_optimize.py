@@ -1,0 +1,71 @@
+"""The commands, apart from the list of commands."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from gs_jax.builtin import geomscope
+from gs_jax.cli.optimize import optimize
+from gs_jax.cli.pareto import pareto
+from gs_jax.designs import read_design, write_design
+from gs_jax.errors import InputError
+
+STUDY = """
+design = "table1.toml"
+depths_mm = [18.0, 23.0]
+depth_count = 2
+[free]
+sensor_distance_mm = [2.0, 6.0]
+[[terms]]
+name = "thickness_mm"
+minimise = 5.0
+[[terms]]
+name = "lateral_resolution_um"
+at_most = 40.0
+weight = 30.0
+[[stages]]
+solver = "levenberg-marquardt"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_design(tmp_path / "table1.toml", geomscope(sensor_distance_mm=4.0))
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path
+
+
+def run(command, *arguments):
+    return CliRunner().invoke(command, arguments, catch_exceptions=False)
+
+
+def test_optimize(folder):
+    """The thinnest with that resolution: v = 4.5 um / 40 um of the farthest z', by hand, within the margin of 0.5 %."""
+    result = run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml")
+    assert result.exit_code == 0 and "thickness_mm" in result.output and "from geomscope in" in result.output
+    distance = read_design("new.toml").imaging.sensor_distance_mm
+    assert 1 <= distance / (4.5 / 40 * (23 + 1 / 1.43)) < 1.01
+    assert json.loads((folder / "new.json").read_text())["terms"][1]["met_after"] is True
+    assert (folder / "new.png").exists() and not (folder / "new.checkpoint").exists()
+
+
+def test_nothing_is_written_on_wrong_input(folder):
+    before = set(folder.iterdir())
+    with pytest.raises(InputError, match="cannot be read"):
+        run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
+    with pytest.raises(InputError, match="found the suffix '.json'"):
+        run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")
+    with pytest.raises(InputError, match="`pareto`: found nothing"):
+        run(pareto, "study.toml", "--out", str(folder))
+    assert set(folder.iterdir()) == before
+
+
+def test_pareto(folder):
+    (folder / "study.toml").write_text(STUDY + '[[pareto]]\nname = "occupancy"\nat_least = [0.3, 0.5]\n')
+    result = run(pareto, "study.toml", "--out", "out")
+    assert result.exit_code == 0 and "2 of 2 points on the front" in result.output
+    points = json.loads((folder / "out" / "pareto.json").read_text())["points"]
+    assert points[0]["thickness_mm"] < points[1]["thickness_mm"]
+    assert (folder / "out" / "pareto.png").exists()

@@ -1,0 +1,100 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax.aperture import clear_diameter, pitch
+from gs_jax.builtin import geomscope
+from gs_jax.coverage import coverage
+from gs_jax.errors import InputError
+from gs_jax.parameters import NAMES, Bounds, candidate, new_design, parent_of, start_values
+
+
+@pytest.fixture(scope="module")
+def design():
+    return geomscope()
+
+
+@pytest.fixture(scope="module")
+def parent(design):
+    return parent_of(design, depths_mm=(18.0, 23.0), confusion=0.036)
+
+
+def test_bounds_are_invertible_from_the_number():
+    """To 4.9 the value stays 1 % of the range from its bounds; the curve is flat there, and rounding grows by its
+    inverse slope, 2 (1 + x^2)^(3/2) = 250."""
+    bounds, free = Bounds(2.0, 6.0), jnp.linspace(-4.9, 4.9, 99)
+    np.testing.assert_allclose(bounds.free(bounds.value(free)), free, atol=1e-12)
+
+
+def test_bounds_are_invertible_from_the_value():
+    bounds, value = Bounds(-1.0, 3.0), jnp.linspace(-0.96, 2.96, 99)
+    np.testing.assert_allclose(bounds.value(bounds.free(value)), value, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [2.0, 6.0, 1.0, 9.0])
+def test_a_start_at_a_bound_can_still_move(value):
+    bounds = Bounds(2.0, 6.0)
+    free = bounds.free(jnp.array(value))
+    slope = jax.grad(bounds.value)(free)
+    # The slope at a share s is 4 (s (1 - s))^(3/2) of the half range: 0.008 for 1 %.
+    assert 2 < bounds.value(free) < 6 and slope > 0.005
+
+
+def test_bounds_have_gradients():
+    bounds = Bounds(2.0, 6.0)
+    check_grads(jax.jit(lambda x: bounds.value(x)), (jnp.array([0.3, -4.0]),), order=2)
+    check_grads(jax.jit(lambda x: bounds.free(x)), (jnp.array([2.5, 5.9]),), order=1)
+
+
+def test_without_values_it_is_the_parent(design, parent):
+    found = candidate(parent, {})
+    imager = design.imager()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found.imager, imager)
+    # Two exact computations of the same areas: from the Voronoi cells' edges, and lens by lens.
+    np.testing.assert_allclose(found.clear_diameter, clear_diameter(imager.array), rtol=1e-9)
+    np.testing.assert_allclose(found.depths, [18, 19, 20, 21, 22, 23], rtol=1e-12)
+    np.testing.assert_allclose(found.covered, coverage(np.array(design.array.centers_mm), (20.0, 20.0), diameter=2.0))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
+    parent = parent_of(design, lenses_move=moving)
+    values = {"pitch_mm": 1.1 * parent.pitch, "aperture_diameter_mm": jnp.array(1.3)}
+    found = candidate(parent, values)
+    scaled = new_design(design, parent, values)
+    np.testing.assert_allclose(found.plate, [22.0, 22.0], rtol=1e-12)
+    np.testing.assert_allclose(pitch(found.imager.array.centers)[0], values["pitch_mm"], rtol=1e-9)
+    # The written design is rounded to 1e-4 mm.
+    np.testing.assert_allclose(found.clear_diameter, clear_diameter(scaled.imager().array), rtol=1e-4)
+    np.testing.assert_allclose(found.lenses_per_point, 200 * np.pi * 9 / 22**2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_everything_has_gradients(moving):
+    small = geomscope().model_copy(
+        update={"array": geomscope().array.model_copy(update={"centers_mm": ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))})}
+    )
+    parent = parent_of(small, lenses_move=moving)
+    values = {name: x for name, x in start_values(parent).items() if moving or name != "centers_mm"}
+
+    def what(values):
+        found = candidate(parent, values)
+        return found.clear_diameter, found.covered, found.plate, found.magnification, found.lenses_per_point
+
+    check_grads(jax.jit(what), (values,), order=1, eps=1e-5)
+
+
+def test_a_new_design_holds_the_values(design, parent):
+    values = start_values(parent) | {"sensor_distance_mm": jnp.array(3.123456), "depth_span_mm": jnp.array(4.0)}
+    found = new_design(design, parent, values)
+    assert found.imaging.sensor_distance_mm == 3.1235
+    assert found.imaging.working_distance_mm == (18.5, 22.5)
+    assert found.lens == design.lens and found.array == design.array
+    assert set(start_values(parent)) == set(NAMES)
+
+
+def test_values_that_make_no_microscope(design, parent):
+    with pytest.raises(InputError, match="make no microscope: `lens.aperture_diameter_mm`: found 3.0"):
+        new_design(design, parent, {"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)})

@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import pytest
+
+from gs_jax.errors import InputError
+from gs_jax.study import parent_path, read_study
+
+STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
+
+STUDY = """
+depths_mm = [18.0, 23.0]
+[free]
+sensor_distance_mm = [2.0, 6.0]
+[[terms]]
+name = "occupancy"
+at_most = 0.5
+[[stages]]
+solver = "bfgs"
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text):
+        (tmp_path / "study.toml").write_text(text)
+        return read_study(tmp_path / "study.toml")
+
+    return read
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_the_studies_that_come_with_the_designs(path):
+    study = read_study(path)
+    assert parent_path(path, study).exists()
+    assert not study.pareto or sum(term.is_goal for term in study.terms) == 1
+
+
+def test_what_a_study_says(read):
+    study = read(STUDY)
+    assert study.free == {"sensor_distance_mm": (2.0, 6.0)}
+    (term,), (stage,) = study.terms, study.stages
+    assert (term.kind, term.target, term.weight, term.is_goal) == ("at_most", 0.5, 1.0, False)
+    assert (stage.solver, stage.free, stage.terms) == ("bfgs", None, None)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("sensor_distance_mm = [2.0", "sensor_distance = [2.0", "`free.sensor_distance`: found a key"),
+        ("[2.0, 6.0]", "[6.0, 2.0]", r"found \[6, 2\], allowed: \[lowest, highest\]"),
+        ("[2.0, 6.0]", "[-2.0, 6.0]", "allowed: above 0"),
+        ("[2.0, 6.0]", "[0.0, inf]", "free.sensor_distance_mm"),
+        ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
+        ('"occupancy"', '"ocupancy"', "`terms` 1: found the name 'ocupancy', allowed: lateral_reso"),
+        ("at_most = 0.5", "", "found no kind, allowed: one of at_most"),
+        ("at_most = 0.5", "at_most = 0.5\nat_least = 0.1", r"found \['at_most', 'at_least'\]"),
+        ("at_most = 0.5", "at_most = -0.5", "found -0.5, allowed: a positive number"),
+        ("at_most = 0.5", "at_most = 0.5\nunit = 'mm'", "`terms` 1: found the key 'unit', allowed: name, at_most"),
+        ('"bfgs"', '"sgd"', "`stages` 1, solver: found 'sgd', allowed: one of levenberg"),
+        ('"bfgs"', '"bfgs"\nterms = ["strehl"]', "`stages.terms`: found 'strehl', allowed: one or more of occupancy"),
+        ('"bfgs"', '"bfgs"\nfree = ["pitch_mm"]', "`stages.free`: found 'pitch_mm'"),
+        ('"bfgs"', '"bfgs"\n[[pareto]]\nname = "occupancy"\nat_most = [0.3]', "found 0 to minimise or maximise"),
+        ('"bfgs"', '"bfgs"\n[[pareto]]\nname = "occupancy"', "`pareto` 1: occupancy: found neither, allowed"),
+        ("[[stages]]", "[[terms]]\nname = 'occupancy'\nat_most = 0.4\n[[stages]]", "found occupancy twice"),
+        ("depths_mm", "starts = 0\ndepths_mm", "`starts`: found 0, allowed: a whole number from 1"),
+        ("depths_mm", "depths_mm = ", "not valid TOML"),
+    ],
+)
+def test_a_wrong_study_is_explained_in_one_line(read, old, new, found):
+    assert old in STUDY
+    with pytest.raises(InputError, match=found) as error:
+        read(STUDY.replace(old, new))
+    assert "study.toml: " in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_study_without_a_design(read, tmp_path):
+    with pytest.raises(InputError, match="`design`: found nothing"):
+        parent_path(tmp_path / "study.toml", read(STUDY))
