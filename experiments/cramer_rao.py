@@ -165,7 +165,7 @@ def main() -> None:
     for row in found["rows"]:
         triples = (" ".join(f"{x:.3g}" for x in row[key]) for key in ("bound_um", "error_um", "ratio"))
         table.add_row(row["layout"], str(row["photons"]), *triples)
-    Console().print(table)
+    Console(width=120).print(table)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from gs_jax.simulate import simulate_points
 # mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
 SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002
 # Of each square of so many pixels the brightest is shown: spots are a pixel or two wide.
-SHOWN = 32
+SHOWN = 40
 
 
 def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> dict:
@@ -97,7 +97,7 @@ def main() -> None:
     with Progress() as progress:
         results = run(design, arguments.data, progress=progress)
     write_json(out / "fig7.json", {name: result["scores"] for name, result in results.items()})
-    picture(results).savefig(out / "fig7.png", dpi=72)
+    picture(results).savefig(out / "fig7.png", dpi=66)
     table = Table("", "points", "found", "F1", "precision", "recall", "lateral, um", "axial, um")
     for name, result in results.items():
         table.add_row(name, *(f"{value:.4g}" for value in result["scores"].values()))

@@ -8,6 +8,7 @@ import sys
 import click
 
 from . import __version__
+from .cli.benchmark import benchmark
 from .cli.demo import demo
 from .cli.info import info
 from .cli.layout import layout
@@ -46,7 +47,7 @@ def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
 
 
-for _command in (reconstruct, simulate, metrics, layout, optimize, pareto, mold, train, demo, info):
+for _command in (reconstruct, simulate, metrics, layout, optimize, pareto, benchmark, mold, train, demo, info):
     commands.add_command(_command)
 
 

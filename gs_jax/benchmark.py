@@ -132,14 +132,14 @@ def measure(name: str, side: int, cases: Sequence[Case]) -> list[dict[str, Any]]
     def work():
         compile_s, call = timed(lambda: METHODS[name].make(at))
         run = lambda image: timed(lambda: jax.block_until_ready(call(image)))
-        first, _ = run(images[0])
-        found = []
+        found, first = [], []
         for image in images:
+            # Some compile in the first call with an image, for as many points as it shows.
+            first.append(run(image)[0])
             seconds, volume = run(image)
             more = [run(image)[0] for _ in range(_REPEATS - 1)] if seconds < _REPEAT else []
-            found.append((float(np.median([seconds, *more])), np.asarray(volume)))
-        # Some is compiled in the first call, as by the network.
-        return compile_s + max(first - found[0][0], 0), found
+            found.append((min(seconds, *more, first[-1]), np.asarray(volume)))
+        return compile_s + first[0] - found[0][0], found
 
     peak, (compile_s, found) = peak_mib(work)
     return [

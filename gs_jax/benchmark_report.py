@@ -39,7 +39,7 @@ def write(records: Records, left_out: Records, folder: Path) -> None:
     notes = {"machine": describe(), "slopes": slopes(records), "left_out": left_out}
     write_json(folder / "benchmark-notes.json", notes)
     with atomic_write(folder / "benchmark.csv") as path, path.open("w", newline="") as file:
-        writer = csv.DictWriter[str](file, COLUMNS)
+        writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(records)
     write_text(folder / "benchmark.md", markdown(records, left_out), [".md"])
@@ -69,7 +69,7 @@ def markdown(records: Records, left_out: Records) -> str:
     timed = [m for m in methods if any(r["seconds"] > 0 for r in records if r["method"] == m)]
     parts = []
     for title, key, form, rows in (
-        ("Time, s (warm)", "seconds", ".2g", timed),
+        ("Time, s (the fastest of some warm calls)", "seconds", ".2g", timed),
         ("Compilation (of a dense method: the matrix too), s", "compile_seconds", ".2g", timed),
         ("Memory that is added at the peak, MiB (at the first size: the compiler too)", "peak_mib", ".0f", timed),
         ("PSNR, dB", "psnr_db", ".1f", methods),

@@ -157,10 +157,12 @@ def picture(front: Front) -> Figure:
     for number, group in enumerate(limits):
         some = np.isclose(groups, group, rtol=0.02) & front.best
         order = np.argsort(front.values[some, 1])
-        label = f"{third[0].name} {group:.3g}" if third else None
+        label = f"{_axis(third[0])}: {group:.2g}" if third else None
         axes.plot(front.values[some, 1][order], front.values[some, 0][order], "o-", color=f"C{number}", label=label)
     others = ~front.best
-    axes.plot(front.values[others, 1], front.values[others, 0], "x", color="0.6", label="dominated or misses a target")
+    if others.any():
+        label = "dominated or misses a target"
+        axes.plot(front.values[others, 1], front.values[others, 0], "x", color="0.6", label=label)
     axes.set(xlabel=_axis(along), ylabel=_axis(goal))
     axes.set_title("what one costs in the other")
     axes.grid(alpha=0.3)

@@ -91,19 +91,21 @@ def interrupted(table1, question, path, monkeypatch, *, writes):
     monkeypatch.setattr(codesign, "write_checkpoint", write)
 
 
-def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch):
-    """Bit for bit, in the second start of the first stage and in the second stage."""
+@pytest.mark.parametrize("writes", [pytest.param(6, marks=pytest.mark.slow), 10], ids=["stage 1", "stage 2"])
+def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
+    """Bit for bit, in the second start of the first stage or in the second stage."""
     stages = [LM | {"steps": 4}, {"solver": "adam", "steps": 5, "learning_rate": 0.01}]
-    question = study(starts=2, stages=stages)
+    terms = [{"name": "thickness_mm", "minimise": 5.0}, TERMS[0]]
+    free = {"sensor_distance_mm": [2.0, 6.0]}
+    question = study(starts=2, stages=stages, terms=terms, free=free, depth_count=2)
     with Progress() as progress:
         whole = optimise(table1, question, progress=progress)
-    for writes in (6, 10):
-        path = tmp_path / f"{writes}.checkpoint"
-        interrupted(table1, question, path, monkeypatch, writes=writes)
-        assert len(read_checkpoint(path, question, table1)[0].steps) == writes
-        with Progress() as progress:
-            resumed = optimise(table1, question, progress=progress, checkpoint=path, resume=True)
-        assert resumed.design == whole.design and resumed.log == whole.log
+    path = tmp_path / "a.checkpoint"
+    interrupted(table1, question, path, monkeypatch, writes=writes)
+    assert len(read_checkpoint(path, question, table1)[0].steps) == writes
+    with Progress() as progress:
+        resumed = optimise(table1, question, progress=progress, checkpoint=path, resume=True)
+    assert resumed.design == whole.design and resumed.log == whole.log
 
 
 def test_wrong_checkpoints(table1, tmp_path, monkeypatch):

@@ -102,17 +102,23 @@ def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
     assert lit.sum() == expected.size
 
 
+@jax.jit
+def loss(imager, key, grid, psf, electrons=1000.0):
+    """Compiled once; scenes that were constants would be computed by the compiler, slowly."""
+    return reconstruction_loss(imager, key, grid=grid, psf=psf, electrons=electrons, **OPTIONS)
+
+
 def test_light_lowers_the_loss():
     """In electrons of a voxel through a lens: shot noise is most of the error at 1, nothing at a million."""
     imager, grid = scene()
-    dark, bright = (reconstruction_loss(imager, KEY, grid=grid, psf=psfs(), electrons=n, **OPTIONS) for n in (1, 1e6))
+    dark, bright = (loss(imager, KEY, grid, psfs(), electrons) for electrons in (1.0, 1e6))
     assert bright < dark - 0.3
 
 
-def test_the_key_decides_and_scenes_are_averaged():
+def test_the_key_decides():
     imager, grid = scene()
-    loss = lambda key, n: reconstruction_loss(imager, key, grid=grid, **OPTIONS | dict(scenes=n))
-    assert loss(KEY, 1) == loss(KEY, 1) != loss(jax.random.key(4), 1)
+    of = lambda key: loss(imager, key, grid, psfs())
+    assert of(KEY) == of(KEY) != of(jax.random.key(4))
 
 
 @pytest.mark.slow
@@ -134,7 +140,7 @@ def test_gradients_by_everything_that_is_continuous():
 
 @jax.jit
 def slopes(centers, imager, key, grid, psf):
-    """Compiled once for both places; scenes that were constants would be computed by the compiler, slowly."""
+    """Compiled once for both places, as `loss`."""
     options: dict[str, Any] = OPTIONS | dict(read_noise=0.0, scenes=1)
     moved = lambda c: Imager(MicrolensArray(c), imager.sensor, imager.sensor_distance, imager.field_radius)
     return jax.value_and_grad(lambda c: reconstruction_loss(moved(c), key, grid=grid, psf=psf, **options))(centers)
@@ -149,10 +155,10 @@ def test_gradients_are_finite(place):
 
 def test_float32():
     (low, grid), (high, exact) = scene(jnp.float32), scene()
-    found = reconstruction_loss(low, KEY, grid=grid, psf=psfs(jnp.float32), **OPTIONS)
+    found = loss(low, KEY, grid, psfs(jnp.float32))
     assert found.dtype == jnp.float32
     # Random numbers differ between the types, so only the level does compare: two scenes of this size, 1 dB.
-    assert found == pytest.approx(float(reconstruction_loss(high, KEY, grid=exact, psf=psfs(), **OPTIONS)), abs=2)
+    assert found == pytest.approx(float(loss(high, KEY, exact, psfs())), abs=2)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from gs_jax.objectives import TERMS
 from gs_jax.parameters import candidate, parent_of, start_values
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
-NAMES = ("ghosts", "lens_shortage", "localization_um", "reconstruction_error")
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um", "reconstruction_error")]
+NAMES = ["ghosts", "lens_shortage", *SLOW]
 
 
 @pytest.fixture(scope="module")

@@ -51,6 +51,10 @@ OPERATORS = {
 }
 
 
+# To compile an operator of rays for each solver takes seconds.
+EVERY = [pytest.param(name, marks=[pytest.mark.slow] * (name in ("ray", "blurred"))) for name in OPERATORS]
+
+
 def light(A):
     """Two bright voxels that much of the image sees."""
     x = jnp.zeros(A.in_structure().shape)
@@ -69,7 +73,7 @@ def compiled(solver, operator):
     return jax.jit(lambda image: SOLVERS[solver](made(operator), image, steps=150))
 
 
-@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("operator", EVERY)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_it_finds_two_bright_voxels(solver, operator):
     A = made(operator)
@@ -82,7 +86,7 @@ def test_it_finds_two_bright_voxels(solver, operator):
     assert np.all(np.isfinite(found.costs)) and found.costs[-1] < 0.05 * found.costs[0]
 
 
-@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("operator", EVERY)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_dark_image_gives_zeros(solver, operator):
     found = compiled(solver, operator)(jnp.zeros(made(operator).out_structure().shape))
@@ -169,7 +173,7 @@ def test_least_squares_without_negative_values_is_scipys(solver):
 
 
 def test_the_convex_solvers_meet_with_sparsity():
-    A = ray_operator(*small())
+    A = dense()
     image = A.mv(light(A)) + 0.1 * jax.random.normal(jax.random.key(4), A.out_structure().shape)
 
     def final(solver, steps):
@@ -214,7 +218,8 @@ def test_list_richardson_lucy_multiplies_by_mean_ratios():
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
     A = ray_operator(*small())
     truth = light(A)
-    run = lambda image, **options: jax.jit(lambda b: richardson_lucy(A, b, steps=40, **options))(image)
+    jitted = cache(lambda **options: jax.jit(lambda b: richardson_lucy(A, b, steps=40, **options)))
+    run = lambda image, **options: jitted(**options)(image)
     image = A.mv(truth) + 0.5
     plain, known = run(image), run(image, background=0.5)
     assert jnp.abs(known.x - truth).max() < 0.05 < jnp.abs(plain.x - truth).max()
