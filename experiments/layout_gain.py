@@ -153,7 +153,7 @@ def run(study: Study = Study(), seeds: int = 5, *, progress: Progress) -> dict:
         scores, empty = judge(chosen, study, fine_psfs, progress)
         row = {"seed": seed, "random_loss_db": losses, "ours_loss_db": our_losses}
         row |= {"hexagonal_loss_db": [score(c) for c in lattices]}
-        least = {name: float(nearest_neighbour_distances(c).min()) for name, c in chosen.items()}
+        least = {name: float(nearest_neighbour_distances(np.asarray(c)).min()) for name, c in chosen.items()}
         row |= {"scores": scores, "empty_psnr_db": empty, "least_distance_mm": least}
         row |= {"lenses_per_lit_pixel": {name: overlap(c, study) for name, c in chosen.items()}}
         row |= {"centers_mm": {name: np.asarray(c).tolist() for name, c in chosen.items()}}

@@ -39,7 +39,8 @@ def write(records: Records, left_out: Records, folder: Path) -> None:
     notes = {"machine": describe(), "slopes": slopes(records), "left_out": left_out}
     write_json(folder / "benchmark-notes.json", notes)
     with atomic_write(folder / "benchmark.csv") as path, path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        columns: list[str] = list(COLUMNS)
+        writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(records)
     write_text(folder / "benchmark.md", markdown(records, left_out), [".md"])

@@ -90,7 +90,7 @@ def reconstruct_iteratively(
     InputError
         If a depth of the grid is blurred over more than 128 pixels.
     """
-    light = jnp.asarray(image, jnp.float32)
+    light = jnp.asarray(image, imager.sensor_distance.dtype)
     light = jnp.maximum(light - jnp.percentile(light, _DARKEST), 0)
     if method == "list-rl":
         psf = jnp.zeros((grid.depths.size, 1, 1))

@@ -8,7 +8,7 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.files import read_capture
+from gs_jax.files import read_capture, read_points
 from gs_jax.volumes import read_volume, write_volume
 
 from .helpers import needs
@@ -65,6 +65,41 @@ def test_reconstruct(folder, monkeypatch, capsys, name):
     np.testing.assert_allclose(grid.depths, np.arange(18, 22.1, 0.5))
     assert volume.max() > 7  # several lenses see the middle
     assert sorted(p.name for p in folder.iterdir()) == ["capture.tif", "design.toml", name]
+
+
+@pytest.mark.parametrize("how", [("--method", "list-rl"), ("--method", "richardson-lucy"), ("--suppress", "unet")])
+def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
+    tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
+    command = (*RECONSTRUCT[:4], "18:22:1", "--voxel-um", "50", "--steps", "2", *how, "-o", "v.tif")
+    status, out, err = run(monkeypatch, capsys, *command)
+    assert (status, err) == (0, "") and out.startswith("v.tif: 5 x 39 x 33 voxels")
+    volume, _ = read_volume(folder / "v.tif")
+    assert np.isfinite(volume).all() and volume.min() >= 0
+
+
+def test_points_of_a_capture(folder, monkeypatch, capsys):
+    design = DESIGN.replace("[96, 80]", "[480, 400]").replace("_um = 20.0", "_um = 4.5")
+    (folder / "design.toml").write_text(design)
+    (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n")
+    run(monkeypatch, capsys, "simulate", "design.toml", "points.csv", "-o", "capture.tif")
+    options = (
+        "--depths",
+        "19:21:0.25",
+        "--voxel-um",
+        "20",
+        "--suppress",
+        "cluster",
+        "-o",
+        "v.tif",
+        "--points",
+        "p.csv",
+    )
+    status, out, err = run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
+    assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
+    found = read_points(folder / "p.csv")[0]
+    assert np.hypot(found[0] - 0.02, found[1] + 0.01) < 0.003 and abs(found[2] - 20) < 0.15  # four lenses, close by
+    volume, grid = read_volume(folder / "v.tif")
+    assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
 
 def test_the_default_voxel_is_a_pixel_seen_at_the_middle_depth(folder, monkeypatch, capsys):
@@ -171,6 +206,8 @@ WRONG_ARGUMENTS = [
         for depths in ("", "18", "18:22", "18:22:0", "18:22:-1", "22:18:1", "0:5:1", "-5:5:1", "a:b:c", "18:nan:1",
                        "18:inf:1", "18:22:1e-9", "18:22:1:1", "18,22,1")
     ),
+    ((*RECONSTRUCT, "-o", "v.tif", "--method", "admm", "--suppress", "unet"), "--suppress unet: found --method admm"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "p.txt: found the suffix"),
     (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
     (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
     (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "design.toml: found the suffix"),
@@ -277,8 +314,11 @@ def test_demo(tmp_path, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, "demo", "--out", tmp_path / "demo")
     assert (status, err) == (0, "") and "report.md" in out
     made = {p.name for p in (tmp_path / "demo").iterdir()}
-    assert made == {"design.toml", "capture.tif", "volume.ome.tif", "picture.png", "report.md"}
-    volume, grid = read_volume(tmp_path / "demo" / "volume.ome.tif")
+    assert made >= {"design.toml", "optimized.toml", "words.tif", "words.ome.tif", "points-found.csv", "mold.stl"}
+    assert len(read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
+    report = (tmp_path / "demo" / "report.md").read_text()
+    assert all(name in made for name in re.findall(r"!\[.*\]\((.*)\)", report)) and "NO" not in report
+    volume, grid = read_volume(tmp_path / "demo" / "words.ome.tif")
     # Each word is brightest on its own plane: at 18, 20 and 22 mm.
     for depth, (x, y) in ((18, (-4, -5)), (20, (0, 0)), (22, (4, 5))):
         near = np.ix_(abs(np.asarray(grid.y) - y) < 1.5, abs(np.asarray(grid.x) - x) < 4)

@@ -83,4 +83,4 @@ def reconstruct(
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
     if points or suppress == "cluster":
-        click.echo(f"{points or output}: {len(found)} points")
+        click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
