@@ -15,7 +15,7 @@ overlap; with `--crowded` it is as wide as the field, lenses are nearer to each 
 
     python -m experiments.layout_gain [--out DIR] [--seeds N] [--crowded]
 
-writes `layout_gain.json` and `layout_gain.png`; about a quarter of an hour on two cores.
+writes `layout_gain.json` and `layout_gain.png`; five minutes on two shared cores, longer if `--crowded`.
 """
 
 import argparse
