@@ -26,6 +26,8 @@ _SQUARE = 32
 _DYNAMIC_RANGE = 1000
 # How far the light of a spot is followed, pixels.
 REACH = 24
+# Spots that are enough to show what a spot looks like.
+_EXAMPLES = 500
 
 
 class Signal(NamedTuple):
@@ -143,15 +145,16 @@ def survival(light: Float32[np.ndarray, "row column"]):
 def spot_profile(readings: Readings, light: Float32[np.ndarray, "row column"]) -> Float64[np.ndarray, " radius"]:
     """The shape of spots as the image shows it: light at 0, 1, 2 ... pixels from the middle, which is 1.
 
-    The median over every pixel of all the spots, which neighbours on one side do not change. It falls from 1 to 0.
+    The median over every pixel of up to 500 spots, of the brightest points where these come first: neighbours on one
+    side do not change it. It falls from 1 to 0.
     """
     offset = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1).T
     middle = np.floor(readings.pixels + 0.5).astype(int)
     whole = ((middle >= REACH) & (middle < np.array(light.shape) - REACH)).all(-1)
     use = readings.seen & whole & (readings.light > 0)
-    place = middle[use][:, None] + offset
-    values = light[place[..., 0], place[..., 1]] / readings.light[use][:, None]
-    radius = np.hypot(*np.moveaxis(place - readings.pixels[use][:, None], -1, 0)).round().astype(int)
+    place = middle[use][:_EXAMPLES, None] + offset
+    values = light[place[..., 0], place[..., 1]] / readings.light[use][:_EXAMPLES, None]
+    radius = np.hypot(*np.moveaxis(place - readings.pixels[use][:_EXAMPLES, None], -1, 0)).round().astype(int)
     profile = [np.median(some) if (some := values[radius == r]).size else 0.0 for r in range(1, REACH)]
     return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
 
