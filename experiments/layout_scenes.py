@@ -34,24 +34,21 @@ Scores = dict[str, list[float]]
 
 
 class Study(NamedTuple):
-    """Sizes in mm; `field` is the width of the object, which is in the middle; `ghosts` weighs that term."""
+    """Sizes in mm; `field` is the width of the object, which is in the middle."""
 
     plate: tuple[float, float] = (5.0, 5.0)
-    distance: float = 1.0
-    pixels: int = 512
+    distance: float = 0.65
+    pixels: int = 640
     pixel: float = 0.01125
     field_radius: float = 2.2
-    field: float = 3.0
+    field: float = 4.4
     voxel: float = 0.05
     depths: tuple[float, ...] = (12.0, 14.0, 16.5)
     density: float = 0.008
     candidates: int = 200
-    scored_on: int = 3
-    starts: int = 16
-    places: int = 15
-    steps: int = 300
+    scenes: int = 3
+    steps: int = 600
     rate: float = 0.03
-    ghosts: float = 0.0
     held_out: int = 30
 
     @property
@@ -86,7 +83,7 @@ def loss(centers: Centers, key: PRNGKeyArray, psfs: Array, study: Study) -> Floa
         key,
         grid=study.grid(),
         psf=psfs,
-        scenes=study.scored_on,
+        scenes=study.scenes,
         density=study.density,
         width=WIDTH,
         electrons=ELECTRONS,

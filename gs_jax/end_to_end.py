@@ -22,6 +22,8 @@ from .subfield import subfield
 from .theory import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
+# Side of the PSF of a voxel where none is given, pixels: three standard deviations of voxels up to 5 pixels wide.
+_FOOTPRINT = 17
 # Summed weight under which a voxel is dimmed: half of a lens on its axis.
 _LEAST_WEIGHT = 0.5
 
@@ -92,6 +94,38 @@ def reconstruct(
     return local_contrast(mean, grid, width=background_width)
 
 
+def footprints(
+    imager: Imager, grid: Grid, psf: Float[Array | np.ndarray, "plane tall wide"] | None = None
+) -> Float[Array, "plane tall wide"]:
+    """PSFs of voxels instead of points: blurred by a Gaussian with a standard deviation of half a voxel's image.
+
+    `forward` images voxels as points. Where these are a pixel apart or more, and sharper than that, the image of a
+    smooth scene is a grid of dots, and what back-projection reads depends on how each lens's grid falls on the pixels:
+    a loss that changes by a tenth of a dB when a lens moves by 2 um, as no microscope's does. Of Gaussians this wide
+    the grid is below 1 %.
+
+    Parameters
+    ----------
+    imager, grid
+        As for `forward`.
+    psf
+        As for `forward`, with room for the blur.
+    """
+    dtype = imager.sensor_distance.dtype
+    if psf is None:
+        planes, middle = grid.depths.size, _FOOTPRINT // 2
+        psf = jnp.zeros((planes, _FOOTPRINT, _FOOTPRINT), dtype).at[:, middle, middle].set(1)
+    psf = jnp.asarray(psf)
+    width = imager.magnification(grid.depths) * grid.pitch / (2 * imager.sensor.pixel_pitch)
+
+    def blur(size):
+        kernel = jax.vmap(lambda w: _gaussian(size, w, dtype))(width)
+        return kernel / kernel.sum(1, keepdims=True)
+
+    _, rows, columns = psf.shape
+    return jnp.einsum("dij,djk,dlk->dil", blur(rows), psf, blur(columns))
+
+
 def misfit_db(estimate: Volume, truth: Volume) -> Float[Array, ""]:
     """Squared error after the best gain, in dB of the truth's energy: `10 log10(1 - <a,b>^2 / (<a,a> <b,b>))`.
 
@@ -145,7 +179,8 @@ def reconstruction_loss(
     grid
         The voxels of a scene. They decide what is imaged, so a scene smaller than the field is darker at its edges.
     psf
-        As for `forward`. It may be computed from the imager: its gradient counts then.
+        Of points, as for `forward`; voxels are imaged by `footprints`. It may be computed from the imager: its gradient
+        counts then.
     scenes
         To average over, one after the other.
     density, width
@@ -180,13 +215,14 @@ def reconstruction_loss(
         raise ValueError(f"`margin` must be 0 or more and leave voxels of {grid.shape}, got {margin}.")
     judged = np.s_[:, margin : grid.shape[0] - margin, margin : grid.shape[1] - margin]
     dtype = imager.sensor_distance.dtype
+    images = footprints(imager, grid, psf)
 
     def one(key):
         scene_key, noise_key, place_key = jax.random.split(key, 3)
         place = jax.random.uniform(place_key, (2,), dtype, -0.5, 0.5) * jnp.asarray(field, dtype)
         local, lit = (imager, None) if window is None else subfield(imager, place, window)
         truth = random_scene(scene_key, grid, density=density, width=width)
-        image = noisy(noise_key, electrons * forward(truth, local, grid, psf), read_noise)
+        image = noisy(noise_key, electrons * forward(truth, local, grid, images), read_noise)
         estimate = reconstruct(image, local, grid, background_width=background_width, lit=lit)
         return misfit_db(estimate[judged], truth[judged])
 

@@ -7,8 +7,16 @@ import pytest
 from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 
-from gs_jax import Grid, Imager, MicrolensArray, backproject, forward
-from gs_jax.end_to_end import local_contrast, misfit_db, noisy, random_scene, reconstruct, reconstruction_loss
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, forward
+from gs_jax.end_to_end import (
+    footprints,
+    local_contrast,
+    misfit_db,
+    noisy,
+    random_scene,
+    reconstruct,
+    reconstruction_loss,
+)
 from gs_jax.metrics import quality
 from gs_jax.subfield import subfield
 
@@ -100,6 +108,31 @@ def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
     np.testing.assert_allclose(np.asarray(local[inner])[trim], expected[trim], atol=1e-9)
     np.testing.assert_array_equal(lit[inner], True)
     assert lit.sum() == expected.size
+
+
+def test_voxels_leave_no_gaps_in_the_image():
+    """An even volume, voxels 1.9 to 2.2 pixels apart: as points they are a grid of dots, as footprints even light."""
+    imager = Imager(MicrolensArray(np.zeros((1, 2))), Sensor((96, 80), 0.02), 5.8, 2.0)
+    grid = Grid([18.0], (61, 61), 0.13)
+    inner = np.s_[38:58, 30:50]  # the envelope falls by a few per cent over it
+    even = np.ones((1, 61, 61))
+    ripple = lambda psf: (
+        np.std(forward(even, imager, grid, psf)[inner]) / np.mean(forward(even, imager, grid, psf)[inner])
+    )
+    assert ripple(None) > 0.1 and ripple(footprints(imager, grid)) < 0.01
+
+
+def test_footprints_keep_the_light_and_add_variance():
+    imager, fine = scene()
+    grid = Grid(fine.depths, (5, 5), 0.15)
+    found = np.asarray(footprints(imager, grid, psfs()))
+    np.testing.assert_allclose(found.sum((1, 2)), 1, rtol=1e-12)
+    assert (found[:, 2, 2] < psfs()[:, 2, 2]).all()
+    place = np.arange(17) - 8
+    alone = np.asarray(footprints(imager, grid))
+    width = np.asarray(imager.magnification(grid.depths)) * float(grid.pitch) / 2 / imager.sensor.pixel_pitch
+    # Sampled Gaussians of a pixel and more have their variance, to 1e-6.
+    np.testing.assert_allclose((alone * place**2).sum((1, 2)), width**2, rtol=1e-4)
 
 
 @jax.jit
