@@ -38,13 +38,24 @@ class Signal(NamedTuple):
 
 
 def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
-    """Takes the background off: the median of each square of 32 pixels, linear between the squares' middles.
-
-    The noise is the root mean square of what is darker than that median, which no spot adds to.
-    """
+    """Smooths an image a little and takes its background off."""
     smooth: np.ndarray = gaussian_filter(np.asarray(image, np.float32), _SMOOTHING)
-    rows, columns = smooth.shape
-    padded = np.pad(smooth, ((0, -rows % _SQUARE), (0, -columns % _SQUARE)), mode="edge")
+    background, noise = local_levels(smooth)
+    light = smooth - background
+    least = max(float(np.median(noise)), float(light.max()) / _DYNAMIC_RANGE)
+    return Signal(light, np.maximum(noise, least))
+
+
+def local_levels(
+    image: Shaped[Array | np.ndarray, "row column"],
+) -> tuple[Float32[np.ndarray, "row column"], Float32[np.ndarray, "row column"]]:
+    """Background and noise: of each square of 32 pixels, then linear between the squares' middles.
+
+    The background is the median; the noise is the root mean square of what is darker, which no spot adds to.
+    """
+    image = np.asarray(image, np.float32)
+    rows, columns = image.shape
+    padded = np.pad(image, ((0, -rows % _SQUARE), (0, -columns % _SQUARE)), mode="edge")
     squares = padded.reshape(padded.shape[0] // _SQUARE, _SQUARE, -1, _SQUARE).swapaxes(1, 2)
     # A third of the pixels says the same.
     squares = squares.reshape(*squares.shape[:2], -1)[..., ::3]
@@ -52,9 +63,7 @@ def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
     darker = np.minimum(squares - median[..., None], 0)
     noise = np.sqrt(2 * np.mean(darker**2, axis=-1))
     wide = lambda part: np.asarray(jax.image.resize(jnp.asarray(part), padded.shape, "linear"))[:rows, :columns]
-    light = smooth - wide(median)
-    least = max(float(np.median(noise)), float(light.max()) / _DYNAMIC_RANGE)
-    return Signal(light, wide(np.maximum(noise, least)))
+    return wide(median), wide(noise)
 
 
 class Readings(NamedTuple):
