@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
+# A file of tests stays in one process: its tests share what they compiled.
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-all lint
 .DELETE_ON_ERROR:
@@ -10,10 +12,10 @@ demo: .venv/core
 	$(BIN)/gs-jax demo --out $(OUT)
 
 test: .venv/dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-all: .venv/dev
-	$(BIN)/python -m pytest -m ""
+	$(BIN)/python -m pytest $(PARALLEL) -m ""
 
 lint: .venv/dev
 	$(BIN)/ruff check .

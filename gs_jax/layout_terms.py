@@ -5,6 +5,8 @@ candidate: places over the part of the plate whose points see a whole field of l
 blobs and spots of a few pixels. Random terms draw anew from their key.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -19,8 +21,8 @@ from .parameters import Candidate
 _SOURCES, _TARGETS, _POINTS, _PHOTONS = 4, 256, 4, 1000.0
 # Places along a side of the plate.
 _RASTER = 15
-# Voxels of a random scene, and their size in pixels seen in the object: a blob is as wide as a voxel.
-_VOXELS, _VOXEL_MM = 33, 0.04
+# Voxels along a side of a random scene, and blobs per voxel, each as wide as a voxel.
+_VOXELS, _DENSITY = 99, 0.008
 
 
 def ghosts(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
@@ -49,17 +51,27 @@ def localization(c: Candidate, key: PRNGKeyArray) -> Float[Array, "3"]:
 def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
     """Logarithm of the relative error, `sqrt(1 - <a,b>^2 / (<a,a> <b,b>))`, of reconstructed random scenes.
 
-    Three depths, 33 x 33 voxels, at a random place of the field.
+    Three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate: sub-images overlap as
+    much as those of an object that fills the field.
     """
-    sensor = c.imager.sensor
+    sensor, reach = c.imager.sensor, c.imager.field_radius
     depths = jnp.stack([c.depths[0], (c.depths[0] + c.depths[-1]) / 2, c.depths[-1]])
-    grid = Grid(depths, (_VOXELS, _VOXELS), _VOXEL_MM)
-    # The lenses that see the scene, and their images of it.
-    reach = round(2 * 1.4 * (c.imager.field_radius + _VOXELS * _VOXEL_MM) / sensor.pixel_pitch)
-    window = min(reach, sensor.shape[0]), min(reach, sensor.shape[1])
-    height, width = (max(0.0, n * sensor.pixel_pitch - 2 * c.imager.field_radius) for n in sensor.shape)
-    field = width, height
-    found = reconstruction_loss(c.imager, key, grid=grid, scenes=1, width=_VOXEL_MM, window=window, field=field)
+    pitch = 2 * reach / _VOXELS
+    # The lenses that see the scene, and their images of it, magnified by up to 0.4.
+    side = math.ceil(2 * 2.4 * reach / sensor.pixel_pitch)
+    window = min(side, sensor.shape[0]), min(side, sensor.shape[1])
+    height, width = (max(0.0, n * sensor.pixel_pitch - 4 * reach) for n in sensor.shape)
+    found = reconstruction_loss(
+        c.imager,
+        key,
+        grid=Grid(depths, (_VOXELS, _VOXELS), pitch),
+        scenes=1,
+        density=_DENSITY,
+        width=pitch,
+        background_width=4 * pitch,
+        window=window,
+        field=(width, height),
+    )
     return found * jnp.log(jnp.asarray(10.0, found.dtype)) / 20
 
 
