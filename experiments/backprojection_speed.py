@@ -32,10 +32,10 @@ from rich.table import Table
 
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.disk import make_folder, write_json
+from gs_jax.benchmark.measure import peak_mib, status_mib, timed
 from gs_jax.info import describe
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts import random_layout
-from gs_jax.measure import peak_mib, status_mib, timed
 from gs_jax.progress import Progress
 
 PAPER_S = 18.0

@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound of `gs_jax.fisher` against maximum likelihood on noisy images of a single point.
+"""The Cramer-Rao bound of `gs_jax.codesign.fisher` against maximum likelihood on noisy images of a single point.
 
 Two layouts of 23 lenses: Poisson discs, and the same after gradient descent on the bound in z (least distance and plate
 kept). For each and for several brightnesses, 500 noisy images of a point at random subpixel places are drawn (Poisson
@@ -27,9 +27,9 @@ from rich.table import Table
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.camera import poisson
+from gs_jax.codesign.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
 from gs_jax.coverage import nearest_neighbour_distances
-from gs_jax.disk import make_folder, write_json
-from gs_jax.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts import poisson_disc_layout
 from gs_jax.progress import Progress
 

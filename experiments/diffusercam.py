@@ -26,15 +26,15 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from gs_jax.admm import admm_convolution
-from gs_jax.convolution import Convolution
-from gs_jax.disk import make_folder, write_json
-from gs_jax.fista import fista
+from gs_jax.benchmark.measure import timed
 from gs_jax.info import describe
-from gs_jax.measure import timed
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.progress import Progress
-from gs_jax.richardson_lucy import richardson_lucy
-from gs_jax.total_variation import differences, total_variation
+from gs_jax.solvers.admm import admm_convolution
+from gs_jax.solvers.convolution import Convolution
+from gs_jax.solvers.fista import fista
+from gs_jax.solvers.richardson_lucy import richardson_lucy
+from gs_jax.solvers.total_variation import differences, total_variation
 
 TV = 1e-4
 Image = Float[Array, "row column"]

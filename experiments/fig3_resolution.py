@@ -21,8 +21,8 @@ from rich.table import Table
 from experiments.profiles import around_the_axis, dip, fwhm, through_peak
 from gs_jax.builtin import geomscope
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
 from gs_jax.progress import Progress
 from gs_jax.simulate import simulate_points
 

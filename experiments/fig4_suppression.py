@@ -25,15 +25,15 @@ from skimage.feature import peak_local_max
 from experiments.point_density import scene
 from gs_jax import Grid
 from gs_jax.builtin import geomscope
-from gs_jax.clustering import cluster
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
-from gs_jax.locate import find_points
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.phantoms import rasterize
 from gs_jax.progress import Progress
 from gs_jax.reconstruct import reconstruct_stack
+from gs_jax.suppression.clustering import cluster
+from gs_jax.suppression.locate import find_points
 
 SHOWN = (18.0, 20.0, 22.0)  # mm
 # Parts of the maximum. Peaks and clustering get the best of these as their lowest threshold, knowing the truth.

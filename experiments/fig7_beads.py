@@ -25,12 +25,12 @@ from gs_jax import Grid
 from gs_jax.builtin import geomscope
 from gs_jax.camera import Camera, expose
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
-from gs_jax.locate import find_points
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
 from gs_jax.phantoms import beads
 from gs_jax.progress import Progress
 from gs_jax.simulate import simulate_points
+from gs_jax.suppression.locate import find_points
 
 # mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
 SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002

@@ -29,15 +29,15 @@ from gs_jax import Grid, Imager
 from gs_jax.builtin import geomscope
 from gs_jax.camera import Camera, electrons, expose
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
-from gs_jax.locate import find_points
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
 from gs_jax.metrics import quality
 from gs_jax.phantoms import letters, rasterize, snowflake
 from gs_jax.progress import Progress
 from gs_jax.reconstruct import reconstruct_stack
 from gs_jax.simulate import simulate_points
-from gs_jax.unet import pretrained, suppress
+from gs_jax.suppression.locate import find_points
+from gs_jax.suppression.unet import pretrained, suppress
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04

@@ -25,9 +25,9 @@ from scipy.spatial import KDTree
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from gs_jax import Imager, forward
 from gs_jax.builtin import geomscope
-from gs_jax.disk import make_folder, write_json
 from gs_jax.geometry import envelope
 from gs_jax.info import describe
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.progress import Progress
 
 STUDY = {

@@ -2,12 +2,12 @@
 
 The prescription, the plate, the number of lenses and their least distance are fixed; only the centres move. The object
 is as wide as the field of a lens, and sub-images overlap. For each of five seeds 200 Poisson-disc layouts are scored by
-the end-to-end loss (`gs_jax.end_to_end.reconstruction_loss`), and the best one is the competitor. From there Adam goes
-down the gradient of that same loss, on other scenes at each step. The controls are hexagonal lattices of as many
-lenses, which nothing optimised: at the least distance, and spread as wide as the plate allows. All are then judged by
-PSNR on 30 held-out scenes that the loss's model did not render (`experiments.layout_scenes`). The reconstruction is the
-same for all: normalised back-projection less its local background (`gs_jax.end_to_end.reconstruct`), and as a second
-method, which nothing was optimised for, ten steps of Richardson-Lucy on the same pixel-voxel lists.
+the end-to-end loss (`gs_jax.codesign.end_to_end.reconstruction_loss`), and the best one is the competitor. From there
+Adam goes down the gradient of that same loss, on other scenes at each step. The controls are hexagonal lattices of as
+many lenses, which nothing optimised: at the least distance, and spread as wide as the plate allows. All are then judged
+by PSNR on 30 held-out scenes that the loss's model did not render (`experiments.layout_scenes`). The reconstruction is
+the same for all: normalised back-projection less its local background (`gs_jax.codesign.end_to_end.reconstruct`), and
+as a second method, which nothing was optimised for, ten steps of Richardson-Lucy on the same pixel-voxel lists.
 
     python -m experiments.layout_gain [--out DIR] [--seeds N]
 
@@ -29,11 +29,11 @@ from scipy import stats
 
 from experiments.layout_scenes import METHODS, Centers, Study, judge, loss, overlap, psf_of
 from gs_jax.coverage import nearest_neighbour_distances
-from gs_jax.disk import make_folder, write_json
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
+from gs_jax.optics.psf import gaussian_psf, psf
+from gs_jax.optics.theory import occupancy
 from gs_jax.progress import Progress
-from gs_jax.psf import gaussian_psf, psf
-from gs_jax.theory import occupancy
 
 NAMES = ("best", "ours", "hexagonal", "spread")
 PAIRS = (("ours", "best"), ("hexagonal", "best"), ("spread", "best"), ("ours", "hexagonal"), ("ours", "spread"))

@@ -19,14 +19,14 @@ from rich.table import Table
 
 from gs_jax import MicrolensArray
 from gs_jax.builtin import geomscope
-from gs_jax.caps import facet_surface
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.mesh_files import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
-from gs_jax.mold_checks import array_volume, mold_volume
-from gs_jax.mold_preview import draw_solid
-from gs_jax.mold_verify import quality, verify
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.mold.caps import facet_surface
+from gs_jax.mold.checks import array_volume, mold_volume
+from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold.preview import draw_solid
+from gs_jax.mold.solids import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
+from gs_jax.mold.verify import quality, verify
 from gs_jax.progress import Progress
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"

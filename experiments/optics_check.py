@@ -27,13 +27,13 @@ from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from gs_jax import Imager, MicrolensArray, Sensor, envelope
-from gs_jax.aberrations import independent_rms, seidel
-from gs_jax.aperture import aperture_area
 from gs_jax.designs import read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
-from gs_jax.psf import geometric_psf, psf, strehl
-from gs_jax.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
+from gs_jax.optics.aberrations import independent_rms, seidel
+from gs_jax.optics.aperture import aperture_area
+from gs_jax.optics.psf import geometric_psf, psf, strehl
+from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
 
 WAVELENGTH = 520e-6
 # Radius of the disc as large as the mean Voronoi cell of the paper's array, mm.

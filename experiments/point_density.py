@@ -23,13 +23,13 @@ from gs_jax import Grid, Imager
 from gs_jax.builtin import geomscope
 from gs_jax.camera import Camera, expose
 from gs_jax.designs import Design, read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.locate import find_points
+from gs_jax.io.disk import make_folder, write_json
 from gs_jax.metrics import localization
 from gs_jax.phantoms import random_points
 from gs_jax.progress import Progress
 from gs_jax.reconstruct import reconstruct_stack
 from gs_jax.simulate import simulate_points
+from gs_jax.suppression.locate import find_points
 
 # Points, and captures of so many.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}

@@ -22,8 +22,8 @@ from scipy.spatial import KDTree
 
 from gs_jax import Grid, Imager
 from gs_jax.designs import read_design
-from gs_jax.disk import make_folder, write_json
-from gs_jax.files import read_capture
+from gs_jax.io.disk import make_folder, write_json
+from gs_jax.io.files import read_capture
 from gs_jax.progress import Progress
 from gs_jax.reconstruct import reconstruct_stack
 

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.table import Table
 
-from . import aberrations, theory
 from .coverage import check_positive, coverage, nearest_neighbour_distances
 from .designs import Design
 from .errors import InputError, shown
 from .geometry import Imager
+from .optics import aberrations, theory
 
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7
@@ -58,7 +58,7 @@ def performance(
     depths
         From the plate, mm.
     diameter
-        Of the clear aperture, mm: `gs_jax.aperture.clear_diameter(imager.array)`.
+        Of the clear aperture, mm: `gs_jax.optics.aperture.clear_diameter(imager.array)`.
     field_radius
         `sqrt(A_e / pi)`, mm.
     wavelength, confusion

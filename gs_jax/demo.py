@@ -11,25 +11,25 @@ from scipy.ndimage import gaussian_filter
 
 from .builtin import geomscope
 from .camera import Camera, expose
-from .codesign import optimise
+from .codesign.outcome import as_records, write_outcome
+from .codesign.search import optimise
+from .codesign.study import read_study
 from .datasheet import datasheet
 from .demo_report import Views, points_picture, report, views_picture
 from .designs import Design, write_design
-from .disk import atomic_write, make_folder, write_json, write_text
-from .files import write_capture, write_points
 from .findings import findings
 from .geometry import Grid
-from .locate import find_points
+from .io.disk import atomic_write, make_folder, write_json, write_text
+from .io.files import write_capture, write_points
+from .io.volumes import write_volume
 from .metrics import localization, quality
-from .mold_report import make_part
-from .outcome import as_records, write_outcome
+from .mold.report import make_part
 from .phantoms import letters, random_points, rasterize
 from .progress import Progress
 from .reconstruct import reconstruct_iteratively, reconstruct_stack
 from .simulate import simulate_points, simulate_volume
-from .study import read_study
-from .unet import pretrained, suppress
-from .volumes import write_volume
+from .suppression.locate import find_points
+from .suppression.unet import pretrained, suppress
 
 # What is written at which depth (mm), and where its middle is (mm).
 WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))

@@ -8,9 +8,9 @@ from .backprojection import backproject
 from .errors import InputError
 from .geometry import Grid, Imager
 from .info import memory_bytes
-from .methods import reconstruct
 from .progress import Progress
 from .simulate import psf_of_depth
+from .solvers.methods import reconstruct
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.aberrations import (
+from gs_jax.optics.aberrations import (
     Wavefront,
     balanced_rms,
     independent_field_radius,
@@ -18,7 +18,7 @@ from gs_jax.aberrations import (
     strehl,
     unbalanced_rms,
 )
-from gs_jax.theory import focus_distance
+from gs_jax.optics.theory import focus_distance
 
 F, N, DEPTH, WAVELENGTH = 2 / 0.43, 1.43, 20.7, 520e-6
 ORIENTATIONS = pytest.mark.parametrize("plano", [True, False])

@@ -8,10 +8,10 @@ import pytest
 from jax.test_util import check_grads
 from skimage.restoration import denoise_tv_chambolle
 
-from gs_jax.admm import admm, admm_convolution
-from gs_jax.convolution import Convolution
-from gs_jax.fista import fista
-from gs_jax.total_variation import differences, differences_adjoint, shrink, total_variation
+from gs_jax.solvers.admm import admm, admm_convolution
+from gs_jax.solvers.convolution import Convolution
+from gs_jax.solvers.fista import fista
+from gs_jax.solvers.total_variation import differences, differences_adjoint, shrink, total_variation
 
 
 def system(depths=1):

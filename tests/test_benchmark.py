@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from gs_jax import benchmark, benchmark_report
-from gs_jax.benchmark import METHODS, obstacle, paper_clusters, run, slopes
-from gs_jax.benchmark_scenes import Case, bench, peaks, scores, spots
-from gs_jax.methods import forward_operator, reconstruct
+from gs_jax.benchmark import compare, report
+from gs_jax.benchmark.compare import METHODS, obstacle, paper_clusters, run, slopes
+from gs_jax.benchmark.scenes import Case, bench, peaks, scores, spots
 from gs_jax.progress import Progress
+from gs_jax.solvers.methods import forward_operator, reconstruct
 
 from .helpers import scene
 
@@ -34,8 +34,8 @@ def found():
             return type("Done", (), {"result": lambda _: result})()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "ProcessPoolExecutor", Here)
-        patch.setattr(benchmark, "_REPEATS", 2)
+        patch.setattr(compare, "ProcessPoolExecutor", Here)
+        patch.setattr(compare, "_REPEATS", 2)
         names = ("backproject", "backproject + paper's clusters", "richardson-lucy", "richardson-lucy, dense")
         return run((16,), methods=names, seeds=(0,), progress=Progress())
 
@@ -45,7 +45,7 @@ def test_records_and_files(found, tmp_path):
     assert len(records) == 5 and not left_out
     assert all(set(record) == KEYS for record in records)
     assert {r["pairs"] for r in records} == {16.0**4}
-    benchmark_report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
+    report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
     assert json.loads((tmp_path / "benchmark.json").read_text()) == records
     with (tmp_path / "benchmark.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(records)
@@ -126,7 +126,7 @@ def test_every_method_reconstructs_and_a_wrong_one_is_named():
 def test_command(found, tmp_path, monkeypatch):
     from gs_jax.cli.benchmark import benchmark as command
 
-    monkeypatch.setattr(benchmark, "run", lambda progress: found)
+    monkeypatch.setattr(compare, "run", lambda progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
     assert result.exit_code == 0 and "benchmark.json" in result.output
     assert len(json.loads((tmp_path / "new" / "benchmark.json").read_text())) == len(found[0])

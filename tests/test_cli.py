@@ -8,8 +8,8 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.files import read_capture, read_points
-from gs_jax.volumes import read_volume, write_volume
+from gs_jax.io.files import read_capture, read_points
+from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs
 

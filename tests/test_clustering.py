@@ -5,7 +5,7 @@ import pytest
 from skimage.measure import label
 
 from gs_jax import Grid
-from gs_jax.clustering import cluster
+from gs_jax.suppression.clustering import cluster
 
 
 def volume_grid(shape=(5, 40, 40)) -> Grid:

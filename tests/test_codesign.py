@@ -4,16 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import codesign
 from gs_jax.builtin import geomscope
-from gs_jax.checkpoint import read_checkpoint
-from gs_jax.codesign import optimise, problem_of, random_start
+from gs_jax.codesign import search
+from gs_jax.codesign.checkpoint import read_checkpoint
+from gs_jax.codesign.outcome import before_and_after, check_outputs, write_outcome
+from gs_jax.codesign.parameters import start_values
+from gs_jax.codesign.search import optimise, problem_of, random_start
+from gs_jax.codesign.study import Study
 from gs_jax.designs import read_design
 from gs_jax.errors import InputError
-from gs_jax.outcome import before_and_after, check_outputs, write_outcome
-from gs_jax.parameters import start_values
 from gs_jax.progress import Progress
-from gs_jax.study import Study
 
 TERMS = [
     {"name": "lateral_resolution_um", "at_most": 40.0},
@@ -77,7 +77,7 @@ def test_files(table1, outcome, tmp_path):
 
 def interrupted(table1, question, path, monkeypatch, *, writes):
     """A search that is stopped after some checkpoints."""
-    count, write = [0], codesign.write_checkpoint
+    count, write = [0], search.write_checkpoint
 
     def counted(*arguments):
         write(*arguments)
@@ -85,10 +85,10 @@ def interrupted(table1, question, path, monkeypatch, *, writes):
         if count[0] == writes:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(codesign, "write_checkpoint", counted)
+    monkeypatch.setattr(search, "write_checkpoint", counted)
     with pytest.raises(KeyboardInterrupt), Progress() as progress:
         optimise(table1, question, progress=progress, checkpoint=path, every=0.0)
-    monkeypatch.setattr(codesign, "write_checkpoint", write)
+    monkeypatch.setattr(search, "write_checkpoint", write)
 
 
 @pytest.mark.parametrize("writes", [pytest.param(6, marks=pytest.mark.slow), 10], ids=["stage 1", "stage 2"])
@@ -150,6 +150,6 @@ def test_a_thin_lens_has_no_radius_to_free(table1):
 
 
 def test_no_start_that_ends_anywhere(table1, monkeypatch):
-    monkeypatch.setattr(codesign, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
+    monkeypatch.setattr(search, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
     with pytest.raises(InputError, match="no start came to a finite cost"), Progress() as progress:
         optimise(table1, study(), progress=progress)

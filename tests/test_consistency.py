@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.stats import binom
 
 from gs_jax import envelope
-from gs_jax.consistency import (
+from gs_jax.suppression.consistency import (
     Readings,
     agreed_level,
     log_false_alarms,

@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.signal import convolve2d
 
-from gs_jax.convolution import Convolution
+from gs_jax.solvers.convolution import Convolution
 
 # Odd and even, larger and smaller than the image, one depth and several.
 SIZES = [((3, 4, 7), (11, 16)), ((2, 12, 15), (9, 10))]

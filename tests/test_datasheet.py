@@ -9,12 +9,13 @@ import pytest
 from jax.test_util import check_grads
 from rich.console import Console
 
-from gs_jax import Imager, MicrolensArray, theory
-from gs_jax.aperture import clear_diameter, pitch
+from gs_jax import Imager, MicrolensArray
 from gs_jax.builtin import geomscope
 from gs_jax.datasheet import datasheet, performance, summary, tables
 from gs_jax.designs import read_design
 from gs_jax.findings import findings
+from gs_jax.optics import theory
+from gs_jax.optics.aperture import clear_diameter, pitch
 
 from .helpers import scene
 from .test_cli import run

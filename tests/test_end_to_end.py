@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, forward
-from gs_jax.end_to_end import (
+from gs_jax.codesign.end_to_end import (
     footprints,
     local_contrast,
     misfit_db,
@@ -17,8 +17,8 @@ from gs_jax.end_to_end import (
     reconstruct,
     reconstruction_loss,
 )
+from gs_jax.codesign.subfield import subfield
 from gs_jax.metrics import quality
-from gs_jax.subfield import subfield
 
 from .helpers import scene
 

@@ -22,7 +22,7 @@ from PIL import Image
 
 from gs_jax import Grid
 from gs_jax.errors import InputError
-from gs_jax.files import (
+from gs_jax.io.files import (
     atomic_write,
     check_output,
     read_capture,
@@ -708,7 +708,7 @@ def test_a_refusal_prints_nothing_else(tmp_path):
     tiff(tmp_path / "a.tif")
     cut(tmp_path / "a.tif", 100)
     code = f"""
-from gs_jax.files import read_capture
+from gs_jax.io.files import read_capture
 try:
     read_capture({str(tmp_path / "a.tif")!r})
 except ValueError as error:

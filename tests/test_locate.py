@@ -14,13 +14,13 @@ from experiments import point_density
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
 from gs_jax.builtin import geomscope
 from gs_jax.camera import Camera, expose
-from gs_jax.clustering import cluster
 from gs_jax.designs import read_design
-from gs_jax.locate import find_points
 from gs_jax.metrics import localization
 from gs_jax.phantoms import random_points
 from gs_jax.progress import Progress
 from gs_jax.simulate import simulate_points
+from gs_jax.suppression.clustering import cluster
+from gs_jax.suppression.locate import find_points
 
 from .helpers import needs
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from gs_jax import MicrolensArray
-from gs_jax.aperture import aperture_edge
-from gs_jax.caps import cap_height, cap_sag, facet_surface
 from gs_jax.designs import read_design
 from gs_jax.errors import InputError
-from gs_jax.mesh_files import printable
-from gs_jax.mold import (
+from gs_jax.mold.caps import cap_height, cap_sag, facet_surface
+from gs_jax.mold.checks import array_volume, caps_volume, check_solid, mold_volume, volume_tolerance
+from gs_jax.mold.mesh_files import printable
+from gs_jax.mold.solids import (
     ENGRAVED,
     MoldShape,
     array_solid,
@@ -25,8 +25,8 @@ from gs_jax.mold import (
     mold_solid,
     plate_thickness,
 )
-from gs_jax.mold_checks import array_volume, caps_volume, check_solid, mold_volume, volume_tolerance
-from gs_jax.mold_verify import verify
+from gs_jax.mold.verify import verify
+from gs_jax.optics.aperture import aperture_edge
 
 from .helpers import needs
 

@@ -9,11 +9,11 @@ import trimesh
 
 from gs_jax import MicrolensArray
 from gs_jax.errors import InputError
-from gs_jax.mesh_files import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold import MoldShape, array_solid, engravings, mold_block, mold_solid
-from gs_jax.mold_checks import array_volume, check_solid
-from gs_jax.mold_report import judge
-from gs_jax.mold_verify import quality, verify
+from gs_jax.mold.checks import array_volume, check_solid
+from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold.report import judge
+from gs_jax.mold.solids import MoldShape, array_solid, engravings, mold_block, mold_solid
+from gs_jax.mold.verify import quality, verify
 
 from .test_mold import CHORD, lenses, random_lenses
 

@@ -14,9 +14,9 @@ from gs_jax.cli.mold import mold
 from gs_jax.coverage import coverage
 from gs_jax.designs import Design, read_design
 from gs_jax.errors import InputError
-from gs_jax.mold import MoldShape, plate_thickness
-from gs_jax.mold_checks import array_volume, check_design, refuse_errors
-from gs_jax.mold_report import Order, make_part
+from gs_jax.mold.checks import array_volume, check_design, refuse_errors
+from gs_jax.mold.report import Order, make_part
+from gs_jax.mold.solids import MoldShape, plate_thickness
 
 DESIGN = """
 name = "small $x"

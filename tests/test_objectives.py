@@ -8,11 +8,11 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax.builtin import geomscope
+from gs_jax.codesign.objectives import TERMS, encircled_radius, psf_width
+from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.coverage import largest_hole, nearest_neighbour_distances
 from gs_jax.datasheet import datasheet
-from gs_jax.objectives import TERMS, encircled_radius, psf_width
-from gs_jax.parameters import candidate, parent_of, start_values
-from gs_jax.psf import psf
+from gs_jax.optics.psf import psf
 
 # Off the raster of places, where a hole has a kink.
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.aperture import clear_diameter, pitch
 from gs_jax.builtin import geomscope
+from gs_jax.codesign.parameters import NAMES, Bounds, candidate, new_design, parent_of, start_values
 from gs_jax.coverage import coverage
 from gs_jax.errors import InputError
-from gs_jax.parameters import NAMES, Bounds, candidate, new_design, parent_of, start_values
+from gs_jax.optics.aperture import clear_diameter, pitch
 
 
 @pytest.fixture(scope="module")

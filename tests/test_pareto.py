@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gs_jax.builtin import geomscope
+from gs_jax.codesign.pareto import as_json, non_dominated, picture, sweep
+from gs_jax.codesign.study import Study
 from gs_jax.errors import InputError
-from gs_jax.pareto import as_json, non_dominated, picture, sweep
 from gs_jax.progress import Progress
-from gs_jax.study import Study
 
 STUDY = {
     "depths_mm": (18.0, 23.0),

@@ -6,8 +6,8 @@ from jax.test_util import check_grads
 from scipy.special import j0, j1
 
 from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
-from gs_jax.psf import gaussian_psf, geometric_psf, psf, strehl, window_fraction
-from gs_jax.unit import best_focus, unit_rays, wavefront_rms
+from gs_jax.optics.psf import gaussian_psf, geometric_psf, psf, strehl, window_fraction
+from gs_jax.optics.unit import best_focus, unit_rays, wavefront_rms
 
 WAVELENGTH, RADIUS = 520e-6, 0.65
 KINDS = [psf, geometric_psf, gaussian_psf]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gs_jax.solve import CONVERGED, LIMIT, MET, NOT_FINITE, State, run, stepper
-from gs_jax.study import StageTable
+from gs_jax.codesign.solve import CONVERGED, LIMIT, MET, NOT_FINITE, State, run, stepper
+from gs_jax.codesign.study import StageTable
 
 KEY = jax.random.key(0)
 SOLVERS = ("levenberg-marquardt", "bfgs", "lbfgs")

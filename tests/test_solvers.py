@@ -12,10 +12,10 @@ from scipy.optimize import nnls
 from skimage.restoration import richardson_lucy as of_skimage
 
 from gs_jax import Imager, MicrolensArray, backproject, forward, ray_operator
-from gs_jax.admm import admm
-from gs_jax.convolution import Convolution
-from gs_jax.fista import fista, gradient_descent, largest_eigenvalue
-from gs_jax.richardson_lucy import list_richardson_lucy, richardson_lucy
+from gs_jax.solvers.admm import admm
+from gs_jax.solvers.convolution import Convolution
+from gs_jax.solvers.fista import fista, gradient_descent, largest_eigenvalue
+from gs_jax.solvers.richardson_lucy import list_richardson_lucy, richardson_lucy
 
 from .helpers import scene
 

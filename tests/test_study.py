@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
+from gs_jax.codesign.study import parent_path, read_study
 from gs_jax.errors import InputError
-from gs_jax.study import parent_path, read_study
 
 STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
 

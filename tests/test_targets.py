@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.objectives import TERMS, Term
-from gs_jax.study import TermTable
-from gs_jax.targets import Row, assess, evaluate, residual, worst_of
+from gs_jax.codesign.objectives import TERMS, Term
+from gs_jax.codesign.study import TermTable
+from gs_jax.codesign.targets import Row, assess, evaluate, residual, worst_of
 
 KEY = jax.random.key(0)
 

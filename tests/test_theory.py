@@ -5,7 +5,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.optimize import brentq
 
-from gs_jax import theory
+from gs_jax.optics import theory
 
 F, DEPTH, PITCH = 2 / 0.43, 20.0, 1.23
 

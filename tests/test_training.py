@@ -6,13 +6,13 @@ import optax
 import pytest
 from click.testing import CliRunner
 
-from gs_jax import training_data
 from gs_jax.cli.train import train as command
 from gs_jax.errors import InputError
 from gs_jax.progress import Progress
-from gs_jax.training import Recipe, read_checkpoint, start, train, write_checkpoint
-from gs_jax.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks
-from gs_jax.unet import UNet, read_weights
+from gs_jax.suppression import training_data
+from gs_jax.suppression.training import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.suppression.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks
+from gs_jax.suppression.unet import UNet, read_weights
 
 
 def toy(offsets=(0,), batch=lambda rng: paper_batch(rng, 16)) -> Recipe:

@@ -6,7 +6,7 @@ from jax.test_util import check_grads
 from scipy.optimize import minimize_scalar
 
 from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
-from gs_jax.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
+from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
 
 WAVELENGTH = 520e-6
 FIELDS = [(0.0, 0.0), (1.0, -0.4), (0.0, 3.0)]

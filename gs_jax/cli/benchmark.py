@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from ..disk import make_folder
+from ..io.disk import make_folder
 from ..progress import Progress
 
 
@@ -12,8 +12,8 @@ from ..progress import Progress
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
 def benchmark(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
-    from ..benchmark import run  # it and Matplotlib take seconds to import
-    from ..benchmark_report import write
+    from ..benchmark.compare import run  # it and Matplotlib take seconds to import
+    from ..benchmark.report import write
 
     folder = make_folder(out)
     with Progress() as progress:

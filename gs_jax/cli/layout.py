@@ -6,7 +6,7 @@ import click
 
 from ..coverage import coverage, nearest_neighbour_distances
 from ..designs import write_centers
-from ..disk import check_output
+from ..io.disk import check_output
 from ..layouts import random_layout
 from .options import MM
 

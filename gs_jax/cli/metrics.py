@@ -7,8 +7,8 @@ from rich.console import Console
 
 from ..datasheet import datasheet, summary, tables
 from ..designs import read_design
-from ..disk import check_output, write_json
 from ..findings import findings
+from ..io.disk import check_output, write_json
 from .options import UM, Depths
 
 

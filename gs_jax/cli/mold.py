@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from ..designs import read_design
-from ..mold import MoldShape
-from ..mold_report import Order, make_part, words
+from ..mold.report import Order, make_part, words
+from ..mold.solids import MoldShape
 from ..progress import Progress
 from .options import Number
 

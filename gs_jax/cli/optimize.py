@@ -6,11 +6,11 @@ import click
 import jax
 from rich.console import Console
 
-from ..checkpoint import checkpoint_path
-from ..codesign import optimise
+from ..codesign.checkpoint import checkpoint_path
+from ..codesign.search import optimise
+from ..codesign.study import read_study
 from ..designs import read_design
 from ..progress import Progress
-from ..study import read_study
 
 
 @click.command()
@@ -23,7 +23,7 @@ def optimize(design: Path, study: Path, resume: bool, output: Path):
 
     Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).
     """
-    from ..outcome import before_and_after, check_outputs, write_outcome  # Matplotlib takes a second to import
+    from ..codesign.outcome import before_and_after, check_outputs, write_outcome  # Matplotlib takes a second to import
 
     check_outputs(output)
     # Searches end within a billionth of the minimum; single precision stops far from it.

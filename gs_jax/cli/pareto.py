@@ -7,10 +7,10 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from ..codesign.study import parent_path, read_study
 from ..designs import read_design
-from ..disk import atomic_write, make_folder, write_json
+from ..io.disk import atomic_write, make_folder, write_json
 from ..progress import Progress
-from ..study import parent_path, read_study
 
 
 @click.command()
@@ -21,7 +21,7 @@ def pareto(study: Path, out: Path):
 
     The folder gets pareto.json, the designs' numbers, and pareto.png.
     """
-    from ..pareto import as_json, picture, sweep  # Matplotlib takes a second to import
+    from ..codesign.pareto import as_json, picture, sweep  # Matplotlib takes a second to import
 
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)

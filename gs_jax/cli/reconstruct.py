@@ -6,16 +6,16 @@ import click
 import numpy as np
 
 from ..designs import read_design
-from ..disk import check_output
 from ..errors import InputError
-from ..files import read_capture, write_points
-from ..locate import find_points
-from ..methods import METHODS
+from ..io.disk import check_output
+from ..io.files import read_capture, write_points
+from ..io.volumes import VOLUME_SUFFIXES, write_volume
 from ..phantoms import rasterize
 from ..progress import Progress
 from ..reconstruct import reconstruct_iteratively, reconstruct_stack, voxel_grid
-from ..unet import pretrained, suppress as without_background
-from ..volumes import VOLUME_SUFFIXES, write_volume
+from ..solvers.methods import METHODS
+from ..suppression.locate import find_points
+from ..suppression.unet import pretrained, suppress as without_background
 from .options import UM, Depths, depth_range
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..camera import Camera, expose
 from ..designs import read_design
-from ..disk import check_output
 from ..errors import InputError
-from ..files import CAPTURE_SUFFIXES, write_capture
+from ..io.disk import check_output
+from ..io.files import CAPTURE_SUFFIXES, write_capture
 from ..progress import Progress
 from ..simulate import PSFS, simulate_scene
 from .options import Number

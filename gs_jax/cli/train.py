@@ -7,11 +7,18 @@ from pathlib import Path
 import click
 import numpy as np
 
-from ..disk import check_output, write_json
+from ..io.disk import check_output, write_json
 from ..progress import Progress
-from ..training import multislice_recipe, paper_recipe, read_checkpoint, start, train as run, write_checkpoint
-from ..training_data import stacks
-from ..unet import PRETRAINED, write_weights
+from ..suppression.training import (
+    multislice_recipe,
+    paper_recipe,
+    read_checkpoint,
+    start,
+    train as run,
+    write_checkpoint,
+)
+from ..suppression.training_data import stacks
+from ..suppression.unet import PRETRAINED, write_weights
 
 # Those of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000}

@@ -1,0 +1,1 @@
+"""Methods compared: time, memory and quality (Fig. 9)."""

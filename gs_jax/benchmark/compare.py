@@ -1,0 +1,225 @@
+"""Reconstruction time and quality against the number of pixel-voxel pairs: the paper's Fig. 9.
+
+One plane at 20 mm with as many voxels as the sensor has pixels, `n^2`, hence `n^4` pairs. The microscope is a middle
+piece of the paper's, 5.76 mm wide, whatever `n`. A scene is ten particles as wide as a pixel seen through a lens. Its
+image is that of points far finer than the voxels, with the diffraction PSF and noise: no operator that a solver uses
+rendered it. Each method runs in its own process. "dense" stands for the system matrix in memory, as the paper's ADMM
+and Richardson-Lucy keep it; the others are matrix-free.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Float, Float32
+
+from ..errors import InputError
+from ..geometry import Grid
+from ..info import memory_bytes
+from ..progress import Progress
+from ..solvers.methods import SOLVERS, forward_operator, reconstruct
+from ..suppression.clustering import cluster
+from ..suppression.locate import find_points
+from ..suppression.unet import pretrained, suppress
+from .measure import peak_mib, timed
+from .scenes import Bench, Case, bench, case, scores, spots
+
+# 1e6 to 2e9 pairs as in the paper, then on to its full scale (5120^2 pixels times 4 million voxels: 1e14).
+SIDES = (32, 56, 100, 212, 1024, 3200)
+STEPS = 30
+COSTS = ("seconds", "compile_seconds", "peak_mib")
+# The clusters that the paper's algorithm finds in noise are left out: what this many deviations do not exceed.
+_FLOOR = 5.0
+# A call that took longer than this is not repeated; one that would take longer than the limit is left out, seconds.
+_REPEAT, LIMIT = 1.0, 30.0
+_REPEATS = 5
+
+
+class Method(NamedTuple):
+    """`make(bench)` returns `image -> volume`; `growth` is the exponent of its time, in pairs, for a forecast."""
+
+    make: Callable[[Bench], Callable[[Any], Any]]
+    growth: float = 0.5
+    dense: bool = False
+
+
+def _compiled(method: str):
+    def make(bench: Bench):
+        arguments = bench.imager, bench.grid, jnp.asarray(bench.psf)
+        image = jax.ShapeDtypeStruct(bench.imager.sensor.shape, jnp.float32)
+        call = reconstruct.lower(image, *arguments, method=method, steps=STEPS).compile()
+        return lambda image: call(image, *arguments)
+
+    return make
+
+
+def _dense(solver: str):
+    """The same solver with the system matrix in memory; making it is counted with compilation."""
+
+    def make(bench: Bench):
+        imager, grid, psf, _ = bench
+        shape = (grid.depths.size, *grid.shape)
+        size, pixels = math.prod(shape), math.prod(imager.sensor.shape)
+        unit = lambda voxel: jnp.zeros(size, jnp.float32).at[voxel].set(1).reshape(shape)
+        column = jax.jit(lambda voxel: forward_operator(imager, grid, jnp.asarray(psf)).mv(unit(voxel)).ravel())
+        matrix = np.empty((size, pixels), np.float32)
+        for voxel in range(size):
+            matrix[voxel] = column(voxel)
+        matrix = jnp.asarray(matrix)
+        voxels = jax.ShapeDtypeStruct((size,), jnp.float32)
+
+        def solve(matrix, image):
+            # On processors XLA is many times slower with `matrix.T @ x`, which is what `MatrixLinearOperator` takes.
+            operator = lx.FunctionLinearOperator(lambda x: x @ matrix, voxels)
+            return SOLVERS[solver](operator, image, steps=STEPS).x
+
+        call = jax.jit(solve).lower(matrix, jax.ShapeDtypeStruct((pixels,), jnp.float32)).compile()
+        return lambda image: call(matrix, image.ravel()).reshape(shape)
+
+    return make
+
+
+def _located(bench: Bench):
+    def run(image):
+        points = find_points(image, bench.imager, bench.grid, progress=Progress())
+        return spots(points, bench.grid, bench.width)
+
+    return run
+
+
+def _clustered(bench: Bench):
+    first = _compiled("backproject")(bench)
+
+    def run(image):
+        points = paper_clusters(np.asarray(first(image)), bench.grid)
+        return spots(points, bench.grid, bench.width)
+
+    return run
+
+
+def paper_clusters(volume: Float32[np.ndarray, "depth y x"], grid: Grid) -> Float[np.ndarray, "point 4"]:
+    """`cluster`, but for what noise can be: five standard deviations, as the median deviation from the median tells."""
+    points = cluster(volume, grid)
+    deviation = np.abs(volume - np.median(volume, axis=(1, 2), keepdims=True))
+    return points[points[:, 3] > _FLOOR * 1.4826 * np.median(deviation)]
+
+
+def _network(bench: Bench):
+    first, network = _compiled("backproject")(bench), pretrained()
+    return lambda image: suppress(np.asarray(first(image)), network)
+
+
+METHODS = {
+    "backproject": Method(_compiled("backproject")),
+    "backproject + cluster": Method(_located),
+    "backproject + paper's clusters": Method(_clustered),
+    "backproject + unet": Method(_network),
+    "list-rl": Method(_compiled("list-rl")),
+    "richardson-lucy": Method(_compiled("richardson-lucy")),
+    "fista": Method(_compiled("fista")),
+    "admm": Method(_compiled("admm")),
+    "richardson-lucy, dense": Method(_dense("richardson-lucy"), 1.0, True),
+    "admm, dense": Method(_dense("admm"), 1.0, True),
+}
+
+
+def measure(name: str, side: int, cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """A record for each case; run in a process of its own."""
+    at = bench(side)
+    images = [jnp.asarray(c.image) for c in cases]
+
+    def work():
+        compile_s, call = timed(lambda: METHODS[name].make(at))
+        run = lambda image: timed(lambda: jax.block_until_ready(call(image)))
+        found, first = [], []
+        for image in images:
+            # Some compile in the first call with an image, for as many points as it shows.
+            first.append(run(image)[0])
+            seconds, volume = run(image)
+            more = [run(image)[0] for _ in range(_REPEATS - 1)] if seconds < _REPEAT else []
+            found.append((min(seconds, *more, first[-1]), np.asarray(volume)))
+        return compile_s + first[0] - found[0][0], found
+
+    peak, (compile_s, found) = peak_mib(work)
+    return [
+        {"method": name, "pairs": float(side) ** 4, "seconds": seconds, "compile_seconds": compile_s, "peak_mib": peak}
+        | scores(volume, c, at)
+        for (seconds, volume), c in zip(found, cases, strict=True)
+    ]
+
+
+def obstacle(name: str, side: int, last: dict[str, Any] | None, limit: float) -> str | None:
+    """Why a method is not run at a size: too much memory, or time; None if nothing is in its way."""
+    method, pairs = METHODS[name], float(side) ** 4
+    # The matrix, and its copy while it is made.
+    if method.dense and 8 * pairs > (room := memory_bytes() / 4):
+        return f"two copies of the matrix take {8 * pairs / 2**30:.3g} GiB, allowed: {room / 2**30:.3g} GiB"
+    if last and (forecast := last["seconds"] * (pairs / last["pairs"]) ** method.growth) > limit:
+        return f"would take {forecast:.3g} s an image, allowed: {limit:g} s"
+    return None
+
+
+def run(
+    sides: Sequence[int] = SIDES,
+    *,
+    methods: Sequence[str] = tuple(METHODS),
+    seeds: Sequence[int] = (0, 1, 2),
+    limit: float = LIMIT,
+    progress: Progress,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The records of all methods and sizes, and what was left out: `method`, `pairs`, `reason`.
+
+    Parameters
+    ----------
+    sides
+        Pixels, and voxels, along a side, ascending.
+    methods
+        Keys of `METHODS`.
+    seeds
+        One scene each; above 1e10 pairs only the first.
+    limit
+        A method is not run at a size where an image would take longer, by its time at the last, seconds.
+    """
+    records, left_out = [], []
+    cases = {}
+    for side in progress.track(sides, "Images"):
+        at = bench(side)
+        cases[side] = [case(at, seed, Progress()) for seed in (seeds if side**4 < 1e10 else seeds[:1])]
+        dark = [scores(np.zeros_like(c.truth), c, at) for c in cases[side]]
+        nothing = {"method": "zeros", "pairs": float(side) ** 4} | dict.fromkeys(COSTS, 0.0)
+        records += [nothing | found | {"seed": seed} for found, seed in zip(dark, seeds, strict=False)]
+    for name in progress.track(methods, "Methods"):
+        last = None
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            for side in progress.track(sides, name):
+                reason = obstacle(name, side, last, limit)
+                if reason is None:
+                    try:
+                        found = pool.submit(measure, name, side, cases[side]).result()
+                        last = found[0]
+                        records += [record | {"seed": seed} for record, seed in zip(found, seeds, strict=False)]
+                        continue
+                    except BrokenProcessPool:
+                        reason = "the process was ended, for want of memory"
+                    except InputError as error:  # weights that are not there
+                        reason = str(error)
+                left_out.append({"method": name, "pairs": float(side) ** 4, "reason": reason})
+    return records, left_out
+
+
+def slopes(records: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Exponent of the time in pairs: of each method, a line through its logarithms from 1e6 to 2e9 pairs."""
+    found = {}
+    for name in dict.fromkeys(r["method"] for r in records if r["seconds"] > 0):
+        mine = [r for r in records if r["method"] == name and r["pairs"] < 3e9]
+        if len({r["pairs"] for r in mine}) > 1:
+            logs = np.log([[r["pairs"], r["seconds"]] for r in mine])
+            found[name] = float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])
+    return found

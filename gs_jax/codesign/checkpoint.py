@@ -1,0 +1,76 @@
+"""The file that a search goes on from: its log as one line of JSON, then the solver's state as arrays."""
+
+import hashlib
+import io
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+
+from ..designs import Design
+from ..errors import InputError
+from ..io.disk import atomic_write, check_input
+from .solve import State
+from .study import Study
+
+_FORMAT = "gs-jax checkpoint 1"
+
+
+@dataclass
+class Log:
+    """What a search has done.
+
+    `steps`: one record a step, with the worst entry of each term. `ends`: one record for each finished start of a
+    stage, with the reason for stopping and the free parameters.
+    """
+
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    ends: list[dict[str, Any]] = field(default_factory=list)
+
+
+def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, design: Design, state: State) -> None:
+    """Write the file, whole or not at all."""
+    head = {"format": _FORMAT, "of": _digest(study, design), "log": asdict(log)}
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(json.dumps(head).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, state)
+
+
+def read_checkpoint(path: str | os.PathLike[str], study: Study, design: Design) -> tuple[Log, bytes]:
+    """The log, and the state for `restored`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no checkpoint, or belongs to another study or design.
+    """
+    head, _, state = check_input(path).read_bytes().partition(b"\n")
+    try:
+        found = json.loads(head)
+        if found["format"] != _FORMAT:
+            raise ValueError
+        log, owner = Log(**found["log"]), found["of"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: found no checkpoint of a search, allowed: what `gs-jax optimize` wrote.") from error
+    if owner != _digest(study, design):
+        raise InputError(
+            f"{path}: found the checkpoint of another study or design, allowed: the ones it was made with."
+        )
+    return log, state
+
+
+def restored(state: bytes, like: State) -> State:
+    """The state of a checkpoint; `like` is one of the same solver."""
+    return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
+
+
+def checkpoint_path(output: Path) -> Path:
+    """Where the checkpoint of a search for this file lies."""
+    return output.with_suffix(".checkpoint")
+
+
+def _digest(study: Study, design: Design) -> str:
+    return hashlib.sha256((study.model_dump_json() + design.model_dump_json()).encode()).hexdigest()

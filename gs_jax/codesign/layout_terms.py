@@ -1,0 +1,83 @@
+"""What a layout of lenses does to the reconstruction, as terms of co-design.
+
+The functions of `comb`, `fisher` and `end_to_end` want points, grids and windows; a study names a term and no more.
+What is chosen here follows from the candidate: places over the part of the plate whose points see a whole field of
+lenses, the depths that are judged, and blobs and spots of a few pixels. Random terms draw anew from their key.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..geometry import Grid
+from .comb import lens_shortage, sidelobes
+from .end_to_end import reconstruction_loss
+from .fisher import localization_bound
+from .parameters import Candidate
+
+# Points whose ghosts are looked for, and places where; points that are located; light of one, electrons a lens.
+_SOURCES, _TARGETS, _POINTS, _PHOTONS = 4, 256, 4, 1000.0
+# Places along a side of the plate.
+_RASTER = 15
+# Voxels along a side of a random scene, and blobs per voxel, each as wide as a voxel.
+_VOXELS, _DENSITY = 99, 0.008
+
+
+def ghosts(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """RMS ghost of a point at random other places, over its own image; a pixel is the width of a tooth."""
+    near, far = jax.random.split(key)
+    sources, targets = _points(c, near, _SOURCES), _points(c, far, _TARGETS)
+    pixel = c.imager.sensor.pixel_pitch
+    size = 4 * pixel / c.magnification[0]
+    axial = size * c.reduced[0] / c.imager.field_radius
+    return sidelobes(c.imager, sources, targets, width=pixel, lateral=size, axial=axial).rms
+
+
+def shortage(c: Candidate) -> Float[Array, ""]:
+    """`comb.lens_shortage` over the whole plate, at the middle depth."""
+    side = jnp.linspace(-0.5, 0.5, _RASTER, dtype=c.plate.dtype)
+    places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * c.plate[None]
+    depth = jnp.broadcast_to((c.depths[0] + c.depths[-1]) / 2, (len(places), 1))
+    return lens_shortage(c.imager, jnp.concatenate([places, depth], 1))
+
+
+def localization(c: Candidate, key: PRNGKeyArray) -> Float[Array, "3"]:
+    """Cramer-Rao bound of x, y, z at random points, um; a spot of one pixel's standard deviation."""
+    return 1000 * localization_bound(c.imager, _points(c, key, _POINTS), photons=_PHOTONS, spot=1.0)
+
+
+def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Logarithm of the relative error, `sqrt(1 - <a,b>^2 / (<a,a> <b,b>))`, of reconstructed random scenes.
+
+    Three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate: sub-images overlap
+    as much as those of an object that fills the field.
+    """
+    sensor, reach = c.imager.sensor, c.imager.field_radius
+    depths = jnp.stack([c.depths[0], (c.depths[0] + c.depths[-1]) / 2, c.depths[-1]])
+    pitch = 2 * reach / _VOXELS
+    # The lenses that see the scene, and their images of it, magnified by up to 0.4.
+    side = math.ceil(2 * 2.4 * reach / sensor.pixel_pitch)
+    window = min(side, sensor.shape[0]), min(side, sensor.shape[1])
+    height, width = (max(0.0, n * sensor.pixel_pitch - 4 * reach) for n in sensor.shape)
+    found = reconstruction_loss(
+        c.imager,
+        key,
+        grid=Grid(depths, (_VOXELS, _VOXELS), pitch),
+        scenes=1,
+        density=_DENSITY,
+        width=pitch,
+        background_width=4 * pitch,
+        window=window,
+        field=(width, height),
+    )
+    return found * jnp.log(jnp.asarray(10.0, found.dtype)) / 20
+
+
+def _points(c: Candidate, key: PRNGKeyArray, count: int) -> Float[Array, "point 3"]:
+    """Points evenly over the depths and the field, a field radius from the plate's edge where it is that large."""
+    inner = jnp.maximum(c.plate - 2 * c.imager.field_radius, c.plate / 4)
+    middle = jnp.stack([0 * inner[0], 0 * inner[0], (c.depths[0] + c.depths[-1]) / 2])
+    size = jnp.stack([inner[0], inner[1], c.depths[-1] - c.depths[0]])
+    return middle[None] + size[None] * jax.random.uniform(key, (count, 3), inner.dtype, -0.5, 0.5)

@@ -1,0 +1,146 @@
+"""What a search found, for people and for files: a table, a picture, JSON, and the design with its provenance."""
+
+import datetime
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from rich.table import Table
+
+from ..designs import Design, write_design
+from ..io.disk import atomic_write, check_output, write_json
+from .objectives import TERMS
+from .search import Outcome
+from .study import Study, TermTable
+from .targets import SIGNS, Row
+
+
+def before_and_after(study: Study, outcome: Outcome) -> Table:
+    """The study's terms before and after."""
+    table = Table("term", "target", "before", "after", "", box=None, pad_edge=False)
+    for term, old, new in zip(study.terms, outcome.before, outcome.after, strict=True):
+        table.add_row(term.name, wanted(term), span(old), span(new), {True: "met", False: "MISSED", None: ""}[new.met])
+    return table
+
+
+def wanted(term: TermTable) -> str:
+    """The target in short."""
+    return SIGNS[term.kind] if term.is_goal else f"{SIGNS[term.kind]} {term.target:g}"
+
+
+def span(row: Row) -> str:
+    """Lowest and highest entry of a term."""
+    low, high = f"{row.low:.4g}", f"{row.high:.4g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, source: str) -> list[Path]:
+    """Writes the design with its provenance, and beside it the numbers (.json) and a picture (.png).
+
+    Parameters
+    ----------
+    path
+        Of the new design.
+    parent, source
+        The files of the old design and of the study, for the provenance.
+
+    Returns
+    -------
+    list
+        Of the files.
+    """
+    records = as_records(study.terms, outcome)
+    paths = [path, path.with_suffix(".json"), path.with_suffix(".png")]
+    history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
+    write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
+    with atomic_write(paths[2]) as temporary:
+        picture(outcome.design, study, outcome).savefig(temporary, format="png", dpi=110)
+    provenance = {
+        "parent": Path(parent).name,
+        "study": Path(source).name,
+        "seed": study.seed,
+        "date": datetime.date.today().isoformat(),
+        "reason": outcome.log.ends[-1]["reason"],
+        "objectives": {record["term"]: record["after"] for record in records if None not in record["after"]},
+    }
+    write_design(paths[0], outcome.design.model_copy(update={"provenance": provenance}))
+    return paths
+
+
+def as_records(terms: Sequence[TermTable], outcome: Outcome) -> list[dict[str, Any]]:
+    """Before and after for a JSON file; `None` stands for infinity."""
+    ends = lambda row: [_finite(row.low), _finite(row.high)]
+    return [
+        {
+            "term": term.name,
+            "meaning": TERMS[term.name].meaning,
+            "kind": term.kind,
+            "target": None if term.is_goal else term.target,
+            "before": ends(old),
+            "after": ends(new),
+            "met_before": old.met,
+            "met_after": new.met,
+        }
+        for term, old, new in zip(terms, outcome.before, outcome.after, strict=True)
+    ]
+
+
+def _finite(x: float) -> float | None:
+    return float(f"{x:.6g}") if math.isfinite(x) else None
+
+
+def _plain(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: _finite(x) if isinstance(x, float) else x for key, x in record.items()}
+
+
+def picture(design: Design, study: Study, outcome: Outcome) -> Figure:
+    """The layout with its clear apertures, the cost, and the terms on their way to the targets, of the best start."""
+    figure = Figure(figsize=(12.5, 4.2), layout="constrained")
+    layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
+    _draw_layout(layout, design)
+    steps = [step for step in outcome.log.steps if _is_best(step, outcome)]
+    places = np.arange(1, len(steps) + 1)
+    cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
+    cost.set(xlabel="step", ylabel="cost", title="best start")
+    for number, term in enumerate(study.terms):
+        values = np.array([step.get(term.name, np.nan) for step in steps], float)
+        style = "-" if term.is_goal else ("--", ":")[number >= 10]
+        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=f"C{number % 10}", label=term.name)
+    terms.axhline(1, color="0.6", lw=0.8)
+    terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
+    terms.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
+    """Whether a step led to the design: the best start of each stage goes on."""
+    ends = [end for end in outcome.log.ends if end["stage"] == step["stage"]]
+    return step["start"] == min(ends, key=lambda end: end["cost"])["start"]
+
+
+def _draw_layout(axes: Axes, design: Design) -> None:
+    """Lenses on the plate, each with its disc, and the sensor."""
+    radius = design.lens.aperture_diameter_mm / 2
+    discs = [Circle(center, radius) for center in design.array.centers_mm]
+    axes.add_collection(PatchCollection(discs, facecolor="C0", alpha=0.35, edgecolor="C0", linewidth=0.5))
+    sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
+    for size, color, name in ((design.array.size_mm, "k", "plate"), (sensor, "C3", "sensor")):
+        corner = (-size[0] / 2, -size[1] / 2)
+        axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=color, label=name))
+    reach = 0.55 * max(*design.array.size_mm, *sensor)
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    axes.set_title(f"{len(discs)} lenses, D = {2 * radius:.3g} mm")
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+
+
+def check_outputs(path: Path) -> None:
+    """Raise `InputError` unless the design, the numbers and the picture can be written."""
+    check_output(path, [".toml"])
+    check_output(path.with_suffix(".json"), [".json"])
+    check_output(path.with_suffix(".png"), [".png"])

@@ -1,0 +1,250 @@
+"""What of a microscope is free in a co-design, and between which bounds.
+
+A `Parent` is the design that an optimisation starts from, `start_values` are its parameters by name, and `candidate`
+is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
+goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index.
+Solvers see neither bounds nor units: `Bounds` maps a value to a number of order one without any bound, and back.
+"""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import ValidationError
+
+from ..coverage import cell_edges
+from ..designs import Design
+from ..errors import InputError
+from ..geometry import Imager, MicrolensArray, as_float
+from ..io.explain import one_line
+from ..optics.aperture import aperture_area, pitch, wedge
+
+Values = dict[str, Float[Array, "..."]]
+
+NAMES = (
+    "sensor_distance_mm",
+    "radius_of_curvature_mm",
+    "aperture_diameter_mm",
+    "refractive_index",
+    "pitch_mm",
+    "centers_mm",
+    "depth_span_mm",
+)
+
+# How near to a bound a start may be, as a fraction of the range: on the bound the map has no slope, and no way back.
+_NEAREST = 0.01
+# Digits of a written length: 0.1 um is finer than a printer, and than a camera's mount.
+_DIGITS = 4
+
+
+class Bounds(eqx.Module):
+    """The values between two bounds as a smooth, invertible image of all numbers `x`: `(1 + x / sqrt(1 + x^2)) / 2` of
+    the way from the lowest to the highest.
+
+    A logistic curve would do as well but for its ends, so flat that a search that comes there does not come back.
+    Bounds may be arrays that broadcast against the value, in its unit.
+    """
+
+    low: Float[Array, "..."] = eqx.field(converter=as_float)
+    high: Float[Array, "..."] = eqx.field(converter=as_float)
+
+    def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """The value of a number of order one."""
+        return self.low + (self.high - self.low) * (1 + free / jnp.sqrt(1 + free**2)) / 2
+
+    def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """The inverse of `value`. Values at a bound or beyond it are first taken within, by 1 % of the range."""
+        share = jnp.clip((value - self.low) / (self.high - self.low), _NEAREST, 1 - _NEAREST)
+        return (2 * share - 1) / (2 * jnp.sqrt(share * (1 - share)))
+
+
+class Cells(eqx.Module):
+    """The edges of the Voronoi cells of lenses that stay where they are: the fast way to their clear aperture.
+
+    `height`: distance of the edge's line from its lens, mm. `low`, `high`: the edge's ends along it, from the foot.
+    """
+
+    height: Float[Array, " edge"] = eqx.field(converter=as_float)
+    low: Float[Array, " edge"] = eqx.field(converter=as_float)
+    high: Float[Array, " edge"] = eqx.field(converter=as_float)
+
+
+class Parent(eqx.Module):
+    """A design with what its file does not say: where it is judged.
+
+    `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm. `middle`, `span`:
+    of the depths that count, from the plate, mm. `depth_count`: how many they are. `wavelength`, `confusion`: mm.
+    """
+
+    imager: Imager
+    cells: Cells | None
+    pitch: Float[Array, ""] = eqx.field(converter=as_float)
+    middle: Float[Array, ""] = eqx.field(converter=as_float)
+    span: Float[Array, ""] = eqx.field(converter=as_float)
+    wavelength: Float[Array, ""] = eqx.field(converter=as_float)
+    confusion: Float[Array, ""] = eqx.field(converter=as_float)
+    depth_count: int = eqx.field(static=True)
+
+
+class Candidate(eqx.Module):
+    """A microscope to be judged.
+
+    `imager`: its own plate size is the parent's and means nothing here. `plate`: `(x, y)` of the scaled plate, mm.
+    `clear_diameter`: of the disc whose area is the mean clear aperture, mm. `covered`: the share of the plate that is
+    clear aperture. `depths`: where it is judged, from the plate, mm. `wavelength`, `confusion`: mm.
+    """
+
+    imager: Imager
+    plate: Float[Array, "2"]
+    clear_diameter: Float[Array, ""]
+    covered: Float[Array, ""]
+    depths: Float[Array, " depth"]
+    wavelength: Float[Array, ""]
+    confusion: Float[Array, ""]
+
+    @property
+    def reduced(self) -> Float[Array, " depth"]:
+        """`z'` of the depths."""
+        return self.imager.reduced_depth(self.depths)
+
+    @property
+    def magnification(self) -> Float[Array, " depth"]:
+        """Of the depths (Eq. 3)."""
+        return self.imager.magnification(self.depths)
+
+    @property
+    def lenses_per_point(self) -> Float[Array, ""]:
+        """`N_e`: lenses on the plate over its area, times `A_e`."""
+        area = math.pi * self.imager.field_radius**2
+        return self.imager.array.centers.shape[0] * area / jnp.prod(self.plate)
+
+
+def parent_of(
+    design: Design,
+    *,
+    depths_mm: tuple[float, float] | None = None,
+    confusion: float | None = None,
+    depth_count: int = 6,
+    lenses_move: bool = False,
+) -> Parent:
+    """A design as an optimisation sees it.
+
+    Parameters
+    ----------
+    depths_mm
+        Nearest and farthest depth that count; by default the design's working distance.
+    confusion
+        Diameter of the circle of confusion, mm; by default two pixels.
+    depth_count
+        Depths between them, both included.
+    lenses_move
+        Whether lens centres will be replaced. It takes longer.
+    """
+    near, far = depths_mm or design.imaging.working_distance_mm
+    imager = design.imager()
+    return Parent(
+        imager,
+        None if lenses_move else _cells(design),
+        pitch(imager.array.centers)[0],
+        (near + far) / 2,
+        far - near,
+        design.imaging.wavelength_nm * 1e-6,
+        2 * imager.sensor.pixel_pitch if confusion is None else confusion,
+        depth_count,
+    )
+
+
+def _cells(design: Design) -> Cells:
+    _, start, end = cell_edges(np.array(design.array.centers_mm), design.array.size_mm)
+    along = (end - start) / np.hypot(*(end - start).T)[:, None]
+    height = np.abs(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])
+    return Cells(height, (start * along).sum(1), (end * along).sum(1))
+
+
+def _clear_area(cells: Cells | None, array: MicrolensArray) -> Float[Array, ""]:
+    """Of all lenses together, mm^2."""
+    if cells is None:
+        return jnp.sum(aperture_area(array))
+    radius = array.aperture_diameter / 2
+    return jnp.sum(wedge(cells.high, cells.height, radius) - wedge(cells.low, cells.height, radius))
+
+
+def start_values(parent: Parent) -> Values:
+    """Every parameter of the parent, by name."""
+    array = parent.imager.array
+    return {
+        "sensor_distance_mm": parent.imager.sensor_distance,
+        "radius_of_curvature_mm": array.radius_of_curvature,
+        "aperture_diameter_mm": array.aperture_diameter,
+        "refractive_index": array.refractive_index,
+        "pitch_mm": parent.pitch,
+        "centers_mm": array.centers,
+        "depth_span_mm": parent.span,
+    }
+
+
+def candidate(parent: Parent, values: Values) -> Candidate:
+    """The parent with some of its parameters replaced; differentiable in all of them.
+
+    Parameters
+    ----------
+    values
+        By name, any subset of `NAMES`. A pitch scales the pattern and the plate about the middle, by its ratio to the
+        parent's; `centers_mm` are the centres before that, and the parent's own if it has `cells`.
+    """
+    values = start_values(parent) | values
+    scale = values["pitch_mm"] / parent.pitch
+    where = lambda i: (
+        i.array.centers,
+        i.array.radius_of_curvature,
+        i.array.aperture_diameter,
+        i.array.refractive_index,
+        i.sensor_distance,
+    )
+    # Areas before scaling: a plate of a size that is traced has no place in `MicrolensArray`.
+    names = "radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "sensor_distance_mm"
+    radius, diameter, index, distance = (values[name] for name in names)
+    unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, index, distance))
+    area, count = _clear_area(parent.cells, unscaled.array), parent.imager.array.centers.shape[0]
+    imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, index, distance))
+    plate = scale * jnp.array(parent.imager.array.size, scale.dtype)
+    offsets = jnp.linspace(-0.5, 0.5, parent.depth_count, dtype=scale.dtype)
+    return Candidate(
+        imager,
+        plate,
+        scale * jnp.sqrt(4 / math.pi / count * area),
+        area / math.prod(parent.imager.array.size),
+        parent.middle + values["depth_span_mm"] * offsets,
+        parent.wavelength,
+        parent.confusion,
+    )
+
+
+def new_design(design: Design, parent: Parent, values: Values) -> Design:
+    """The design of these values as a file holds it: lengths to 0.1 um, the working distance that was asked for.
+
+    Raises
+    ------
+    InputError
+        If the values make no microscope.
+    """
+    values = start_values(parent) | values
+    numbers = {name: round(float(values[name]), _DIGITS) for name in NAMES if name != "centers_mm"}
+    scale = float(values["pitch_mm"] / parent.pitch)
+    size = [round(scale * side, _DIGITS) for side in design.array.size_mm]
+    # Rounding may not push a lens off the plate.
+    half = np.array(size) / 2
+    centers = np.clip(np.round(scale * np.asarray(values["centers_mm"], float), _DIGITS), -half, half)
+    middle = float(parent.middle)
+    working = [round(middle + sign * numbers["depth_span_mm"] / 2, _DIGITS) for sign in (-1, 1)]
+    data = design.model_dump()
+    data["lens"] |= {name: numbers[name] for name in ("radius_of_curvature_mm", "aperture_diameter_mm")}
+    data["lens"]["refractive_index"] = numbers["refractive_index"]
+    data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
+    data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}
+    try:
+        return Design.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"the values found make no microscope: {one_line(error, Design, {})}.") from error

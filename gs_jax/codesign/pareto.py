@@ -1,0 +1,188 @@
+"""Trade-offs between two or three things that are wanted: what one costs in the others.
+
+The epsilon constraint (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971): one term is the goal,
+and limits on one or two others move from value to value. Each search starts from where the one before ended, and from
+as many random points as the study asks for, less one. Every point is a design that a search found, so the true front
+may be better, not worse.
+"""
+
+import itertools
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+
+from ..designs import Design
+from ..errors import InputError
+from ..progress import Progress
+from .parameters import NAMES, Values, start_values
+from .search import Stage, entries_of, make_stage, problem_of, random_start, targets_of
+from .solve import run
+from .study import LimitTable, Study, TermTable
+from .targets import Row, assess, worst_of
+
+
+class Point(NamedTuple):
+    """A design on the way: its parameters, and what the terms (the limits last) say of it."""
+
+    values: Values
+    rows: list[Row]
+    cost: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it meets every target."""
+        return all(row.met is not False for row in self.rows)
+
+
+class Front(NamedTuple):
+    """The terms with those that move last, the points, the objectives `(point, objective)` and which are not dominated.
+
+    Objectives are the goal and the limited terms, in the terms' units.
+    """
+
+    terms: list[TermTable]
+    objectives: list[TermTable]
+    points: list[Point]
+    values: Float[np.ndarray, "point objective"]
+    best: Bool[np.ndarray, " point"]
+
+
+def non_dominated(losses: Float[np.ndarray, "point objective"]) -> Bool[np.ndarray, " point"]:
+    """Which points no other point beats: at least as good in every objective, and better in one. Less is better."""
+    no_worse = (losses[:, None] <= losses[None]).all(2)
+    better = (losses[:, None] < losses[None]).any(2)
+    return np.logical_not((no_worse & better).any(0))
+
+
+def sweep(design: Design, study: Study, *, progress: Progress) -> Front:
+    """The trade-off that a study asks for.
+
+    Parameters
+    ----------
+    design
+        To start from.
+    study
+        With one term to minimise or maximise and one or two `[[pareto]]` tables. Its stages run one after the other
+        for each combination of limits.
+
+    Raises
+    ------
+    InputError
+        If the study has no `[[pareto]]` table, or does not fit the design.
+    """
+    if not study.pareto:
+        raise InputError("`pareto`: found nothing, allowed: one or two tables.")
+    moving = [_term(limit) for limit in study.pareto]
+    kept = [term for term in study.terms if term.is_goal or all(not _same(term, limit) for limit in moving)]
+    wider = study.model_copy(update={"terms": (*kept, *moving)})
+    problem = problem_of(design, wider)
+    values = start_values(problem.parent)
+    stages = [make_stage(problem, index, values) for index in range(len(study.stages))]
+    entries = entries_of(problem.parent, [*kept, *moving])
+    combinations = list(itertools.product(*(limit.targets for limit in study.pareto)))
+    points, last = [], values
+    for limits in progress.track(combinations, "Trade-off"):
+        now = _with_targets(kept, moving, limits)
+        starts = [last, *(random_start(problem, values, start) for start in range(1, study.starts))]
+        found = [_search(stages, start, now, entries) for start in starts]
+        # A design that misses a target counts only if none meets them.
+        best = min(found, key=lambda point: (not point.feasible, point.cost))
+        points.append(best)
+        last = best.values
+    return _front([*kept, *moving], [next(t for t in kept if t.is_goal), *moving], points)
+
+
+def _term(limit: LimitTable) -> TermTable:
+    return TermTable.model_validate({"name": limit.name, limit.kind: limit.targets[0], "weight": 30.0})
+
+
+def _same(term: TermTable, other: TermTable) -> bool:
+    return (term.name, term.kind) == (other.name, other.kind)
+
+
+def _with_targets(kept, moving, limits) -> list[TermTable]:
+    moved = [term.model_copy(update={term.kind: limit}) for term, limit in zip(moving, limits, strict=True)]
+    return [*kept, *moved]
+
+
+def _search(stages: list[Stage], values: Values, terms: list[TermTable], entries) -> Point:
+    """All stages from these parameters, with the terms' targets."""
+    cost = float("inf")
+    for stage in stages:
+        names = [(term.name, term.kind) for term in stage.terms]
+        targets = targets_of([term for term in terms if (term.name, term.kind) in names])
+        begin = stage.steps.begin(stage.free(values), targets)
+        state, _ = run(stage.steps, begin, targets, limit=stage.limit, enough=stage.enough)
+        values, cost = stage.values(state.free), float(state.cost)
+    rows = [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
+    return Point(values, rows, cost)
+
+
+def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Point]) -> Front:
+    places = [terms.index(objective) for objective in objectives]
+    ends = [[jnp.array(point.rows[place][:2]) for place in places] for point in points]
+    values = np.array([[float(worst_of(t, x)) for t, x in zip(objectives, row, strict=True)] for row in ends])
+    signs = np.array([-1.0 if t.kind in ("at_least", "maximise") else 1.0 for t in objectives])
+    feasible = np.array([point.feasible for point in points])
+    best = np.zeros(len(points), bool)
+    best[feasible] = non_dominated((values * signs)[feasible])
+    return Front(terms, objectives, points, values, best)
+
+
+def as_json(front: Front) -> dict[str, Any]:
+    """The front's numbers: objectives and free parameters of every point."""
+    names = [name for name in NAMES if name != "centers_mm"]
+    return {
+        "objectives": [{"term": term.name, "kind": term.kind} for term in front.objectives],
+        "points": [
+            {term.name: float(f"{x:.6g}") for term, x in zip(front.objectives, row, strict=True)}
+            | {"parameters": {name: round(float(point.values[name]), 6) for name in names}}
+            | {"terms": {t.name: list(r[:2]) for t, r in zip(front.terms, point.rows, strict=True)}}
+            | {"feasible": point.feasible, "on_front": bool(best)}
+            for point, row, best in zip(front.points, front.values, front.best, strict=True)
+        ],
+    }
+
+
+def picture(front: Front) -> Figure:
+    """The goal against the first limited term; a second limit makes lines of one colour each."""
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    axes = figure.subplots()
+    goal, along, *third = front.objectives
+    groups = np.round(front.values[:, 2], 9) if third else np.zeros(len(front.points))
+    limits = _groups(groups)
+    for number, group in enumerate(limits):
+        some = np.isclose(groups, group, rtol=0.02) & front.best
+        order = np.argsort(front.values[some, 1])
+        label = f"{_axis(third[0])}: {group:.2g}" if third else None
+        axes.plot(front.values[some, 1][order], front.values[some, 0][order], "o-", color=f"C{number}", label=label)
+    others = ~front.best
+    if others.any():
+        label = "dominated or misses a target"
+        axes.plot(front.values[others, 1], front.values[others, 0], "x", color="0.6", label=label)
+    axes.set(xlabel=_axis(along), ylabel=_axis(goal))
+    axes.set_title("what one costs in the other")
+    axes.grid(alpha=0.3)
+    if third or others.any():
+        axes.legend(fontsize=8)
+    return figure
+
+
+def _groups(values: Float[np.ndarray, " point"]) -> list[float]:
+    """Values that differ by more than 2 %, in order."""
+    found: list[float] = []
+    for value in np.sort(values).tolist():
+        if not found or not np.isclose(value, found[-1], rtol=0.02):
+            found.append(value)
+    return found
+
+
+def _axis(term: TermTable) -> str:
+    """A term's name with its unit after a comma."""
+    units = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
+    words = term.name.split("_")
+    unit = units.get(words[-1])
+    return f"{' '.join(words[:-1])}, {unit}" if unit else " ".join(words)

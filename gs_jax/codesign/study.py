@@ -1,0 +1,228 @@
+"""Study files: what is free, what is wanted, and how it is searched for, as TOML.
+
+design = "../geomscope-table1.toml"     # to start from; `gs-jax optimize` takes its own
+name = "geomscope-optimized"
+depths_mm = [18.0, 23.0]
+confusion_um = 36.0
+
+[free]                                  # name = [lowest, highest]; see gs_jax.codesign.parameters
+sensor_distance_mm = [2.0, 6.0]
+
+[[terms]]                               # see gs_jax.codesign.objectives
+name = "occupancy"
+at_most = 0.5
+
+[[stages]]
+solver = "levenberg-marquardt"
+"""
+
+import math
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ..errors import InputError, shown
+from ..io.disk import read_text
+from ..io.explain import one_line
+from .objectives import TERMS
+from .parameters import NAMES
+
+Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "adam"]
+KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
+
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+Range = Annotated[tuple[float, float], Field(strict=False)]
+Depths = Annotated[tuple[Positive, Positive], Field(strict=False, description="[near, far] in mm, near below far")]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class TermTable(_Table):
+    """`[[terms]]`: one of the kinds, and how much a miss counts beside the other terms.
+
+    `at_most`, `at_least`, `equal`: a target, for every entry of the term. `minimise`, `maximise`: the size of a value
+    that is worth 1; of a term with several entries the worst counts.
+    """
+
+    name: str = Field(description="the name of a term")
+    at_most: Positive | None = Field(default=None, description="a positive number")
+    at_least: Positive | None = Field(default=None, description="a positive number")
+    equal: Positive | None = Field(default=None, description="a positive number")
+    minimise: Positive | None = Field(default=None, description="a positive number")
+    maximise: Positive | None = Field(default=None, description="a positive number")
+    weight: Positive = Field(default=1.0, description="a positive number")
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> "TermTable":
+        if self.name not in TERMS:
+            raise ValueError(f"found the name {shown(self.name)}, allowed: {', '.join(TERMS)}")
+        found = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(found) != 1:
+            raise ValueError(f"{self.name}: found {found or 'no kind'}, allowed: one of {', '.join(KINDS)}")
+        return self
+
+    @property
+    def kind(self) -> str:
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+
+    @property
+    def target(self) -> float:
+        return getattr(self, self.kind)
+
+    @property
+    def is_goal(self) -> bool:
+        """Whether it is to be as small, or as large, as possible."""
+        return self.kind in ("minimise", "maximise")
+
+
+class StageTable(_Table):
+    """`[[stages]]`: a solver on some of the parameters and terms, all by default. Stages follow each other."""
+
+    solver: Solver = Field(description="one of levenberg-marquardt, bfgs, lbfgs, adam")
+    steps: int = Field(default=200, ge=1, le=10**7, description="a whole number from 1 to 1e7")
+    learning_rate: Positive = Field(default=0.03, description="a positive number")
+    free: tuple[str, ...] | None = Field(default=None, strict=False, description="names of parameters in [free]")
+    terms: tuple[str, ...] | None = Field(default=None, strict=False, description="names of terms in [[terms]]")
+
+
+class LimitTable(_Table):
+    """`[[pareto]]`: a term whose limit is moved from value to value; each as a target in place of the term's own."""
+
+    name: str = Field(description="the name of a term")
+    at_most: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
+    at_least: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> "LimitTable":
+        if self.name not in TERMS:
+            raise ValueError(f"found the name {shown(self.name)}, allowed: {', '.join(TERMS)}")
+        if bool(self.at_most) == bool(self.at_least):
+            found = "both" if self.at_most else "neither"
+            raise ValueError(f"{self.name}: found {found}, allowed: one of at_most, at_least")
+        return self
+
+    @property
+    def kind(self) -> Literal["at_most", "at_least"]:
+        return "at_most" if self.at_most else "at_least"
+
+    @property
+    def targets(self) -> tuple[float, ...]:
+        return self.at_most or self.at_least or ()
+
+
+class Study(_Table):
+    """A study, with the tables and keys of its file; the module's docstring has one.
+
+    `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.
+    `starts`: the first stage also starts from this many points at random between the bounds less one, and the best
+    goes on; `seed` says which.
+    """
+
+    design: str | None = Field(default=None, description="the file of a design, relative to the study")
+    name: str = Field(default="optimized", description="a string")
+    depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
+    depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
+    confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
+    margin: float = Field(default=0.005, ge=0, le=0.5, description="a number from 0 to 0.5")
+    starts: int = Field(default=1, ge=1, le=10_000, description="a whole number from 1 to 10000")
+    seed: int = Field(default=0, ge=0, le=2**31 - 1, description="a whole number from 0 to 2147483647")
+    free: dict[str, Range] = Field(description="a table of name = [lowest, highest]")
+    terms: tuple[TermTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
+    stages: tuple[StageTable, ...] = Field(strict=False, min_length=1, description="one or more tables")
+    pareto: tuple[LimitTable, ...] = Field(default=(), strict=False, max_length=2, description="one or two tables")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Study":
+        for check in (_check_free, _check_terms, _check_stages, _check_pareto):
+            check(self)
+        return self
+
+
+def read_study(path: str | os.PathLike[str]) -> Study:
+    """The study in a TOML file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a key is missing, extra, of the wrong type or out of its range.
+    """
+    text = read_text(path)
+    try:
+        data: dict[str, Any] = tomllib.loads(text)
+        return Study.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{path}: {_in_a_list(error) or one_line(error, Study, {})}.") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
+
+
+def parent_path(path: str | os.PathLike[str], study: Study) -> Path:
+    """The file of the design that a study starts from.
+
+    Raises
+    ------
+    InputError
+        If the study names none.
+    """
+    if study.design is None:
+        raise InputError(f"{path}: `design`: found nothing, allowed: the file of a design, relative to the study.")
+    return Path(path).parent / study.design
+
+
+def _in_a_list(error: ValidationError) -> str | None:
+    """The first problem in one line if it is in one of several tables of a name: `one_line` sees single tables."""
+    problem = error.errors(include_url=False)[0]
+    name, number, *keys = problem["loc"] if len(problem["loc"]) > 1 else ("", "")
+    if not isinstance(number, int):
+        return None
+    where = f"`{name}` {number + 1}"
+    table = {"terms": TermTable, "stages": StageTable, "pareto": LimitTable}[str(name)]
+    if not keys:
+        return f"{where}: {problem['msg'].removeprefix('Value error, ')}"
+    field = table.model_fields.get(str(keys[0]))
+    if field is None:
+        return f"{where}: found the key {shown(keys[0])}, allowed: {', '.join(table.model_fields)}"
+    found = "nothing" if problem["type"] == "missing" else shown(problem["input"])
+    return f"{where}, {keys[0]}: found {found}, allowed: {field.description}"
+
+
+def _check_free(study: Study) -> None:
+    if not study.free:
+        raise ValueError(f"`free`: found nothing, allowed: one or more of {', '.join(NAMES)}")
+    for name, (low, high) in study.free.items():
+        if name not in NAMES:
+            raise ValueError(f"`free.{name}`: found a key that does not exist, allowed: {', '.join(NAMES)}")
+        if not low < high or not math.isfinite(high - low):
+            raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: [lowest, highest], lowest below")
+        if name != "centers_mm" and not low > (least := 1 if name == "refractive_index" else 0):
+            raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: above {least}")
+    if study.depths_mm is not None and not study.depths_mm[0] < study.depths_mm[1]:
+        raise ValueError(f"`depths_mm`: found {list(study.depths_mm)}, allowed: [near, far] in mm, near below far")
+
+
+def _check_terms(study: Study) -> None:
+    pairs = [(term.name, term.kind) for term in study.terms]
+    if twice := [name for name, kind in pairs if pairs.count((name, kind)) > 1]:
+        raise ValueError(f"`terms`: found {twice[0]} twice with the same kind, allowed: once")
+
+
+def _check_stages(study: Study) -> None:
+    known = {"free": set(study.free), "terms": {term.name for term in study.terms}}
+    for stage in study.stages:
+        for key, names in known.items():
+            chosen = getattr(stage, key)
+            wrong = [name for name in chosen or () if name not in names]
+            if wrong or chosen == ():
+                found = shown(wrong[0]) if wrong else "nothing"
+                raise ValueError(f"`stages.{key}`: found {found}, allowed: one or more of {', '.join(sorted(names))}")
+
+
+def _check_pareto(study: Study) -> None:
+    goals = [term.name for term in study.terms if term.is_goal]
+    if study.pareto and len(goals) != 1:
+        raise ValueError(f"`terms`: found {len(goals)} to minimise or maximise, allowed: one beside `pareto`")

@@ -1,0 +1,1 @@
+"""Files: captures, points, volumes, and writing them whole or not at all."""

@@ -1,0 +1,281 @@
+"""Volumes on disk: OME-TIFF, or OME-Zarr when the name ends in `.zarr`.
+
+Both hold float32 voxels `[depth, row, column]` as they are, and the grid in micrometres: the lateral pitch, every
+depth, and the centre of the first voxel, so that Fiji and napari show the volume to scale and in place.
+
+OME-Zarr is written in version 0.4 (Zarr 2), not 0.5 (Zarr 3): every reader of Fiji (n5-viewer, MoBIE, Bio-Formats)
+and of napari knows 0.4, while 0.5 needs recent versions of each; both are read here. Chunks are compressed with
+Blosc (LZ4), the default of bioformats2raw and ome-zarr-py and several times as fast as zlib; they are one plane deep,
+as planes are what a viewer asks for.
+"""
+
+import contextlib
+import math
+import os
+from pathlib import Path
+from typing import Any, cast
+from xml.etree import ElementTree
+
+import numpy as np
+import tifffile
+import zarr
+from jaxtyping import Array, Float32, Shaped
+
+from ..errors import InputError, shown
+from ..geometry import Grid
+from .disk import atomic_write, check_input, check_output, decoding
+from .tiff import decode_page
+
+VOLUME_SUFFIXES = (".tif", ".tiff", ".zarr")
+MAX_VOXELS = 10**10
+CHUNK = 1024
+
+_MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+_MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
+
+
+def write_volume(
+    path: str | os.PathLike[str], volume: Shaped[Array | np.ndarray, "depth row column"], grid: Grid
+) -> None:
+    """Writes a volume, never rescaled or clipped, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Ends in `.tif` or `.tiff` (best `.ome.tif`) or in `.zarr`.
+    volume
+        `(depth, row, column)` of float32, or of a type whose values float32 holds exactly.
+    grid
+        Where its voxels are.
+
+    Raises
+    ------
+    InputError
+        As `check_output`; if float32 cannot hold the values; if the depths are uneven or do not ascend and the
+        path is `.zarr`, which has one step only.
+    ValueError
+        If the volume has not the grid's shape, or holds a NaN or an infinity.
+    """
+    path = check_output(path, VOLUME_SUFFIXES)
+    voxels = _as_float32(path, np.asarray(volume))
+    depths = [float(str(depth)) for depth in np.asarray(grid.depths)]  # 18.1, not float32's 18.100000381
+    if voxels.shape != (len(depths), *grid.shape):
+        raise ValueError(f"`volume` must have the grid's shape {(len(depths), *grid.shape)}, got {voxels.shape}.")
+    if not np.isfinite(voxels).all():
+        raise ValueError("`volume` must be finite, got a NaN or an infinity.")
+    if path.suffix.lower() == ".zarr":
+        _write_zarr(path, voxels, depths, grid.pitch)
+    else:
+        _write_tiff(path, voxels, depths, grid.pitch)
+
+
+def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
+    """A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is damaged, is not one image with the axes z, y, x, has values that float32 cannot
+        hold or that are not finite, or lacks the metadata: pitch, a depth above 0 for each plane, centred grid.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in VOLUME_SUFFIXES:
+        raise InputError(f"{path}: found the suffix {shown(suffix)}, allowed: {', '.join(VOLUME_SUFFIXES)}.")
+    voxels, grid = _read_zarr(Path(path)) if suffix == ".zarr" else _read_tiff(check_input(path))
+    if not np.isfinite(voxels).all():
+        raise InputError(f"{path}: found a NaN or an infinity among the voxels, allowed: finite numbers.")
+    return voxels, grid
+
+
+def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth row column"]:
+    if voxels.dtype == np.float32:
+        return voxels
+    if voxels.dtype.kind in "buif":
+        with np.errstate(over="ignore", invalid="ignore"):
+            cast = voxels.astype(np.float32)
+        if (cast.astype(np.float64) == voxels).all():
+            return cast
+    raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: float32, or values that it holds exactly.")
+
+
+def _um(mm: float) -> float:
+    return float(f"{mm * 1000:.12g}")  # 18100, not 18100.000000000004
+
+
+def _mm(value: float, unit: float) -> float:
+    return float(f"{value * unit:.12g}")
+
+
+def _first(n: int, pitch: float) -> float:
+    """The centre of the first of `n` voxels of a grid that is centred on the axis, mm."""
+    return -(n - 1) / 2 * pitch
+
+
+def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    if len(shape) != 3 or min(shape) < 1 or math.prod(shape) > MAX_VOXELS:
+        raise InputError(f"{path}: found {shape} voxels, allowed: (depth, row, column), at most {MAX_VOXELS} in all.")
+    if dtype.kind not in "buif" or not np.can_cast(dtype, np.float32):
+        raise InputError(f"{path}: found voxels of type {dtype}, allowed: float32, or integers up to 16 bits.")
+
+
+def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
+    """The grid of `depths` and of pitches and first voxel centres, both `(y, x)`, mm; `first` None if unknown."""
+    pitch = pitches[1]
+    if not (1e-6 <= pitch <= 1e4 and math.isclose(pitches[0], pitch, rel_tol=1e-6)):
+        raise InputError(f"{path}: found voxels of {pitches} mm (y, x), allowed: squares from 1e-6 to 1e4 mm.")
+    for depth in depths:
+        if not 1e-6 <= depth <= 1e4:
+            raise InputError(f"{path}: found a plane at the depth {depth} mm, allowed: from 1e-6 to 1e4 mm.")
+    expected = [_first(n, pitch) for n in shape]
+    if first is not None and any(not abs(a - b) < 0.01 * pitch for a, b in zip(first, expected, strict=True)):
+        advice = f"{expected}, a volume centred on the axis (was it cropped?)"
+        raise InputError(f"{path}: found the first voxel at {list(first)} mm (y, x), allowed: {advice}.")
+    return Grid(depths, shape, pitch)
+
+
+# OME-TIFF
+
+
+def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], pitch: float) -> None:
+    planes = len(depths)
+    plane: dict[str, Any] = {"PositionZ": [_um(depth) for depth in depths]}
+    plane["PositionX"] = [_um(_first(voxels.shape[2], pitch))] * planes
+    plane["PositionY"] = [_um(_first(voxels.shape[1], pitch))] * planes
+    metadata = {"axes": "ZYX", "PhysicalSizeX": _um(pitch), "PhysicalSizeY": _um(pitch), "Plane": plane}
+    # Uneven depths: the mean step is what a viewer that knows one step only can show; the planes keep the truth.
+    step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
+    if step > 0:
+        metadata["PhysicalSizeZ"] = _um(step)
+    metadata |= {f"{name}Unit": "µm" for name in list(metadata) if name.startswith("PhysicalSize")}
+    plane |= {f"{name}Unit": ["µm"] * planes for name in list(plane)}
+    per_cm = 10 / pitch  # for readers of plain TIFF, such as ImageJ without Bio-Formats
+    with atomic_write(path) as temporary:
+        tifffile.imwrite(
+            temporary,
+            voxels,
+            ome=True,
+            photometric="minisblack",
+            metadata=metadata,
+            resolution=(per_cm, per_cm),
+            resolutionunit="CENTIMETER",
+        )
+
+
+def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
+    with contextlib.ExitStack() as stack:
+        with decoding(path, "OME-TIFF"):
+            # The pages of this file in their order: tifffile's own view of OME opens further files.
+            tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
+            pages = cast(list[tifffile.TiffPage], list(tiff.pages))
+            kinds = {(tuple(page.shape), page.dtype) for page in pages}
+            root = ElementTree.fromstring(tiff.pages.first.description)
+        if len(kinds) != 1:
+            raise InputError(f"{path}: found pages of {len(kinds)} sizes or types, allowed: one.")
+        size, dtype = kinds.pop()
+        shape = (len(pages), *size)
+        _check_declared(path, shape, np.dtype(dtype))
+        grid = _grid_of_ome(path, root, (len(pages), size[0], size[1]))
+        voxels = np.empty(shape, np.float32)
+        for index, page in enumerate(pages):
+            voxels[index] = decode_page(path, page)
+    return voxels, grid
+
+
+def _grid_of_ome(path: Path, root: ElementTree.Element, shape: tuple[int, int, int]) -> Grid:
+    images = root.findall("{*}Image/{*}Pixels")
+    if len(images) != 1:
+        raise InputError(f"{path}: found {len(images)} images in the OME-XML, allowed: one.")
+    pixels = images[0]
+    found = tuple(pixels.get(f"Size{axis}") for axis in "TCZYX")
+    if found != ("1", "1", *(str(n) for n in shape)):
+        raise InputError(f"{path}: found the OME sizes {found} (T, C, Z, Y, X), allowed: {(1, 1, *shape)}.")
+    planes = {plane.get("TheZ"): plane for plane in pixels.findall("{*}Plane")}
+    missing = [index for index in range(shape[0]) if str(index) not in planes]
+    if missing:
+        raise InputError(f"{path}: found no `PositionZ` of plane {missing[0] + 1}, allowed: a depth for each plane.")
+    ordered = [planes[str(index)] for index in range(shape[0])]
+    depths = [_length(path, plane, "PositionZ", "reference frame") for plane in ordered]
+    pitches = [_length(path, pixels, f"PhysicalSize{axis}", "µm") for axis in "YX"]
+    placed = all(ordered[0].get(f"Position{axis}") is not None for axis in "YX")
+    first = [_length(path, ordered[0], f"Position{axis}", "reference frame") for axis in "YX"] if placed else None
+    return _checked_grid(path, depths, shape[1:], pitches, first)
+
+
+def _length(path: Path, element: ElementTree.Element, name: str, default_unit: str) -> float:
+    """An attribute of OME-XML, mm. `default_unit` is the schema's, where the attribute `...Unit` is missing."""
+    found, unit = element.get(name), element.get(f"{name}Unit", default_unit)
+    try:
+        return _mm(float(found or ""), _MM_PER_UNIT[unit])
+    except (ValueError, KeyError) as error:
+        value = "nothing" if found is None else f"{shown(found)} in {shown(unit)}"
+        raise InputError(f"{path}: OME-XML `{name}`: found {value}, allowed: a length in µm.") from error
+
+
+# OME-Zarr
+
+
+def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], pitch: float) -> None:
+    # One plane has no step, and the format wants one: the lateral pitch, as of a cube.
+    step = (depths[-1] - depths[0]) / (len(depths) - 1) if len(depths) > 1 else pitch
+    even = np.abs(np.array(depths) - depths[0] - step * np.arange(len(depths))).max() <= 1e-6 * max(depths)
+    if step <= 0 or not even:
+        raise InputError(f"{path}: found uneven or descending depths, allowed in OME-Zarr: even steps; use .ome.tif.")
+    scale = [_um(step), _um(pitch), _um(pitch)]
+    first = [_um(depths[0]), *(_um(_first(n, pitch)) for n in voxels.shape[1:])]
+    transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
+    multiscale = {
+        "version": "0.4",
+        "name": path.stem,
+        "axes": [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"],
+        "datasets": [{"path": "0", "coordinateTransformations": transforms}],
+    }
+    with atomic_write(path) as temporary:
+        group = zarr.create_group(store=temporary, zarr_format=2, attributes={"multiscales": [multiscale]})
+        array = group.create_array(
+            "0",
+            shape=voxels.shape,
+            dtype=voxels.dtype,
+            chunks=(1, *(min(n, CHUNK) for n in voxels.shape[1:])),
+            compressors={"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1},
+            chunk_key_encoding={"name": "v2", "separator": "/"},
+        )
+        array[...] = voxels
+
+
+def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
+    if not os.path.isdir(path):
+        raise InputError(f"{path}: found {'a file' if os.path.exists(path) else 'nothing'}, allowed: a Zarr folder.")
+    with decoding(path, "OME-Zarr"):
+        group = zarr.open_group(path, mode="r")
+        attributes = group.attrs.asdict()
+    name, scale, first = _ngff(path, attributes)
+    with decoding(path, "OME-Zarr"):
+        array = group[name]
+    if not isinstance(array, zarr.Array):
+        raise InputError(f"{path}: found no array {shown(name)}, allowed: the one that the metadata names.")
+    _check_declared(path, array.shape, array.dtype)
+    depths, rows, columns = array.shape
+    z = [_mm(first[0] + index * scale[0], 1.0) for index in range(depths)]
+    grid = _checked_grid(path, z, (rows, columns), scale[1:], first[1:])
+    with decoding(path, "OME-Zarr"):
+        voxels = np.asarray(array[...], dtype=np.float32)
+    return voxels, grid
+
+
+def _ngff(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], list[float]]:
+    """Name of the full-size array, scale and translation `(z, y, x)`, mm; of NGFF 0.4, or 0.5 (in `ome`)."""
+    try:
+        (multiscale,) = attributes.get("ome", attributes)["multiscales"]
+        axes = [(axis["name"], _MM_PER_NAME[axis["unit"]]) for axis in multiscale["axes"]]
+        if [name for name, _ in axes] != ["z", "y", "x"] or "coordinateTransformations" in multiscale:
+            raise ValueError("not three axes with one scale each")
+        dataset = multiscale["datasets"][0]
+        scale, translation = dataset["coordinateTransformations"]
+        step, first = (
+            [_mm(value * 1.0, unit) for value, (_, unit) in zip(values, axes, strict=True)]
+            for values in (scale["scale"], translation["translation"])
+        )
+        return str(dataset["path"]), step, first
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        allowed = "NGFF 0.4 or 0.5, axes z, y, x in micrometer, one scale and one translation"
+        raise InputError(f"{path}: found other `multiscales` metadata ({error!r:.80}), allowed: {allowed}.") from error

@@ -1,0 +1,1 @@
+"""Molds: a design as a solid, checked before and measured after."""

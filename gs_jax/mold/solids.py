@@ -1,0 +1,260 @@
+"""The microlens array as a solid, and the negative mold to cast it in.
+
+Both are in the design's frame: x and y as the sensor's, z toward the object. The plano face is z = 0, the vertices of
+the lenses, which look at the sensor, are at z = -t. The optics counts the plate's thickness t to the vertices, and so
+does the part: between lenses it is thinner by their sag. The frame is right-handed, as it is for a camera whose
+ordinary pictures are not mirrored; a part that is mirrored would be another design.
+
+The mold holds the array as it lies, lenses down, and opens upward, toward +z: pour, cover with a glass plate, cure,
+peel. Lengths in mm, angles in radians.
+"""
+
+import math
+from dataclasses import dataclass
+
+import manifold3d as m3
+import numpy as np
+from jaxtyping import Float
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
+
+from ..coverage import nearest_neighbour_distances
+from ..geometry import MicrolensArray
+from ..progress import Progress
+from .caps import Surface, cap_sag, facet_surface
+
+# How far a tool that cuts reaches beyond what it cuts: no two faces coincide.
+_BEYOND = 1.0
+# Depth of what is engraved in the rim.
+ENGRAVED = 0.4
+# Steeper rims are neither printed nor peeled well, and hide their facets from above.
+STEEPEST = math.radians(75)
+CLOSEST = 1e-3
+
+
+@dataclass(frozen=True)
+class MoldShape:
+    """What is around the array in its mold.
+
+    Parameters
+    ----------
+    wall, floor
+        Thickness of the walls, and of the floor below the lenses, mm.
+    headroom
+        How much higher the walls are than the array's plano face, mm: 0 to cast flush with the rim.
+    draft
+        Angle of the walls' inner faces from the vertical, radians. The cast part's sides have it too.
+    shrinkage
+        Fraction by which the cast material shrinks; the cavity is larger by `1 / (1 - shrinkage)`.
+    marks
+        Crosses in three corners of the rim, for alignment; as in a QR code, the corner without (+x, +y) tells which
+        way round and which side up it is.
+    label
+        Text to engrave in the rim, in so far as the font has it.
+
+    Raises
+    ------
+    ValueError
+        If a length, the angle or the shrinkage is out of its range.
+    """
+
+    wall: float = 4.0
+    floor: float = 2.0
+    headroom: float = 0.0
+    draft: float = 0.0
+    shrinkage: float = 0.0
+    marks: bool = True
+    label: str = ""
+
+    def __post_init__(self):
+        for name in ("wall", "floor"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"`{name}` must be positive and finite, mm, got {getattr(self, name)}.")
+        if not 0 <= self.headroom < math.inf:
+            raise ValueError(f"`headroom` must be zero or more and finite, mm, got {self.headroom}.")
+        if not 0 <= self.draft < math.pi / 4:
+            raise ValueError(f"`draft` must be from 0 to below pi/4 radians, got {self.draft}.")
+        if not 0 <= self.shrinkage < 0.5:
+            raise ValueError(f"`shrinkage` must be a fraction from 0 to below 0.5, got {self.shrinkage}.")
+
+    @property
+    def scale(self) -> float:
+        """Size of the cavity in that of the cast part after it has shrunk."""
+        return 1 / (1 - self.shrinkage)
+
+
+def plate_thickness(array: MicrolensArray) -> float:
+    """Thickness of the array between its lenses: the optics' plate up to the vertices, less their sag, mm."""
+    return float(array.substrate_thickness) - cap_sag(array)
+
+
+def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progress | None = None) -> m3.Manifold:
+    """The array as a solid: the plate with its lenses, plano behind, straight sides.
+
+    Parameters
+    ----------
+    array
+        Lenses on a plate of finite size, thicker than the lenses' sag.
+    chord
+        The largest distance between a facet and its sphere, mm.
+    progress
+        Shows how many lenses are done.
+
+    Raises
+    ------
+    InputError
+        If a lens lies outside the plate, or the plate is infinite.
+    ValueError
+        If two lenses are at one place, their rims are too steep, the plate is not thicker than their sag, or `chord` is
+        out of its range.
+    """
+    check_array(array)
+    return solid_of(facet_surface(array, chord, progress), plate_thickness(array))
+
+
+def check_array(array: MicrolensArray) -> None:
+    """`ValueError` for an array that has no solid."""
+    aperture, widest = float(array.aperture_diameter), widest_aperture(array)
+    if not 0 < aperture <= widest:
+        raise ValueError(f"`aperture_diameter` must be positive and at most {widest:.4g} mm, got {aperture:g}.")
+    if not plate_thickness(array) > 0:
+        allowed = f"more than the lenses' sag, {cap_sag(array):.4g} mm"
+        raise ValueError(f"`substrate_thickness` must be {allowed}, got {float(array.substrate_thickness):g} mm.")
+    centers = np.asarray(array.centers, float)
+    if not np.isfinite(centers).all():
+        raise ValueError("`centers` must be finite.")
+    # An array of JAX's float32 is exact to a little less than the limit.
+    if len(centers) > 1 and (closest := nearest_neighbour_distances(centers).min()) < 0.99 * CLOSEST:
+        raise ValueError(f"`centers` must be {CLOSEST} mm apart or more, got two lenses {closest:.3g} mm apart.")
+
+
+def widest_aperture(array: MicrolensArray) -> float:
+    """The widest lens that can be made, mm: its rim slopes by `asin(D / 2R)`, which is limited."""
+    return 2 * float(array.radius_of_curvature) * math.sin(STEEPEST)
+
+
+def solid_of(surface: Surface, thickness: float) -> m3.Manifold:
+    """The solid between a surface over the plate and the plano face, `thickness` behind the plate's plane.
+
+    Raises
+    ------
+    RuntimeError
+        If the surface has a crack: a fault of the program.
+    """
+    loop = _boundary(surface)
+    top = surface.vertices[loop]
+    half = np.abs(surface.vertices[:, :2]).max(axis=0)
+    is_corner = (np.abs(top[:, :2]) == half).all(axis=1)
+    start = int(np.flatnonzero(is_corner)[0])
+    loop, top, is_corner = (np.roll(x, -start, axis=0) for x in (loop, top, is_corner))
+    corners = [*np.flatnonzero(is_corner), len(loop)]
+    back = len(surface.vertices) + np.arange(4)
+    facets = [surface.facets, back[[[0, 2, 1], [0, 3, 2]]]]
+    for side in range(4):
+        edge = np.append(loop, loop[0])[corners[side] : corners[side + 1] + 1]
+        index = np.concatenate([back[[side, (side + 1) % 4]], edge[::-1]])
+        height = np.concatenate([[-thickness] * 2, surface.vertices[edge[::-1], 2]])
+        along = np.linalg.norm(surface.vertices[edge, :2] - surface.vertices[edge[0], :2], axis=1)
+        polygon = np.column_stack([np.concatenate([[0, along[-1]], along[::-1]]), height])
+        facets.append(index[m3.triangulate([polygon])])
+    behind = np.column_stack([top[is_corner, :2], np.full(4, -thickness)])
+    vertices = np.concatenate([surface.vertices, behind])
+    # From heights over the plate, lenses up, to the design's frame, lenses down: mirrored, so turned inside out.
+    vertices[:, 2] = -thickness - vertices[:, 2]
+    return checked(m3.Manifold(m3.Mesh64(vertices, np.concatenate(facets)[:, ::-1].astype(np.uint64))))
+
+
+def _boundary(surface: Surface):
+    """Vertices around the plate, counter-clockwise."""
+    a, b = surface.facets, np.roll(surface.facets, -1, axis=1)
+    n = len(surface.vertices)
+    free = ~np.isin(a * n + b, b * n + a)
+    after = dict(zip(a[free].tolist(), b[free].tolist(), strict=True))
+    loop = [next(iter(after))]
+    while (following := after.get(loop[-1], loop[0])) != loop[0]:
+        loop.append(following)
+    if len(loop) != free.sum():
+        raise RuntimeError(f"the surface has a crack: {free.sum() - len(loop)} edges within the plate have one facet")
+    return np.array(loop)
+
+
+def checked(solid: m3.Manifold) -> m3.Manifold:
+    """The solid itself, if it is one; `RuntimeError` otherwise, a fault of the program."""
+    if solid.status() != m3.Error.NoError or solid.is_empty():
+        raise RuntimeError(f"the surface encloses no solid: {solid.status().name}")
+    return solid
+
+
+def cast_solid(array: MicrolensArray, part: m3.Manifold, shape: MoldShape) -> m3.Manifold:
+    """What fills the mold up to its rim, before it shrinks: the array, enlarged, with the sides of the walls."""
+    cavity = part.scale([shape.scale] * 3)
+    if shape.draft == 0 and shape.headroom == 0:
+        return cavity
+    return cavity + _within_walls(array, shape, shape.headroom)
+
+
+def _within_walls(array, shape, top):
+    """What the walls enclose from the plate's plane up to a height."""
+    half, bottom = np.array(array.size) / 2 * shape.scale, -plate_thickness(array) * shape.scale
+    flare = (top - bottom) * math.tan(shape.draft)
+    signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    rings = [np.column_stack([signs * (half + wider), np.full(4, z)]) for wider, z in ((0, bottom), (flare, top))]
+    return m3.Manifold.hull_points(np.concatenate(rings))
+
+
+def mold_block(array: MicrolensArray, shape: MoldShape) -> Float[np.ndarray, "2 3"]:
+    """Lowest and highest corner of the mold, mm."""
+    deep = float(array.substrate_thickness) * shape.scale
+    opening = np.array(array.size) / 2 * shape.scale
+    opening = opening + (plate_thickness(array) * shape.scale + shape.headroom) * math.tan(shape.draft)
+    high = np.array([*(opening + shape.wall), shape.headroom])
+    return np.stack([[-high[0], -high[1], -deep - shape.floor], high])
+
+
+def mold_solid(array: MicrolensArray, part: m3.Manifold, shape: MoldShape = MoldShape()) -> m3.Manifold:
+    """The negative mold of an array: a block, less the cavity that the array fills.
+
+    Parameters
+    ----------
+    array
+        Lenses on a plate of finite size.
+    part
+        Its solid, `array_solid(array)`.
+    shape
+        What is around it.
+    """
+    low, high = mold_block(array, shape)
+    block = m3.Manifold.cube((high - low).tolist()).translate(low.tolist())
+    open_above = _within_walls(array, shape, shape.headroom + _BEYOND)
+    tools = [part.scale([shape.scale] * 3), open_above, *engravings(array, shape)]
+    return checked(block - m3.Manifold.batch_boolean(tools, m3.OpType.Add))
+
+
+def engravings(array: MicrolensArray, shape: MoldShape) -> list[m3.Manifold]:
+    """The tools that cut the marks and the label into the rim."""
+    low, high = mold_block(array, shape)
+    middle = high[:2] - shape.wall / 2
+    plans = []
+    if shape.marks:
+        arm = 0.6 * shape.wall
+        bar = m3.CrossSection.square([arm, arm / 6], center=True)
+        cross = bar + bar.rotate(90)
+        plans += [cross.translate([sx * middle[0], sy * middle[1]]) for sx, sy in ((-1, -1), (1, -1), (-1, 1))]
+    text = _text(shape.label, height=0.4 * shape.wall, width=2 * (middle[0] - shape.wall))
+    if not text.is_empty():
+        plans.append(text.translate([0.0, -middle[1]]))
+    depth = min(ENGRAVED, (high[2] - low[2]) / 4)
+    return [plan.extrude(depth + _BEYOND).translate([0, 0, high[2] - depth]) for plan in plans]
+
+
+def _text(label: str, *, height: float, width: float) -> m3.CrossSection:
+    """The label's outlines about the origin, at most so high and wide; empty without a letter that can be drawn."""
+    drawable = "".join(c for c in label if " " <= c <= "~")
+    if not drawable.strip() or width <= 0:
+        return m3.CrossSection()
+    path = TextPath((0, 0), drawable.replace("$", r"\$"), size=10, prop=FontProperties(family="DejaVu Sans"))
+    outlines = [np.array(ring, float)[:-1] for ring in path.to_polygons()]
+    text = m3.CrossSection(outlines, m3.FillRule.NonZero)
+    x0, y0, x1, y1 = text.bounds()
+    size = min(height / 10, width / (x1 - x0))
+    return text.translate([-(x0 + x1) / 2, -(y0 + y1) / 2]).scale([size, size])

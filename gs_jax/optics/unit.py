@@ -1,0 +1,269 @@
+"""One lens unit, exactly: rays through a plano-convex lens by Snell's law, and the wavefront that they carry.
+
+The frame is the lens's own: the axis through its vertex, the plano face toward the object. The object point is
+`field` beside the axis and `depth` in front of the plano face; the vertex is `t` behind that face, so that the
+convex surface takes glass away off the axis; the sensor is `v` behind the vertex. A ray is named by the point
+`(x, y)` at which it leaves the convex surface: that is where neighbouring lenses cut the aperture, and the ray
+through such a point is found exactly. The ray through the vertex is the chief ray. Paths are counted from the
+chief ray's and computed as differences, so that float32 keeps a wavefront to a thousandth of a wave.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..geometry import Imager, chief_ray
+
+Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]]
+
+# Newton's steps for the height of refraction at the plane. Each squares an error that starts at 1e-3.
+_STEPS = 3
+
+
+class UnitRay(NamedTuple):
+    """A ray behind the lens.
+
+    `landing`: where it meets the sensor, `(x, y)` from the lens's axis, mm. `tangent`: its slopes `dx/dz, dy/dz`.
+    `path`: optical path from the object to the sensor less the chief ray's, mm. `valid`: False if the pupil point is
+    not on the sphere or the light is reflected totally; the other numbers are then finite and meaningless.
+    """
+
+    landing: Float[Array, "*batch 2"]
+    tangent: Float[Array, "*batch 2"]
+    path: Float[Array, "*batch"]
+    valid: Bool[Array, "*batch"]
+
+
+@jax.jit
+def unit_rays(
+    imager: Imager,
+    depth: Float[ArrayLike, ""],
+    pupil_points: Float[Array | np.ndarray, "*batch 2"],
+    field: Point = (0.0, 0.0),
+) -> UnitRay:
+    """Rays from one object point through points of the lens, to the sensor.
+
+    With `thin_lens_focal_length` the unit is an ideal lens in the vertex plane: the object's image at
+    `1/v' = 1/f - 1/z'` is free of aberrations.
+
+    Parameters
+    ----------
+    imager
+        Its array says what the lens is, its `sensor_distance` where the sensor is.
+    depth
+        `z` of the object point, in front of the plano face, mm.
+    pupil_points
+        `(*batch, 2)` points `(x, y)` at which the rays leave the lens, from its axis, mm.
+    field
+        `(x, y)` of the object point from the lens's axis, mm.
+    """
+    dtype = imager.sensor_distance.dtype
+    depth, field = jnp.asarray(depth, dtype), jnp.asarray(field, dtype)
+    points = jnp.asarray(pupil_points, dtype)
+    one = _thick_ray if imager.array.thin_lens_focal_length is None else _thin_ray
+    # Points last: the processor works along the last axis, and two are too few.
+    over_points = jax.vmap(lambda point: tuple(one(imager, depth, point, field)), 1, (1, 1, 0, 0))
+    landing, tangent, path, valid = over_points(points.reshape(-1, 2).T)
+    landing, tangent = landing.T.reshape(points.shape), tangent.T.reshape(points.shape)
+    return UnitRay(landing, tangent, path.reshape(points.shape[:-1]), valid.reshape(points.shape[:-1]))
+
+
+@jax.jit
+def wavefront(
+    imager: Imager,
+    depth: Float[ArrayLike, ""],
+    pupil_points: Float[Array | np.ndarray, "*batch 2"],
+    field: Point = (0.0, 0.0),
+) -> Float[Array, "*batch"]:
+    """Wavefront error, mm: optical path to the reference sphere less the chief ray's.
+
+    The sphere goes through the vertex and has its centre where the chief ray meets the sensor: what is out of focus on
+    the sensor is in the wavefront, as defocus. A path that is too long, hence light that is late, is positive.
+
+    Parameters
+    ----------
+    imager, depth, pupil_points, field
+        As for `unit_rays`.
+
+    Returns
+    -------
+    Array
+        `(*batch,)`; NaN where no ray gets through.
+    """
+    rays = unit_rays(imager, depth, pupil_points, field)
+    chief = unit_rays(imager, depth, np.zeros(2), field)
+    radius2 = jnp.sum(chief.landing**2) + imager.sensor_distance**2
+    offset = rays.landing - chief.landing.reshape((1,) * (rays.path.ndim) + (2,))
+    cosines = direction_cosines(rays.tangent)
+    along, offset2 = jnp.sum(offset * cosines, -1), jnp.sum(offset**2, -1)
+    # From the sphere to the sensor along the ray: m = along + sqrt(radius^2 - offset^2 + along^2), the chief's radius.
+    root = jnp.sqrt(jnp.maximum(radius2 - offset2 + along**2, 0))
+    past = along + (along**2 - offset2) / (root + jnp.sqrt(radius2))
+    return jnp.where(rays.valid, rays.path - past, jnp.nan)
+
+
+@jax.jit
+def wavefront_rms(
+    imager: Imager,
+    depth: Float[ArrayLike, ""],
+    *,
+    field: Point = (0.0, 0.0),
+    radius: Float[ArrayLike, ""] | None = None,
+) -> Float[Array, ""]:
+    """RMS wavefront error over the pupil, mm, without piston and tilt: neither changes the shape of the spot.
+
+    Parameters
+    ----------
+    imager, depth, field
+        As for `unit_rays`.
+    radius
+        Of the pupil, mm. Half the aperture's diameter by default.
+    """
+    points, weights = pupil_disc(pupil_radius(imager, radius))
+    return jnp.sqrt(jnp.sum(weights * _without_tilt(wavefront(imager, depth, points, field), points, weights) ** 2))
+
+
+@jax.jit
+def best_focus(
+    imager: Imager,
+    depth: Float[ArrayLike, ""],
+    *,
+    field: Point = (0.0, 0.0),
+    radius: Float[ArrayLike, ""] | None = None,
+) -> Float[Array, ""]:
+    """Sensor distance `v` of the least `wavefront_rms`, mm. The imager's own sensor distance does not matter.
+
+    Under spherical aberration it lies between the paraxial image and the smallest RMS spot, near the caustic's sharp
+    core. There is none for an object within the focal length; the result is then not a distance.
+
+    Parameters
+    ----------
+    imager, depth, field, radius
+        As for `wavefront_rms`.
+    """
+    points, weights = pupil_disc(pupil_radius(imager, radius))
+
+    def error(vergence):
+        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence)
+        return _without_tilt(wavefront(moved, depth, points, field), points, weights)
+
+    # Gauss-Newton: the wavefront is all but linear in 1/v, so that the first step is right to 1e-3.
+    vergence = 1 / imager.array.focal_length - 1 / imager.reduced_depth(jnp.asarray(depth, weights.dtype))
+
+    def step(_, vergence):
+        value, slope = jax.jvp(error, (vergence,), (jnp.ones_like(vergence),))
+        return vergence - jnp.sum(weights * value * slope) / jnp.sum(weights * slope**2)
+
+    return 1 / jax.lax.fori_loop(0, _STEPS, step, vergence)
+
+
+def pupil_radius(imager: Imager, radius: Float[ArrayLike, ""] | None = None) -> Float[Array, ""]:
+    """`radius` in the imager's precision; half the aperture's diameter if it is None."""
+    if radius is None:
+        return imager.array.aperture_diameter / 2
+    return jnp.asarray(radius, imager.sensor_distance.dtype)
+
+
+def _without_tilt(error: Array, points: Array, weights: Array) -> Array:
+    """Less its average and its slopes: by symmetry `1, x, y` are orthogonal over a disc."""
+    error = error - jnp.sum(weights * error)
+    slopes = jnp.sum((weights * error)[:, None] * points, 0) / jnp.sum(weights[:, None] * points**2, 0)
+    return error - points @ slopes
+
+
+def pupil_disc(radius: Float[ArrayLike, ""], rings: int = 8) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
+    """Points and weights of an average over a disc, exact for polynomials of `(x, y)` up to degree `4 rings - 2`.
+
+    Gauss-Legendre in the squared radius, equal angles around: the product rule of Abramowitz and Stegun 25.4.61.
+    The weights sum to 1.
+    """
+    radius = jnp.asarray(radius)
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    around = 4 * rings
+    angle = 2 * np.pi * (np.arange(around) + 0.5) / around
+    unit = np.sqrt((nodes + 1) / 2)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    points = jnp.asarray(unit.reshape(-1, 2), radius.dtype) * radius
+    return points, jnp.asarray(np.repeat(weights / (2 * around), around), radius.dtype)
+
+
+def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """Lateral direction cosines of a ray with the slopes `tangent`."""
+    return tangent / jnp.sqrt(1 + jnp.sum(tangent**2, -1, keepdims=True))
+
+
+def _thin_ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
+    """An ideal lens: the slope behind it is `(image - point) / v'`, written with `1/v'`, which may be zero."""
+    v, reduced = imager.sensor_distance, imager.reduced_depth(depth)
+    vergence = 1 / imager.array.focal_length - 1 / reduced
+    tilt = -field / reduced
+    tangent = tilt - vergence * point
+    s, s_chief = _secant(tangent), _secant(tilt)
+    # |point - image| - |image| = v' (s - s_chief), from the object on; then v (s - s_chief) along the ray.
+    longer = jnp.sum(vergence * point**2 - 2 * point * tilt) / (s + s_chief)
+    landing = chief_ray(jnp.zeros(2, v.dtype), field, v / reduced) + point * (1 - v * vergence)
+    return UnitRay(landing, tangent, longer * (v * vergence - 1), jnp.asarray(True))
+
+
+def _thick_ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
+    """Plane, plate, sphere. Quantities with `_chief` are those of the ray through the vertex."""
+    array, v = imager.array, imager.sensor_distance
+    n, t, radius = array.refractive_index, array.substrate_thickness, array.radius_of_curvature
+    r2 = jnp.sum(point**2)
+    on_sphere = r2 < radius**2
+    point, r2 = jnp.where(on_sphere, point, 0), jnp.where(on_sphere, r2, 0)
+    depth_of_center = jnp.sqrt(radius**2 - r2)
+    sag = r2 / (radius + depth_of_center)
+
+    # Slope in front q = (point - field) / (depth + air), with the glass as so much air.
+    air, air_chief = _as_air(n, t - sag, depth, point - field), _as_air(n, t, depth, -field)
+    h, h_chief = depth + air, depth + air_chief
+    q, q_chief = (point - field) / h, -field / h_chief
+    change = point / h + field * (air - air_chief) / (h * h_chief)
+    glass, glass_chief = _slope_in_glass(n, q), _slope_in_glass(n, q_chief)
+    s_chief, s_glass, s_glass_chief = _secant(q_chief), _secant(glass), _secant(glass_chief)
+    squares = jnp.sum(change * (q + q_chief))
+    path = depth * squares / (_secant(q) + s_chief)
+    # Snell's law for the square of the slope in glass; see `_slope_in_glass`.
+    flat, flat_chief = n**2 + (n**2 - 1) * jnp.sum(q**2), n**2 + (n**2 - 1) * jnp.sum(q_chief**2)
+    glass_squares = n**2 * squares / (flat * flat_chief)
+    path = path + n * (t * glass_squares / (s_glass + s_glass_chief) - sag * s_glass)
+
+    # Lateral and axial parts of the ray and of the sphere's normal.
+    ray, ray_z = glass / s_glass, 1 / s_glass
+    normal, normal_z = point / radius, depth_of_center / radius
+    cosine = jnp.sum(ray * normal) + ray_z * normal_z
+    behind2 = 1 - n**2 * (1 - cosine**2)
+    valid = on_sphere & (behind2 > 0)
+    bend = jnp.sqrt(jnp.where(behind2 > 0, behind2, 1)) - n * cosine
+    tangent = jnp.where(valid, n * ray + bend * normal, 0) / jnp.where(valid, n * ray_z + bend * normal_z, 1)
+    landing = point + (v + sag) * tangent
+    # At the vertex the sphere is parallel to the plane: the chief ray leaves as it came.
+    s = _secant(tangent)
+    path = path + sag * s + v * jnp.sum((tangent - q_chief) * (tangent + q_chief)) / (s + s_chief)
+    return UnitRay(landing, tangent, path, valid)
+
+
+def _as_air(n: Array, thickness: Array, depth: Array, across: Array) -> Array:
+    """The layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
+    square = jnp.sum(across**2)
+    g = thickness / n
+    for _ in range(_STEPS):
+        h = depth + g
+        flat = n**2 + (n**2 - 1) * square / h**2
+        g = g - (g - thickness / jnp.sqrt(flat)) / (
+            1 - thickness * (n**2 - 1) * square / (h**3 * flat * jnp.sqrt(flat))
+        )
+    return g
+
+
+def _slope_in_glass(n: Array, slope: Array) -> Array:
+    """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
+    return slope / jnp.sqrt(n**2 + (n**2 - 1) * jnp.sum(slope**2))
+
+
+def _secant(slope: Array) -> Array:
+    return jnp.sqrt(1 + jnp.sum(slope**2))

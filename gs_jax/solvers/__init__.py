@@ -1,0 +1,1 @@
+"""Iterative reconstruction, for any linear operator."""

@@ -1,0 +1,264 @@
+"""Points out of a capture: what the lenses agree on. Host code, but for the back-projection in it.
+
+The paper's particle clustering (`gs_jax.suppression.clustering`) takes bright groups of voxels for points. Here a
+candidate is checked against the capture: a true point is seen by nearly all lenses in reach, a ghost by some. Points
+are rows `(x, y, z, intensity)`, mm; `gs_jax.phantoms.rasterize` makes a volume of them.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64, Shaped
+from scipy.spatial import KDTree
+
+from ..backprojection import backproject
+from ..geometry import Grid, Imager
+from ..optics.aperture import clear_diameter
+from ..optics.psf import geometric_psf
+from ..progress import Progress
+from .consistency import (
+    REACH,
+    Readings,
+    Signal,
+    agreed_level,
+    log_false_alarms,
+    readings,
+    signal,
+    spot_profile,
+    survival,
+    taken,
+    without_spots,
+)
+
+Points = Float64[np.ndarray, "_ 4"]
+Places = Float64[np.ndarray, "_ 3"]
+
+# Share of its lenses that must see a point; the others may be blocked, scratched, or under a brighter point.
+_SHARE = 0.7
+# Lit is what exceeds the noise this many times. Back-projected are the logarithms of what exceeds it half as much.
+_LIT = 5.0
+# Three numbers are found from two of each lens.
+_FEWEST = 3
+# Part of its light that a point must keep when the points that were found before it are taken away.
+_OWN = 0.5
+# Points by chance in a capture, on average: one in ten captures.
+_FALSE_ALARMS = 0.1
+# Times that a candidate's neighbourhood is searched, each half as wide: to 1/128 of a voxel, 0.3 um.
+_REFINEMENTS = 7
+# Width of the voxels that are searched first, pixels.
+_COARSE = 2
+# Planes that are searched at once.
+_PLANES = 16
+# Half the sides, in pixels, of the square in which the light of a spot is summed and of the one that holds all of it;
+# depths at which the ratio is computed.
+_APERTURE, _WINDOW, _DEPTHS = 3, 128, 5
+# Searches: the second, without the light that the first explains, finds what is close to brighter points.
+_SEARCHES = 2
+
+
+def find_points(
+    image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, *, progress: Progress
+) -> Points:
+    """Finds the points that a capture shows: those that nearly all of their lenses see.
+
+    1. The background is taken off the image (`consistency.signal`).
+    2. The logarithms of what exceeds the noise are back-projected onto voxels of two pixels. A sum of logarithms is
+       high where all lenses are lit, not where one is bright. Its local maxima, then searched between the voxels, are
+       candidates.
+    3. Brightest first, a candidate is a point if 7 of 10 of its lenses are lit above the noise, more than chance would
+       light them anywhere in the volume (`consistency.log_false_alarms`), and mostly not by points that were found
+       before. The light of these is subtracted from the readings, with the spot's shape as this image shows it.
+    4. All is repeated once on what the image holds beside the points, for those in the shadow of brighter ones.
+
+    No threshold depends on the scene, and nothing is random. Chief rays are as the imager says; where aberrations bend
+    them, depths are off by what its calibration leaves (0.1 to 0.2 mm for the paper's lenses at 2 mm from the focus).
+
+    Parameters
+    ----------
+    image
+        `sensor.shape`, linear, in any unit, on any offset.
+    imager
+        What took it.
+    grid
+        Where to look: the box of these voxels, at most as large as the sensor. How large the voxels are has no effect.
+    progress
+        Shows how far the search is.
+
+    Returns
+    -------
+    ndarray
+        `(point, 4)`, brightest first. The intensity is that of `stamps.forward_points` in the image's unit: the light
+        of one lens's spot, over the envelope.
+
+    Raises
+    ------
+    ValueError
+        If the image is not `sensor.shape`.
+    """
+    if image.shape != imager.sensor.shape:
+        raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    seen, voxels = signal(image), _voxels(imager, grid)
+    rest, candidates = seen, np.zeros((0, 3))
+    points, spots, own = _consistent(candidates, seen, imager, voxels)
+    for _ in range(_SEARCHES):
+        # A spot between two voxels must not be missed.
+        wide = rest._replace(light=np.asarray(_brightest_neighbour(rest.light)))
+        new = _candidates(wide, imager, voxels, progress)
+        with progress.step("Comparing lenses"):
+            lit = _lit(readings(new, wide, imager), survival(wide.light), _count(voxels))
+            new = _refined(new[lit], voxels, rest, imager)
+            points, spots, own = _consistent(np.concatenate([points, new]), seen, imager, voxels)
+            rest = seen._replace(light=without_spots(seen.light, spots, own))
+    found = np.column_stack([points, _intensity(points, spots, own, seen, imager)])
+    found = found[_inside(found, grid, float(voxels.depths[1] - voxels.depths[0]) / _COARSE)]
+    return found[np.argsort(-found[:, 3], kind="stable")]
+
+
+def _voxels(imager: Imager, grid: Grid) -> Grid:
+    """Coarse voxels that fill the sensor and the grid's depths, and a plane beyond: maxima need neighbours."""
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    middle = (near + far) / 2
+    pitch = _COARSE * imager.sensor.pixel_pitch / float(imager.magnification(middle))
+    # A lens at the field radius sees a point move from plane to plane as from voxel to voxel.
+    step = pitch * float(imager.reduced_depth(middle)) / imager.field_radius
+    planes = near + step * np.arange(-1, math.ceil((far - near) / step) + 2)
+    return Grid.over(imager.sensor, depths=planes, pitch=pitch)
+
+
+def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point"]:
+    """Which points lie in the grid's voxels, the outer planes of which are a step thick."""
+    x, y, z = points[:, :3].T
+    rows, columns = grid.shape
+    lateral = (np.abs(x) <= columns * grid.pitch / 2) & (np.abs(y) <= rows * grid.pitch / 2)
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    return lateral & (near - step / 2 <= z) & (z <= far + step / 2)
+
+
+def _count(voxels: Grid) -> int:
+    return voxels.depths.size * math.prod(voxels.shape)
+
+
+def _brightness(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """What is summed over the lenses: the logarithm of what exceeds the noise, so that no lens outweighs the others."""
+    return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (_LIT / 2), 1))
+
+
+@jax.jit
+def _brightest_neighbour(light: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+    """The most of 3 x 3 pixels; beyond the edge it goes on."""
+    light = jnp.asarray(light)
+    for axis in (0, 1):
+        n = light.shape[axis]
+        padded = jnp.pad(light, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        shifted = [jax.lax.slice_in_dim(padded, start, start + n, axis=axis) for start in range(3)]
+        light = jnp.maximum(jnp.maximum(shifted[0], shifted[1]), shifted[2])
+    return light
+
+
+def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) -> Places:
+    """Local maxima of the summed logarithms, at voxels."""
+    image = jnp.asarray(_brightness(rest.light, rest.noise))
+    x, y, z = (np.asarray(axis, np.float64) for axis in (voxels.x, voxels.y, voxels.depths))
+    # Each part has a plane of its neighbours; the last is as long as the others, its planes after the end repeat.
+    planes = np.arange(_PLANES)
+    found = [np.zeros((0, 3))]
+    for first in progress.track(range(0, len(z) - 2, _PLANES - 2), "Searching for points"):
+        some = np.minimum(first + planes, len(z) - 1)
+        volume = backproject(image, imager, Grid(voxels.depths[some], voxels.shape, voxels.pitch))
+        depth, row, column = np.argwhere(np.asarray(_is_maximum(volume))).T + 1
+        inside = first + depth < len(z) - 1
+        found.append(np.column_stack([x[column], y[row], z[some[depth]]])[inside])
+    return np.concatenate(found)
+
+
+@jax.jit
+def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
+    """Which inner voxels exceed what three lenses would read, and all 26 neighbours; the last of equal neighbours."""
+    inner = volume[1:-1, 1:-1, 1:-1]
+    highest = inner > _FEWEST * _SHARE * math.log(2)
+    for step in np.ndindex(3, 3, 3):
+        there = volume[tuple(slice(at, at + n) for at, n in zip(step, inner.shape, strict=True))]
+        highest &= inner >= there if step <= (1, 1, 1) else inner > there
+    return highest
+
+
+def _refined(points: Places, voxels: Grid, rest: Signal, imager: Imager) -> Places:
+    """Points moved uphill between the voxels: to the best of 27 places, twice as close each time."""
+    step = float(voxels.depths[1] - voxels.depths[0])
+    around = (np.array(list(np.ndindex(3, 3, 3))) - 1) * (voxels.pitch, voxels.pitch, step)
+    each = np.arange(len(points))
+    for part in 0.5 ** np.arange(1, _REFINEMENTS + 1):
+        places = points[:, None] + part * around
+        seen = readings(places.reshape(-1, 3), rest, imager)
+        brightness = _brightness(seen.light, seen.noise).sum(1).reshape(places.shape[:2])
+        points = places[each, brightness.argmax(1)]
+    return points
+
+
+def _lit(seen: Readings, as_bright, tests: int) -> np.ndarray:
+    """Which points enough of their lenses see, and more than by chance."""
+    count, noise = seen.seen.sum(1), seen.noise.max(1, initial=0)
+    level = agreed_level(seen.light, seen.seen, _SHARE)
+    log_alarms = log_false_alarms(level, count, _SHARE, as_bright, tests)
+    return (level > _LIT * noise) & (log_alarms <= np.log(_FALSE_ALARMS)) & (count >= _FEWEST)
+
+
+def _consistent(
+    candidates: Places, signal: Signal, imager: Imager, voxels: Grid
+) -> tuple[Places, Readings, Float64[np.ndarray, "point lens"]]:
+    """The points among the candidates, their readings, and their own part of what was read.
+
+    Brightest first; from the readings of each, the light of the points before it is taken away.
+    """
+    seen = readings(candidates, signal, imager)
+    order = np.argsort(-agreed_level(seen.light, seen.seen, _SHARE), kind="stable")
+    candidates, seen = candidates[order], taken(seen, order)
+    as_bright, tests = survival(signal.light), _count(voxels)
+    profile = spot_profile(seen, signal.light)
+    spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
+    tree = KDTree(spots)
+    left, height = seen.light.copy(), np.zeros(len(candidates))
+    for number, mine in enumerate(seen.seen):
+        one = taken(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
+        bright = agreed_level(one.light, one.seen, _SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
+        if not (bright and _lit(one, as_bright, tests)[0]):
+            continue
+        height[number] = np.median(left[number, mine])
+        for pixel in seen.pixels[number, mine]:
+            others = tree.query_ball_point(pixel, REACH)
+            distance = np.hypot(*(spots[others] - pixel).T)
+            left[tuple(owner[others].T)] -= height[number] * np.interp(distance, np.arange(REACH + 1), profile)
+    points = height > 0
+    return candidates[points], taken(seen, points), (left + height[:, None])[points]
+
+
+def _intensity(
+    points: Places, seen: Readings, own: np.ndarray, signal: Signal, imager: Imager
+) -> Float64[np.ndarray, " point"]:
+    """Light of the spots over the envelope, the median of the lenses.
+
+    Summed in a square about each spot; of it the part that is the point's own at the chief ray; over the part of all
+    its light that falls into the square, by counted rays.
+    """
+    side = np.arange(-_APERTURE, _APERTURE + 1)
+    middle = np.floor(seen.pixels + 0.5).astype(int)
+    row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
+    total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
+    use = seen.seen & (seen.light > 0)
+    ratio = np.where(use, total * own / np.where(use, seen.light * seen.weight, 1), 0)
+    medians = [np.median(some[which]) if which.any() else 0.0 for some, which in zip(ratio, use, strict=True)]
+    return np.array(medians) / _enclosed(points[:, 2], imager)
+
+
+def _enclosed(depth: np.ndarray, imager: Imager) -> np.ndarray:
+    """The part of a spot's light that falls into the square."""
+    if not depth.size:
+        return np.ones(0)
+    some = np.linspace(depth.min(), depth.max(), _DEPTHS if np.ptp(depth) > 0 else 1)
+    square = slice(_WINDOW - _APERTURE, _WINDOW + _APERTURE + 1)
+    radius = clear_diameter(imager.array) / 2
+    spot = lambda z: np.asarray(geometric_psf(imager, z, size=2 * _WINDOW + 1, radius=radius))
+    parts = np.array([spot(z)[square, square].sum() for z in some])
+    return np.interp(depth, some, np.where(parts > 0, parts, 1))

@@ -1,0 +1,129 @@
+"""Training of the networks of `unet`: the paper's recipe and ours, with checkpoints from which it goes on exactly."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Float32, PRNGKeyArray
+
+from ..errors import InputError
+from ..io.disk import atomic_write, check_input, decoding
+from .training_data import Batch, Stack, paper_batch, patches
+from .unet import UNet, multislice_network, paper_network
+
+
+class Recipe(NamedTuple):
+    """How a network is made and trained.
+
+    Parameters
+    ----------
+    network
+        Makes it from a key.
+    optimizer
+        Makes it for a number of steps.
+    batch
+        Draws one with a generator of random numbers.
+    """
+
+    network: Callable[[PRNGKeyArray], UNet]
+    optimizer: Callable[[int], optax.GradientTransformation]
+    batch: Callable[[np.random.Generator], Batch]
+
+
+def paper_recipe() -> Recipe:
+    """The paper's: RMSprop and mean squared error on synthetic polygons. It prints no rate."""
+    return Recipe(paper_network, lambda steps: optax.rmsprop(3e-4), paper_batch)
+
+
+def multislice_recipe(stacks: list[Stack]) -> Recipe:
+    """Ours: Adam, its rate falling as a cosine, and mean squared error on simulated stacks."""
+    rate = lambda steps: optax.warmup_cosine_decay_schedule(0, 1e-3, min(100, steps // 10), steps)
+    optimizer = lambda steps: optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate(steps)))
+    offsets = eqx.filter_eval_shape(multislice_network, jax.random.key(0)).offsets
+    return Recipe(multislice_network, optimizer, lambda rng: patches(stacks, offsets, rng))
+
+
+class State(eqx.Module):
+    """Where a training is: everything that decides how it goes on.
+
+    Parameters
+    ----------
+    network, optimizer
+        The weights, and what the optimizer remembers.
+    losses
+        One a step; those of steps to come are NaN.
+    seed, step
+        Which training it is, and the steps that are done.
+    """
+
+    network: UNet
+    optimizer: optax.OptState
+    losses: Float32[np.ndarray, " step"]
+    seed: np.ndarray
+    step: np.ndarray
+
+
+def start(recipe: Recipe, *, steps: int, seed: int) -> State:
+    """A training of `steps` steps before the first."""
+    network: Any = recipe.network(jax.random.key(seed))  # optax does not know that modules are trees
+    memory = recipe.optimizer(steps).init(network)
+    return State(network, memory, np.full(steps, np.nan, np.float32), np.array(seed), np.array(0))
+
+
+def train(recipe: Recipe, state: State, *, each: Callable[[State], None] = lambda state: None) -> State:
+    """The rest of a training. `each` is called with the state after every step.
+
+    The batch of a step follows from the seed and the step alone, so that a training that goes on from a checkpoint
+    ends with the weights that it would have had without the interruption.
+    """
+    steps = len(state.losses)
+    for number in range(int(state.step), steps):
+        batch = recipe.batch(np.random.default_rng([int(state.seed), 1, number]))
+        network, memory, value = _step(recipe.optimizer, steps, state.network, state.optimizer, batch)
+        losses = state.losses.copy()
+        losses[number] = value
+        state = State(network, memory, losses, state.seed, np.array(number + 1))
+        each(state)
+    return state
+
+
+def loss(network: UNet, batch: Batch) -> Float[Array, ""]:
+    """Mean squared error over the voxels of a batch, weighted."""
+    error = jax.vmap(network)(jnp.asarray(batch.slices)) - jnp.asarray(batch.truth)
+    return jnp.mean(jnp.asarray(batch.weight) * jnp.mean(error**2, axis=(1, 2)))
+
+
+@eqx.filter_jit
+def _step(optimizer, steps: int, network: Any, memory: optax.OptState, batch: Batch) -> tuple[Any, optax.OptState, Any]:
+    value, gradient = jax.value_and_grad(loss)(network, batch)
+    with jax.numpy_dtype_promotion("standard"):  # optax counts steps with integers
+        updates, memory = optimizer(steps).update(gradient, memory, network)
+    return optax.apply_updates(network, updates), memory, value
+
+
+def write_checkpoint(path: Path, state: State) -> None:
+    """Writes a state, exactly, whole or not at all."""
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        eqx.tree_serialise_leaves(file, state)
+
+
+def read_checkpoint(path: Path, recipe: Recipe, *, steps: int, seed: int) -> State:
+    """The state in a file of `write_checkpoint`, of the same recipe, number of steps and seed.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is of another training. Nothing in it is ever executed.
+    """
+    expected = start(recipe, steps=steps, seed=seed)
+    kind = f"checkpoint of this network and of {steps} steps"
+    with decoding(check_input(path), kind), open(path, "rb") as file:
+        state = eqx.tree_deserialise_leaves(file, expected)
+    if int(state.seed) != seed:
+        raise InputError(f"{path}: found a training of seed {int(state.seed)}, allowed: of the seed given, {seed}.")
+    return state

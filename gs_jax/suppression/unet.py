@@ -1,0 +1,276 @@
+"""Background suppression by a U-Net (paper, "Background suppression through a convolutional neural network").
+
+A back-projected stack holds every object again, blurred or as ghosts, in the slices where it is not. A network that
+looks at one slice (the paper's) or at several around it (ours) gives back what is in focus there. A volume goes in
+and a volume comes out, of the same voxels: nothing is downsampled.
+"""
+
+import json
+import zipfile
+from importlib import resources
+from itertools import product
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, PRNGKeyArray
+
+from ..errors import InputError, shown
+from ..io.disk import atomic_write, check_input, check_output, decoding
+
+# The networks that come with the package, and what a file of weights may hold at most.
+PRETRAINED = ("paper", "multislice")
+_MOST_BYTES, _MOST_LEVELS, _MOST_WIDTH, _MOST_OFFSET = 2**27, 8, 4096, 64
+# The most voxels of a plane that one call of the network answers for, along each axis: about half a GiB.
+_CORE = 1024
+
+
+class Block(eqx.Module):
+    """Two 3 x 3 convolutions, each with a rectifier."""
+
+    first: eqx.nn.Conv2d
+    second: eqx.nn.Conv2d
+
+    def __init__(self, channels: int, width: int, *, key: PRNGKeyArray):
+        one, two = jax.random.split(key)
+        self.first = _convolution(channels, width, 3, one)
+        self.second = _convolution(width, width, 3, two)
+
+    def __call__(self, x: Float[Array, "channel y x"]) -> Float[Array, "width y x"]:
+        return jax.nn.relu(self.second(jax.nn.relu(self.first(x))))
+
+
+class UNet(eqx.Module):
+    """A U-Net (Ronneberger, Fischer, Brox, MICCAI 2015) from some slices of a stack to one.
+
+    Each level has two convolutions and half as many rows and columns as the one above; on the way up a level is
+    narrowed, enlarged and put beside what the way down had there.
+
+    Parameters
+    ----------
+    offsets
+        Which slices it sees, counted from the one that it is for: `(0,)` is that slice alone.
+    widths
+        Channels of each level, the finest first.
+    standardized
+        The network is meant for volumes less each plane's median, in standard deviations; without it, for volumes over
+        their largest value. `suppress` sees to it.
+    key
+        For the weights at the start (He's normal distribution).
+
+    Raises
+    ------
+    ValueError
+        If `offsets` lacks 0 or `widths` is empty.
+    """
+
+    down: tuple[Block, ...]
+    narrow: tuple[eqx.nn.Conv2d, ...]
+    up: tuple[Block, ...]
+    last: eqx.nn.Conv2d
+    offsets: tuple[int, ...] = eqx.field(static=True)
+    widths: tuple[int, ...] = eqx.field(static=True)
+    standardized: bool = eqx.field(static=True)
+
+    def __init__(self, offsets: tuple[int, ...], widths: tuple[int, ...], *, standardized: bool, key: PRNGKeyArray):
+        if 0 not in offsets:
+            raise ValueError(f"`offsets` must have 0, the slice that is wanted, got {offsets}.")
+        if not widths:
+            raise ValueError("`widths` must have a level at least, got none.")
+        self.offsets, self.widths, self.standardized = offsets, widths, standardized
+        pairs = list(zip(widths, widths[1:], strict=False))
+        keys = iter(jax.random.split(key, 3 * len(widths)))
+        self.down = tuple(Block(a, b, key=next(keys)) for a, b in zip((len(offsets), *widths), widths, strict=False))
+        self.narrow = tuple(_convolution(b, a, 1, next(keys)) for a, b in reversed(pairs))
+        self.up = tuple(Block(2 * a, a, key=next(keys)) for a, _ in reversed(pairs))
+        self.last = _convolution(widths[0], 1, 1, next(keys))
+
+    @property
+    def multiple(self) -> int:
+        """What rows and columns must be a multiple of."""
+        return 2 ** (len(self.widths) - 1)
+
+    @property
+    def margin(self) -> int:
+        """How far, in voxels, an output may look, rounded up to a multiple of `multiple`.
+
+        A convolution of level l looks 2^l voxels further, and a pool 2^l - 1 at most: `4 (2^L - 1) + 2 2^L` for the
+        four convolutions of each of the L upper levels and two of the lowest, and `2^L - 1` for the pools.
+        """
+        scale = self.multiple
+        reach = 5 * (scale - 1) + 2 * scale
+        return -(-reach // scale) * scale
+
+    def __call__(self, slices: Float[Array, "channel y x"]) -> Float[Array, "y x"]:
+        """What is in focus; it may be a little below zero, which `suppress` cuts off."""
+        x, skipped = slices, []
+        for level, block in enumerate(self.down):
+            x = block(x if level == 0 else _halved(x))
+            skipped.append(x)
+        for narrow, block, same in zip(self.narrow, self.up, reversed(skipped[:-1]), strict=True):
+            x = block(jnp.concatenate([same, _doubled(narrow(x))]))
+        return self.last(x)[0]
+
+
+def paper_network(key: PRNGKeyArray) -> UNet:
+    """The paper's: single slices, five levels of 16 to 256 channels (the widths are those of the authors' code)."""
+    return UNet((0,), (16, 32, 64, 128, 256), standardized=False, key=key)
+
+
+def multislice_network(key: PRNGKeyArray) -> UNet:
+    """Ours: a slice and the three on each side of it, so that it sees in which one light is in focus."""
+    return UNet((-3, -2, -1, 0, 1, 2, 3), (16, 32, 64, 128), standardized=True, key=key)
+
+
+def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet) -> Float32[np.ndarray, "depth y x"]:
+    """What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero.
+
+    What the network sees is in its own unit (`standardized`), what it gives back in the volume's, above each plane's
+    background. The first and last slices are repeated where the network looks beyond them, and planes are mirrored at
+    their edges. A plane is handled in tiles that overlap by as much as the network can see: the result does not depend
+    on them, and the memory needed beside the two volumes does not grow with the planes.
+
+    Parameters
+    ----------
+    volume
+        Of any size, finite; a stack as `reconstruct_stack` makes it.
+    network
+        From `pretrained`, `read_weights` or training.
+
+    Returns
+    -------
+    ndarray
+        Of the volume's shape, not negative.
+    """
+    volume = np.asarray(volume, np.float32)
+    result = np.zeros_like(volume)
+    if not volume.size:
+        return result
+    if network.standardized:
+        volume, unit = standardized(volume)
+    else:
+        unit = volume.max()
+    if not unit > 0:
+        return result
+    last = len(volume) - 1
+    rows, columns = (_tiles(size, network) for size in volume.shape[1:])
+    for depth in range(len(volume)):
+        slices = volume[np.clip(depth + np.array(network.offsets), 0, last)]
+        for (row, tall), (column, wide) in product(rows, columns):
+            tile = slices[:, tall[:, None], wide[None]] / unit
+            found = np.asarray(_inner(network, tile))
+            place = result[depth, row : row + found.shape[0], column : column + found.shape[1]]
+            place[...] = found[: place.shape[0], : place.shape[1]]
+    return unit * result
+
+
+def standardized(volume: Float[np.ndarray, "depth y x"]) -> tuple[Float[np.ndarray, "depth y x"], float]:
+    """A volume less the median of each plane, and the standard deviation of what is left."""
+    above = volume - np.median(volume, axis=(1, 2), keepdims=True)
+    return above, float(np.sqrt(np.mean(np.square(above, dtype=np.float64))))
+
+
+@eqx.filter_jit
+def _inner(network: UNet, tile):
+    """The network's answer without the margin, where it would see the tile's edges."""
+    margin = network.margin
+    return jnp.maximum(network(jnp.asarray(tile, network.last.weight.dtype)), 0)[margin:-margin, margin:-margin]
+
+
+def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
+    """Along an axis: where each tile's core starts, and the voxels that core and margins hold, mirrored at the ends."""
+    count = -(-size // _CORE)
+    core = -(-size // (count * network.multiple)) * network.multiple
+    offsets = np.arange(-network.margin, core + network.margin)
+    return [(start, _mirrored(start + offsets, size)) for start in range(0, size, core)]
+
+
+def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
+    index = index % (2 * size)
+    return np.minimum(index, 2 * size - 1 - index)
+
+
+def write_weights(path: str | Path, network: UNet) -> None:
+    """Writes a network as `.npz`: its weights as float16, and what it is as JSON. Whole or not at all.
+
+    Raises
+    ------
+    InputError
+        As `check_output`.
+    """
+    about = {"offsets": network.offsets, "widths": network.widths, "standardized": network.standardized}
+    arrays = {f"array_{i}": np.asarray(leaf, np.float16) for i, leaf in enumerate(jax.tree.leaves(network))}
+    with atomic_write(check_output(path, [".npz"])) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+
+
+def read_weights(path: str | Path) -> UNet:
+    """The network in a file of `write_weights`, in float32. Nothing in the file is ever executed.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or holds no network, or not the arrays of its network, finite.
+    """
+    return _read(check_input(path))
+
+
+def pretrained(name: str = "multislice") -> UNet:
+    """A network that comes with the package: `"paper"` or `"multislice"`, ours. Its model card says how it was made.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    if name not in PRETRAINED:
+        raise InputError(f"found the network {shown(name)}, allowed: {', '.join(PRETRAINED)}.")
+    with resources.as_file(resources.files("gs_jax") / "weights" / f"{name}.npz") as path:
+        return _read(path)
+
+
+def _read(path: Path) -> UNet:
+    with decoding(path, "file of weights (.npz)"):
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _MOST_BYTES:
+            raise ValueError(f"found {size} bytes, allowed: at most {_MOST_BYTES}")
+        with np.load(path, allow_pickle=False) as archive:
+            about = json.loads(str(archive["about"]))
+            skeleton = _skeleton(**about)
+            leaves, structure = jax.tree.flatten(skeleton)
+            arrays = [archive[f"array_{i}"] for i in range(len(leaves))]
+        for leaf, array in zip(leaves, arrays, strict=True):
+            if array.shape != leaf.shape or array.dtype != np.float16 or not np.isfinite(array).all():
+                raise ValueError(f"found {array.dtype} {array.shape}, allowed: finite float16 {leaf.shape}")
+    return jax.tree.unflatten(structure, [jnp.asarray(array, jnp.float32) for array in arrays])
+
+
+def _skeleton(offsets: list[int], widths: list[int], standardized: bool) -> UNet:
+    """The shapes of a network, checked: what a file says decides how much memory is asked for."""
+    whole = lambda values, most: all(type(n) is int and abs(n) <= most for n in values)
+    if not (whole(offsets, _MOST_OFFSET) and whole(widths, _MOST_WIDTH) and type(standardized) is bool):
+        raise ValueError("its offsets, widths or kind are out of range")
+    if not (1 <= len(widths) <= _MOST_LEVELS and len(offsets) <= 2 * _MOST_OFFSET + 1 and min(widths) > 0):
+        raise ValueError("its number of levels or slices is out of range")
+    make = lambda key: UNet(tuple(offsets), tuple(widths), standardized=standardized, key=key)
+    return eqx.filter_eval_shape(make, jax.random.key(0))
+
+
+def _convolution(channels: int, width: int, size: int, key: PRNGKeyArray) -> eqx.nn.Conv2d:
+    layer = eqx.nn.Conv2d(channels, width, size, padding="SAME", key=key)
+    # Equinox starts smaller, and without normalisation layers the signal would fade on the way down.
+    start = jax.nn.initializers.he_normal(in_axis=1, out_axis=0)(key, layer.weight.shape, jnp.float32)
+    return eqx.tree_at(lambda l: (l.weight, l.bias), layer, (start, jnp.zeros((width, 1, 1), jnp.float32)))
+
+
+def _halved(x: Float[Array, "channel y x"]) -> Float[Array, "channel y_half x_half"]:
+    """The largest of each 2 x 2 voxels."""
+    channels, rows, columns = x.shape
+    return x.reshape(channels, rows // 2, 2, columns // 2, 2).max((2, 4))
+
+
+def _doubled(x: Float[Array, "channel y x"]) -> Float[Array, "channel y_double x_double"]:
+    return jnp.repeat(jnp.repeat(x, 2, 1), 2, 2)
