@@ -4,22 +4,27 @@ Exit status 0 on success, 2 on wrong input (one line, no traceback), 1 otherwise
 """
 
 import sys
+from importlib import import_module
 
 import click
 
 from . import __version__
-from .cli.benchmark import benchmark
-from .cli.demo import demo
-from .cli.info import info
-from .cli.layout import layout
-from .cli.metrics import metrics
-from .cli.mold import mold
-from .cli.optimize import optimize
-from .cli.pareto import pareto
-from .cli.reconstruct import reconstruct
-from .cli.simulate import simulate
-from .cli.train import train
 from .errors import InputError
+
+# Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
+COMMANDS = (
+    "reconstruct",
+    "simulate",
+    "metrics",
+    "layout",
+    "optimize",
+    "pareto",
+    "benchmark",
+    "mold",
+    "train",
+    "demo",
+    "info",
+)
 
 
 def main() -> None:
@@ -41,14 +46,20 @@ def _fail(message: str, status: int) -> None:
     sys.exit(status)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=False)
+class _Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        return getattr(import_module(f".cli.{cmd_name}", __package__), cmd_name)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=False)
 @click.version_option(__version__, prog_name="gs-jax")
 def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
-
-
-for _command in (reconstruct, simulate, metrics, layout, optimize, pareto, benchmark, mold, train, demo, info):
-    commands.add_command(_command)
 
 
 if __name__ == "__main__":

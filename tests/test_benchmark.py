@@ -126,7 +126,7 @@ def test_every_method_reconstructs_and_a_wrong_one_is_named():
 def test_command(found, tmp_path, monkeypatch):
     from gs_jax.cli.benchmark import benchmark as command
 
-    monkeypatch.setattr(compare, "run", lambda progress: found)
+    monkeypatch.setattr("gs_jax.cli.benchmark.run", lambda progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
     assert result.exit_code == 0 and "benchmark.json" in result.output
     assert len(json.loads((tmp_path / "new" / "benchmark.json").read_text())) == len(found[0])

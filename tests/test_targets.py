@@ -53,6 +53,13 @@ def test_goals_count_their_worst(entries):
     np.testing.assert_allclose(entries(table({"maximise": 2.0}), X), [power(2 / x)], rtol=1e-12)
 
 
+def test_a_goal_of_a_logarithm_is_that_of_its_value(entries):
+    """Far below its size too, where a logarithm is negative: less stays better."""
+    small = X * 1e-3
+    for kind in ({"minimise": 2.0}, {"maximise": 2.0}):
+        np.testing.assert_allclose(entries(table(kind, name="strehl"), small), entries(table(kind), small), rtol=1e-12)
+
+
 def test_logarithms(entries):
     found = entries(table({"at_least": 2.0}, name="strehl"), X, 0.1)
     np.testing.assert_allclose(found * np.sqrt(3), np.maximum(0.1 - np.log(np.asarray(X) / 2), 0), atol=1e-12)

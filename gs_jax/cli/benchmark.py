@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from ..benchmark.compare import run
+from ..benchmark.report import write
 from ..io.disk import make_folder
 from ..progress import Progress
 
@@ -12,9 +14,6 @@ from ..progress import Progress
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
 def benchmark(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
-    from ..benchmark.compare import run  # it and Matplotlib take seconds to import
-    from ..benchmark.report import write
-
     folder = make_folder(out)
     with Progress() as progress:
         records, left_out = run(progress=progress)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from ..demo import run
 from ..progress import Progress
 
 
@@ -11,8 +12,6 @@ from ..progress import Progress
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
 def demo(out: Path):
     """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with a report."""
-    from ..demo import run  # Matplotlib takes a second to import
-
     with Progress() as progress:
         report = run(out, progress)
     click.echo(f"{report}: what was made, and what it shows")

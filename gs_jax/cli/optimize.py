@@ -7,6 +7,7 @@ import jax
 from rich.console import Console
 
 from ..codesign.checkpoint import checkpoint_path
+from ..codesign.outcome import before_and_after, check_outputs, write_outcome
 from ..codesign.search import optimise
 from ..codesign.study import read_study
 from ..designs import read_design
@@ -23,8 +24,6 @@ def optimize(design: Path, study: Path, resume: bool, output: Path):
 
     Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).
     """
-    from ..codesign.outcome import before_and_after, check_outputs, write_outcome  # Matplotlib takes a second to import
-
     check_outputs(output)
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)

@@ -7,6 +7,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from ..codesign.pareto import as_json, picture, sweep
 from ..codesign.study import parent_path, read_study
 from ..designs import read_design
 from ..io.disk import atomic_write, make_folder, write_json
@@ -21,8 +22,6 @@ def pareto(study: Path, out: Path):
 
     The folder gets pareto.json, the designs' numbers, and pareto.png.
     """
-    from ..codesign.pareto import as_json, picture, sweep  # Matplotlib takes a second to import
-
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     question = read_study(study)

@@ -21,8 +21,8 @@ from .parameters import Candidate
 _SOURCES, _TARGETS, _POINTS, _PHOTONS = 4, 256, 4, 1000.0
 # Places along a side of the plate.
 _RASTER = 15
-# Voxels along a side of a random scene, and blobs per voxel, each as wide as a voxel.
-_VOXELS, _DENSITY = 99, 0.008
+# Voxels along a side of a random scene, blobs per voxel, each as wide as a voxel; scenes of a draw.
+_VOXELS, _DENSITY, _SCENES = 99, 0.008, 2
 
 
 def ghosts(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
@@ -65,7 +65,7 @@ def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
         c.imager,
         key,
         grid=Grid(depths, (_VOXELS, _VOXELS), pitch),
-        scenes=1,
+        scenes=_SCENES,
         density=_DENSITY,
         width=pitch,
         background_width=4 * pitch,

@@ -56,7 +56,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
     free, given
         Examples of its arguments, for shapes. Free parameters are of order one and have no bounds.
     stage
-        Which solver. Adam is for a residual that is random: it gets a new key in each step, and never converges.
+        Which solver. Adam is for a residual that is random: it gets a new key in each step, its rate falls to zero by a
+        cosine over the stage's steps, and it never converges.
     key
         The steps' keys follow from it.
     """
@@ -135,4 +136,6 @@ def _solver(stage: StageTable, tolerance: float):
         case "lbfgs":
             return optx.LBFGS(tolerance, tolerance)
         case "adam":
-            return optx.OptaxMinimiser(optax.adam(stage.learning_rate), tolerance, tolerance)
+            # What is random is only found as well as the last steps are small.
+            rate = optax.cosine_decay_schedule(stage.learning_rate, stage.steps)
+            return optx.OptaxMinimiser(optax.adam(rate), tolerance, tolerance)

@@ -81,7 +81,10 @@ class TermTable(_Table):
 
 
 class StageTable(_Table):
-    """`[[stages]]`: a solver on some of the parameters and terms, all by default. Stages follow each other."""
+    """`[[stages]]`: a solver on some of the parameters and terms, all by default. Stages follow each other.
+
+    `learning_rate`: of Adam, at the start; it falls to zero over the steps.
+    """
 
     solver: Solver = Field(description="one of levenberg-marquardt, bfgs, lbfgs, adam")
     steps: int = Field(default=200, ge=1, le=10**7, description="a whole number from 1 to 1e7")

@@ -15,6 +15,8 @@ from .study import TermTable
 # The worst of a term's entries, smoothly: their mean's power.
 _POWER = 8
 _LEAST_TOLERANCE = 1e-3
+# Logarithm of a ratio; e^50 is far from where float32 overflows.
+_LONGEST = 50.0
 
 SIGNS = {"at_most": "<=", "at_least": ">=", "equal": "=", "minimise": "min", "maximise": "max"}
 
@@ -40,7 +42,7 @@ def residual(
 
     `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal; times
     the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the place of
-    `x/t - 1`. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power 1/8.
+    `x/t - 1` in a limit. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power 1/8.
 
     Parameters
     ----------
@@ -52,9 +54,16 @@ def residual(
         By which a limit is tightened.
     """
     entries = _entries(table.name, candidate, key)
-    ratio = 1 + entries - jnp.log(target) if TERMS[table.name].log else entries / target
-    missing = _missing(table.kind, ratio, margin)
+    missing = _missing(table.kind, _ratio(table, entries, target), margin)
     return missing * (table.weight / math.sqrt(missing.size))
+
+
+def _ratio(table: TermTable, entries: Float[Array, " entry"], target: Float[Array, ""]) -> Float[Array, " entry"]:
+    if not TERMS[table.name].log:
+        return entries / target
+    logarithm = entries - jnp.log(target)
+    # A goal needs a ratio that stays positive, however small.
+    return jnp.exp(jnp.clip(logarithm, -_LONGEST, _LONGEST)) if table.is_goal else 1 + logarithm
 
 
 def _missing(kind: str, ratio: Float[Array, " entry"], margin: float) -> Float[Array, " _"]:
