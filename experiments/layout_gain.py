@@ -1,7 +1,7 @@
 """What a lens layout alone can gain: optimised layouts against the best of 200 random ones, and hexagonal ones.
 
 The prescription, the plate, the number of lenses and their least distance are fixed; only the centres move. The object
-is as wide as the field of a lens, and sub-images overlap. For each of five seeds 200 Poisson-disc layouts are scored by
+fills most of the plate, and sub-images overlap. For each of five seeds 200 Poisson-disc layouts are scored by
 the end-to-end loss (`gs_jax.codesign.end_to_end.reconstruction_loss`), and the best one is the competitor. From there
 Adam goes down the gradient of that same loss, on other scenes at each step. The controls are hexagonal lattices of as
 many lenses, which nothing optimised: at the least distance, and spread as wide as the plate allows. All are then judged
@@ -11,7 +11,7 @@ as a second method, which nothing was optimised for, ten steps of Richardson-Luc
 
     python -m experiments.layout_gain [--out DIR] [--seeds N]
 
-writes `layout_gain.json` and `layout_gain.png`; half an hour on two cores.
+writes `layout_gain.json` and `layout_gain.png`; a quarter of an hour on two cores.
 """
 
 import argparse

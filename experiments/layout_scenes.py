@@ -36,18 +36,18 @@ Scores = dict[str, list[float]]
 class Study(NamedTuple):
     """Sizes in mm; `field` is the width of the object, which is in the middle."""
 
-    plate: tuple[float, float] = (5.0, 5.0)
+    plate: tuple[float, float] = (3.5, 3.5)
     distance: float = 0.65
-    pixels: int = 640
+    pixels: int = 560
     pixel: float = 0.01125
     field_radius: float = 2.2
-    field: float = 4.4
+    field: float = 3.0
     voxel: float = 0.05
     depths: tuple[float, ...] = (12.0, 14.0, 16.5)
     density: float = 0.008
     candidates: int = 200
     scenes: int = 3
-    steps: int = 600
+    steps: int = 700
     rate: float = 0.03
     held_out: int = 30
 
