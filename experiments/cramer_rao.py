@@ -47,7 +47,7 @@ def improved(centers: Float[np.ndarray, "lens 2"], steps: int) -> Float[np.ndarr
     """Centres that lower the bound in z of points near the axis, as far apart as they were at least."""
     points = np.array([(x, y, DEPTH) for x in (-0.3, 0, 0.3) for y in (-0.3, 0, 0.3)])
     first, second = np.triu_indices(len(centers), 1)
-    half, solver = jnp.array(PLATE) / 2, optax.adam(0.03)
+    half, solver = jnp.array([PLATE]) / 2, optax.adam(0.03)
 
     def objective(c):
         near = DISTANCE - jnp.sqrt(jnp.sum((c[first] - c[second]) ** 2, axis=1))
@@ -57,7 +57,9 @@ def improved(centers: Float[np.ndarray, "lens 2"], steps: int) -> Float[np.ndarr
 
     @jax.jit
     def step(c, state):
-        change, state = solver.update(jax.grad(objective)(c), state)
+        slope = jax.grad(objective)(c)
+        with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
+            change, state = solver.update(slope, state)
         return jnp.clip(c + change, -half, half), state
 
     c, best = jnp.asarray(centers), centers

@@ -104,14 +104,15 @@ def optimise(
 
     Returns the centres, and the loss at each step.
     """
-    half = jnp.array(study.plate) / 2
+    half = jnp.array([study.plate]) / 2
     solver = optax.adam(optax.cosine_decay_schedule(study.rate, study.steps))
 
     @jax.jit
     def step(centers, memory, key):
         objective = lambda c: loss(c, key, psfs, study) + 100 * too_near(c, study.distance)
         value, slope = jax.value_and_grad(objective)(centers)
-        change, memory = solver.update(slope, memory)
+        with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
+            change, memory = solver.update(slope, memory)
         return jnp.clip(centers + change, -half, half), memory, value
 
     centers, losses = jnp.asarray(start), []

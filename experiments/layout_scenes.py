@@ -108,6 +108,7 @@ def _imaged(scene, centers, psfs, study):
 
 @partial(jax.jit, static_argnames=("study", "method"))
 def _reconstructed(image, centers, study, method):
+    image = jnp.asarray(image, centers.dtype)
     if method == "backproject":
         return reconstruct(image, study.imager(centers), study.grid(), background_width=BACKGROUND)
     return list_richardson_lucy(image, study.imager(centers), study.grid(), steps=10).x

@@ -97,7 +97,8 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
     found = read_points(folder / "p.csv")[0]
-    assert np.hypot(found[0] - 0.02, found[1] + 0.01) < 0.003 and abs(found[2] - 20) < 0.15  # four lenses, close by
+    # Four lenses within 0.45 mm: a pixel of parallax is 0.7 mm of depth, and a third of one is left.
+    assert np.hypot(found[0] - 0.02, found[1] + 0.01) < 0.003 and abs(found[2] - 20) < 0.25
     volume, grid = read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
