@@ -1,4 +1,4 @@
-"""Writes what the endoscopes' studies start from, beside this file: `python design/endoscope.py`."""
+"""Writes what the endoscope's study starts from, beside this file: `python design/endoscope.py`."""
 
 from pathlib import Path
 
@@ -9,24 +9,20 @@ HERE = Path(__file__).parent
 SIZE = (4.4, 4.4)
 
 
-def start(name: str, lenses: int) -> Design:
-    """A sensor of 5 mm under random lenses, a rough guess of the distances."""
-    centers = random_layout(lenses, SIZE, diameter=None, seed=0).round(4).tolist()
-    return Design(
-        name=f"{name}-start",
+def main() -> None:
+    """A sensor of 5 mm under 60 lenses, a rough guess of the distances."""
+    centers = random_layout(60, SIZE, diameter=None, seed=0).round(4).tolist()
+    design = Design(
+        name="endoscope-start",
         sensor=SensorTable(pixel_pitch_um=2.2, shape=(2272, 2272)),
         lens=LensTable(radius_of_curvature_mm=0.5, refractive_index=1.43, aperture_diameter_mm=0.3),
         array=ArrayTable(size_mm=SIZE, substrate_thickness_mm=0.5, centers_mm=tuple(map(tuple, centers))),
         imaging=ImagingTable(
             sensor_distance_mm=1.4, working_distance_mm=(5.0, 6.5), wavelength_nm=520.0, field_radius_mm=0.9
         ),
-        provenance={"note": f"a guess, to be optimised with studies/{name}.toml"},
+        provenance={"note": "a guess, to be optimised with studies/endoscope.toml"},
     )
-
-
-def main() -> None:
-    for name, lenses in {"endoscope": 60, "endoscope-bright": 180}.items():
-        write_design(HERE / f"{name}-start.toml", start(name, lenses))
+    write_design(HERE / "endoscope-start.toml", design)
 
 
 if __name__ == "__main__":

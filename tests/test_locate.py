@@ -137,6 +137,15 @@ def test_two_points_close_together_are_two(axis, distance):
     assert len(found) == 2 and score.recall == 1
 
 
+@pytest.mark.slow
+def test_a_spot_that_is_a_ring_is_one_point():
+    """Two of these points are out of focus, and the rim of their spots is as bright as the middle."""
+    truth, capture = point_density.scene(10, 0, geomscope(), Progress())
+    imager = geomscope().imager()
+    found = find_points(capture, imager, Grid.over(imager.sensor, depths=[17.0, 23.0], pitch=0.03), progress=Progress())
+    assert len(found) == 10 and localization(found, truth).f1 == 1
+
+
 def test_what_only_half_of_the_lenses_see_is_a_ghost():
     """Spots of the left lenses of one point and of the right lenses of another: one half of each is taken away."""
     imager, grid = small()

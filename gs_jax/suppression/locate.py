@@ -137,7 +137,8 @@ def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point
 
 
 def _count(voxels: Grid) -> int:
-    return voxels.depths.size * math.prod(voxels.shape)
+    """Places that are told apart: voxels of a pixel."""
+    return voxels.depths.size * math.prod(voxels.shape) * _COARSE**3
 
 
 def _brightness(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -210,7 +211,8 @@ def _consistent(
 ) -> tuple[Places, Readings, Float64[np.ndarray, "point lens"]]:
     """The points among the candidates, their readings, and their own part of what was read.
 
-    Brightest first; from the readings of each, the light of the points before it is taken away.
+    Brightest first; from the readings of each, the light of the points before it is taken away. Nearer than a coarse
+    voxel to one of them there is no other point, only the rim of its spot.
     """
     seen = readings(candidates, signal, imager)
     order = np.argsort(-agreed_level(seen.light, seen.seen, _SHARE), kind="stable")
@@ -220,7 +222,10 @@ def _consistent(
     spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
     tree = KDTree(spots)
     left, height = seen.light.copy(), np.zeros(len(candidates))
+    places = candidates / (voxels.pitch, voxels.pitch, float(voxels.depths[1] - voxels.depths[0]))
     for number, mine in enumerate(seen.seen):
+        if (np.linalg.norm(places[height > 0] - places[number], axis=1) < 1).any():
+            continue
         one = taken(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
         bright = agreed_level(one.light, one.seen, _SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
         if not (bright and _lit(one, as_bright, tests)[0]):
