@@ -83,7 +83,7 @@ def report(
     distances = nearest_neighbour_distances(np.array(design.array.centers_mm))
     marks = {True: "yes", False: "NO", None: ""}
     span = lambda ends: " to ".join(dict.fromkeys("inf" if x is None else f"{x:.3g}" for x in ends))
-    aim = lambda t: f"{t['kind'].replace('_', ' ')} {t['target']:g}"
+    aim = lambda t: f"{t['kind'].replace('_', ' ')} {t['target']:g} {t['unit']}".rstrip()
     wanted = "\n".join(
         f"| {t['meaning']} | {aim(t)} | {span(t['before'])} | {span(t['after'])} | {marks[t['met_after']]} |"
         for t in targets

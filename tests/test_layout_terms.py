@@ -6,25 +6,29 @@ import pytest
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.designs import ArrayTable, Design, ImagingTable, LensTable, SensorTable
+from gs_jax.layouts import hexagonal_layout
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um", "reconstruction_error")]
-NAMES = ["ghosts", "lens_shortage", *SLOW]
+NAMES = ["ghosts", "lens_shortage", "spectral_flatness", "condition_number", *SLOW]
+
+
+def small_design(centers, side, field_radius, pixel):
+    return Design(
+        name="small",
+        sensor=SensorTable(pixel_pitch_um=pixel, shape=(96, 80)),
+        lens=LensTable(radius_of_curvature_mm=2.0, refractive_index=1.43, aperture_diameter_mm=0.4),
+        array=ArrayTable(size_mm=(side, side), substrate_thickness_mm=1.0, centers_mm=tuple(map(tuple, centers))),
+        imaging=ImagingTable(
+            sensor_distance_mm=5.8, working_distance_mm=(18.0, 23.0), wavelength_nm=520.0, field_radius_mm=field_radius
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
 def parent():
     """Five lenses on a plate of 1.2 mm, a sensor of 96 x 80 pixels."""
-    design = Design(
-        name="small",
-        sensor=SensorTable(pixel_pitch_um=20.0, shape=(96, 80)),
-        lens=LensTable(radius_of_curvature_mm=2.0, refractive_index=1.43, aperture_diameter_mm=0.4),
-        array=ArrayTable(size_mm=(1.2, 1.2), substrate_thickness_mm=1.0, centers_mm=CENTERS),
-        imaging=ImagingTable(
-            sensor_distance_mm=5.8, working_distance_mm=(18.0, 23.0), wavelength_nm=520.0, field_radius_mm=0.5
-        ),
-    )
-    return parent_of(design, depth_count=3, lenses_move=True)
+    return parent_of(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, lenses_move=True)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -41,3 +45,19 @@ def test_values_and_gradients_are_finite(parent, name):
     value, slopes = jax.jit(jax.value_and_grad(total))(values)
     assert np.isfinite(value) and all(np.isfinite(slope).all() for slope in slopes.values())
     assert np.abs(slopes["centers_mm"]).max() > 0
+
+
+def test_spectrum_of_random_lenses_and_of_a_lattice():
+    """Random: exponential powers, a flatness of exp(-Euler's constant) = 0.56; a lattice has power in few places."""
+    rng = np.random.default_rng(0)
+    flat, condition = (TERMS[name].function for name in ("spectral_flatness", "condition_number"))
+    keys = jax.random.split(jax.random.key(1), 8)
+
+    def found(centers):
+        judged = candidate(parent_of(small_design(centers.tolist(), 12.0, 4.0, 200.0), depth_count=2), {})
+        return np.mean([(flat(judged, key), condition(judged, key)) for key in keys], axis=0)
+
+    random = found(rng.uniform(-6, 6, (150, 2)))
+    lattice = found(hexagonal_layout((12.0, 12.0), pitch=1.0))
+    assert random[0] == pytest.approx(np.exp(-np.euler_gamma), abs=0.05)
+    assert lattice[0] < 0.5 * random[0] and lattice[1] > random[1]

@@ -57,8 +57,8 @@ def test_nothing_is_written_on_wrong_input(folder):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
     with pytest.raises(InputError, match="found the suffix '.json'"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")
-    with pytest.raises(InputError, match="`pareto`: found nothing"):
-        run(pareto, "study.toml", "--out", str(folder))
+    with pytest.raises(InputError, match="study.toml: `pareto`: found nothing"):
+        run(pareto, "study.toml", "--out", "new")
     assert set(folder.iterdir()) == before
 
 

@@ -6,7 +6,6 @@ import pytest
 from gs_jax.builtin import geomscope
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, sweep
 from gs_jax.codesign.study import Study
-from gs_jax.errors import InputError
 from gs_jax.progress import Progress
 
 STUDY = {
@@ -62,9 +61,3 @@ def test_numbers_and_picture(front, tmp_path):
     assert [entry["term"] for entry in numbers["objectives"]] == ["light_percent", "depth_of_field_mm"]
     assert all(point["on_front"] and point["feasible"] for point in numbers["points"])
     picture(front).savefig(tmp_path / "a.png")
-
-
-def test_a_study_without_limits():
-    study = Study.model_validate(STUDY | {"pareto": []})
-    with pytest.raises(InputError, match="`pareto`: found nothing"), Progress() as progress:
-        sweep(geomscope(), study, progress=progress)

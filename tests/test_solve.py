@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from gs_jax.codesign.solve import CONVERGED, LIMIT, MET, NOT_FINITE, State, run, stepper
 from gs_jax.codesign.study import StageTable
@@ -18,6 +18,7 @@ def rosenbrock(free, given, key):
 
 
 START = {"x": jnp.array(-1.2), "y": jnp.array(1.0)}
+INSIDE = {"x": jnp.array(0.9), "y": jnp.array(0.1)}
 ONE = jnp.array(1.0)
 
 
@@ -35,13 +36,25 @@ def test_rosenbrocks_valley(solver):
     assert reason == CONVERGED
 
 
-@pytest.mark.parametrize("solver", (*SOLVERS, "adam"))
+def test_rosenbrocks_valley_within_bounds():
+    """L-BFGS-B of SciPy comes to the same place, on a bound; the unit square, from 0 to 1."""
+    start, two = INSIDE, jnp.array(2.0)
+    steps = stepper(rosenbrock, start, two, StageTable(solver="lbfgsb"), KEY)
+    state, reason = run(steps, steps.begin(start, two), two, limit=200)
+    cost = lambda x: (100 * (x[1] - x[0] ** 2) ** 2 + (2 - x[0]) ** 2) / 2
+    expected = minimize(cost, [0.9, 0.1], method="L-BFGS-B", bounds=[(0, 1), (0, 1)], tol=1e-14).x
+    np.testing.assert_allclose([state.free["x"], state.free["y"]], expected, atol=1e-6)
+    assert state.free["x"] == 1 and reason == CONVERGED
+
+
+@pytest.mark.parametrize("solver", (*SOLVERS, "lbfgsb", "adam"))
 def test_going_on_from_any_step_is_the_same(solver):
     """Bit for bit: the state is all that the next step depends on, and it survives a copy through bytes."""
-    steps = stepper(rosenbrock, START, ONE, StageTable(solver=solver), KEY)
-    whole, _ = run(steps, steps.begin(START, ONE), ONE, limit=9)
-    part, _ = run(steps, steps.begin(START, ONE), ONE, limit=4)
-    again = stepper(rosenbrock, START, ONE, StageTable(solver=solver), KEY)
+    start = INSIDE if solver == "lbfgsb" else START
+    steps = stepper(rosenbrock, start, ONE, StageTable(solver=solver), KEY)
+    whole, _ = run(steps, steps.begin(start, ONE), ONE, limit=9)
+    part, _ = run(steps, steps.begin(start, ONE), ONE, limit=4)
+    again = stepper(rosenbrock, start, ONE, StageTable(solver=solver), KEY)
     copy = jax.tree.map(lambda x: jnp.array(np.asarray(x).copy()), part)
     rest, _ = run(again, State(*copy), ONE, limit=9)
     jax.tree.map(np.testing.assert_array_equal, whole, rest)

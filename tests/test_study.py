@@ -1,8 +1,12 @@
+import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
-from gs_jax.codesign.study import parent_path, read_study
+from gs_jax.codesign.objectives import TERMS
+from gs_jax.codesign.parameters import NAMES
+from gs_jax.codesign.study import KINDS, Solver, Study, parent_path, read_study
 from gs_jax.errors import InputError
 
 STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
@@ -76,3 +80,11 @@ def test_a_wrong_study_is_explained_in_one_line(read, old, new, found):
 def test_a_study_without_a_design(read, tmp_path):
     with pytest.raises(InputError, match="`design`: found nothing"):
         parent_path(tmp_path / "study.toml", read(STUDY))
+
+
+def test_the_readme_names_everything():
+    """Terms, parameters and solvers; and its study is one."""
+    text = (Path(__file__).parents[1] / "design" / "README.md").read_text().split("## Studies")[1]
+    for name in (*TERMS, *NAMES, *get_args(Solver), *KINDS):
+        assert f"`{name}`" in text or f"`{name} =" in text, name
+    Study.model_validate(tomllib.loads(text.split("```toml")[1].split("```")[0]))

@@ -10,6 +10,7 @@ from rich.table import Table
 from ..codesign.pareto import as_json, picture, sweep
 from ..codesign.study import parent_path, read_study
 from ..designs import read_design
+from ..errors import InputError
 from ..io.disk import atomic_write, make_folder, write_json
 from ..progress import Progress
 
@@ -25,6 +26,8 @@ def pareto(study: Path, out: Path):
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     question = read_study(study)
+    if not question.pareto:
+        raise InputError(f"{study}: `pareto`: found nothing, allowed: one or two tables.")
     design = read_design(parent_path(study, question))
     make_folder(out)
     with Progress() as progress:

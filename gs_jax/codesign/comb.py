@@ -117,8 +117,8 @@ def lens_shortage(
 ) -> Float[Array, ""]:
     """Mean over points of `1 / (sum_j C_j + floor)`: how much a voxel lacks lenses.
 
-    Of a reconstruction by back-projection, the error by ghosts from elsewhere goes as one over the number of lenses.
-    It is smooth over the distance of lenses, where an end-to-end loss has ripples as fine as its pixels: a first stage.
+    Of a reconstruction by back-projection, the error by ghosts from elsewhere goes as one over the number of lenses,
+    as long as sub-images hardly overlap. Smooth over the distance of lenses, and cheap: a first stage.
 
     Parameters
     ----------

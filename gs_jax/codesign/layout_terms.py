@@ -12,13 +12,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..geometry import Grid
-from .comb import lens_shortage, sidelobes
+from .comb import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import localization_bound
 from .parameters import Candidate
 
-# Points whose ghosts are looked for, and places where; points that are located; light of one, electrons a lens.
+# Points whose ghosts are looked for, and places where; points that are located or whose combs are looked at; light of
+# one, electrons a lens.
 _SOURCES, _TARGETS, _POINTS, _PHOTONS = 4, 256, 4, 1000.0
+# Spatial frequencies at which a point's comb is looked at.
+_FREQUENCIES = 256
 # Places along a side of the plate.
 _RASTER = 15
 # Voxels along a side of a random scene, blobs per voxel, each as wide as a voxel; scenes of a draw.
@@ -41,6 +44,26 @@ def shortage(c: Candidate) -> Float[Array, ""]:
     places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * c.plate[None]
     depth = jnp.broadcast_to((c.depths[0] + c.depths[-1]) / 2, (len(places), 1))
     return lens_shortage(c.imager, jnp.concatenate([places, depth], 1))
+
+
+def flatness(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """`comb.spectral_flatness` of random points' combs, at random frequencies of `_spectrum`."""
+    return spectral_flatness(_spectrum(c, key))
+
+
+def conditioning(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """`comb.condition_number` of the same."""
+    return condition_number(_spectrum(c, key))
+
+
+def _spectrum(c: Candidate, key: PRNGKeyArray) -> Float[Array, "point frequency"]:
+    """Power from one over the field radius to the Nyquist frequency, evenly over its logarithm and all directions."""
+    place, size, angle = jax.random.split(key, 3)
+    low, high = 1 / c.imager.field_radius, 0.5 / c.imager.sensor.pixel_pitch
+    draw = lambda key: jax.random.uniform(key, (_FREQUENCIES,), c.depths.dtype)
+    frequency, turn = low * (high / low) ** draw(size), jnp.pi * draw(angle)
+    frequencies = jnp.stack([frequency * jnp.cos(turn), frequency * jnp.sin(turn)], 1)
+    return comb_spectrum(c.imager, _points(c, place, _POINTS), frequencies)
 
 
 def localization(c: Candidate, key: PRNGKeyArray) -> Float[Array, "3"]:

@@ -19,7 +19,7 @@ from ..geometry import envelope
 from ..optics import aberrations, theory
 from ..optics.aperture import safe_sqrt
 from ..optics.unit import pupil_disc, unit_rays
-from .layout_terms import ghosts, localization, log_error, shortage
+from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
 from .parameters import Candidate
 
 Result = Float[Array, "..."]
@@ -257,7 +257,16 @@ TERMS: dict[str, Term] = {
     "sag_mm": Term("height of a whole lens", sag),
     "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True),
     "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage),
+    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True),
+    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
     "edge_slope_deg": Term("slope at the clear aperture's rim", edge_slope),
 }
+
+_UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
+
+
+def unit_of(name: str) -> str:
+    """The unit that a term's name ends in, as people write it; empty for a number without one."""
+    return _UNITS.get(name.rpartition("_")[2], "")

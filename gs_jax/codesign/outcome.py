@@ -15,7 +15,7 @@ from rich.table import Table
 
 from ..designs import Design, write_design
 from ..io.disk import atomic_write, check_output, write_json
-from .objectives import TERMS
+from .objectives import TERMS, unit_of
 from .search import Outcome
 from .study import Study, TermTable
 from .targets import SIGNS, Row
@@ -80,6 +80,7 @@ def as_records(terms: Sequence[TermTable], outcome: Outcome) -> list[dict[str, A
         {
             "term": term.name,
             "meaning": TERMS[term.name].meaning,
+            "unit": unit_of(term.name),
             "kind": term.kind,
             "target": None if term.is_goal else term.target,
             "before": ends(old),

@@ -3,7 +3,8 @@
 A `Parent` is the design that an optimisation starts from, `start_values` are its parameters by name, and `candidate`
 is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
 goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index.
-Solvers see neither bounds nor units: `Bounds` maps a value to a number of order one without any bound, and back.
+Solvers do not see units: `Bounds` maps a value to a number of order one without any bound, and back; `Box`, for the one
+solver that keeps bounds by itself, to its share of the way between them.
 """
 
 import math
@@ -58,6 +59,21 @@ class Bounds(eqx.Module):
         """The inverse of `value`. Values at a bound or beyond it are first taken within, by 1 % of the range."""
         share = jnp.clip((value - self.low) / (self.high - self.low), _NEAREST, 1 - _NEAREST)
         return (2 * share - 1) / (2 * jnp.sqrt(share * (1 - share)))
+
+
+class Box(eqx.Module):
+    """The values between two bounds by their share of the way from the lowest to the highest, 0 to 1."""
+
+    low: Float[Array, "..."] = eqx.field(converter=as_float)
+    high: Float[Array, "..."] = eqx.field(converter=as_float)
+
+    def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """The value of a share."""
+        return self.low + (self.high - self.low) * free
+
+    def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """The inverse of `value`. Values beyond a bound are first taken to it."""
+        return jnp.clip((value - self.low) / (self.high - self.low), 0, 1)
 
 
 class Cells(eqx.Module):

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from ..designs import Design
-from ..errors import InputError
 from ..progress import Progress
+from .objectives import unit_of
 from .parameters import NAMES, Values, start_values
 from .search import Stage, entries_of, make_stage, problem_of, random_start, targets_of
 from .solve import run
@@ -71,10 +71,8 @@ def sweep(design: Design, study: Study, *, progress: Progress) -> Front:
     Raises
     ------
     InputError
-        If the study has no `[[pareto]]` table, or does not fit the design.
+        If the study does not fit the design.
     """
-    if not study.pareto:
-        raise InputError("`pareto`: found nothing, allowed: one or two tables.")
     moving = [_term(limit) for limit in study.pareto]
     kept = [term for term in study.terms if term.is_goal or all(not _same(term, limit) for limit in moving)]
     wider = study.model_copy(update={"terms": (*kept, *moving)})
@@ -182,7 +180,5 @@ def _groups(values: Float[np.ndarray, " point"]) -> list[float]:
 
 def _axis(term: TermTable) -> str:
     """A term's name with its unit after a comma."""
-    units = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
-    words = term.name.split("_")
-    unit = units.get(words[-1])
+    unit, words = unit_of(term.name), term.name.split("_")
     return f"{' '.join(words[:-1])}, {unit}" if unit else " ".join(words)

@@ -20,7 +20,7 @@ from ..designs import Design
 from ..errors import InputError
 from ..progress import Progress
 from .checkpoint import Log, read_checkpoint, restored, write_checkpoint
-from .parameters import Bounds, Parent, Values, candidate, new_design, parent_of, start_values
+from .parameters import Bounds, Box, Parent, Values, candidate, new_design, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, stepper
 from .study import Study, TermTable
 from .targets import Row, assess, evaluate, residual, worst_of
@@ -47,7 +47,6 @@ class Problem(NamedTuple):
     """A design and a study as a solver sees them."""
 
     parent: Parent
-    bounds: dict[str, Bounds]
     study: Study
 
 
@@ -75,7 +74,7 @@ def problem_of(design: Design, study: Study) -> Problem:
     Raises
     ------
     InputError
-        If the radius or the index is free and the design has a thin lens, or a parameter starts outside its bounds.
+        If the radius or the index is free and the design has a thin lens.
     """
     of_lens = {"radius_of_curvature_mm", "refractive_index"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
@@ -90,14 +89,15 @@ def problem_of(design: Design, study: Study) -> Problem:
         depth_count=study.depth_count,
         lenses_move="centers_mm" in study.free,
     )
-    return Problem(parent, {name: Bounds(*limits) for name, limits in study.free.items()}, study)
+    return Problem(parent, study)
 
 
 def make_stage(problem: Problem, index: int, values: Values) -> Stage:
     """The solver of a stage, with the parameters that it does not free at these values."""
-    parent, every, study = problem
+    parent, study = problem
     table = study.stages[index]
-    bounds = {name: every[name] for name in (study.free if table.free is None else table.free)}
+    between = Box if table.solver == "lbfgsb" else Bounds
+    bounds = {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
     terms = [term for term in study.terms if table.terms is None or term.name in table.terms]
     to_free = lambda values: {name: bound.free(values[name]) for name, bound in bounds.items()}
     to_values = lambda free: values | {name: bound.value(free[name]) for name, bound in bounds.items()}

@@ -1,6 +1,6 @@
 """Solvers for co-design, step by step: what stops can go on later, exactly.
 
-Optimistix has the algorithms. Its solvers run here one step at a time from the host, so that progress can be shown
+Optimistix has the algorithms, and jaxopt the one that keeps bounds. They run here one step at a time from the host, so that progress can be shown
 and the state saved; a run that is interrupted and resumed takes the same steps, bit for bit, as one that is not.
 """
 
@@ -15,6 +15,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from ..solvers.bounded import lbfgsb
 from .study import StageTable
 
 # A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
@@ -54,7 +55,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
     residual
         One number for each thing that is wanted.
     free, given
-        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds.
+        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for L-BFGS-B they are
+        between 0 and 1.
     stage
         Which solver. Adam is for a residual that is random: it gets a new key in each step, its rate falls to zero by a
         cosine over the stage's steps, and it never converges.
@@ -62,8 +64,10 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
         The steps' keys follow from it.
     """
     tolerance = 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6
-    solver: Any = _solver(stage, tolerance)
     cost = lambda free, args: jnp.sum(residual(free, *args) ** 2) / 2
+    if stage.solver == "lbfgsb":
+        return _within_box(cost, key, tolerance)
+    solver: Any = _solver(stage, tolerance)
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     target = (lambda free, args: residual(free, *args)) if least_squares else cost
     args = given, key
@@ -87,6 +91,27 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
         done, result = solver.terminate(function, new, args, options, inner, frozenset())
         done = (done | (result != optx.RESULTS.successful)) & (stage.solver != "adam")
         return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1), done
+
+    return Stepper(begin, advance)
+
+
+def _within_box(cost, key, tolerance) -> Stepper:
+    solver = lbfgsb(cost)
+    box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))
+
+    @jax.jit
+    def begin(free: PyTree, given: PyTree) -> State:
+        inner = solver.init_state(free, box(free), (given, key))
+        return State(free, inner, cost(free, (given, key)), jnp.zeros((), int))
+
+    @jax.jit
+    def advance(state: State, given: PyTree) -> tuple[State, Array]:
+        args = given, jax.random.fold_in(key, state.step)
+        new, inner = solver.update(state.free, state.solver, box(state.free), args)
+        found = cost(new, args)
+        still = lambda old, new: jnp.max(jnp.abs(new - old) / (1 + jnp.abs(old))) < tolerance
+        same = jax.tree.leaves(jax.tree.map(still, (state.free, state.cost), (new, found)))
+        return State(new, inner, found, state.step + 1), jnp.all(jnp.stack(same))
 
     return Stepper(begin, advance)
 

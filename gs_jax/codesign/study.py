@@ -30,7 +30,7 @@ from ..io.explain import one_line
 from .objectives import TERMS
 from .parameters import NAMES
 
-Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "adam"]
+Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
@@ -86,7 +86,7 @@ class StageTable(_Table):
     `learning_rate`: of Adam, at the start; it falls to zero over the steps.
     """
 
-    solver: Solver = Field(description="one of levenberg-marquardt, bfgs, lbfgs, adam")
+    solver: Solver = Field(description="one of levenberg-marquardt, bfgs, lbfgs, lbfgsb, adam")
     steps: int = Field(default=200, ge=1, le=10**7, description="a whole number from 1 to 1e7")
     learning_rate: Positive = Field(default=0.03, description="a positive number")
     free: tuple[str, ...] | None = Field(default=None, strict=False, description="names of parameters in [free]")

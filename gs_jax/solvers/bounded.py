@@ -41,9 +41,14 @@ def minimise_within(
         The minimum, its objective, the steps taken, and whether the tolerance was met.
     """
     bounds = lower, upper
-    solver = jaxopt.LBFGSB(objective, maxiter=steps, tol=tolerance, implicit_diff=False)
+    solver = lbfgsb(objective, steps=steps, tolerance=tolerance)
     start = jax.tree.map(jnp.clip, start, lower, upper)
     return _minimum(objective, *solver.run(start, bounds=bounds), tolerance)
+
+
+def lbfgsb(objective: Callable[..., Float[Array, ""]], *, steps: int = 1, tolerance: float = 0.0) -> jaxopt.LBFGSB:
+    """The solver of `minimise_within`, to be run step by step: `init_state(x, bounds, ...)`, `update(x, state, ...)`."""
+    return jaxopt.LBFGSB(objective, maxiter=steps, tol=tolerance, implicit_diff=False)
 
 
 def proximal_gradient(
