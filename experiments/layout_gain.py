@@ -128,8 +128,8 @@ def run(study: Study = Study(), seeds: int = 5, *, progress: Progress) -> dict:
     fine_psfs, psfs = psf_of(psf, study, study.fine_grid()), psf_of(gaussian_psf, study, study.grid())
     rows = []
     for seed in range(seeds):
-        layouts, key = candidates(study, seed), jax.random.key(10_000 + seed)
-        score = lambda c, key=key: float(loss(jnp.asarray(c), key, psfs, study))
+        layouts, keys = candidates(study, seed), jax.random.split(jax.random.key(10_000 + seed), study.scored_on)
+        score = lambda c, keys=keys: float(np.mean([loss(jnp.asarray(c), key, psfs, study) for key in keys]))
         losses = [score(c) for c in progress.track(layouts, f"Seed {seed}: scoring")]
         best = layouts[int(np.argmin(losses))]
         ours, descent = optimise(best, psfs, study, seed, progress)

@@ -46,8 +46,8 @@ class Study(NamedTuple):
     depths: tuple[float, ...] = (12.0, 14.0, 16.5)
     density: float = 0.008
     candidates: int = 200
-    scenes: int = 3
-    steps: int = 700
+    scored_on: int = 10
+    steps: int = 12_000
     rate: float = 0.03
     held_out: int = 30
 
@@ -77,13 +77,13 @@ def psf_of(make: Callable[..., Array], study: Study, grid: Grid) -> Float[Array,
 
 @partial(jax.jit, static_argnames="study")
 def loss(centers: Centers, key: PRNGKeyArray, psfs: Array, study: Study) -> Float[Array, ""]:
-    """The end-to-end loss, dB: PSFs as given, voxels as reconstructed."""
+    """The end-to-end loss of one scene, dB: PSFs as given, voxels as reconstructed."""
     return reconstruction_loss(
         study.imager(centers),
         key,
         grid=study.grid(),
         psf=psfs,
-        scenes=study.scenes,
+        scenes=1,
         density=study.density,
         width=WIDTH,
         electrons=ELECTRONS,
@@ -122,7 +122,7 @@ def judge(
     columns = [f"{method}_{what}" for method in METHODS for what in ("psnr_db", "ssim")]
     scores: dict[str, Scores] = {name: {column: [] for column in columns} for name in layouts}
     empty = []
-    keys = jax.random.split(jax.random.key(2**20), (study.held_out, 2))
+    keys = jax.random.split(jax.random.key(2**22), (study.held_out, 2))
     for scene_key, noise_key in progress.track(list(keys), "Held-out scenes"):
         scene, truth = held_out(study, scene_key)
         empty.append(quality(jnp.zeros_like(truth), truth).psnr_db)

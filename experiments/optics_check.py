@@ -36,7 +36,7 @@ from gs_jax.optics.psf import geometric_psf, psf, strehl
 from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
 
 WAVELENGTH = 520e-6
-# Radius of the disc as large as the mean Voronoi cell of the paper's array, mm.
+# Of the pupil, mm: near half the paper's pitch (1.23 mm), and as far as its lens can be traced to a field of 3 mm.
 RADIUS = 0.65
 FIELDS, DEPTHS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0), (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
 SPOTS = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))

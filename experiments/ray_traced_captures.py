@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -32,11 +33,17 @@ LATERAL, AXIAL = 0.04, 0.3
 SINGLE = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
 
 
-def run(data: Path, *, singles=SINGLE, voxel_mm=0.02, step_mm=0.1, progress: Progress) -> dict:
-    """Errors of the single points, and how many of the 120 points are peaks and how many peaks are points."""
+def run(
+    data: Path, *, singles=SINGLE, voxel_mm=0.02, step_mm=0.1, progress: Progress
+) -> tuple[dict, Float32[np.ndarray, "y x"]]:
+    """Errors of the single points, and how many of the 120 points are peaks and how many peaks are points.
+
+    Also the maximum over the depths of the reconstruction of the 120.
+    """
     imager = read_design(data / "P1.toml").imager()
     rows = [{"scene": name, **_single(data, name, imager, voxel_mm, progress)} for name in singles]
-    return {"single_points": rows, "many_points": _many(data, imager, voxel_mm, step_mm, progress)[0]}
+    many, projection = _many(data, imager, voxel_mm, step_mm, progress)
+    return {"single_points": rows, "many_points": many}, projection
 
 
 def _truth(data: Path, scene: str) -> np.ndarray:
@@ -87,12 +94,10 @@ def _peaks(volume: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([x[c], y[r], z[d]]), volume[d, r, c]
 
 
-def picture(data: Path, progress: Progress) -> Figure:
+def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float = 0.02) -> Figure:
     """The 120 points: maximum over the depths, and the truth."""
-    imager = read_design(data / "P1.toml").imager()
-    _, projection = _many(data, imager, 0.02, 0.1, progress)
     truth = _truth(data, "d")
-    half = projection.shape[0] * 0.02 / 2
+    half = projection.shape[0] * voxel_mm / 2
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     for axis, lim, title in zip(figure.subplots(1, 2), (half, 2.5), ("whole field", "its middle"), strict=True):
         top = np.percentile(projection, 99.95)
@@ -111,8 +116,8 @@ def main() -> None:
     arguments = parser.parse_args()
     out = make_folder(arguments.out)
     with Progress() as progress:
-        result = run(arguments.data, progress=progress)
-        picture(arguments.data, progress).savefig(out / "points.png", dpi=90)
+        result, projection = run(arguments.data, progress=progress)
+    picture(projection, arguments.data).savefig(out / "points.png", dpi=90)
     write_json(out / "result.json", result)
     table = Table("scene", "lateral error, um", "axial error, um", title="Single points")
     for row in result["single_points"]:

@@ -55,7 +55,7 @@ def backproject(
     """
     if image.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
-    dtype = image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else imager.sensor_distance.dtype
+    dtype = _type_of(image, imager)
 
     def some_depths(depths):
         shapes, rays = _prepare(imager, eqx.tree_at(lambda g: g.depths, grid, depths), method, dtype)
@@ -72,7 +72,7 @@ def backproject(
 
 @partial(jax.jit, static_argnames=("method",))
 def backproject_adjoint(
-    volume: Float[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
+    volume: Num[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
 ) -> Float[Array, "row column"]:
     """The exact adjoint of `backproject`: each voxel adds its value to the pixels that it is read from.
 
@@ -82,7 +82,7 @@ def backproject_adjoint(
     Parameters
     ----------
     volume
-        `(len(depths), *grid.shape)`.
+        `(len(depths), *grid.shape)`; integers count as the imager's type.
     imager, grid, method
         As for `backproject`.
 
@@ -99,6 +99,7 @@ def backproject_adjoint(
     expected = (grid.depths.size, *grid.shape)
     if volume.shape != expected:
         raise ValueError(f"`volume` must be of the grid's shape {expected}, got {volume.shape}.")
+    volume = as_volume(volume, imager)
 
     def add_depths(image, group):
         depths, volume = group
@@ -109,6 +110,15 @@ def backproject_adjoint(
     padding = [(0, depths.size - grid.depths.size), (0, 0), (0, 0)]
     volume = jnp.pad(volume, padding).reshape(*depths.shape, *grid.shape)
     return lax.scan(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), (depths, volume))[0]
+
+
+def as_volume(volume: Num[Array | np.ndarray, "*shape"], imager: Imager) -> Float[Array, "*shape"]:
+    """The volume as floats: its own, or the imager's if it is of integers."""
+    return jnp.asarray(volume, _type_of(volume, imager))
+
+
+def _type_of(array, imager):
+    return array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else imager.sensor_distance.dtype
 
 
 def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group some"]:

@@ -83,7 +83,7 @@ def performance(
     f_number, aperture = theory.f_number(f, diameter), theory.numerical_aperture(f, diameter)
     lateral = theory.lateral_resolution(wavelength, aperture, imager.sensor.pixel_pitch, m)
     n_e = theory.lenses_per_point(float(array.centers.shape[0]), plate_area, field_radius)
-    rms = aberrations.linear_rms(aberrations.seidel(f, array.refractive_index, diameter / 2, reduced, 0.0, v))
+    rms = aberrations.linear_rms(aberrations.of_array(array, diameter / 2, reduced, 0.0, v))
     return Performance(
         magnification=m,
         scale=imager.scale(depths),

@@ -73,7 +73,7 @@ def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
     pupil = f / sheet["f_number"] / 2
     reduced = np.array(sheet["depth_mm"]) + _plate(design)
     lens = (f, design.lens.refractive_index, pupil, reduced)
-    error = aberrations.seidel(*lens, 0.0, v)
+    error = aberrations.of_array(design.imager().array, pupil, reduced, 0.0, v)
     waves = np.asarray(aberrations.linear_rms(error)) / wavelength
     if waves.max() <= _STREHL_DOMAIN:
         return []
@@ -81,9 +81,13 @@ def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
         "the Strehl ratios only say that the image is far from diffraction-limited.",
+    ]
+    if design.lens.focal_length_mm is not None:  # an ideal lens: all of it is defocus
+        return found
+    found.append(
         f"By Eqs. 9 and 10 the Strehl ratio halves {_span(half)} um beside the axis, "
         f"not at the field radius of {_length(sheet['field_radius_mm'])}.",
-    ]
+    )
     spherical, paraxial = np.asarray(error.spherical), sheet["focus_distance_mm"]
     if (
         paraxial[0] is not None

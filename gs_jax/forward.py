@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 from scipy.fft import next_fast_len
 
-from .backprojection import backproject_adjoint
-from .geometry import Grid, Imager
+from .backprojection import as_volume, backproject_adjoint
+from .geometry import Grid, Imager, Sensor
 
 
 @jax.jit
 def forward(
-    volume: Float[Array | np.ndarray, "depth y x"],
+    volume: Num[Array | np.ndarray, "depth y x"],
     imager: Imager,
     grid: Grid,
     psf: Float[Array | np.ndarray, "plane tall wide"] | None = None,
@@ -26,14 +26,15 @@ def forward(
     Each voxel is a point at its centre. Every lens images it at the chief ray's pixel (scale `s_z`, magnification
     `M_z`), weighted by the envelope C, and spread by PSF_o of its depth. The paper takes C from the centre of the
     voxel's zone instead of from the voxel, which is the only difference. As in Eq. (2) a voxel counts the same at
-    every depth; the aperture's solid angle would add a factor 1/z'^2.
+    every depth; the aperture's solid angle would add a factor 1/z'^2. Chief rays that miss the sensor by less than half
+    a PSF count with what spreads onto it.
 
     Linear in the volume and in the PSF; differentiable with respect to everything that is continuous.
 
     Parameters
     ----------
     volume
-        `(len(depths), *grid.shape)`.
+        `(len(depths), *grid.shape)`; integers count as the imager's type.
     imager, grid
         As for `backproject`.
     psf
@@ -51,13 +52,19 @@ def forward(
     ValueError
         If the volume is not of the grid's shape, or there is not one PSF of odd size for each depth.
     """
+    volume = as_volume(volume, imager)
     if psf is None:
         return backproject_adjoint(volume, imager, grid)
     size = psf.shape[-1]
     if psf.shape != (grid.depths.size, size, size) or size % 2 == 0:
         raise ValueError(f"`psf` must be ({grid.depths.size}, size, size) with an odd size, got {psf.shape}.")
-    # Room for what spreads beyond the sensor, so that the far side does not see it.
-    padded = [int(next_fast_len(n + size - 1, real=True) or 0) for n in imager.sensor.shape]
+    # Sharp images up to half a PSF beyond the sensor, whose light spreads onto it; a line more each way, as rays that
+    # land there share their light with the next. What a transform without these lines wraps round falls on its first
+    # `size - 1`, which are beyond the sensor.
+    rows, columns = imager.sensor.shape
+    wide = Sensor((rows + size + 1, columns + size + 1), imager.sensor.pixel_pitch)
+    imager = eqx.tree_at(lambda i: i.sensor, imager, wide)
+    padded = [int(next_fast_len(n + size - 1, real=True) or 0) for n in (rows, columns)]
     transform = partial(jnp.fft.rfft2, s=padded)
 
     # Not kept for the gradient: a spectrum for each depth is more than the volume.
@@ -65,12 +72,10 @@ def forward(
     def add_depth(spectrum, plane):
         depth, voxels, kernel = plane
         one = eqx.tree_at(lambda g: g.depths, grid, depth[None])
-        sharp = backproject_adjoint(voxels[None], imager, one)
+        sharp = backproject_adjoint(voxels[None], imager, one)[1:-1, 1:-1]
         return spectrum + transform(sharp) * transform(kernel), None
 
     dark = jnp.zeros((padded[0], padded[1] // 2 + 1), volume.dtype)
     planes = grid.depths, volume, jnp.asarray(psf, volume.dtype)
     spectrum = lax.scan(add_depth, lax.complex(dark, dark), planes)[0]
-    rows, columns = imager.sensor.shape
-    half = size // 2
-    return jnp.fft.irfft2(spectrum, s=padded)[half : half + rows, half : half + columns]
+    return jnp.fft.irfft2(spectrum, s=padded)[size - 1 : size - 1 + rows, size - 1 : size - 1 + columns]

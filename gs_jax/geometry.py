@@ -254,8 +254,10 @@ class Grid(eqx.Module):
     def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
         """The grid that covers as much of the object as the sensor is large (the paper's field of view).
 
-        Its numbers of rows and columns are odd: there is a voxel on the axis.
+        Its numbers of rows and columns are odd: there is a voxel on the axis. `depths` and `pitch` are mm.
         """
+        if not pitch > 0:
+            raise ValueError(f"`pitch` must be positive, got {pitch}.")
         rows, columns = (2 * round((n * sensor.pixel_pitch / pitch - 1) / 2) + 1 for n in sensor.shape)
         rows, columns = max(rows, 1), max(columns, 1)
         return cls(depths, (rows, columns), pitch)

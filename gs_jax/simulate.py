@@ -26,6 +26,8 @@ from .stamps import STEPS, forward_points, stamps
 PSFS = {"diffraction": psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
 # Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.
 _MARGIN, _FARTHEST = 16, 128
+# Rays along the aperture's radius that are asked how far they reach.
+_ZONES = 65
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
 
@@ -130,6 +132,8 @@ def simulate_points(
 def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: int = 1):
     """Function from a depth to its PSF, in a window that holds the rays of all depths.
 
+    Rays that the lens reflects totally do not count.
+
     Parameters
     ----------
     imager
@@ -149,8 +153,10 @@ def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: in
         If the rays reach farther than 128 pixels.
     """
     radius = clear_diameter(imager.array) / 2
-    edge = radius * jnp.array([[1.0, 0.0]])
-    reaches = [float(jnp.abs(unit_rays(imager, depth, edge).landing).max()) for depth in (min(depths), max(depths))]
+    # All zones: near the focus of the rim's rays those of other zones land farther out.
+    fan = radius * jnp.linspace(0, 1, _ZONES)[:, None] * jnp.array([[1.0, 0.0]])
+    ends = [unit_rays(imager, depth, fan) for depth in (min(depths), max(depths))]
+    reaches = [float(jnp.where(rays.valid, jnp.abs(rays.landing[:, 0]), 0).max()) for rays in ends]
     pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
     if not pixels <= _FARTHEST:
         depth = (min(depths), max(depths))[int(np.argmax(reaches))]

@@ -117,6 +117,16 @@ def test_what_is_wrong_with_the_design_in_focus(table1):
     assert "draws the sharpest image of 18 mm toward the lens, by up to 460 um" in text
 
 
+def test_an_ideal_lens_has_no_aberrations(table1):
+    """In focus at 20 mm its wavefront is perfect there, and what is wrong elsewhere is defocus."""
+    thin = changed(changed(table1, "lens", focal_length_mm=4.65), "imaging", sensor_distance_mm=6.0)
+    reduced = 1 / (1 / 4.65 - 1 / 6.0)
+    sheet = datasheet(thin, [reduced - 1 / 1.43 * thin.array.substrate_thickness_mm])
+    assert sheet["strehl_on_axis"] == pytest.approx([1.0])
+    text = "\n".join(findings(thin, datasheet(thin)))
+    assert "wavefront error on the axis" in text and "spherical" not in text and "halves" not in text
+
+
 def test_nothing_is_wrong_with_a_small_lens_in_focus(table1):
     """A thousandth of the aperture's area: a pinhole that is as wide as the pitch."""
     design = changed(table1, "lens", aperture_diameter_mm=0.06)

@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,10 @@ def psfs(depths, size=5, dtype=jnp.float64):
     return jnp.asarray(kernels / kernels.sum((1, 2), keepdims=True), dtype)
 
 
+def with_sensor(imager, shape):
+    return eqx.tree_at(lambda i: i.sensor, imager, Sensor(shape, imager.sensor.pixel_pitch))
+
+
 def volume_of(grid, dtype=jnp.float64):
     return jax.random.uniform(jax.random.key(2), (grid.depths.size, *grid.shape), dtype)
 
@@ -30,17 +35,44 @@ def test_without_a_psf_it_is_the_adjoint_of_back_projection():
     expected = backproject_adjoint(volume, imager, grid)
     np.testing.assert_array_equal(forward(volume, imager, grid), expected)
     point = jnp.zeros((3, 5, 5)).at[:, 2, 2].set(1.0)
-    np.testing.assert_allclose(forward(volume, imager, grid, point), expected, atol=1e-13 * expected.max())
+    # But for the edge, which shares the light of rays up to a pixel beyond it.
+    found, inner = forward(volume, imager, grid, point), np.s_[1:-1, 1:-1]
+    np.testing.assert_allclose(found[inner], expected[inner], atol=1e-13 * expected.max())
 
 
 def test_each_depth_is_convolved_with_its_psf():
     imager, grid = scene()
     volume, kernels = volume_of(grid), psfs(3)
     expected = np.zeros(imager.sensor.shape)
+    wide = with_sensor(imager, [n + 6 for n in imager.sensor.shape])
     for depth, plane, kernel in zip(grid.depths, volume, kernels, strict=True):
-        sharp = backproject_adjoint(plane[None], imager, Grid(depth[None], grid.shape, grid.pitch))
-        expected += fftconvolve(sharp, kernel, mode="same")
+        sharp = backproject_adjoint(plane[None], wide, Grid(depth[None], grid.shape, grid.pitch))
+        expected += fftconvolve(sharp[1:-1, 1:-1], kernel, mode="valid")
     np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
+
+
+def test_light_of_chief_rays_beside_the_sensor():
+    """The middle of a larger sensor: a PSF of 11 pixels reaches 5 pixels in."""
+    imager, grid = scene(shape=(48, 40))
+    volume, kernels = volume_of(grid), psfs(3, 11)
+    expected = forward(volume, with_sensor(imager, (48 + 40, 40 + 40)), grid, kernels)[20:-20, 20:-20]
+    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
+    # Points' images are made one by one, and nowhere else.
+    lone = Grid([20.0], (1, 1), 0.01)
+    beside = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((41, 41), 0.01), 5.0, 3.0, shift=(0.22, 0.0))
+    fine = np.zeros((1, 55, 55))
+    fine[0, 20:35, 20:35] = 1 / 225
+    point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, stamps(np.array([20.0]), fine), Progress())
+    kernel = jnp.asarray(fine.reshape(1, 11, 5, 11, 5).sum((2, 4)))
+    np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
+
+
+def test_voxels_may_be_integers():
+    imager, grid = scene()
+    volume = jax.random.randint(jax.random.key(2), (grid.depths.size, *grid.shape), 0, 9)
+    for kernels in (None, psfs(3)):
+        expected = forward(volume.astype(float), imager, grid, kernels)
+        np.testing.assert_array_equal(forward(volume, imager, grid, kernels), expected)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 1e-5)])

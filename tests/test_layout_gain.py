@@ -61,7 +61,7 @@ def test_the_picture_and_the_gains():
 @pytest.mark.slow
 def test_the_whole_experiment():
     """A tenth of everything."""
-    study = Study(pixels=280, pixel=0.0225, candidates=4, steps=3, scenes=1, held_out=2)
+    study = Study(pixels=280, pixel=0.0225, candidates=4, scored_on=2, steps=3, held_out=2)
     with Progress() as progress:
         found = run(study, 2, progress=progress)
     assert found["occupancy"] == pytest.approx(5.2, abs=0.6)

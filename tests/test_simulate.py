@@ -5,8 +5,9 @@ import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.errors import InputError
+from gs_jax.optics.unit import pupil_disc, unit_rays
 from gs_jax.progress import Progress
-from gs_jax.simulate import PSFS, simulate_points, simulate_volume
+from gs_jax.simulate import PSFS, psf_of_depth, simulate_points, simulate_volume
 
 WAVELENGTH = 520e-6
 
@@ -32,6 +33,18 @@ def test_a_point_is_a_small_voxel(kind):
         assert abs(middle(from_points) - middle(from_volume)) < 0.1  # the steps of a stamp
     # The volume's point is shared by four pixels first.
     np.testing.assert_allclose(from_points.max(), from_volume.max(), rtol=0.3)
+
+
+@pytest.mark.parametrize(("sensor_distance", "pixel"), [(5.0, 0.002), (5.0, 0.001), (5.8, 0.01)])
+def test_the_window_holds_the_light(sensor_distance, pixel):
+    """Near the focus of the rim's rays other zones land farther out: all rays that get through, counted one by one."""
+    array = MicrolensArray([[0.0, 0.0]], aperture_diameter=1.6, size=(4.0, 4.0))
+    wide = Imager(array, Sensor((64, 64), pixel), sensor_distance, 0.6)
+    window = psf_of_depth(wide, [20.0], WAVELENGTH, "geometric")(20.0).shape[0]
+    points, weights = pupil_disc(0.8, rings=40)
+    rays = unit_rays(wide, 20.0, points)
+    inside = (np.abs(rays.landing) < window / 2 * pixel).all(1)
+    assert np.sum(weights, where=rays.valid & inside) > 0.999 * np.sum(weights, where=rays.valid)
 
 
 def test_a_coarse_volume_has_no_dots():

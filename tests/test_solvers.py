@@ -94,6 +94,21 @@ def test_a_dark_image_gives_zeros(solver, operator):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+def test_what_no_pixel_sees_stays_dark(solver):
+    """An operator of zeros: nothing is known, and nothing is NaN."""
+    A = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
+    found = jax.jit(lambda image: SOLVERS[solver](A, image, steps=5))(jnp.ones(30))
+    assert not np.any(found.x)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_images_may_be_integers(solver):
+    image = jnp.arange(30, dtype=jnp.uint16)
+    run = jax.jit(lambda image: SOLVERS[solver](dense(), image, steps=5).x)
+    np.testing.assert_array_equal(run(image), run(image.astype(float)))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_a_dark_image_ends_it_in_float32(solver):
     A = lx.MatrixLinearOperator(dense().matrix.astype(jnp.float32))
     found = jax.jit(lambda image: SOLVERS[solver](A, image, steps=20, tolerance=1e-3))(jnp.zeros(30, jnp.float32))

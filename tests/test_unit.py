@@ -157,6 +157,13 @@ def test_no_ray_through_what_is_no_lens():
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
 
 
+def test_a_perfect_wavefront_has_a_gradient():
+    """An ideal lens in focus; the error is the root of zero."""
+    perfect = unit(8.0, thin_lens_focal_length=4.0, substrate_thickness=0.0)
+    value, slopes = jax.value_and_grad(lambda imager: wavefront_rms(imager, 8.0))(perfect)
+    assert value < 1e-12 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+
+
 @pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients(lens, modes):

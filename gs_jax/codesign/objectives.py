@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 
 from ..geometry import envelope
 from ..optics import aberrations, theory
-from ..optics.aperture import safe_sqrt
 from ..optics.unit import pupil_disc, unit_rays
+from ..safe import safe_sqrt
 from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
 from .parameters import Candidate
 
@@ -100,9 +100,8 @@ def wavefront(c: Candidate) -> Float[Array, "depth field"]:
 
 
 def _seidel(c: Candidate):
-    array = c.imager.array
-    lens = array.focal_length, array.refractive_index, c.clear_diameter / 2, c.reduced[:, None]
-    return aberrations.seidel(*lens, _heights(c)[None], c.imager.sensor_distance)
+    place = c.reduced[:, None], _heights(c)[None]
+    return aberrations.of_array(c.imager.array, c.clear_diameter / 2, *place, c.imager.sensor_distance)
 
 
 def occupancy(c: Candidate) -> Float[Array, " depth"]:

@@ -1,7 +1,8 @@
 """Solvers for co-design, step by step: what stops can go on later, exactly.
 
-Optimistix has the algorithms, and jaxopt the one that keeps bounds. They run here one step at a time from the host, so that progress can be shown
-and the state saved; a run that is interrupted and resumed takes the same steps, bit for bit, as one that is not.
+Optimistix has the algorithms, and jaxopt the one that keeps bounds. They run here one step at a time from the host, so
+that progress can be shown and the state saved; a run that is interrupted and resumed takes the same steps, bit for bit,
+as one that is not.
 """
 
 from collections.abc import Callable
@@ -55,8 +56,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
     residual
         One number for each thing that is wanted.
     free, given
-        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for L-BFGS-B they are
-        between 0 and 1.
+        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for L-BFGS-B they
+        are between 0 and 1.
     stage
         Which solver. Adam is for a residual that is random: it gets a new key in each step, its rate falls to zero by a
         cosine over the stage's steps, and it never converges.

@@ -26,8 +26,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .aperture import safe_sqrt
-from .theory import Real, Result, safe_quotient
+from ..geometry import MicrolensArray
+from ..safe import safe_quotient, safe_sqrt
+from .theory import Real, Result
 
 
 class Wavefront(eqx.Module):
@@ -90,6 +91,18 @@ def seidel(
     s4 = s3 / n
     defocus = a**2 / 2 * (power - toward - 1 / jnp.asarray(sensor_distance))
     return Wavefront(s1 / 8, s2 / 2 if plano_to_object else -s2 / 2, s3 / 2, (s3 + s4) / 4, defocus)
+
+
+def of_array(
+    array: MicrolensArray, pupil_radius: Real, reduced_depth: Real, field_height: Real, sensor_distance: Real
+) -> Wavefront:
+    """`seidel` of an array's lens, its plano side to the object; of an ideal thin lens nothing but the defocus."""
+    lens = array.focal_length, array.refractive_index, pupil_radius, reduced_depth
+    error = seidel(*lens, field_height, sensor_distance)
+    if array.thin_lens_focal_length is None:
+        return error
+    nothing = jnp.zeros_like(error.coma)
+    return Wavefront(nothing, nothing, nothing, nothing, nothing + error.defocus)
 
 
 def unbalanced_rms(error: Wavefront) -> Terms:

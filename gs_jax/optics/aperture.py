@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import MicrolensArray
+from ..safe import safe_sqrt
 
 # Lenses that are handled at once.
 _LENSES = 16
@@ -104,12 +105,6 @@ def pitch(centers: Float[Array | np.ndarray, "lens 2"]) -> tuple[Float[Array, ""
     distances = safe_sqrt(_for_each_lens(nearest, centers))
     mean = jnp.mean(distances)
     return mean, safe_sqrt(jnp.mean((distances - mean) ** 2))
-
-
-def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Square root, with a derivative of zero at zero, where it has none."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
 def _bisectors(offset, diameter):

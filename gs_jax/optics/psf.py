@@ -1,9 +1,9 @@
 """The point spread function of one lens unit on the sensor: PSF_o of Eq. (2).
 
 `psf` is scalar diffraction with the exact wavefront of `gs_jax.optics.unit`; `geometric_psf` counts rays and
-`gaussian_psf` is a Gaussian, for a fraction of the time. They take the same arguments, less those that do not matter to
-them, and return `(size, size)` pixels `[row, column]` with the sum 1. In the middle is the chief ray of
-`gs_jax.geometry`, not the true one: what the map gets wrong (distortion, coma) is in the PSF.
+`gaussian_psf` is a Gaussian, for a fraction of the time. They return `(size, size)` pixels `[row, column]` with the
+sum 1, however little of the light falls into the window (`window_fraction` says how much). In the middle is the chief
+ray of `gs_jax.geometry`, not the true one: what the map gets wrong (distortion, coma) is in the PSF.
 
 The field of `gs_jax.optics.exit_pupil` goes to the sensor by a Fourier transform, done by two small matrix products
 (Soummer et al., Opt. Express 15, 15935, 2007).
@@ -153,8 +153,9 @@ def gaussian_psf(
 ) -> Float[Array, "row column"]:
     """Round Gaussian about the rays' centroid, integrated over the pixels, with the sum 1. Parameters as for `psf`.
 
-    Its variance along an axis is the rays' (half the mean squared distance from their centroid) plus that of the
-    Gaussian as wide at half its height as the Airy disc of the pupil: full width `0.5145 wavelength v / radius`.
+    The aperture is round: it has no `edges`. The variance along an axis is the rays' (half the mean squared distance
+    from their centroid) plus that of the Gaussian as wide at half its height as the Airy disc of the pupil: full width
+    `0.5145 wavelength v / radius`.
 
     Raises
     ------

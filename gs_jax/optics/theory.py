@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-Real = Float[Array | np.ndarray, "*#shape"] | float | int
+from ..safe import Real, safe_quotient
+
 Result = Float[Array, "..."]
 
 
@@ -164,9 +165,3 @@ def field_of_view(plate: Real, sensor: Real, magnification: Real, field_radius: 
     """
     half = jnp.asarray(sensor) / 2 + magnification * field_radius
     return 2 * (jnp.minimum(jnp.asarray(plate) / 2, half) + field_radius)
-
-
-def safe_quotient(above: Real, below: Real) -> Result:
-    """`above / below`, or infinity without a derivative where `below` is not positive."""
-    positive = jnp.asarray(below) > 0
-    return jnp.where(positive, above / jnp.where(positive, below, 1), jnp.inf)

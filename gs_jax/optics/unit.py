@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..geometry import Imager, chief_ray
+from ..safe import safe_sqrt
 
 Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]]
 
@@ -116,6 +117,8 @@ def wavefront_rms(
 ) -> Float[Array, ""]:
     """RMS wavefront error over the pupil, mm, without piston and tilt: neither changes the shape of the spot.
 
+    NaN if part of the pupil reflects the light totally.
+
     Parameters
     ----------
     imager, depth, field
@@ -124,7 +127,7 @@ def wavefront_rms(
         Of the pupil, mm. Half the aperture's diameter by default.
     """
     points, weights = pupil_disc(pupil_radius(imager, radius))
-    return jnp.sqrt(jnp.sum(weights * _without_tilt(wavefront(imager, depth, points, field), points, weights) ** 2))
+    return safe_sqrt(jnp.sum(weights * _without_tilt(wavefront(imager, depth, points, field), points, weights) ** 2))
 
 
 @jax.jit
@@ -138,7 +141,8 @@ def best_focus(
     """Sensor distance `v` of the least `wavefront_rms`, mm. The imager's own sensor distance does not matter.
 
     Under spherical aberration it lies between the paraxial image and the smallest RMS spot, near the caustic's sharp
-    core. There is none for an object within the focal length; the result is then not a distance.
+    core. There is none for an object within the focal length; the result is then not a distance. NaN if part of the
+    pupil reflects the light totally.
 
     Parameters
     ----------

@@ -15,12 +15,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from ..coverage import Real
+from ..safe import divide
 from .convolution import Convolution
-from .iterate import Callback, Solution, check_image, divide, iterate, norm
+from .iterate import Callback, Solution, as_image, iterate, norm
 from .total_variation import differences, differences_adjoint, shrink, total_variation
 
 # The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1). Boyd's 10
@@ -55,7 +57,7 @@ class Prior(NamedTuple):
 
 def admm(
     A: lx.AbstractLinearOperator,
-    image: Float[Array, "..."],
+    image: Num[Array | np.ndarray, "..."],
     *,
     steps: int,
     tolerance: float = 0.0,
@@ -93,7 +95,7 @@ def admm(
     ValueError
         If the image is not of the operator's output shape, or a number is out of range.
     """
-    check_image(A, image)
+    image = as_image(A, image)
     prior = _prior(tv, l1, isotropic, image.dtype, wrap=False)
     back = A.T.mv(image)
 
@@ -117,7 +119,7 @@ def admm(
 
 def admm_convolution(
     system: Convolution,
-    image: Float[Array, "row column"],
+    image: Num[Array | np.ndarray, "row column"],
     *,
     steps: int,
     tolerance: float = 0.0,
@@ -131,7 +133,7 @@ def admm_convolution(
     Differences wrap round the edge of the scene, in depth too. The convolved scene has its own split, weighted so that
     it is as large as the scene. `x` is of `system.scene_shape`; `system.place` says where the image is in it.
     """
-    check_image(system.operator, image)
+    image = as_image(system.operator, image)
     prior = _prior(tv, l1, isotropic, image.dtype, wrap=True)
     shape = system.scene_shape
     axes = (0, 1, 2) if shape[0] > 1 else (1, 2)
@@ -166,7 +168,11 @@ def admm_convolution(
     zeros = jnp.zeros(shape, image.dtype)
     split = (zeros, *prior.split(zeros))
     (_, (_, _, w), _, _), *history = iterate(
-        _step(update, prox, cost), (zeros, split, split, gain**2), steps=steps, tolerance=tolerance, callback=callback
+        _step(update, prox, cost),
+        (zeros, split, split, _or_one(gain**2)),
+        steps=steps,
+        tolerance=tolerance,
+        callback=callback,
     )
     return Solution(w, *history)
 
@@ -218,11 +224,18 @@ def _conjugate_gradients(normal, vector, x, steps):
 
 
 def _mean_gain(A):
-    """The mean of `A'A`'s diagonal: a penalty of this size weighs the split like the image (Hutchinson's estimate)."""
+    """The mean of `A'A`'s diagonal: a penalty of this size weighs the split like the image (Hutchinson's estimate).
+
+    1 for an operator that is zero.
+    """
     structure = A.in_structure()
     signs = jax.random.rademacher(jax.random.key(0), structure.shape, structure.dtype)
     image = A.mv(signs)
-    return jnp.vdot(image, image) / signs.size
+    return _or_one(jnp.vdot(image, image) / signs.size)
+
+
+def _or_one(penalty):
+    return jnp.where(penalty > 0, penalty, 1)
 
 
 def _times(factor, spectrum):

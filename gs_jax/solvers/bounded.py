@@ -47,7 +47,7 @@ def minimise_within(
 
 
 def lbfgsb(objective: Callable[..., Float[Array, ""]], *, steps: int = 1, tolerance: float = 0.0) -> jaxopt.LBFGSB:
-    """The solver of `minimise_within`, to be run step by step: `init_state(x, bounds, ...)`, `update(x, state, ...)`."""
+    """The solver of `minimise_within`, to be run step by step: `init_state(x, bounds)`, `update(x, state, bounds)`."""
     return jaxopt.LBFGSB(objective, maxiter=steps, tol=tolerance, implicit_diff=False)
 
 

@@ -7,11 +7,13 @@ Both minimise `|A x - image|^2 / 2 + l1 |x|_1` over `x >= 0`. FISTA: Beck and Te
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from ..coverage import Real
-from .iterate import Callback, Solution, check_image, divide, iterate, norm
+from ..safe import divide
+from .iterate import Callback, Solution, as_image, iterate, norm
 
 # Steps of the power method, and what it may fall short by: for operators without negative entries the largest
 # eigenvalue stands alone, and this many steps find it to about a percent.
@@ -20,7 +22,7 @@ _POWER_STEPS, _MARGIN = 20, 1.05
 
 def fista(
     A: lx.AbstractLinearOperator,
-    image: Float[Array, "..."],
+    image: Num[Array | np.ndarray, "..."],
     *,
     steps: int,
     tolerance: float = 0.0,
@@ -55,7 +57,7 @@ def fista(
 
 def gradient_descent(
     A: lx.AbstractLinearOperator,
-    image: Float[Array, "..."],
+    image: Num[Array | np.ndarray, "..."],
     *,
     steps: int,
     tolerance: float = 0.0,
@@ -67,7 +69,7 @@ def gradient_descent(
 
 
 def _descend(A, image, l1, momentum, **options):
-    check_image(A, image)
+    image = as_image(A, image)
     l1 = jnp.asarray(l1, image.dtype)
     rate = divide(jnp.ones((), image.dtype), _MARGIN * largest_eigenvalue(A))
 

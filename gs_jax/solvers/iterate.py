@@ -11,8 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Num, PyTree
+
+from ..safe import safe_sqrt
 
 # Called on the host after each step, with its number (from 1) and its cost.
 Callback = Callable[[Any, Any], None]
@@ -102,19 +105,15 @@ def iterate(
     return state, costs, number, residual <= tolerance
 
 
-def check_image(A: lx.AbstractLinearOperator, image: Shaped[Array, "..."]) -> None:
-    """Raise a `ValueError` that names the shapes if `image` is not what the operator gives."""
-    if image.shape != (expected := A.out_structure().shape):
-        raise ValueError(f"`image` must be of the operator's output shape {expected}, got {image.shape}.")
+def as_image(A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
+    """`image` in the operator's type; raises a `ValueError` that names the shapes if it is not of its output's."""
+    expected = A.out_structure()
+    if image.shape != expected.shape:
+        raise ValueError(f"`image` must be of the operator's output shape {expected.shape}, got {image.shape}.")
+    return jnp.asarray(image, expected.dtype)
 
 
 def norm(x: PyTree) -> Float[Array, ""]:
     """Euclidean norm of all leaves together; its gradient is 0 at 0."""
     square = sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(x))
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-
-
-def divide(a: Float[Array, "*shape"], b: Float[Array, "*shape"], least=0) -> Float[Array, "*shape"]:
-    """`a / b` where `b` is above `least`, else 0, with finite gradients."""
-    ok = b > least
-    return jnp.where(ok, a / jnp.where(ok, b, 1), 0)
+    return safe_sqrt(jnp.asarray(square))

@@ -8,16 +8,15 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from ..backprojection import backproject
 from ..forward import forward
 from ..geometry import Grid, Imager
-from ..operators import ray_operator
 from .admm import admm
 from .fista import fista
-from .iterate import Callback, Solution
-from .richardson_lucy import richardson_lucy
+from .iterate import Callback, Solution, as_image
+from .richardson_lucy import list_richardson_lucy, richardson_lucy
 
 # Weight of the sum of voxels, in parts of the least weight that would leave nothing but darkness.
 _SPARSITY = 0.01
@@ -34,6 +33,7 @@ def forward_operator(
 
 
 def _sparse(solver, A, image, **options):
+    image = as_image(A, image)
     weight = _SPARSITY * jnp.max(A.T.mv(image))
     return solver(A, image, l1=jnp.maximum(weight, 0), **options)
 
@@ -48,7 +48,7 @@ METHODS = ("backproject", "list-rl", *SOLVERS)
 
 @partial(jax.jit, static_argnames=("method", "steps", "tolerance", "callback"))
 def reconstruct(
-    image: Float[Array | np.ndarray, "row column"],
+    image: Num[Array | np.ndarray, "row column"],
     imager: Imager,
     grid: Grid,
     psf: Float[Array | np.ndarray, "plane tall wide"],
@@ -79,7 +79,7 @@ def reconstruct(
     if method == "backproject":
         return backproject(image, imager, grid)
     if method == "list-rl":
-        return richardson_lucy(ray_operator(imager, grid), image, **options).x
+        return list_richardson_lucy(image, imager, grid, **options).x
     if method not in SOLVERS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
     return SOLVERS[method](forward_operator(imager, grid, psf), image, **options).x

@@ -6,13 +6,15 @@ back-projected ratio of the image to what the estimate would give, and so climbs
 
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from ..coverage import Real
 from ..geometry import Grid, Imager
 from ..operators import ray_operator
-from .iterate import Callback, Solution, check_image, divide, iterate, norm
+from ..safe import divide
+from .iterate import Callback, Solution, as_image, iterate, norm
 from .total_variation import differences, differences_adjoint, magnitude
 
 # The most that total variation may hold back a voxel in one step: Dey's denominator must stay positive.
@@ -23,7 +25,7 @@ _ROUNDING = 100
 
 def richardson_lucy(
     A: lx.AbstractLinearOperator,
-    image: Float[Array, "..."],
+    image: Num[Array | np.ndarray, "..."],
     *,
     steps: int,
     tolerance: float = 0.0,
@@ -64,8 +66,7 @@ def richardson_lucy(
     ValueError
         If the image is not of the operator's output shape, or a number is out of range.
     """
-    check_image(A, image)
-    image = jnp.maximum(image, 0)
+    image = jnp.maximum(as_image(A, image), 0)
     sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
     background = jnp.asarray(background, image.dtype)
     # The scale of the start does not matter without a background; this one has the image's light.
@@ -92,7 +93,7 @@ def richardson_lucy(
 
 
 def list_richardson_lucy(
-    image: Float[Array, "row column"], imager: Imager, grid: Grid, *, steps: int, **options
+    image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, *, steps: int, **options
 ) -> Solution:
     """Richardson-Lucy on the pixel-voxel lists of back-projection: no PSF, so as local as `backproject`.
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .iterate import divide
+from ..safe import divide, safe_sqrt
 
 
 def differences(x: Float[Array, "*shape"], *, wrap: bool) -> Float[Array, " axis *shape"]:
@@ -31,8 +31,7 @@ def long_axes(shape: tuple[int, ...]) -> list[int]:
 
 def magnitude(u: Float[Array, " axis *shape"]) -> Float[Array, "*shape"]:
     """Length of the vector of differences at each voxel; its gradient is 0 where they are."""
-    square = jnp.sum(u**2, axis=0)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return safe_sqrt(jnp.sum(u**2, axis=0))
 
 
 def total_variation(u: Float[Array, " axis *shape"], *, isotropic: bool) -> Float[Array, ""]:
