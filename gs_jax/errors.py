@@ -1,7 +1,9 @@
 """The one exception that a user's mistake raises."""
 
+import contextlib
 import re
 import reprlib
+from collections.abc import Iterator
 
 # C0 and C1 controls and Unicode's own line ends: a file name or a key may hold any of them.
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
@@ -21,6 +23,15 @@ class InputError(ValueError):
 
     def __init__(self, message: str):
         super().__init__(_CONTROLS.sub(" ", message).strip())
+
+
+@contextlib.contextmanager
+def about(path: object) -> Iterator[None]:
+    """Around what does not know the file that its input came from: an `InputError` then names it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def shown(value: object) -> str:

@@ -268,5 +268,5 @@ def _check_coverable(count, half, diameter):
     if count < fewest:
         raise InputError(
             f"`count` must be {fewest} or more for lenses of {diameter:.4g} mm to cover {in_mm(half)}, got {count}; "
-            "`diameter=None` allows holes."
+            "in Python `diameter=None` allows holes."
         )

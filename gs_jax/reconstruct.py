@@ -28,7 +28,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
     depths
         In mm.
     pitch
-        Of the voxels laterally, mm. By default a pixel as seen at the middle depth, rounded to 0.1 um.
+        Of the voxels laterally, mm. By default a pixel as seen at the middle depth, rounded to 0.1 um, and no less.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
     """
     if pitch is None:
         middle = float(imager.magnification(np.median(depths)))
-        pitch = round(imager.sensor.pixel_pitch / middle, 4)
+        pitch = max(round(imager.sensor.pixel_pitch / middle, 4), 1e-4)
     grid = Grid.over(imager.sensor, depths=jnp.array(depths), pitch=pitch)
     size = 4 * len(depths) * grid.shape[0] * grid.shape[1]
     # The volume, the copy that is being computed, and room for the image.

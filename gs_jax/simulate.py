@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .designs import Design
-from .errors import InputError
+from .errors import InputError, about
 from .forward import forward
 from .geometry import Grid, Imager, Sensor
 from .info import memory_bytes
@@ -50,10 +50,8 @@ def simulate_scene(
     else:
         volume, grid = read_volume(path)
         simulate = lambda: simulate_volume(volume, imager, grid, **options)
-    try:
+    with about(path):
         return simulate()
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def simulate_volume(

@@ -6,10 +6,11 @@ import pytest
 
 from gs_jax.builtin import geomscope
 from gs_jax.codesign import search
-from gs_jax.codesign.checkpoint import read_checkpoint
-from gs_jax.codesign.outcome import before_and_after, check_outputs, write_outcome
+from gs_jax.codesign.checkpoint import Log, read_checkpoint
+from gs_jax.codesign.outcome import before_and_after, check_outputs, picture, write_outcome
 from gs_jax.codesign.parameters import start_values
 from gs_jax.codesign.search import optimise, problem_of, random_start
+from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.study import Study
 from gs_jax.designs import read_design
 from gs_jax.errors import InputError
@@ -116,7 +117,15 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
         path.write_bytes(b"{}\n")
         with pytest.raises(InputError, match="no checkpoint of a search"):
             optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
+        path.write_bytes(b'{"format": "gs-jax checkpoint 2", "of": "", "log": {"steps": 1, "ends": 2}}\n')
+        with pytest.raises(InputError, match="no checkpoint of a search"):
+            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
         interrupted(table1, study(), path, monkeypatch, writes=1)
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-30])
+        with pytest.raises(InputError, match="a.checkpoint: not a whole and valid checkpoint"):
+            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
+        path.write_bytes(whole)
         with pytest.raises(InputError, match="of another study or design"):
             optimise(table1, study(seed=1), progress=progress, checkpoint=path, resume=True)
 
@@ -147,6 +156,43 @@ def test_a_thin_lens_has_no_radius_to_free(table1):
     thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
     with pytest.raises(InputError, match="free.radius_of_curvature_mm"), Progress() as progress:
         optimise(thin, study(), progress=progress)
+
+
+def test_a_single_lens(table1):
+    """It has no pitch: everything else can be free."""
+    array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),), "size_mm": (2.0, 2.0)})
+    single = table1.model_copy(update={"array": array})
+    free = {"sensor_distance_mm": [2.0, 7.0]}
+    with Progress() as progress:
+        found = optimise(single, study(free=free, terms=[TERMS[1]]), progress=progress)
+        with pytest.raises(InputError, match="free.pitch_mm.*one lens"):
+            optimise(single, study(), progress=progress)
+    assert found.after[0].met and found.design.array == array
+
+
+def test_depths_stay_before_the_plate(table1):
+    with pytest.raises(InputError, match=r"depth_span_mm.*below 41"), Progress() as progress:
+        optimise(table1, study(free={"depth_span_mm": [0.5, 60.0]}), progress=progress)
+
+
+def test_the_record_is_that_of_the_start_that_won():
+    ends = [
+        {"stage": 0, "start": 0, "cost": float("nan"), "reason": NOT_FINITE},
+        {"stage": 0, "start": 1, "cost": 1.0, "reason": "won"},
+        {"stage": 0, "start": 2, "cost": 2.0, "reason": "lost"},
+    ]
+    assert search.best_end(Log(ends=ends), 0)["reason"] == "won"
+
+
+def test_both_limits_of_a_term_are_recorded(table1):
+    terms = [{"name": "occupancy", "at_most": 0.5}, {"name": "occupancy", "at_least": 0.2}]
+    question = study(terms=terms, free={"sensor_distance_mm": [2.0, 6.0]})
+    with Progress() as progress:
+        found = optimise(table1, question, progress=progress)
+    last = found.log.steps[-1]
+    np.testing.assert_allclose(last["occupancy at_most"], found.after[0].high, rtol=1e-3)
+    np.testing.assert_allclose(last["occupancy at_least"], found.after[0].low, rtol=1e-3)
+    assert picture(found.design, question, found).axes
 
 
 def test_no_start_that_ends_anywhere(table1, monkeypatch):

@@ -47,6 +47,15 @@ def test_values_and_gradients_are_finite(parent, name):
     assert np.abs(slopes["centers_mm"]).max() > 0
 
 
+@pytest.mark.slow
+def test_points_are_located_to_a_small_part_of_a_pixel(parent):
+    """Spots of one pixel, 20 um, of 1000 photons a lens through five lenses: 20 / sqrt(5000) um by the lenses' share of
+    light, over the magnification of a quarter; read noise and a point's depth cost more, a few times."""
+    found = np.asarray(TERMS["localization_um"].function(candidate(parent, {}), jax.random.key(0)))
+    least = 20 / np.sqrt(5000) / 0.3
+    assert (least < found[:2]).all() and (found[:2] < 20 * least).all() and found[2] < 1000
+
+
 def test_spectrum_of_random_lenses_and_of_a_lattice():
     """Random: exponential powers, a flatness of exp(-Euler's constant) = 0.56; a lattice has power in few places."""
     rng = np.random.default_rng(0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gs_jax.builtin import geomscope
+from gs_jax.codesign import pareto as module
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, sweep
 from gs_jax.codesign.study import Study
 from gs_jax.progress import Progress
@@ -53,6 +54,21 @@ def test_light_against_depth_of_field(front):
         far = float(imager.reduced_depth(23.0))
         np.testing.assert_allclose(light, 100 * 200 * np.pi * 9 / 400 * (widest / 4 / far) ** 2, rtol=0.02)
     assert front.best.all()
+
+
+def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
+    calls, run = [0], module.run
+
+    def first_lost(steps, state, *arguments, **options):
+        calls[0] += 1
+        if calls[0] == 1:
+            state = state._replace(cost=state.cost * np.nan)
+        return run(steps, state, *arguments, **options)
+
+    monkeypatch.setattr(module, "run", first_lost)
+    with Progress() as progress:
+        found = sweep(geomscope(), Study.model_validate(STUDY), progress=progress)
+    assert np.isfinite(found.values).all() and found.best[1:].all()
 
 
 def test_numbers_and_picture(front, tmp_path):

@@ -60,6 +60,16 @@ def test_going_on_from_any_step_is_the_same(solver):
     jax.tree.map(np.testing.assert_array_equal, whole, rest)
 
 
+@pytest.mark.parametrize("solver", (*SOLVERS, "lbfgsb"))
+def test_going_on_from_the_last_step_takes_no_other(solver):
+    start = INSIDE if solver == "lbfgsb" else START
+    steps = stepper(rosenbrock, start, ONE, StageTable(solver=solver), KEY)
+    whole, reason = run(steps, steps.begin(start, ONE), ONE, limit=1000)
+    again, same = run(steps, whole, ONE, limit=1000)
+    assert reason == same == CONVERGED
+    jax.tree.map(np.testing.assert_array_equal, whole, again)
+
+
 def test_targets_are_given_later():
     """One compilation for all of them."""
     steps = stepper(rosenbrock, START, ONE, StageTable(solver="levenberg-marquardt"), KEY)

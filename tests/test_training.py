@@ -216,4 +216,6 @@ def test_wrong_arguments_write_nothing(toy_command, tmp_path):
     assert isinstance(result.exception, InputError) and "allowed: .npz" in str(result.exception)
     result = toy_command("--steps", 5, "--resume", "-o", tmp_path / "w.npz")
     assert isinstance(result.exception, InputError) and "w.checkpoint" in str(result.exception)
+    result = toy_command("--network", "multislice", "--resume", "-o", tmp_path / "w.npz")
+    assert isinstance(result.exception, InputError) and "w.checkpoint" in str(result.exception)
     assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from ..designs import read_design
+from ..errors import about
 from ..mold.report import Order, make_part, words
 from ..mold.solids import MoldShape
 from ..progress import Progress
@@ -77,6 +78,6 @@ def mold(
         label=microscope.name if label else "",
     )
     order = Order(positive=positive, shape=shape, chord=chord_um / 1000, resolution=resolution_um / 1000)
-    with Progress() as progress:
+    with Progress() as progress, about(design):
         report = make_part(microscope, output, order, progress)
     click.echo(words(report), nl=False)

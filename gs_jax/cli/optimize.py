@@ -11,6 +11,7 @@ from ..codesign.outcome import before_and_after, check_outputs, write_outcome
 from ..codesign.search import optimise
 from ..codesign.study import read_study
 from ..designs import read_design
+from ..errors import about
 from ..progress import Progress
 
 
@@ -28,7 +29,7 @@ def optimize(design: Path, study: Path, resume: bool, output: Path):
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     question, parent, checkpoint = read_study(study), read_design(design), checkpoint_path(output)
-    with Progress() as progress:
+    with Progress() as progress, about(study):
         outcome = optimise(parent, question, progress=progress, checkpoint=checkpoint, resume=resume)
     write_outcome(output, question, outcome, parent=str(design), source=str(study))
     checkpoint.unlink(missing_ok=True)

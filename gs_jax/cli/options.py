@@ -6,6 +6,8 @@ import click
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MOST_DEPTHS = 10_000
+# The nearest depth that a volume on disk may have, mm.
+_NEAREST = 1e-6
 
 
 class Number(click.ParamType):
@@ -38,8 +40,8 @@ class Depths(click.ParamType):
             start, stop, step = map(float, value.split(":"))
         except ValueError:
             self.fail(f"found {value!r}, allowed: START:STOP:STEP, three numbers of mm such as 18:22:0.25.", param, ctx)
-        if not all(map(math.isfinite, (start, stop, step))) or not 0 < start <= stop or not step > 0:
-            self.fail(f"found {value!r}, allowed: 0 < START <= STOP and STEP > 0, in mm.", param, ctx)
+        if not all(map(math.isfinite, (start, stop, step))) or not _NEAREST <= start <= stop or not step > 0:
+            self.fail(f"found {value!r}, allowed: {_NEAREST:g} <= START <= STOP and STEP > 0, in mm.", param, ctx)
         # A step that misses STOP by rounding alone falls on it.
         count = (stop - start) / step + 1 + 1e-6
         if count > _MOST_DEPTHS + 1:

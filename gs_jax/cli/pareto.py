@@ -8,10 +8,11 @@ from rich.console import Console
 from rich.table import Table
 
 from ..codesign.pareto import as_json, picture, sweep
+from ..codesign.search import problem_of
 from ..codesign.study import parent_path, read_study
 from ..designs import read_design
-from ..errors import InputError
-from ..io.disk import atomic_write, make_folder, write_json
+from ..errors import InputError, about
+from ..io.disk import atomic_write, check_output, make_folder, write_json
 from ..progress import Progress
 
 
@@ -29,15 +30,18 @@ def pareto(study: Path, out: Path):
     if not question.pareto:
         raise InputError(f"{study}: `pareto`: found nothing, allowed: one or two tables.")
     design = read_design(parent_path(study, question))
+    with about(study):
+        problem_of(design, question)
     make_folder(out)
-    with Progress() as progress:
+    numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
+    with Progress() as progress, about(study):
         front = sweep(design, question, progress=progress)
-    write_json(out / "pareto.json", as_json(front))
-    with atomic_write(out / "pareto.png") as path:
+    write_json(numbers, as_json(front))
+    with atomic_write(drawing) as path:
         picture(front).savefig(path, format="png", dpi=110)
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):
         status = "" if best else "dominated" if point.feasible else "misses a target"
         table.add_row(*(f"{x:.4g}" for x in row), status)
     Console().print(table)
-    click.echo(f"{out / 'pareto.png'}: {front.best.sum()} of {len(front.points)} points on the front")
+    click.echo(f"{drawing}: {front.best.sum()} of {len(front.points)} points on the front")

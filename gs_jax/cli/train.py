@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from ..io.disk import check_output, write_json
+from ..io.disk import check_input, check_output, write_json
 from ..progress import Progress
 from ..suppression.training import (
     multislice_recipe,
@@ -43,6 +43,8 @@ def train(network: str, steps: int | None, seed: int, resume: bool, output: Path
     steps = steps or STEPS[network]
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
+    if resume:
+        check_input(checkpoint)
     if network == "paper":
         recipe = paper_recipe()
     else:

@@ -12,11 +12,11 @@ import equinox as eqx
 
 from ..designs import Design
 from ..errors import InputError
-from ..io.disk import atomic_write, check_input
+from ..io.disk import atomic_write, check_input, decoding
 from .solve import State
 from .study import Study
 
-_FORMAT = "gs-jax checkpoint 1"
+_FORMAT = "gs-jax checkpoint 2"
 
 
 @dataclass
@@ -53,6 +53,8 @@ def read_checkpoint(path: str | os.PathLike[str], study: Study, design: Design) 
         if found["format"] != _FORMAT:
             raise ValueError
         log, owner = Log(**found["log"]), found["of"]
+        if not isinstance(log.steps, list) or not isinstance(log.ends, list):
+            raise TypeError
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: found no checkpoint of a search, allowed: what `gs-jax optimize` wrote.") from error
     if owner != _digest(study, design):
@@ -62,9 +64,16 @@ def read_checkpoint(path: str | os.PathLike[str], study: Study, design: Design) 
     return log, state
 
 
-def restored(state: bytes, like: State) -> State:
-    """The state of a checkpoint; `like` is one of the same solver."""
-    return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
+def restored(path: Path, state: bytes, like: State) -> State:
+    """The state of a checkpoint; `like` is one of the same solver.
+
+    Raises
+    ------
+    InputError
+        If it is not whole; it names `path`.
+    """
+    with decoding(path, "checkpoint"):
+        return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
 
 
 def checkpoint_path(output: Path) -> Path:

@@ -68,7 +68,8 @@ def _spectrum(c: Candidate, key: PRNGKeyArray) -> Float[Array, "point frequency"
 
 def localization(c: Candidate, key: PRNGKeyArray) -> Float[Array, "3"]:
     """Cramer-Rao bound of x, y, z at random points, um; a spot of one pixel's standard deviation."""
-    return 1000 * localization_bound(c.imager, _points(c, key, _POINTS), photons=_PHOTONS, spot=1.0)
+    points, spot = _points(c, key, _POINTS), c.imager.sensor.pixel_pitch
+    return 1000 * localization_bound(c.imager, points, photons=_PHOTONS, spot=spot)
 
 
 def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:

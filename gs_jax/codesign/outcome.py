@@ -16,8 +16,8 @@ from rich.table import Table
 from ..designs import Design, write_design
 from ..io.disk import atomic_write, check_output, write_json
 from .objectives import TERMS, unit_of
-from .search import Outcome
-from .study import Study, TermTable
+from .search import Outcome, best_end
+from .study import Study, TermTable, labels
 from .targets import SIGNS, Row
 
 
@@ -66,7 +66,7 @@ def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, so
         "study": Path(source).name,
         "seed": study.seed,
         "date": datetime.date.today().isoformat(),
-        "reason": outcome.log.ends[-1]["reason"],
+        "reason": best_end(outcome.log, len(study.stages) - 1)["reason"],
         "objectives": {record["term"]: record["after"] for record in records if None not in record["after"]},
     }
     write_design(paths[0], outcome.design.model_copy(update={"provenance": provenance}))
@@ -109,10 +109,10 @@ def picture(design: Design, study: Study, outcome: Outcome) -> Figure:
     places = np.arange(1, len(steps) + 1)
     cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
     cost.set(xlabel="step", ylabel="cost", title="best start")
-    for number, term in enumerate(study.terms):
-        values = np.array([step.get(term.name, np.nan) for step in steps], float)
+    for number, (term, label) in enumerate(zip(study.terms, labels(study.terms, study), strict=True)):
+        values = np.array([step.get(label, np.nan) for step in steps], float)
         style = "-" if term.is_goal else ("--", ":")[number >= 10]
-        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=f"C{number % 10}", label=term.name)
+        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=f"C{number % 10}", label=label)
     terms.axhline(1, color="0.6", lw=0.8)
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
     terms.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -121,8 +121,7 @@ def picture(design: Design, study: Study, outcome: Outcome) -> Figure:
 
 def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
     """Whether a step led to the design: the best start of each stage goes on."""
-    ends = [end for end in outcome.log.ends if end["stage"] == step["stage"]]
-    return step["start"] == min(ends, key=lambda end: end["cost"])["start"]
+    return step["start"] == best_end(outcome.log, step["stage"])["start"]
 
 
 def _draw_layout(axes: Axes, design: Design) -> None:

@@ -90,8 +90,9 @@ class Cells(eqx.Module):
 class Parent(eqx.Module):
     """A design with what its file does not say: where it is judged.
 
-    `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm. `middle`, `span`:
-    of the depths that count, from the plate, mm. `depth_count`: how many they are. `wavelength`, `confusion`: mm.
+    `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm; 1 for one lens.
+    `middle`, `span`: of the depths that count, from the plate, mm. `depth_count`: how many they are. `wavelength`,
+    `confusion`: mm.
     """
 
     imager: Imager
@@ -163,7 +164,7 @@ def parent_of(
     return Parent(
         imager,
         None if lenses_move else _cells(design),
-        pitch(imager.array.centers)[0],
+        pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
         design.imaging.wavelength_nm * 1e-6,

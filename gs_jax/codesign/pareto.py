@@ -19,7 +19,7 @@ from ..progress import Progress
 from .objectives import unit_of
 from .parameters import NAMES, Values, start_values
 from .search import Stage, entries_of, make_stage, problem_of, random_start, targets_of
-from .solve import run
+from .solve import NOT_FINITE, run
 from .study import LimitTable, Study, TermTable
 from .targets import Row, assess, worst_of
 
@@ -107,16 +107,21 @@ def _with_targets(kept, moving, limits) -> list[TermTable]:
 
 
 def _search(stages: list[Stage], values: Values, terms: list[TermTable], entries) -> Point:
-    """All stages from these parameters, with the terms' targets."""
+    """All stages from these parameters, with the terms' targets; a stage that ends in no number is not counted."""
     cost = float("inf")
     for stage in stages:
         names = [(term.name, term.kind) for term in stage.terms]
         targets = targets_of([term for term in terms if (term.name, term.kind) in names])
         begin = stage.steps.begin(stage.free(values), targets)
-        state, _ = run(stage.steps, begin, targets, limit=stage.limit, enough=stage.enough)
+        state, reason = run(stage.steps, begin, targets, limit=stage.limit, enough=stage.enough)
+        if reason == NOT_FINITE:
+            return Point(values, _assessed(terms, entries, values), float("inf"))
         values, cost = stage.values(state.free), float(state.cost)
-    rows = [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
-    return Point(values, rows, cost)
+    return Point(values, _assessed(terms, entries, values), cost)
+
+
+def _assessed(terms: list[TermTable], entries, values: Values) -> list[Row]:
+    return [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
 
 
 def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Point]) -> Front:

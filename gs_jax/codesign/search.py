@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from ..progress import Progress
 from .checkpoint import Log, read_checkpoint, restored, write_checkpoint
 from .parameters import Bounds, Box, Parent, Values, candidate, new_design, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, stepper
-from .study import Study, TermTable
+from .study import Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
 
 # Seconds between two checkpoints.
@@ -53,13 +53,15 @@ class Problem(NamedTuple):
 class Stage(NamedTuple):
     """A stage that is ready to run, compiled once for all its starts.
 
-    `free`: from parameters to what the solver moves. `values`: back, with the parameters that it does not move.
-    `watch`: the worst entry of each term. `enough`: a cost at which all targets are met.
+    `labels`: of the terms, for the log. `free`: from parameters to what the solver moves. `values`: back, with the
+    parameters that it does not move. `watch`: the worst entry of each term. `enough`: a cost at which all targets are
+    met.
     """
 
     number: int
     limit: int
     terms: list[TermTable]
+    labels: list[str]
     targets: Float[Array, " term"]
     steps: Stepper
     free: Callable[[Values], Values]
@@ -74,13 +76,9 @@ def problem_of(design: Design, study: Study) -> Problem:
     Raises
     ------
     InputError
-        If the radius or the index is free and the design has a thin lens.
+        If what is free does not exist in the design, or depths may come to lie behind the plate.
     """
-    of_lens = {"radius_of_curvature_mm", "refractive_index"} & set(study.free)
-    if design.lens.focal_length_mm is not None and of_lens:
-        raise InputError(
-            f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
-        )
+    _check_free(design, study)
     confusion = None if study.confusion_um is None else study.confusion_um / 1000
     parent = parent_of(
         design,
@@ -90,6 +88,20 @@ def problem_of(design: Design, study: Study) -> Problem:
         lenses_move="centers_mm" in study.free,
     )
     return Problem(parent, study)
+
+
+def _check_free(design: Design, study: Study) -> None:
+    if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
+        raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
+    twice = sum(study.depths_mm or design.imaging.working_distance_mm)
+    if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
+        found = f"`free.depth_span_mm`: found {list(study.free['depth_span_mm'])}"
+        raise InputError(f"{found}, allowed: below {twice:g}, twice the middle of the depths.")
+    of_lens = {"radius_of_curvature_mm", "refractive_index"} & set(study.free)
+    if design.lens.focal_length_mm is not None and of_lens:
+        raise InputError(
+            f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
+        )
 
 
 def make_stage(problem: Problem, index: int, values: Values) -> Stage:
@@ -114,8 +126,18 @@ def make_stage(problem: Problem, index: int, values: Values) -> Stage:
     key = jax.random.fold_in(jax.random.key(study.seed), index)
     targets = targets_of(terms)
     steps = stepper(residuals, to_free(values), targets, table, key)
-    enough = _enough(problem, values, terms)
-    return Stage(index, table.steps, terms, targets, steps, to_free, to_values, jax.jit(watch), enough)
+    return Stage(
+        number=index,
+        limit=table.steps,
+        terms=terms,
+        labels=labels(terms, study),
+        targets=targets,
+        steps=steps,
+        free=to_free,
+        values=to_values,
+        watch=jax.jit(watch),
+        enough=_enough(problem, values, terms),
+    )
 
 
 def targets_of(terms: Sequence[TermTable]) -> Float[Array, " term"]:
@@ -185,7 +207,10 @@ def optimise(
         If the study does not fit the design, the checkpoint is missing or another study's, or nothing was found.
     """
     began = time.monotonic()
-    log, saved = read_checkpoint(checkpoint, study, design) if resume and checkpoint else (Log(), None)
+    log, saved = Log(), None
+    if resume and checkpoint:
+        log, state = read_checkpoint(checkpoint, study, design)
+        saved = checkpoint, state
     problem, saver = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.parent)
     before = _rows(problem.parent, study.terms)
@@ -195,7 +220,7 @@ def optimise(
         starts = range(done, study.starts if index == 0 else 1)
         for start in progress.track(starts, f"Stage {index + 1}, {study.stages[index].solver}"):
             begin = stage.steps.begin(stage.free(random_start(problem, values, start)), stage.targets)
-            state = begin if saved is None else restored(saved, begin)
+            state = begin if saved is None else restored(*saved, begin)
             saved = None
             log.ends.append(_search(stage, start, state, log, saver))
         values = _best(stage, values, log)
@@ -222,8 +247,7 @@ def _search(stage: Stage, start: int, state: State, log: Log, saver: _Saver) -> 
     """One start of a stage to its end: a record for `log.ends`."""
 
     def each(state: State) -> None:
-        names = [term.name for term in stage.terms]
-        worst = dict(zip(names, map(float, stage.watch(state.free)), strict=True))
+        worst = dict(zip(stage.labels, map(float, stage.watch(state.free)), strict=True))
         record = {"stage": stage.number, "start": start, "step": int(state.step), "cost": float(state.cost)}
         log.steps.append(record | worst)
         saver(state)
@@ -233,13 +257,24 @@ def _search(stage: Stage, start: int, state: State, log: Log, saver: _Saver) -> 
     return record | {"reason": reason, "free": {name: np.asarray(x).tolist() for name, x in state.free.items()}}
 
 
+def best_end(log: Log, stage: int) -> dict[str, Any]:
+    """The record of the start of a stage that came to the least cost.
+
+    Raises
+    ------
+    InputError
+        If none came to a finite one.
+    """
+    ends = [end for end in log.ends if end["stage"] == stage and end["reason"] != NOT_FINITE]
+    if not ends:
+        raise InputError(f"stage {stage + 1}: no start came to a finite cost, allowed: other bounds or terms.")
+    return min(ends, key=lambda end: end["cost"])
+
+
 def _best(stage: Stage, values: Values, log: Log) -> Values:
     """The parameters that the best start of a stage came to.
 
     Of Adam's costs, which are random, there is only one: it runs from one start unless it is the first stage.
     """
-    ends = [end for end in log.ends if end["stage"] == stage.number and end["reason"] != NOT_FINITE]
-    if not ends:
-        raise InputError(f"stage {stage.number + 1}: no start came to a finite cost, allowed: other bounds or terms.")
-    best = min(ends, key=lambda end: end["cost"])
+    best = best_end(log, stage.number)
     return stage.values({name: jnp.asarray(x, values[name].dtype) for name, x in best["free"].items()})

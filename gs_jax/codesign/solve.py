@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..solvers.bounded import lbfgsb
+from ..bounded import lbfgsb
 from .study import StageTable
 
 # A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
@@ -30,22 +30,23 @@ NOT_FINITE = "stopped: the cost or a parameter is not finite"
 
 
 class State(NamedTuple):
-    """Where a solver is: everything that its next step depends on, arrays only."""
+    """Where a solver is: everything that its next step depends on, and whether there is one, arrays only."""
 
     free: PyTree[Array]
     solver: PyTree[Array]
     cost: Float[Array, ""]
     step: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 class Stepper(NamedTuple):
     """A solver as steps; both functions take what does not change within a run as their second argument.
 
-    `begin`: the state at free parameters. `advance`: the state one step later, and whether it has converged.
+    `begin`: the state at free parameters. `advance`: the state one step later.
     """
 
     begin: Callable[[PyTree, PyTree], State]
-    advance: Callable[[State, PyTree], tuple[State, Array]]
+    advance: Callable[[State, PyTree], State]
 
 
 def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: StageTable, key: Key[Array, ""]) -> Stepper:
@@ -81,17 +82,17 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
     @jax.jit
     def begin(free: PyTree, given: PyTree) -> State:
         arrays = eqx.filter(init(free, (given, key)), eqx.is_array)
-        return State(free, arrays, cost(free, (given, key)), jnp.zeros((), int))
+        return State(free, arrays, cost(free, (given, key)), jnp.array(0), jnp.array(False))
 
     @jax.jit
-    def advance(state: State, given: PyTree) -> tuple[State, Array]:
+    def advance(state: State, given: PyTree) -> State:
         args = given, jax.random.fold_in(key, state.step)
         inner = eqx.combine(state.solver, static)
         with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
             new, inner, _ = solver.step(function, state.free, args, options, inner, frozenset())
         done, result = solver.terminate(function, new, args, options, inner, frozenset())
         done = (done | (result != optx.RESULTS.successful)) & (stage.solver != "adam")
-        return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1), done
+        return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1, done)
 
     return Stepper(begin, advance)
 
@@ -103,16 +104,16 @@ def _within_box(cost, key, tolerance) -> Stepper:
     @jax.jit
     def begin(free: PyTree, given: PyTree) -> State:
         inner = solver.init_state(free, box(free), (given, key))
-        return State(free, inner, cost(free, (given, key)), jnp.zeros((), int))
+        return State(free, inner, cost(free, (given, key)), jnp.array(0), jnp.array(False))
 
     @jax.jit
-    def advance(state: State, given: PyTree) -> tuple[State, Array]:
+    def advance(state: State, given: PyTree) -> State:
         args = given, jax.random.fold_in(key, state.step)
         new, inner = solver.update(state.free, state.solver, box(state.free), args)
         found = cost(new, args)
         still = lambda old, new: jnp.max(jnp.abs(new - old) / (1 + jnp.abs(old))) < tolerance
         same = jax.tree.leaves(jax.tree.map(still, (state.free, state.cost), (new, found)))
-        return State(new, inner, found, state.step + 1), jnp.all(jnp.stack(same))
+        return State(new, inner, found, state.step + 1, jnp.all(jnp.stack(same)))
 
     return Stepper(begin, advance)
 
@@ -139,17 +140,16 @@ def run(
     each
         Called after every step.
     """
-    done = False
     while True:
         if not all(np.isfinite(x).all() for x in jax.tree.leaves((state.cost, state.free))):
             return state, NOT_FINITE
         if float(state.cost) < enough:
             return state, MET
-        if done:
+        if state.converged:
             return state, CONVERGED
         if int(state.step) >= limit:
             return state, LIMIT.format(limit)
-        state, done = steps.advance(state, given)
+        state = steps.advance(state, given)
         each(state)
 
 

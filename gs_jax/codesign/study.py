@@ -19,6 +19,7 @@ solver = "levenberg-marquardt"
 import math
 import os
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -94,7 +95,10 @@ class StageTable(_Table):
 
 
 class LimitTable(_Table):
-    """`[[pareto]]`: a term whose limit is moved from value to value; each as a target in place of the term's own."""
+    """`[[pareto]]`: a term whose limit is moved from value to value, each with a weight of 30.
+
+    It takes the place of the term of that name and kind, if there is one.
+    """
 
     name: str = Field(description="the name of a term")
     at_most: tuple[Positive, ...] | None = Field(default=None, strict=False, description="positive numbers")
@@ -146,6 +150,12 @@ class Study(_Table):
         return self
 
 
+def labels(terms: Sequence[TermTable], study: Study) -> list[str]:
+    """Names of terms in records: with the kind where the study has a name twice."""
+    names = [term.name for term in study.terms]
+    return [term.name if names.count(term.name) == 1 else f"{term.name} {term.kind}" for term in terms]
+
+
 def read_study(path: str | os.PathLike[str]) -> Study:
     """The study in a TOML file.
 
@@ -181,10 +191,10 @@ def _in_a_list(error: ValidationError) -> str | None:
     """The first problem in one line if it is in one of several tables of a name: `one_line` sees single tables."""
     problem = error.errors(include_url=False)[0]
     name, number, *keys = problem["loc"] if len(problem["loc"]) > 1 else ("", "")
-    if not isinstance(number, int):
+    table = {"terms": TermTable, "stages": StageTable, "pareto": LimitTable}.get(str(name))
+    if table is None or not isinstance(number, int):
         return None
     where = f"`{name}` {number + 1}"
-    table = {"terms": TermTable, "stages": StageTable, "pareto": LimitTable}[str(name)]
     if not keys:
         return f"{where}: {problem['msg'].removeprefix('Value error, ')}"
     field = table.model_fields.get(str(keys[0]))

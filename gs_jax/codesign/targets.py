@@ -97,7 +97,7 @@ def _entries(name, candidate, key):
 
 
 def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:
-    """What a term says of a design. An equality holds to the study's usual margin, 0.1 %."""
+    """What a term says of a design. An equality holds within 0.1 %."""
     low, high = float(np.min(entries)), float(np.max(entries))
     target = table.target
     off = max(abs(low - target), abs(high - target)) / target

@@ -90,13 +90,15 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     InputError
-        If it cannot be made, or is no folder.
+        If it cannot be made, is no folder, or cannot be written to.
     """
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be made a folder: {_reason(error)}.") from error
+        raise InputError(f"{path}: cannot be made a folder to write to: {_reason(error)}.") from error
     return path
 
 

@@ -104,15 +104,16 @@ def make_part(
         mesh = printable(solid)
         findings += check_solid(mesh, expected, order.part, volume_tolerance(array, order.chord))
         _stop_at_fault(findings)
-    with progress.step("Writing and measuring"):
-        write_mesh(path, mesh, f"{design.name} {order.part}")
-        found = verify(read_mesh(path), array, scale=order.shape.scale)
     imaging = design.imaging
-    measured = quality(
-        found, array, wavelength=imaging.wavelength_nm * 1e-6, sensor_distance=imaging.sensor_distance_mm
-    )
-    findings += judge(measured, chord=order.chord, radius=design.lens.radius_of_curvature_mm)
-    _stop_at_fault(findings)
+    # A part that is not the design does not get its name.
+    with progress.step("Writing and measuring"), atomic_write(path) as temporary:
+        write_mesh(temporary, mesh, f"{design.name} {order.part}")
+        found = verify(read_mesh(temporary), array, scale=order.shape.scale)
+        measured = quality(
+            found, array, wavelength=imaging.wavelength_nm * 1e-6, sensor_distance=imaging.sensor_distance_mm
+        )
+        findings += judge(measured, chord=order.chord, radius=design.lens.radius_of_curvature_mm)
+        _stop_at_fault(findings)
     report = _report(design, order, path, mesh, expected, findings, measured, found)
     with progress.step("Drawing"), atomic_write(beside[".png"]) as temporary:
         figure = preview(array, None if order.positive else order.shape, design.name)
