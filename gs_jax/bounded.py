@@ -1,4 +1,4 @@
-"""Minimisation within bounds, and proximal gradient, by `jaxopt`: for objectives that are no least squares.
+"""Minimisation within bounds, and proximal gradient, by `jaxopt`.
 
 The only module that imports `jaxopt`, which is no longer maintained.
 """

@@ -16,7 +16,6 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..bounded import lbfgsb
 from .study import StageTable
 
 # A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
@@ -98,6 +97,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
 
 
 def _within_box(cost, key, tolerance) -> Stepper:
+    from ..bounded import lbfgsb  # here, so that the other solvers do without a package that is no longer maintained
+
     solver = lbfgsb(cost)
     box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))
 
