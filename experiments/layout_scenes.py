@@ -46,6 +46,7 @@ class Study(NamedTuple):
     depths: tuple[float, ...] = (12.0, 14.0, 16.5)
     density: float = 0.008
     candidates: int = 200
+    jitter: float = 0.05
     scored_on: int = 10
     steps: int = 12_000
     rate: float = 0.03

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments.layout_gain import NAMES, PAIRS, apart, gain, gains, hexagonal, picture, run, spread
+from experiments.layout_gain import NAMES, PAIRS, apart, gain, gains, hexagonal, picture, rows, run, spread
 from experiments.layout_scenes import METHODS, Study
 from gs_jax.coverage import nearest_neighbour_distances
 from gs_jax.progress import Progress
@@ -19,6 +19,9 @@ def test_the_controls_are_fair(seed):
     wider = nearest_neighbour_distances(spread(ROOMY, seed, 23)).min()
     # As wide as the plate allows: 23 lenses on 25 mm^2 have a pitch of 1.12 mm, and the plate's edge may waste some.
     assert 1.04 < wider < 1.2
+    uneven = rows(ROOMY._replace(distance=0.8, candidates=3), seed, 23)
+    assert uneven.shape == (3, 23, 2) and np.abs(uneven).max() <= 2.5
+    assert min(nearest_neighbour_distances(centers).min() for centers in uneven) >= 0.8
 
 
 def test_more_lenses_than_there_is_room_for():
@@ -49,13 +52,14 @@ def test_the_picture_and_the_gains():
         "seed": seed,
         "random_loss_db": [-8.0, -9.0],
         "ours_loss_db": -9.1,
+        "rows_loss_db": [-8.9, -9.0],
         "hexagonal_loss_db": [-8.5, -8.6],
         "scores": scores(),
         "centers_mm": {name: [[0.0, 1.0]] for name in NAMES},
     }
-    rows = [row(0), row(1)]
-    assert len(gains(rows)) == len(PAIRS) * len(METHODS)
-    assert len(picture({"study": Study()._asdict(), "seeds": rows}).axes) == 5
+    records = [row(0), row(1)]
+    assert len(gains(records)) == len(PAIRS) * len(METHODS)
+    assert len(picture({"study": Study()._asdict(), "seeds": records}).axes) == 1 + len(NAMES)
 
 
 @pytest.mark.slow
