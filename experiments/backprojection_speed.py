@@ -32,11 +32,11 @@ from rich.table import Table
 
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax.base.info import describe
+from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import peak_mib, status_mib, timed
-from gs_jax.info import describe
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.layouts import random_layout
-from gs_jax.progress import Progress
+from gs_jax.layouts.patterns import random_layout
 
 PAPER_S = 18.0
 FIELD_MM = 5120 * 0.0045

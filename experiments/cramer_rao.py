@@ -26,12 +26,12 @@ from rich.console import Console
 from rich.table import Table
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.camera import poisson
+from gs_jax.base.progress import Progress
 from gs_jax.codesign.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
-from gs_jax.coverage import nearest_neighbour_distances
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.layouts import poisson_disc_layout
-from gs_jax.progress import Progress
+from gs_jax.layouts.cells import nearest_neighbour_distances
+from gs_jax.layouts.patterns import poisson_disc_layout
+from gs_jax.simulation.camera import poisson
 
 PLATE, DISTANCE, DEPTH = (5.0, 5.0), 1.0, 20.0
 SIZE = 15

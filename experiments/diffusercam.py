@@ -26,10 +26,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from gs_jax.base.info import describe
+from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
-from gs_jax.info import describe
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.progress import Progress
 from gs_jax.solvers.admm import admm_convolution
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import fista

@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.profiles import around_the_axis, dip, fwhm, through_peak
-from gs_jax.builtin import geomscope
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
-from gs_jax.progress import Progress
-from gs_jax.simulate import simulate_points
+from gs_jax.simulation.scene import simulate_points
 
 SCENES = {
     "a": [[0.0, 0.0, 20.0, 1.0]],

@@ -24,14 +24,14 @@ from skimage.feature import peak_local_max
 
 from experiments.point_density import scene
 from gs_jax import Grid
-from gs_jax.builtin import geomscope
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
-from gs_jax.phantoms import rasterize
-from gs_jax.progress import Progress
-from gs_jax.reconstruct import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.simulation.phantoms import rasterize
 from gs_jax.suppression.clustering import cluster
 from gs_jax.suppression.locate import find_points
 

@@ -20,12 +20,12 @@ from rich.table import Table
 
 from experiments.profiles import around_the_axis, fwhm, through_peak
 from gs_jax import Imager
-from gs_jax.builtin import geomscope
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
-from gs_jax.progress import Progress
-from gs_jax.simulate import simulate_points
+from gs_jax.simulation.scene import simulate_points
 
 CAPTURES = {18.0: "P1_i_18_c.tif", 20.0: "P1_a.tif", 22.0: "P1_i_22_c.tif"}
 DEPTHS = tuple(np.arange(17, 25.01, 0.5).tolist())

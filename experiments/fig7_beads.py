@@ -22,14 +22,14 @@ from skimage.measure import block_reduce
 
 from experiments.point_density import scores
 from gs_jax import Grid
-from gs_jax.builtin import geomscope
-from gs_jax.camera import Camera, expose
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
-from gs_jax.phantoms import beads
-from gs_jax.progress import Progress
-from gs_jax.simulate import simulate_points
+from gs_jax.simulation.camera import Camera, expose
+from gs_jax.simulation.phantoms import beads
+from gs_jax.simulation.scene import simulate_points
 from gs_jax.suppression.locate import find_points
 
 # mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.

@@ -26,16 +26,16 @@ from rich.table import Table
 from scipy.ndimage import gaussian_filter
 
 from gs_jax import Grid, Imager
-from gs_jax.builtin import geomscope
-from gs_jax.camera import Camera, electrons, expose
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
 from gs_jax.metrics import quality
-from gs_jax.phantoms import letters, rasterize, snowflake
-from gs_jax.progress import Progress
-from gs_jax.reconstruct import reconstruct_stack
-from gs_jax.simulate import simulate_points
+from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.simulation.camera import Camera, electrons, expose
+from gs_jax.simulation.phantoms import letters, rasterize, snowflake
+from gs_jax.simulation.scene import simulate_points
 from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress
 

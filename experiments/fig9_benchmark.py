@@ -33,19 +33,19 @@ from scipy.ndimage import gaussian_filter
 from skimage.feature import peak_local_max
 
 from gs_jax import Grid, Imager, Sensor
+from gs_jax.base.progress import Progress
 from gs_jax.benchmark.compare import paper_clusters
 from gs_jax.benchmark.measure import timed
 from gs_jax.benchmark.report import table
 from gs_jax.benchmark.scenes import FWHM, spots
-from gs_jax.designs import read_design
+from gs_jax.designs.design import read_design
 from gs_jax.io.disk import make_folder, write_json, write_text
 from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
-from gs_jax.phantoms import rasterize
-from gs_jax.progress import Progress
-from gs_jax.solvers.methods import reconstruct
+from gs_jax.reconstruction.methods import reconstruct
+from gs_jax.simulation.phantoms import rasterize
 from gs_jax.suppression.consistency import local_levels
 from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress

@@ -24,11 +24,11 @@ from scipy.spatial import KDTree
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from gs_jax import Imager, forward
-from gs_jax.builtin import geomscope
+from gs_jax.base.info import describe
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
 from gs_jax.geometry import envelope
-from gs_jax.info import describe
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.progress import Progress
 
 STUDY = {
     "depths": [Job(depths=n) for n in (1, 4, 13, 40)],

@@ -20,10 +20,10 @@ from rich.console import Console
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.forward_model import PSF_PIXELS
 from gs_jax import backproject, forward
+from gs_jax.base.info import describe
+from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import misfit_db
-from gs_jax.info import describe
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.progress import Progress
 
 
 def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:

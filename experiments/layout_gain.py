@@ -31,12 +31,12 @@ from rich.table import Table
 from scipy import stats
 
 from experiments.layout_scenes import METHODS, Centers, Study, judge, loss, overlap, psf_of
-from gs_jax.coverage import nearest_neighbour_distances
+from gs_jax.base.progress import Progress
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
+from gs_jax.layouts.cells import nearest_neighbour_distances
+from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout
 from gs_jax.optics.psf import gaussian_psf, psf
 from gs_jax.optics.theory import occupancy
-from gs_jax.progress import Progress
 
 NAMES = ("best", "ours", "rows", "hexagonal", "spread")
 PAIRS = (*((name, "best") for name in NAMES[1:]), *(("ours", name) for name in NAMES[2:]))

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
-from gs_jax.camera import Camera, electrons, expose
+from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
-from gs_jax.progress import Progress
+from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.solvers.richardson_lucy import list_richardson_lucy
 
 WAVELENGTH = 520e-6

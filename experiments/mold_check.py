@@ -18,16 +18,16 @@ from rich.console import Console
 from rich.table import Table
 
 from gs_jax import MicrolensArray
-from gs_jax.builtin import geomscope
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.mold.caps import facet_surface
 from gs_jax.mold.checks import array_volume, mold_volume
+from gs_jax.mold.measurement import quality, verify
 from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold.preview import draw_solid
+from gs_jax.mold.pictures import draw_solid
 from gs_jax.mold.solids import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
-from gs_jax.mold.verify import quality, verify
-from gs_jax.progress import Progress
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
 CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)

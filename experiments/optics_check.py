@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from gs_jax import Imager, MicrolensArray, Sensor, envelope
-from gs_jax.designs import read_design
+from gs_jax.designs.design import read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
 from gs_jax.optics.aberrations import independent_rms, seidel

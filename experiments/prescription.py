@@ -21,12 +21,12 @@ from rich.table import Table
 
 from experiments.profiles import fwhm
 from gs_jax import Grid, Imager, Sensor, backproject
-from gs_jax.designs import Design, read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import atomic_write, make_folder, write_json
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import psf
-from gs_jax.progress import Progress
-from gs_jax.simulate import simulate_points
+from gs_jax.simulation.scene import simulate_points
 
 FOLDER = Path(__file__).parents[1] / "design"
 DESIGNS = ("geomscope", "geomscope-optimized")

@@ -22,11 +22,11 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
 
 from gs_jax import Grid, Imager
-from gs_jax.designs import read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.design import read_design
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.io.files import read_capture
-from gs_jax.progress import Progress
-from gs_jax.reconstruct import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct_stack
 
 # A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
 LATERAL, AXIAL = 0.04, 0.3

@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import root_scalar
 
-from gs_jax.builtin import geomscope
-from gs_jax.coverage import nearest_neighbour_distances
-from gs_jax.datasheet import datasheet
-from gs_jax.designs import Design
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design
+from gs_jax.designs.sheet import datasheet
 from gs_jax.io.disk import make_folder, write_json
+from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 
 COLUMNS = ("what", "paper", "printed: v = 4 mm", "focused: v = 5.8 mm", "why")

@@ -7,7 +7,7 @@ from jax.test_util import check_grads
 from scipy.spatial.distance import cdist
 
 from gs_jax import MicrolensArray
-from gs_jax.coverage import coverage, nearest_neighbour_distances
+from gs_jax.layouts.cells import coverage, nearest_neighbour_distances
 from gs_jax.optics.aperture import aperture_area, aperture_edge, clear_diameter, pitch
 
 gradient_of_diameter = jax.jit(jax.grad(clear_diameter))

@@ -10,8 +10,8 @@ import pytest
 from experiments.backprojection_speed import Job, memory, run, write
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import backproject
+from gs_jax.base.progress import Progress
 from gs_jax.geometry import field_limit
-from gs_jax.progress import Progress
 
 from .helpers import scene
 

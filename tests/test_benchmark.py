@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from gs_jax.base.progress import Progress
 from gs_jax.benchmark import compare, report
 from gs_jax.benchmark.compare import METHODS, obstacle, paper_clusters, run, slopes
 from gs_jax.benchmark.scenes import Case, bench, peaks, scores, spots
-from gs_jax.progress import Progress
-from gs_jax.solvers.methods import forward_operator, reconstruct
+from gs_jax.reconstruction.methods import forward_operator, reconstruct
 
 from .helpers import scene
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, rosen
 
-from gs_jax.bounded import minimise_within, proximal_gradient
+from gs_jax.codesign.bounded import minimise_within, proximal_gradient
 
 
 def rosenbrock(x):

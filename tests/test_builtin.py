@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs_jax.builtin import geomscope
-from gs_jax.coverage import coverage, nearest_neighbour_distances
-from gs_jax.designs import read_design
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design
+from gs_jax.layouts.cells import coverage, nearest_neighbour_distances
 
 DESIGNS = Path(__file__).parents[1] / "design"
 

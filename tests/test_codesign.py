@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax.builtin import geomscope
+from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
 from gs_jax.codesign import search
 from gs_jax.codesign.checkpoint import Log, read_checkpoint
 from gs_jax.codesign.outcome import before_and_after, check_outputs, picture, write_outcome
@@ -12,9 +13,8 @@ from gs_jax.codesign.parameters import start_values
 from gs_jax.codesign.search import optimise, problem_of, random_start
 from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.study import Study
-from gs_jax.designs import read_design
-from gs_jax.errors import InputError
-from gs_jax.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design
 
 TERMS = [
     {"name": "lateral_resolution_um", "at_most": 40.0},

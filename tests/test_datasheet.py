@@ -10,10 +10,10 @@ from jax.test_util import check_grads
 from rich.console import Console
 
 from gs_jax import Imager, MicrolensArray
-from gs_jax.builtin import geomscope
-from gs_jax.datasheet import datasheet, performance, summary, tables
-from gs_jax.designs import read_design
-from gs_jax.findings import findings
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design
+from gs_jax.designs.problems import findings
+from gs_jax.designs.sheet import datasheet, performance, summary, tables
 from gs_jax.optics import theory
 from gs_jax.optics.aperture import clear_diameter, pitch
 

@@ -13,8 +13,8 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings, strategies as st
 from pydantic import ValidationError
 
-from gs_jax.designs import Design, read_design, write_design
-from gs_jax.errors import InputError
+from gs_jax.base.errors import InputError
+from gs_jax.designs.design import Design, read_design, write_design
 
 from .helpers import needs
 

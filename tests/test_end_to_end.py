@@ -17,8 +17,8 @@ from gs_jax.codesign.end_to_end import (
     reconstruct,
     reconstruction_loss,
 )
-from gs_jax.codesign.subfield import subfield
 from gs_jax.metrics import quality
+from gs_jax.projection.subfields import subfield
 
 from .helpers import scene
 

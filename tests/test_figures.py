@@ -9,8 +9,8 @@ from experiments import fig3_resolution, fig5_fwhm_depth, forward_model, table1
 from experiments.backprojection_speed import Job
 from experiments.profiles import dip, fwhm
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.designs import read_design
-from gs_jax.progress import Progress
+from gs_jax.base.progress import Progress
+from gs_jax.designs.design import read_design
 
 from .helpers import needs
 

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from PIL import Image
 
 from gs_jax import Grid
-from gs_jax.errors import InputError
+from gs_jax.base.errors import InputError
 from gs_jax.io.files import (
     atomic_write,
     check_output,

@@ -9,10 +9,10 @@ from scipy.special import erf
 
 from experiments import cramer_rao as experiment
 from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax.base.progress import Progress
 from gs_jax.codesign.fisher import cramer_rao, fisher_information, localization_bound
 from gs_jax.geometry import envelope
 from gs_jax.optics.psf import psf
-from gs_jax.progress import Progress
 
 POINT = np.array([0.05, -0.03, 20.0])
 OPTIONS: dict[str, Any] = dict(photons=800.0, spot=0.009, background=3.0, read_noise=2.0, size=15)

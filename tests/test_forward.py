@@ -8,9 +8,9 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
+from gs_jax.base.progress import Progress
 from gs_jax.geometry import envelope
-from gs_jax.progress import Progress
-from gs_jax.stamps import STEPS, forward_points, stamps
+from gs_jax.projection.points import STEPS, forward_points, stamps
 
 from .helpers import scene
 

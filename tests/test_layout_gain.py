@@ -4,8 +4,8 @@ from scipy import stats
 
 from experiments.layout_gain import NAMES, PAIRS, apart, gain, gains, hexagonal, picture, rows, run, spread
 from experiments.layout_scenes import METHODS, Study
-from gs_jax.coverage import nearest_neighbour_distances
-from gs_jax.progress import Progress
+from gs_jax.base.progress import Progress
+from gs_jax.layouts.cells import nearest_neighbour_distances
 
 ROOMY = Study(plate=(5.0, 5.0), distance=1.0)
 

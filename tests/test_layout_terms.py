@@ -5,8 +5,8 @@ import pytest
 
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
-from gs_jax.designs import ArrayTable, Design, ImagingTable, LensTable, SensorTable
-from gs_jax.layouts import hexagonal_layout
+from gs_jax.designs.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable
+from gs_jax.layouts.patterns import hexagonal_layout
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um", "reconstruction_error")]

@@ -12,13 +12,13 @@ from scipy.spatial import KDTree
 
 from experiments import point_density
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
-from gs_jax.builtin import geomscope
-from gs_jax.camera import Camera, expose
-from gs_jax.designs import read_design
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design
 from gs_jax.metrics import localization
-from gs_jax.phantoms import random_points
-from gs_jax.progress import Progress
-from gs_jax.simulate import simulate_points
+from gs_jax.simulation.camera import Camera, expose
+from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation.scene import simulate_points
 from gs_jax.suppression.clustering import cluster
 from gs_jax.suppression.locate import find_points
 

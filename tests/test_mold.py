@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from gs_jax import MicrolensArray
-from gs_jax.designs import read_design
-from gs_jax.errors import InputError
+from gs_jax.base.errors import InputError
+from gs_jax.designs.design import read_design
 from gs_jax.mold.caps import cap_height, cap_sag, facet_surface
 from gs_jax.mold.checks import array_volume, caps_volume, check_solid, mold_volume, volume_tolerance
+from gs_jax.mold.measurement import verify
 from gs_jax.mold.mesh_files import printable
 from gs_jax.mold.solids import (
     ENGRAVED,
@@ -25,7 +26,6 @@ from gs_jax.mold.solids import (
     mold_solid,
     plate_thickness,
 )
-from gs_jax.mold.verify import verify
 from gs_jax.optics.aperture import aperture_edge
 
 from .helpers import needs

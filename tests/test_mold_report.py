@@ -10,13 +10,13 @@ import trimesh
 from click.testing import CliRunner
 
 from experiments import mold_check
+from gs_jax.base.errors import InputError
 from gs_jax.cli.mold import mold
-from gs_jax.coverage import coverage
-from gs_jax.designs import Design, read_design
-from gs_jax.errors import InputError
-from gs_jax.mold import report as report_module
+from gs_jax.designs.design import Design, read_design
+from gs_jax.layouts.cells import coverage
+from gs_jax.mold import make
 from gs_jax.mold.checks import Finding, array_volume, check_design, refuse_errors
-from gs_jax.mold.report import Order, make_part
+from gs_jax.mold.make import Order, make_part
 from gs_jax.mold.solids import MoldShape, plate_thickness
 
 DESIGN = """
@@ -101,7 +101,7 @@ def test_mold(folder, positive):
 
 def test_a_part_that_is_not_the_design_is_not_written(folder, monkeypatch):
     wrong = lambda *_, **__: [Finding("lenses", "error", "read back, lenses are elsewhere.")]
-    monkeypatch.setattr(report_module, "judge", wrong)
+    monkeypatch.setattr(make, "judge", wrong)
     with pytest.raises(RuntimeError, match="lenses are elsewhere"):
         make_part(read_design("design.toml"), "part.stl", Order(chord=2e-3))
     assert [path.name for path in folder.iterdir()] == ["design.toml"]

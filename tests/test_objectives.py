@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.builtin import geomscope
 from gs_jax.codesign.objectives import TERMS, encircled_radius, psf_width
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
-from gs_jax.coverage import largest_hole, nearest_neighbour_distances
-from gs_jax.datasheet import datasheet
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.sheet import datasheet
+from gs_jax.layouts.cells import largest_hole, nearest_neighbour_distances
 from gs_jax.optics.psf import psf
 
 # Off the raster of places, where a hole has a kink.

@@ -5,11 +5,11 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.builtin import geomscope
+from gs_jax.base.errors import InputError
 from gs_jax.cli.optimize import optimize
 from gs_jax.cli.pareto import pareto
-from gs_jax.designs import read_design, write_design
-from gs_jax.errors import InputError
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design, write_design
 
 STUDY = """
 design = "table1.toml"

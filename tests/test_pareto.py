@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from gs_jax.builtin import geomscope
+from gs_jax.base.progress import Progress
 from gs_jax.codesign import pareto as module
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, sweep
 from gs_jax.codesign.study import Study
-from gs_jax.progress import Progress
+from gs_jax.designs.builtin import geomscope
 
 STUDY = {
     "depths_mm": (18.0, 23.0),

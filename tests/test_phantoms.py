@@ -10,7 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import ConvexHull, KDTree
 
 from gs_jax import Grid
-from gs_jax.phantoms import beads, letters, random_points, rasterize, snowflake, usaf_1951, usaf_bars
+from gs_jax.simulation.phantoms import beads, letters, random_points, rasterize, snowflake, usaf_1951, usaf_bars
 
 from .helpers import needs
 

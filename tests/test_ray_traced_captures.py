@@ -1,5 +1,5 @@
 from experiments.ray_traced_captures import run
-from gs_jax.progress import Progress
+from gs_jax.base.progress import Progress
 
 from .helpers import needs
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
-from gs_jax.errors import InputError
+from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
 from gs_jax.optics.unit import pupil_disc, unit_rays
-from gs_jax.progress import Progress
-from gs_jax.simulate import PSFS, psf_of_depth, simulate_points, simulate_volume
+from gs_jax.simulation.scene import PSFS, psf_of_depth, simulate_points, simulate_volume
 
 WAVELENGTH = 520e-6
 

@@ -4,10 +4,10 @@ from typing import get_args
 
 import pytest
 
+from gs_jax.base.errors import InputError
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import NAMES
 from gs_jax.codesign.study import KINDS, Solver, Study, parent_path, read_study
-from gs_jax.errors import InputError
 
 STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
 

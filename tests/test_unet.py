@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.errors import InputError
+from gs_jax.base.errors import InputError
 from gs_jax.suppression.unet import (
     PRETRAINED,
     UNet,

@@ -20,11 +20,11 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Float, Float32
 
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.info import memory_bytes
+from ..base.progress import Progress
 from ..geometry import Grid
-from ..info import memory_bytes
-from ..progress import Progress
-from ..solvers.methods import SOLVERS, forward_operator, reconstruct
+from ..reconstruction.methods import SOLVERS, forward_operator, reconstruct
 from ..suppression.clustering import cluster
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..info import describe
+from ..base.info import describe
 from ..io.disk import atomic_write, write_json, write_text
 from .compare import slopes
 

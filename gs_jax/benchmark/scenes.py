@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from skimage.feature import peak_local_max
 
-from ..builtin import geomscope
-from ..camera import Camera, electrons, expose
+from ..base.progress import Progress
+from ..designs.builtin import geomscope
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..metrics import localization, quality
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
-from ..progress import Progress
-from ..simulate import simulate_points
+from ..simulation.camera import Camera, electrons, expose
+from ..simulation.scene import simulate_points
 
 WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
 # A full width at half maximum, in standard deviations.

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import click
 
+from ..base.progress import Progress
 from ..benchmark.compare import run
 from ..benchmark.report import write
 from ..io.disk import make_folder
-from ..progress import Progress
 
 
 @click.command()

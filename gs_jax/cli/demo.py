@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from ..demo import run
-from ..progress import Progress
+from ..base.progress import Progress
+from ..demo.story import run
 
 
 @click.command()

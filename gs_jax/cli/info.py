@@ -2,7 +2,7 @@
 
 import click
 
-from ..info import describe
+from ..base.info import describe
 
 
 @click.command()

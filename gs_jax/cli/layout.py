@@ -4,10 +4,10 @@ from pathlib import Path
 
 import click
 
-from ..coverage import coverage, nearest_neighbour_distances
-from ..designs import write_centers
+from ..designs.design import write_centers
 from ..io.disk import check_output
-from ..layouts import random_layout
+from ..layouts.cells import coverage, nearest_neighbour_distances
+from ..layouts.patterns import random_layout
 from .options import MM
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from ..datasheet import datasheet, summary, tables
-from ..designs import read_design
-from ..findings import findings
+from ..designs.design import read_design
+from ..designs.problems import findings
+from ..designs.sheet import datasheet, summary, tables
 from ..io.disk import check_output, write_json
 from .options import UM, Depths
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import click
 
-from ..designs import read_design
-from ..errors import about
-from ..mold.report import Order, make_part, words
+from ..base.errors import about
+from ..base.progress import Progress
+from ..designs.design import read_design
+from ..mold.make import Order, make_part, words
 from ..mold.solids import MoldShape
-from ..progress import Progress
 from .options import Number
 
 

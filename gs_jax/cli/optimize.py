@@ -6,13 +6,13 @@ import click
 import jax
 from rich.console import Console
 
+from ..base.errors import about
+from ..base.progress import Progress
 from ..codesign.checkpoint import checkpoint_path
 from ..codesign.outcome import before_and_after, check_outputs, write_outcome
 from ..codesign.search import optimise
 from ..codesign.study import read_study
-from ..designs import read_design
-from ..errors import about
-from ..progress import Progress
+from ..designs.design import read_design
 
 
 @click.command()

@@ -7,13 +7,13 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from ..base.errors import InputError, about
+from ..base.progress import Progress
 from ..codesign.pareto import as_json, picture, sweep
 from ..codesign.search import problem_of
 from ..codesign.study import parent_path, read_study
-from ..designs import read_design
-from ..errors import InputError, about
+from ..designs.design import read_design
 from ..io.disk import atomic_write, check_output, make_folder, write_json
-from ..progress import Progress
 
 
 @click.command()

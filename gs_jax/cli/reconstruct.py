@@ -5,15 +5,15 @@ from pathlib import Path
 import click
 import numpy as np
 
-from ..designs import read_design
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..designs.design import read_design
 from ..io.disk import check_output
 from ..io.files import read_capture, write_points
 from ..io.volumes import VOLUME_SUFFIXES, write_volume
-from ..phantoms import rasterize
-from ..progress import Progress
-from ..reconstruct import reconstruct_iteratively, reconstruct_stack, voxel_grid
-from ..solvers.methods import METHODS
+from ..reconstruction.methods import METHODS
+from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack, voxel_grid
+from ..simulation.phantoms import rasterize
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress as without_background
 from .options import UM, Depths, depth_range

@@ -6,13 +6,13 @@ import click
 import jax
 import numpy as np
 
-from ..camera import Camera, expose
-from ..designs import read_design
-from ..errors import InputError
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..designs.design import read_design
 from ..io.disk import check_output
 from ..io.files import CAPTURE_SUFFIXES, write_capture
-from ..progress import Progress
-from ..simulate import PSFS, simulate_scene
+from ..simulation.camera import Camera, expose
+from ..simulation.scene import PSFS, simulate_scene
 from .options import Number
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 import numpy as np
 
+from ..base.progress import Progress
 from ..io.disk import check_input, check_output, write_json
-from ..progress import Progress
 from ..suppression.training import (
     multislice_recipe,
     paper_recipe,

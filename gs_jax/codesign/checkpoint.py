@@ -10,8 +10,8 @@ from typing import Any
 
 import equinox as eqx
 
-from ..designs import Design
-from ..errors import InputError
+from ..base.errors import InputError
+from ..designs.design import Design
 from ..io.disk import atomic_write, check_input, decoding
 from .solve import State
 from .study import Study

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..base.safe import safe_sqrt
 from ..geometry import envelope
 from ..optics import aberrations, theory
 from ..optics.unit import pupil_disc, unit_rays
-from ..safe import safe_sqrt
 from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
 from .parameters import Candidate
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
-from ..designs import Design, write_design
+from ..designs.design import Design, write_design
 from ..io.disk import atomic_write, check_output, write_json
 from .objectives import TERMS, unit_of
 from .search import Outcome, best_end

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from pydantic import ValidationError
 
-from ..coverage import cell_edges
-from ..designs import Design
-from ..errors import InputError
+from ..base.errors import InputError
+from ..designs.design import Design
 from ..geometry import Imager, MicrolensArray, as_float
 from ..io.explain import one_line
+from ..layouts.cells import cell_edges
 from ..optics.aperture import aperture_area, pitch, wedge
 
 Values = dict[str, Float[Array, "..."]]

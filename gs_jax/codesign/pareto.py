@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from ..designs import Design
-from ..progress import Progress
+from ..base.progress import Progress
+from ..designs.design import Design
 from .objectives import unit_of
 from .parameters import NAMES, Values, start_values
 from .search import Stage, entries_of, make_stage, problem_of, random_start, targets_of

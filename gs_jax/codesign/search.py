@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..designs import Design
-from ..errors import InputError
-from ..progress import Progress
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..designs.design import Design
 from .checkpoint import Log, read_checkpoint, restored, write_checkpoint
 from .parameters import Bounds, Box, Parent, Values, candidate, new_design, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, stepper

@@ -97,7 +97,7 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
 
 
 def _within_box(cost, key, tolerance) -> Stepper:
-    from ..bounded import lbfgsb  # here, so that the other solvers do without a package that is no longer maintained
+    from .bounded import lbfgsb  # here, so that the other solvers do without a package that is no longer maintained
 
     solver = lbfgsb(cost)
     box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))

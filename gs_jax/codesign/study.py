@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ..errors import InputError, shown
+from ..base.errors import InputError, shown
 from ..io.disk import read_text
 from ..io.explain import one_line
 from .objectives import TERMS

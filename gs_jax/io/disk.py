@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ..errors import InputError, shown
+from ..base.errors import InputError, shown
 
 MAX_TEXT_BYTES = 2**26
 

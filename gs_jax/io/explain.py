@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from ..errors import shown
+from ..base.errors import shown
 
 Place = tuple[int | str, ...]
 

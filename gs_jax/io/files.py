@@ -15,7 +15,7 @@ import tifffile
 from jaxtyping import Array, Float, Float32, Float64, Shaped, UInt8, UInt16
 from PIL import Image
 
-from ..errors import InputError, shown
+from ..base.errors import InputError, shown
 from .disk import (
     atomic_write as atomic_write,
     check_input as check_input,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from ..errors import InputError
+from ..base.errors import InputError
 from .disk import decoding
 
 

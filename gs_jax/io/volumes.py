@@ -21,7 +21,7 @@ import tifffile
 import zarr
 from jaxtyping import Array, Float32, Shaped
 
-from ..errors import InputError, shown
+from ..base.errors import InputError, shown
 from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
 from .tiff import decode_page

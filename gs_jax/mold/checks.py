@@ -10,10 +10,10 @@ from typing import Literal
 import manifold3d as m3
 import numpy as np
 
-from ..coverage import cell_edges, coverage, cross, largest_hole, nearest_neighbour_distances
-from ..designs import Design
-from ..errors import InputError
+from ..base.errors import InputError
+from ..designs.design import Design
 from ..geometry import MicrolensArray
+from ..layouts.cells import cell_edges, coverage, cross, largest_hole, nearest_neighbour_distances
 from .caps import COARSEST, MAX_FACETS, cap_sag, estimated_facets
 from .mesh_files import Mesh
 from .solids import STEEPEST, MoldShape, engravings, mold_block, plate_thickness, widest_aperture

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from trimesh.exchange.stl import export_stl
 from trimesh.exchange.threemf import export_3MF
 
-from ..errors import InputError
+from ..base.errors import InputError
 from ..io.disk import atomic_write, check_input, check_output, decoding
 
 MESH_SUFFIXES = (".stl", ".3mf")

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from ..coverage import nearest_neighbour_distances
+from ..base.progress import Progress
 from ..geometry import MicrolensArray
-from ..progress import Progress
+from ..layouts.cells import nearest_neighbour_distances
 from .caps import Surface, cap_sag, facet_surface
 
 # How far a tool that cuts reaches beyond what it cuts: no two faces coincide.

@@ -26,8 +26,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..base.safe import safe_quotient, safe_sqrt
 from ..geometry import MicrolensArray
-from ..safe import safe_quotient, safe_sqrt
 from .theory import Real, Result
 
 

@@ -2,7 +2,7 @@
 
 The array's surface is the upper envelope of the lenses' spherical caps, so a lens ends where it meets its neighbours'
 caps: its clear aperture is its Voronoi cell, within the disc of `aperture_diameter` and within the plate. Seen from
-the vertex it is star-shaped, so its edge is one distance in each direction. `gs_jax.coverage` has areas and
+the vertex it is star-shaped, so its edge is one distance in each direction. `gs_jax.layouts.cells` has areas and
 distances too, on the host and without derivatives.
 """
 
@@ -14,8 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..base.safe import safe_sqrt
 from ..geometry import MicrolensArray
-from ..safe import safe_sqrt
 
 # Lenses that are handled at once.
 _LENSES = 16

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from ..base.safe import safe_sqrt
 from ..geometry import Imager, chief_ray
-from ..safe import safe_sqrt
 
 Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]]
 

@@ -19,10 +19,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..coverage import Real
-from ..safe import divide
+from ..base.safe import divide
+from ..layouts.cells import Real
 from .convolution import Convolution
-from .iterate import Callback, Solution, as_image, iterate, norm
+from .iteration import Callback, Solution, as_image, iterate, norm
 from .total_variation import differences, differences_adjoint, shrink, total_variation
 
 # The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1). Boyd's 10

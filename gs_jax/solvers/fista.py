@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..coverage import Real
-from ..safe import divide
-from .iterate import Callback, Solution, as_image, iterate, norm
+from ..base.safe import divide
+from ..layouts.cells import Real
+from .iteration import Callback, Solution, as_image, iterate, norm
 
 # Steps of the power method, and what it may fall short by: for operators without negative entries the largest
 # eigenvalue stands alone, and this many steps find it to about a percent.

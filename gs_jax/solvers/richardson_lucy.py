@@ -10,11 +10,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..coverage import Real
+from ..base.safe import divide
 from ..geometry import Grid, Imager
-from ..operators import ray_operator
-from ..safe import divide
-from .iterate import Callback, Solution, as_image, iterate, norm
+from ..layouts.cells import Real
+from ..projection.operators import ray_operator
+from .iteration import Callback, Solution, as_image, iterate, norm
 from .total_variation import differences, differences_adjoint, magnitude
 
 # The most that total variation may hold back a voxel in one step: Dey's denominator must stay positive.

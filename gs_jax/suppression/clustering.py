@@ -1,7 +1,6 @@
 """The paper's particle clustering: background suppression for sparse objects, from the volume alone. Host code.
 
-`gs_jax.suppression.locate` goes back to the capture and finds more; `gs_jax.phantoms.rasterize` makes a volume of
-points.
+`gs_jax.suppression.locate` goes back to the capture and finds more; `gs_jax.rasterize` makes a volume of points.
 """
 
 from collections.abc import Sequence
@@ -10,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 from skimage.measure import label, regionprops
 
-from ..coverage import Real
 from ..geometry import Grid
+from ..layouts.cells import Real
 
 
 def cluster(

@@ -2,7 +2,7 @@
 
 The paper's particle clustering (`gs_jax.suppression.clustering`) takes bright groups of voxels for points. Here a
 candidate is checked against the capture: a true point is seen by nearly all lenses in reach, a ghost by some. Points
-are rows `(x, y, z, intensity)`, mm; `gs_jax.phantoms.rasterize` makes a volume of them.
+are rows `(x, y, z, intensity)`, mm; `gs_jax.simulation.phantoms.rasterize` makes a volume of them.
 """
 
 import math
@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Shaped
 from scipy.spatial import KDTree
 
-from ..backprojection import backproject
+from ..base.progress import Progress
 from ..geometry import Grid, Imager
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
-from ..progress import Progress
+from ..projection.backprojection import backproject
 from .consistency import (
     REACH,
     Readings,

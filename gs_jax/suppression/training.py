@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
-from ..errors import InputError
+from ..base.errors import InputError
 from ..io.disk import atomic_write, check_input, decoding
 from .training_data import Batch, Stack, paper_batch, patches
 from .unet import UNet, multislice_network, paper_network

@@ -14,15 +14,15 @@ from jaxtyping import Array, Float, Float16, Float32
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
-from ..backprojection import backproject
-from ..camera import Camera, electrons, expose
-from ..forward import forward
+from ..base.progress import Progress
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..io.disk import atomic_write, decoding, make_folder
-from ..layouts import random_layout
+from ..layouts.patterns import random_layout
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
-from ..progress import Progress
+from ..projection.backprojection import backproject
+from ..projection.forward_model import forward
+from ..simulation.camera import Camera, electrons, expose
 from .unet import standardized
 
 # The paper's training: slices in a set, how the others blur (voxels a slice) and count (factor a slice), and the noise.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
-from ..errors import InputError, shown
+from ..base.errors import InputError, shown
 from ..io.disk import atomic_write, check_input, check_output, decoding
 
 # The networks that come with the package, and what a file of weights may hold at most.

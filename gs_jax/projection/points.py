@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import KDTree
 
-from .geometry import Imager, envelope, field_limit
-from .progress import Progress
+from ..base.progress import Progress
+from ..geometry import Imager, envelope, field_limit
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
 STEPS = 5

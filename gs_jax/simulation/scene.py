@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .designs import Design
-from .errors import InputError, about
-from .forward import forward
-from .geometry import Grid, Imager, Sensor
-from .info import memory_bytes
-from .io.files import read_points
-from .io.volumes import read_volume
-from .optics.aperture import clear_diameter
-from .optics.psf import gaussian_psf, geometric_psf, psf
-from .optics.unit import unit_rays
-from .progress import Progress
-from .stamps import STEPS, forward_points, stamps
+from ..base.errors import InputError, about
+from ..base.info import memory_bytes
+from ..base.progress import Progress
+from ..designs.design import Design
+from ..geometry import Grid, Imager, Sensor
+from ..io.files import read_points
+from ..io.volumes import read_volume
+from ..optics.aperture import clear_diameter
+from ..optics.psf import gaussian_psf, geometric_psf, psf
+from ..optics.unit import unit_rays
+from ..projection.forward_model import forward
+from ..projection.points import STEPS, forward_points, stamps
 
 PSFS = {"diffraction": psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
 # Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.

@@ -10,8 +10,8 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from .coverage import Real
-from .geometry import as_float
+from ..geometry import as_float
+from ..layouts.cells import Real
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
 EXPANDED = 16.0

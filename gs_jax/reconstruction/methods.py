@@ -10,13 +10,13 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from ..backprojection import backproject
-from ..forward import forward
 from ..geometry import Grid, Imager
-from .admm import admm
-from .fista import fista
-from .iterate import Callback, Solution, as_image
-from .richardson_lucy import list_richardson_lucy, richardson_lucy
+from ..projection.backprojection import backproject
+from ..projection.forward_model import forward
+from ..solvers.admm import admm
+from ..solvers.fista import fista
+from ..solvers.iteration import Callback, Solution, as_image
+from ..solvers.richardson_lucy import list_richardson_lucy, richardson_lucy
 
 # Weight of the sum of voxels, in parts of the least weight that would leave nothing but darkness.
 _SPARSITY = 0.01

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .geometry import Grid, Imager, chief_ray, field_limit
+from ..geometry import Grid, Imager, chief_ray, field_limit
 
 # Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
 # where the envelope and all its derivatives vanish.

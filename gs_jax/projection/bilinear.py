@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .geometry import envelope, field_limit
-from .linear import linear_call
+from ..geometry import envelope, field_limit
+from .primitive import linear_call
 from .rays import Axis, Rays
 
 # Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache, and the number of

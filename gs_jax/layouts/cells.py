@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import Delaunay, KDTree, Voronoi
 
-from .errors import InputError
+from ..base.errors import InputError
 
 Real = float | int
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
+from ..geometry import Grid, Imager
 from .bilinear import Shapes, image_to_volume, volume_to_image
-from .geometry import Grid, Imager
 from .rays import Rays, trace
 
 # Depths that are handled at once. More would be no faster, and patches would grow with the volume.

@@ -16,10 +16,10 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from scipy.spatial import KDTree
 
-from .errors import InputError, shown
-from .geometry import Imager, MicrolensArray, Sensor
-from .io.disk import check_output, read_table, read_text, write_text
-from .io.explain import one_line
+from ..base.errors import InputError, shown
+from ..geometry import Imager, MicrolensArray, Sensor
+from ..io.disk import check_output, read_table, read_text, write_text
+from ..io.explain import one_line
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000

@@ -9,27 +9,27 @@ import jax
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from .builtin import geomscope
-from .camera import Camera, expose
-from .codesign.outcome import as_records, write_outcome
-from .codesign.search import optimise
-from .codesign.study import read_study
-from .datasheet import datasheet
-from .demo_report import Views, points_picture, report, views_picture
-from .designs import Design, write_design
-from .findings import findings
-from .geometry import Grid
-from .io.disk import atomic_write, make_folder, write_json, write_text
-from .io.files import write_capture, write_points
-from .io.volumes import write_volume
-from .metrics import localization, quality
-from .mold.report import make_part
-from .phantoms import letters, random_points, rasterize
-from .progress import Progress
-from .reconstruct import reconstruct_iteratively, reconstruct_stack
-from .simulate import simulate_points, simulate_volume
-from .suppression.locate import find_points
-from .suppression.unet import pretrained, suppress
+from ..base.progress import Progress
+from ..codesign.outcome import as_records, write_outcome
+from ..codesign.search import optimise
+from ..codesign.study import read_study
+from ..designs.builtin import geomscope
+from ..designs.design import Design, write_design
+from ..designs.problems import findings
+from ..designs.sheet import datasheet
+from ..geometry import Grid
+from ..io.disk import atomic_write, make_folder, write_json, write_text
+from ..io.files import write_capture, write_points
+from ..io.volumes import write_volume
+from ..metrics import localization, quality
+from ..mold.make import make_part
+from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack
+from ..simulation.camera import Camera, expose
+from ..simulation.phantoms import letters, random_points, rasterize
+from ..simulation.scene import simulate_points, simulate_volume
+from ..suppression.locate import find_points
+from ..suppression.unet import pretrained, suppress
+from .report import Views, points_picture, report, views_picture
 
 # What is written at which depth (mm), and where its middle is (mm).
 WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))

@@ -17,9 +17,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from PIL import Image, ImageDraw, ImageFont
 
-from .coverage import Real, check_positive, half_size
-from .errors import InputError, shown
-from .geometry import Grid
+from ..base.errors import InputError, shown
+from ..geometry import Grid
+from ..layouts.cells import Real, check_positive, half_size
 
 Emitters = Float[np.ndarray, "emitter 4"]
 

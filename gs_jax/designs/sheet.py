@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.table import Table
 
-from .coverage import check_positive, coverage, nearest_neighbour_distances
-from .designs import Design
-from .errors import InputError, shown
-from .geometry import Imager
-from .optics import aberrations, theory
+from ..base.errors import InputError, shown
+from ..geometry import Imager
+from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
+from ..optics import aberrations, theory
+from .design import Design
 
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax
 import lineax as lx
 
+from ..geometry import Grid, Imager
 from .backprojection import backproject_adjoint
-from .geometry import Grid, Imager
 
 
 def ray_operator(imager: Imager, grid: Grid, *, method: str = "linear") -> lx.AbstractLinearOperator:

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float32, Shaped
 
-from .backprojection import backproject
-from .errors import InputError
-from .geometry import Grid, Imager
-from .info import memory_bytes
-from .progress import Progress
-from .simulate import psf_of_depth
-from .solvers.methods import reconstruct
+from ..base.errors import InputError
+from ..base.info import memory_bytes
+from ..base.progress import Progress
+from ..geometry import Grid, Imager
+from ..projection.backprojection import backproject
+from ..simulation.scene import psf_of_depth
+from .methods import reconstruct
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16

@@ -1,7 +1,7 @@
 """The built-in designs, as the paper describes them."""
 
-from .designs import ArrayTable, Design, ImagingTable, LensTable, SensorTable
-from .layouts import random_layout
+from ..layouts.patterns import random_layout
+from .design import ArrayTable, Design, ImagingTable, LensTable, SensorTable
 
 
 def geomscope(*, sensor_distance_mm: float = 5.8) -> Design:

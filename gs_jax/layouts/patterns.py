@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from .coverage import (
+from ..base.errors import InputError
+from .cells import (
     Real,
     cell_edges,
     check_positive,
@@ -23,7 +24,6 @@ from .coverage import (
     largest_hole,
     nearest_neighbour_distances,
 )
-from .errors import InputError
 
 # The authors' array: 213 centres on 20 x 20 mm, pitch 1.23 mm, and SD 0.09 mm in the paper.
 PITCH_BY_SPACING = 1.23 / math.sqrt(20 * 20 / 213)

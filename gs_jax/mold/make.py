@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..designs import Design
+from ..base.progress import Progress
+from ..designs.design import Design
 from ..io.disk import atomic_write, check_output, write_json, write_text
-from ..progress import Progress
 from .caps import facet_surface
 from .checks import (
     Finding,
@@ -22,10 +22,10 @@ from .checks import (
     refuse_errors,
     volume_tolerance,
 )
+from .measurement import Verification, quality, verify
 from .mesh_files import MESH_SUFFIXES, Mesh, printable, read_mesh, write_mesh
-from .preview import preview
+from .pictures import preview
 from .solids import MoldShape, mold_solid, plate_thickness, solid_of
-from .verify import Verification, quality, verify
 
 # What a part must keep of its design: far below what a calibration of the assembled microscope corrects.
 CENTER_TOLERANCE = 1e-3

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from .coverage import nearest_neighbour_distances
-from .designs import Design
-from .metrics import Localization, Quality
+from ..designs.design import Design
+from ..layouts.cells import nearest_neighbour_distances
+from ..metrics import Localization, Quality
 
 
 class Views(NamedTuple):

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from .datasheet import confusion_of
-from .designs import Design
-from .optics import aberrations, theory
+from ..optics import aberrations, theory
+from .design import Design
+from .sheet import confusion_of
 
 # Eq. 9 holds below this RMS wavefront error, in waves.
 _STREHL_DOMAIN = 0.1

@@ -10,8 +10,8 @@ from jax import lax
 from jaxtyping import Array, Float, Num
 from scipy.fft import next_fast_len
 
+from ..geometry import Grid, Imager, Sensor
 from .backprojection import as_volume, backproject_adjoint
-from .geometry import Grid, Imager, Sensor
 
 
 @jax.jit

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 
-from ..safe import safe_sqrt
+from ..base.safe import safe_sqrt
 
 # Called on the host after each step, with its number (from 1) and its cost.
 Callback = Callable[[Any, Any], None]

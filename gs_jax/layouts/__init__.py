@@ -1,0 +1,1 @@
+"""Where the lenses go, and how they cover the plate."""

@@ -1,0 +1,1 @@
+"""Scenes, their images, and what a camera makes of them."""
