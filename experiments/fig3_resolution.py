@@ -36,8 +36,8 @@ BARS = {"lateral_fwhm_um": 40, "axial_fwhm_um": 300, "lateral_dip": 0.85, "axial
 
 def run(design: Design, data: Path | None, *, progress: Progress) -> dict:
     """Profiles of each scene, and the four figures, for every source of images."""
-    imager, wavelength = design.imager(), design.imaging.wavelength_nm * 1e-6
-    images = {"gs_jax": lambda name: _simulated(SCENES[name], imager, wavelength, progress)}
+    imager = design.imager()
+    images = {"gs_jax": lambda name: _simulated(SCENES[name], imager, progress)}
     if data is not None:
         images["ray-traced"] = lambda name: _captured(data / f"P1_{name}.tif", imager)
     found = {}
@@ -52,8 +52,8 @@ def run(design: Design, data: Path | None, *, progress: Progress) -> dict:
     return found
 
 
-def _simulated(points, imager, wavelength, progress):
-    return simulate_points(np.array(points), imager, wavelength=wavelength, progress=progress)
+def _simulated(points, imager, progress):
+    return simulate_points(np.array(points), imager, progress=progress)
 
 
 def _captured(path, imager):

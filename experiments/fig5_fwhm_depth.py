@@ -33,8 +33,8 @@ DEPTHS = tuple(np.arange(17, 25.01, 0.5).tolist())
 
 def run(design: Design, data: Path | None, *, depths: Sequence[float] = DEPTHS, progress: Progress) -> dict:
     """Widths (um) against depth, and the depths over which they stay within the paper's 40 and 300 um."""
-    imager, wavelength = design.imager(), design.imaging.wavelength_nm * 1e-6
-    images = {z: _simulated(z, imager, wavelength, progress) for z in progress.track(depths, "Depths")}
+    imager = design.imager()
+    images = {z: _simulated(z, imager, progress) for z in progress.track(depths, "Depths")}
     found = {"gs_jax": [_widths(image, imager, z) for z, image in images.items()]}
     if data is not None:
         read = lambda name: read_capture(data / name, imager.sensor.shape).astype(np.float32) - 16
@@ -42,8 +42,8 @@ def run(design: Design, data: Path | None, *, depths: Sequence[float] = DEPTHS, 
     return found
 
 
-def _simulated(depth, imager, wavelength, progress):
-    return simulate_points(np.array([[0, 0, depth, 1.0]]), imager, wavelength=wavelength, progress=progress)
+def _simulated(depth, imager, progress):
+    return simulate_points(np.array([[0, 0, depth, 1.0]]), imager, progress=progress)
 
 
 def _widths(image: np.ndarray, imager: Imager, depth: float) -> dict[str, float]:

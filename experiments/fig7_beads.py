@@ -58,8 +58,7 @@ def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, 
     emitters = beads(count, SIZE, SLAB, pitch=APART)
     each = emitters.reshape(count, -1, 4)
     each[..., 3] *= np.random.default_rng(0).uniform(0.3, 1.7, (count, 1)) / each[0, :, 3].sum()
-    wavelength = design.imaging.wavelength_nm * 1e-6
-    image = simulate_points(emitters, design.imager(), wavelength=wavelength, progress=progress)
+    image = simulate_points(emitters, design.imager(), progress=progress)
     capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
     return np.column_stack([each[..., :3].mean(1), each[..., 3].sum(1)]), capture
 

@@ -64,7 +64,7 @@ def run(design: Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progre
     grid = Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
     captures = {name: (*each, grid) for name, each in _simulations(design, progress).items()}
     if data:
-        calibrated = Grid(_apparent(np.array(DEPTHS), data, imager, progress), grid.shape, grid.pitch)
+        calibrated = grid.at(_apparent(np.array(DEPTHS), data, imager, progress))
         for name, scene, emitters in (("letters", "h", traced_letters), ("USAF target", "f", traced_bars)):
             image = read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
             captures[f"{name}, ray-traced"] = image, emitters(data), grid
@@ -116,8 +116,7 @@ def _simulations(design: Design, progress: Progress) -> dict[str, tuple[np.ndarr
 
 
 def _simulated(emitters: np.ndarray, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
-    wavelength = design.imaging.wavelength_nm * 1e-6
-    light = simulate_points(emitters, design.imager(), wavelength=wavelength, progress=progress)
+    light = simulate_points(emitters, design.imager(), progress=progress)
     counts = expose(np.maximum(light, 0), Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
     return np.asarray(counts), emitters
 

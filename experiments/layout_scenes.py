@@ -21,7 +21,6 @@ from gs_jax.metrics import quality
 from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.solvers.richardson_lucy import list_richardson_lucy
 
-WAVELENGTH = 520e-6
 # Standard deviation of a blob and of the local background, mm.
 WIDTH, BACKGROUND = 0.06, 0.2
 ELECTRONS, READ_NOISE = 1000.0, 2.0
@@ -73,7 +72,7 @@ class Study(NamedTuple):
 def psf_of(make: Callable[..., Array], study: Study, grid: Grid) -> Float[Array, "depth row column"]:
     """One PSF a depth; it does not depend on the layout."""
     imager = study.imager(np.zeros((1, 2)))
-    return jnp.stack([make(imager, depth, wavelength=WAVELENGTH, size=33) for depth in grid.depths])
+    return jnp.stack([make(imager, depth, size=33) for depth in grid.depths])
 
 
 @partial(jax.jit, static_argnames="study")
@@ -141,7 +140,7 @@ def judge(
 @partial(jax.jit, static_argnames="study")
 def _lit(centers, study):
     grid = study.grid()
-    middle = Grid([study.middle], grid.shape, grid.pitch)
+    middle = grid.at(study.middle)
     one = lambda center: forward(jnp.ones((1, *grid.shape)), study.imager(center[None]), middle) > 0.05
     return jax.lax.map(lambda center: one(center).astype(int), centers).sum(0)
 

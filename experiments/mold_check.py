@@ -52,13 +52,7 @@ def measure(design: Design, chord_um: float) -> dict:
     block = float(np.prod(np.diff(mold_block(array, shape), axis=0)))
     engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
     cast = cast_solid(array, part, shape).volume()
-    imaging = design.imaging
-    numbers = quality(
-        verify(meshes[1], array),
-        array,
-        wavelength=imaging.wavelength_nm * 1e-6,
-        sensor_distance=imaging.sensor_distance_mm,
-    )
+    numbers = quality(verify(meshes[1], array), design.imager())
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),

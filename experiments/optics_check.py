@@ -95,7 +95,7 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
         "wavefront_rms_waves": float(wavefront_rms(imager, depth, field=off, radius=radius)) / WAVELENGTH,
         "wavefront_rms_optiland_waves": _rms(error, points, weights) / WAVELENGTH,
         "wavefront_rms_third_order_waves": _third_order(imager, depth, field, radius) / WAVELENGTH,
-        "strehl": float(strehl(imager, depth, wavelength=WAVELENGTH, field=off, radius=radius)),
+        "strehl": float(strehl(imager, depth, field=off, radius=radius)),
         "strehl_optiland": _strehl(imager, (theirs, slopes, path), points, weights),
     }
 
@@ -183,7 +183,7 @@ def _model(imager, depth, field, offset, edges, half: int) -> dict:
     # Lenses reach to 1 mm: 4 samples would fold the edge of their halo back into the window.
     return {
         "rays": geometric_psf(imager, depth, **arguments),
-        "diffraction": psf(imager, depth, wavelength=WAVELENGTH, samples=6, **arguments),
+        "diffraction": psf(imager, depth, samples=6, **arguments),
     }
 
 
@@ -246,7 +246,7 @@ def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0))
     for radius in radii:
         focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=radius))
         waves = float(wavefront_rms(focused, 20.0, radius=radius)) / WAVELENGTH
-        peak = float(strehl(focused, 20.0, wavelength=WAVELENGTH, radius=radius))
+        peak = float(strehl(focused, 20.0, radius=radius))
         equation = float(np.exp(-((2 * np.pi * waves) ** 2)))
         rows.append({"pupil_radius_mm": radius, "wavefront_rms_waves": waves, "strehl": peak, "equation_9": equation})
     return rows

@@ -55,8 +55,7 @@ def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np
     """Points and a capture of them."""
     truth = random_points(count, SIZE, DEPTHS, seed=seed)
     truth[:, 3] = np.random.default_rng(seed).uniform(0.5, 1.5, count)
-    wavelength = design.imaging.wavelength_nm * 1e-6
-    image = simulate_points(truth, design.imager(), wavelength=wavelength, progress=progress)
+    image = simulate_points(truth, design.imager(), progress=progress)
     return truth, np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=10_000))
 
 

@@ -55,8 +55,7 @@ def _cropped(imager: Imager) -> Imager:
 
 
 def _at(design: Design, imager: Imager, depth: float, progress: Progress) -> dict[str, float]:
-    wavelength = design.imaging.wavelength_nm * 1e-6
-    image = simulate_points(np.array([[0, 0, depth, 1.0]]), imager, wavelength=wavelength, progress=progress)
+    image = simulate_points(np.array([[0, 0, depth, 1.0]]), imager, progress=progress)
     side = 2 * round(HALF / VOXEL) + 1
     grid = Grid([depth], (side, side), VOXEL)
     spot = np.asarray(backproject(image, imager, grid), np.float64)[0]
@@ -69,14 +68,14 @@ def _at(design: Design, imager: Imager, depth: float, progress: Progress) -> dic
         "most_of_light_um": 1000 * encircled(spot, VOXEL, 0.8),
         "contrast_of_40_um_lines": contrast(spot, axis),
     }
-    return found | {f"most_of_light_field_{h:g}_mm_um": _unit(imager, depth, h, wavelength) for h in FIELDS}
+    return found | {f"most_of_light_field_{h:g}_mm_um": _unit(imager, depth, h) for h in FIELDS}
 
 
-def _unit(imager: Imager, depth: float, height: float, wavelength: float) -> float:
+def _unit(imager: Imager, depth: float, height: float) -> float:
     """Radius of 80 % of one lens's light, seen in the object, um."""
     radius = clear_diameter(imager.array) / 2
-    sharp = float(2 * radius * imager.sensor.pixel_pitch / (wavelength * imager.sensor_distance))
-    options: dict[str, Any] = dict(wavelength=wavelength, size=WINDOW, field=(height, 0.0), radius=radius)
+    sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
+    options: dict[str, Any] = dict(size=WINDOW, field=(height, 0.0), radius=radius)
     pixels = psf(imager, depth, samples=int(np.ceil(sharp)), **options)
     pitch = imager.sensor.pixel_pitch / float(imager.magnification(depth))
     return 1000 * encircled(np.asarray(pixels, np.float64), pitch, 0.8)

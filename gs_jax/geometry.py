@@ -12,7 +12,8 @@ import operator
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float, Int
 
 
 def as_float(x) -> Array:
@@ -32,6 +33,9 @@ def _as_shape(x) -> tuple[int, int]:
 def _as_float_or_none(x) -> Array | None:
     return None if x is None else as_float(x)
 
+
+# A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
+SHORTEST, LONGEST = 1e-5, 0.1
 
 # Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a
 # gradient, narrow enough to leave the paper's N_e lenses nearly alone (it adds 5 % to the radius to visit).
@@ -101,6 +105,12 @@ class Sensor(eqx.Module):
         if not self.pixel_pitch > 0:
             raise ValueError(f"`pixel_pitch` must be positive, got {self.pixel_pitch}.")
 
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Edges of an image of this sensor for `imshow`, `(left, right, bottom, top)`, mm; row 0 is at the top."""
+        y, x = (n * self.pixel_pitch / 2 for n in self.shape)
+        return -x, x, y, -y
+
     def to_pixels(self, points: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Fractional `(row, column)` of points `(x, y)`; pixel centres have whole numbers."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
@@ -158,7 +168,7 @@ class MicrolensArray(eqx.Module):
 
 
 class Imager(eqx.Module):
-    """A microlens array in front of a sensor: the one geometry of the package.
+    """A microlens array in front of a sensor, and the light that it images: the one geometry of the package.
 
     Parameters
     ----------
@@ -169,6 +179,8 @@ class Imager(eqx.Module):
     field_radius
         `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
         of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
+    wavelength
+        Of the light, mm: 520e-6 for 520 nm.
     rotation
         Of the array about the sensor's centre, radians, from +x toward +y.
     shift
@@ -177,19 +189,23 @@ class Imager(eqx.Module):
     Raises
     ------
     ValueError
-        If `field_radius` is not positive.
+        If `field_radius` is not positive, or `wavelength` is none in mm.
     """
 
     array: MicrolensArray
     sensor: Sensor
     sensor_distance: Float[Array, ""] = eqx.field(converter=as_float)
     field_radius: float = eqx.field(static=True, converter=float)
+    wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
     rotation: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
 
     def __check_init__(self):
         if not self.field_radius > 0:
             raise ValueError(f"`field_radius` must be positive, got {self.field_radius}.")
+        if not isinstance(self.wavelength, Tracer) and not SHORTEST <= self.wavelength <= LONGEST:
+            allowed = f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)"
+            raise ValueError(f"`wavelength` must be {allowed}, got {self.wavelength:g}.")
 
     @property
     def centers(self) -> Float[Array, "lens 2"]:
@@ -221,16 +237,19 @@ class Imager(eqx.Module):
 
 
 class Grid(eqx.Module):
-    """Voxels of the object space, centred on the axis.
+    """Voxels of the object space; centred on the axis, unless it has another origin.
 
     Parameters
     ----------
     depths
-        `(depth,)`, in any order and spacing, mm.
+        `(depth,)` of the planes, mm, evenly spaced or not. Back-projection and the forward model take any order;
+        what interpolates between planes or writes them to disk says if they must ascend.
     shape
         `(rows, columns)` of each plane.
     pitch
         Lateral distance of voxel centres, mm. Like the field radius it decides shapes: a plain number.
+    origin
+        `(x, y)` of the middle of each plane, mm: of a region of interest beside the axis.
 
     Raises
     ------
@@ -241,6 +260,7 @@ class Grid(eqx.Module):
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
     pitch: float = eqx.field(static=True, converter=float)
+    origin: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
 
     def __check_init__(self):
         if self.depths.ndim != 1 or self.depths.size < 1:
@@ -262,12 +282,37 @@ class Grid(eqx.Module):
         rows, columns = max(rows, 1), max(columns, 1)
         return cls(depths, (rows, columns), pitch)
 
+    def at(self, depths) -> "Grid":
+        """The same voxels at other depths `(depth,)`, or at a single one, mm."""
+        return eqx.tree_at(lambda g: g.depths, self, jnp.atleast_1d(jnp.asarray(depths, self.depths.dtype)))
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """`(depths, rows, columns)` of a volume on this grid."""
+        return self.depths.size, *self.shape
+
     @property
     def y(self) -> Float[Array, " row"]:
         """Voxel centres along the rows' axis, mm."""
-        return (jnp.arange(self.shape[0], dtype=self.depths.dtype) - (self.shape[0] - 1) / 2) * self.pitch
+        return self.origin[1] + self._offsets(self.shape[0])
 
     @property
     def x(self) -> Float[Array, " column"]:
         """Voxel centres along the columns' axis, mm."""
-        return (jnp.arange(self.shape[1], dtype=self.depths.dtype) - (self.shape[1] - 1) / 2) * self.pitch
+        return self.origin[0] + self._offsets(self.shape[1])
+
+    def _offsets(self, count):
+        return (jnp.arange(count, dtype=self.depths.dtype) - (count - 1) / 2) * self.pitch
+
+    def to_mm(self, voxels: Int[Array | np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points `(x, y, z)` of the voxels `(depth, row, column)`, mm, on the host in float64."""
+        depth, row, column = np.moveaxis(np.asarray(voxels), -1, 0)
+        axes = ((self.x, column), (self.y, row), (self.depths, depth))
+        return np.stack([np.asarray(axis, np.float64)[index] for axis, index in axes], axis=-1)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Edges of a plane for `imshow`, `(left, right, bottom, top)`, mm; row 0 is at the top."""
+        (x, y), (rows, columns) = map(float, self.origin), self.shape
+        across, along = columns * self.pitch / 2, rows * self.pitch / 2
+        return x - across, x + across, y + along, y - along

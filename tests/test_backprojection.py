@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -250,3 +251,30 @@ def test_a_ray_traced_point_is_found():
     depth, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
     assert abs(float(grid.depths[depth]) - 20) <= 0.1
     assert np.hypot(float(grid.x[column]), float(grid.y[row])) <= 0.02
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "nearest"])
+def test_a_region_of_interest_is_a_part_of_the_whole(interpolation):
+    imager, grid = scene()
+    image = image_of(imager.sensor)
+    rows, columns = slice(2, 9), slice(5, 14)
+    region = Grid(grid.depths, (7, 9), grid.pitch, (grid.x[columns].mean(), grid.y[rows].mean()))
+    part, whole = (backproject(image, imager, g, method=interpolation) for g in (region, grid))
+    np.testing.assert_allclose(part, whole[:, rows, columns], rtol=1e-11, atol=1e-12)
+
+
+def test_gradient_by_the_origin():
+    """Moving the region is moving all of the microscope the other way."""
+    imager, grid = scene()
+    weight = jnp.cos(jnp.arange(np.prod(grid.volume_shape))).reshape(grid.volume_shape)
+    total = jax.jit(
+        lambda origin, shift: jnp.vdot(
+            weight,
+            backproject(
+                image_of(imager.sensor),
+                eqx.tree_at(lambda i: i.shift, imager, shift),
+                eqx.tree_at(lambda g: g.origin, grid, origin),
+            ),
+        )
+    )
+    check_grads(lambda origin: total(origin, imager.shift), (jnp.array([0.011, -0.007]),), order=1, eps=1e-7, rtol=1e-4)

@@ -152,7 +152,7 @@ def test_wrong_arguments_are_named(table1, arguments, words):
 def test_an_infinite_plate_has_no_density():
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
-        performance(imager, grid.depths, diameter=1.0, field_radius=1.0, wavelength=520e-6, confusion=0.009)
+        performance(imager, grid.depths, diameter=1.0, field_radius=1.0, confusion=0.009)
 
 
 def test_gradients_by_everything_that_is_continuous():
@@ -170,11 +170,10 @@ def test_gradients_by_everything_that_is_continuous():
             size=(2.0, 2.0),
         )
         result = performance(
-            Imager(moved, imager.sensor, v, 1.0),
+            Imager(moved, imager.sensor, v, 1.0, um * 1e-3),
             depths,
             diameter=clear_diameter(moved),
             field_radius=field_radius,
-            wavelength=um * 1e-3,
             confusion=um * 1e-2,
         )
         return result.scale, *jax.tree.leaves(result), jnp.log(result.lateral_resolution), pitch(centers)

@@ -131,7 +131,7 @@ def test_a_psf_that_follows_from_the_imager_has_a_gradient():
     def bound(distance):
         base = random_imager()
         microscope = Imager(base.array, base.sensor, distance, base.field_radius)
-        spot = psf(microscope, 20.0, wavelength=520e-6, size=15, radius=0.3)
+        spot = psf(microscope, 20.0, size=15, radius=0.3)
         return jnp.log(localization_bound(microscope, POINT[None], **OPTIONS | dict(spot=spot)))
 
     check_grads(jax.jit(bound), (jnp.array(5.8),), order=1, eps=1e-6, atol=1e-4, rtol=1e-4)

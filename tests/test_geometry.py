@@ -89,6 +89,17 @@ def test_focal_length_follows_the_radius_unless_given():
     np.testing.assert_allclose(MicrolensArray([[0.0, 0.0]], thin_lens_focal_length=4.0).focal_length, 4)
 
 
+def test_a_grid_knows_where_its_voxels_are():
+    grid = Grid([18.0, 20.0], (3, 5), 0.1, origin=(1.0, -2.0))
+    assert grid.volume_shape == (2, 3, 5)
+    np.testing.assert_allclose(grid.to_mm(np.array([[0, 0, 0], [1, 2, 4]])), [[0.8, -2.1, 18], [1.2, -1.9, 20]])
+    np.testing.assert_allclose(grid.extent, (0.75, 1.25, -1.85, -2.15))
+    one = grid.at(21.0)
+    assert one.volume_shape == (1, 3, 5) and one.depths[0] == 21
+    np.testing.assert_array_equal(one.origin, grid.origin)
+    np.testing.assert_allclose(Sensor((3, 5), 0.1).extent, (-0.25, 0.25, 0.15, -0.15))
+
+
 def test_map_is_separable():
     center, q = jnp.array([1.0, 2.0]), jnp.array([0.3, -0.4])
     np.testing.assert_array_equal(chief_ray(center, q, 0.28)[0], chief_ray(center[0], q[0], 0.28))
@@ -100,6 +111,8 @@ def test_map_is_separable():
         (lambda: Sensor((1, 64), 0.0045), "2 or more"),
         (lambda: Sensor((64, 64), 0.0), "`pixel_pitch` must be positive, got 0.0"),
         (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, -1.0), "`field_radius`"),
+        (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, 520.0), "520 nm are 520e-6 mm"),
+        (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, 0.52), "`wavelength`.*got 0.52"),
         (lambda: Grid([20.0], (0, 3), 0.1), "two positive numbers of voxels"),
         (lambda: Grid([20.0], (3, 3), 0.0), "`pitch` must be positive"),
         (lambda: Grid(np.zeros(0), (3, 3), 0.1), "a depth at least"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gs_jax import MicrolensArray
+from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.mold.checks import array_volume, check_solid
 from gs_jax.mold.make import judge
@@ -25,6 +25,10 @@ def corners_in_stl(path):
     assert len(data) == 84 + 50 * count
     rows = np.frombuffer(data, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]), offset=84)
     return rows["normal"].astype(float), rows["corners"].astype(float)
+
+
+def behind(array):
+    return Imager(array, Sensor((64, 64), 0.0045), 5.8, 3.0)
 
 
 def volume_of(corners):
@@ -155,7 +159,7 @@ def test_lenses_that_are_not_where_they_should_be_are_found():
     found = verify(printable(array_solid(other, 5e-4)), array)
     np.testing.assert_allclose(found.center, moved, atol=1e-4)
     np.testing.assert_allclose(found.radius, 2.001, atol=1e-3)
-    measured = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+    measured = quality(found, behind(array))
     assert measured["center_deviation_max_um"] == pytest.approx(
         1000 * np.linalg.norm(moved - np.asarray(array.centers), axis=1).max(), abs=0.1
     )
@@ -168,7 +172,7 @@ def test_facets_cost_light_as_the_square_of_their_depth():
     measured = {}
     for chord in (2e-4, 4e-4):
         found = verify(printable(array_solid(array, chord)), array)
-        measured[chord] = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+        measured[chord] = quality(found, behind(array))
     rms = {chord: numbers["surface_error_rms_um"] / 1000 for chord, numbers in measured.items()}
     # Not all facets are equilateral, or as deep as they may be.
     for chord, found in rms.items():
@@ -193,7 +197,7 @@ def test_a_lens_that_is_not_there_is_said():
     one = lenses([[-1.0, 0]], (5.0, 4.0))
     found = verify(printable(array_solid(one, CHORD)), array)
     assert np.isnan(found.radius).tolist() == [False, True]
-    measured = quality(found, array, wavelength=520e-6, sensor_distance=5.8)
+    measured = quality(found, behind(array))
     assert measured["lenses_not_measured"] == [2] and measured["lenses_measured"] == 1
     assert any(finding.check == "lenses not measured" for finding in judge(measured, chord=CHORD, radius=2.0))
 

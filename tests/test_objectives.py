@@ -104,7 +104,7 @@ def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     v = 1 / (1 / f - 1 / focused.imager.reduced_depth(20.5))
     where = lambda c: (c.imager.sensor_distance, c.clear_diameter)
     lens = eqx.tree_at(where, focused, (v, jnp.array(small)))
-    spot = psf(lens.imager, 20.5, wavelength=520e-6, size=31, radius=small / 2, samples=4)
+    spot = psf(lens.imager, 20.5, size=31, radius=small / 2, samples=4)
     line = np.asarray(spot.sum(0))
     above = np.interp(line.max() / 2, line[:16], np.arange(16))
     width = 2 * (15 - above) * 4.5 / float(lens.imager.magnification(20.5))

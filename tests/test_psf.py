@@ -33,7 +33,7 @@ def centroid(image):
 def test_a_thin_lens_in_focus_makes_airys_pattern():
     """On fine pixels, so that a pixel's middle stands for the pixel."""
     imager, radius = in_focus(pitch=0.0002), 0.3
-    image = psf(imager, 20.0, wavelength=WAVELENGTH, size=65, radius=radius, samples=4)
+    image = psf(imager, 20.0, size=65, radius=radius, samples=4)
     rows, columns = (np.indices((65, 65)) - 32) * 0.0002
     x = 2 * np.pi * radius * np.hypot(rows, columns) / (WAVELENGTH * float(imager.sensor_distance))
     airy = (2 * j1(np.where(x, x, 1)) / np.where(x, x, 1)) ** 2
@@ -45,12 +45,12 @@ def test_a_thin_lens_in_focus_makes_airys_pattern():
 def test_what_is_outside_the_window_is_accounted_for():
     """Airy's encircled energy in a square window is between that of its inner and outer circles."""
     imager, radius, size = in_focus(), 0.3, 5
-    fraction = window_fraction(imager, 20.0, wavelength=WAVELENGTH, size=size, radius=radius, samples=8)
+    fraction = window_fraction(imager, 20.0, size=size, radius=radius, samples=8)
     circle = lambda r: 2 * np.pi * radius * r / (WAVELENGTH * float(imager.sensor_distance))
     inner, outer = (1 - j0(circle(r)) ** 2 - j1(circle(r)) ** 2 for r in (size * 0.0045 / 2, size * 0.0045 / 2**0.5))
     assert inner < fraction < outer
     # Parseval: all of it is somewhere.
-    everything = window_fraction(imager, 20.0, wavelength=WAVELENGTH, size=129, radius=radius)
+    everything = window_fraction(imager, 20.0, size=129, radius=radius)
     np.testing.assert_allclose(everything, 1, atol=3e-3)  # the rings beyond 65 pixels
 
 
@@ -58,13 +58,13 @@ def test_what_is_outside_the_window_is_accounted_for():
 def test_far_from_focus_it_is_the_shadow_of_the_aperture(field):
     """Thin lens, v = 4 mm: a disc, a (1 - v/v') in radius, evenly lit, about the chief ray."""
     imager = unit(4.0, thin_lens_focal_length=4.65)
-    image = psf(imager, 20.0, wavelength=WAVELENGTH, size=129, radius=RADIUS, field=field)
+    image = psf(imager, 20.0, size=129, radius=RADIUS, field=field)
     blur = RADIUS * (1 - 4 * (1 / 4.65 - 1 / (20 + 1 / 1.43))) / 0.0045
     distance = np.hypot(*(np.indices((129, 129)) - 64))
     # Fresnel fringes at the edge, a few pixels wide, are what is not geometric.
     np.testing.assert_allclose(np.asarray(image)[distance < blur - 5].mean(), 1 / (np.pi * blur**2), rtol=0.03)
     assert float(image[distance > blur + 5].sum()) < 0.01
-    rays = geometric_psf(imager, 20.0, wavelength=WAVELENGTH, size=129, radius=RADIUS, field=field)
+    rays = geometric_psf(imager, 20.0, size=129, radius=RADIUS, field=field)
     np.testing.assert_allclose(np.asarray(rays)[distance < blur - 2], 1 / (np.pi * blur**2), rtol=0.15)
 
 
@@ -91,7 +91,6 @@ def test_huygens_principle_summed_directly(v, field):
     ours = psf(
         tiny,
         z,
-        wavelength=WAVELENGTH,
         size=4 * size - 1 if size % 2 == 0 else 4 * size + 1,
         field=field,
         radius=RADIUS,
@@ -121,19 +120,19 @@ def test_strehl_of_small_errors_is_the_exponential(what):
     imager = unit(v, **lens)
     rms = wavefront_rms(imager, 20.0, field=field, radius=radius) / WAVELENGTH
     assert 0.02 < rms < 0.1
-    ratio = strehl(imager, 20.0, wavelength=WAVELENGTH, field=field, radius=radius)
+    ratio = strehl(imager, 20.0, field=field, radius=radius)
     # The exponential leaves out the fourth power of the phase: (2 pi 0.1)^4 / 8 is 2 %.
     np.testing.assert_allclose(ratio, np.exp(-((2 * np.pi * rms) ** 2)), rtol=0.02)
 
 
 def test_strehl_is_one_without_aberrations():
-    np.testing.assert_allclose(strehl(in_focus(), 20.0, wavelength=WAVELENGTH, radius=RADIUS), 1, rtol=1e-9)
+    np.testing.assert_allclose(strehl(in_focus(), 20.0, radius=RADIUS), 1, rtol=1e-9)
 
 
 @pytest.mark.parametrize("field", [(0.0, 0.0), (1.0, -2.0)])
 def test_rays_and_waves_have_the_same_centroid(field):
     """Ehrenfest: the mean of the waves is that of the rays, whatever the aberrations."""
-    options = dict(wavelength=WAVELENGTH, size=129, field=field, radius=RADIUS)
+    options = dict(size=129, field=field, radius=RADIUS)
     image, rays, gauss = (kind(unit(5.2), 20.0, **options) for kind in KINDS)
     # The wings outside the window, and the aperture's soft edge: some hundredths of a pixel.
     np.testing.assert_allclose(centroid(image), centroid(rays), atol=0.15)
@@ -142,7 +141,7 @@ def test_rays_and_waves_have_the_same_centroid(field):
 
 def test_the_gaussian_has_the_rays_second_moment():
     imager = unit(4.0)
-    image = gaussian_psf(imager, 20.0, wavelength=WAVELENGTH, size=257, radius=RADIUS)
+    image = gaussian_psf(imager, 20.0, size=257, radius=RADIUS)
     second = lambda a: (np.asarray(a) * (np.arange(257) - 128.0) ** 2).sum()
     rays = geometric_psf(imager, 20.0, size=257, radius=RADIUS)
     # Sheppard: integration over pixels adds 1/12; sharing rays among pixels about 1/6.
@@ -151,7 +150,7 @@ def test_the_gaussian_has_the_rays_second_moment():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sum_centre_and_symmetry(kind):
-    options = dict(wavelength=WAVELENGTH, size=65, radius=RADIUS)
+    options = dict(size=65, radius=RADIUS)
     image = kind(unit(), 20.0, **options)
     np.testing.assert_allclose(image.sum(), 1, rtol=1e-12)
     # The spiral of rays is symmetric only on average.
@@ -169,7 +168,7 @@ def test_sum_centre_and_symmetry(kind):
 def test_edges_cut_the_aperture(kind):
     """Half a lens far from focus makes half a disc, on the side where the lens is: before the image, no inversion."""
     imager = unit(4.0, thin_lens_focal_length=4.65)
-    options = dict(wavelength=WAVELENGTH, size=129, radius=RADIUS, edges=np.array([[1e-6, 0.0]]))
+    options = dict(size=129, radius=RADIUS, edges=np.array([[1e-6, 0.0]]))
     image = kind(imager, 20.0, **options)
     # Half of the middle column, 1/80 of the light, and Fresnel's fringes are beyond.
     assert float(image[:, :64].sum()) > 0.97
@@ -180,7 +179,7 @@ def test_edges_cut_the_aperture(kind):
     [(5.8, (0.0, 0.0), 65), (5.8, (3.0, 0.0), 65), pytest.param(4.0, (0.0, 0.0), 129, marks=pytest.mark.slow)],
 )
 def test_float32(v, field, size):
-    options = dict(wavelength=WAVELENGTH, size=size, field=field, radius=RADIUS)
+    options = dict(size=size, field=field, radius=RADIUS)
     exact, low = psf(unit(v), 20.0, **options), psf(unit(v, jnp.float32), 20.0, **options)
     assert low.dtype == jnp.float32
     # Phases of 30 waves to a thousandth.
@@ -191,15 +190,13 @@ def test_float32(v, field, size):
 @pytest.mark.parametrize(("v", "size", "samples"), [(5.8, 65, 3), (4.0, 129, 4)])
 def test_more_samples_change_little(v, size, samples):
     """Parseval asks for 1.9 and 2.8. What is left is the aperture's edge, and light folded back."""
-    image, finer = (
-        psf(unit(v), 20.0, samples=s, wavelength=WAVELENGTH, size=size, radius=RADIUS) for s in (samples, 6)
-    )
+    image, finer = (psf(unit(v), 20.0, samples=s, size=size, radius=RADIUS) for s in (samples, 6))
     assert float(jnp.abs(image - finer).sum()) < 0.03
 
 
 def test_depths_map():
     depths = jnp.array([18.0, 20.0])
-    one = lambda z: psf(unit(), z, wavelength=WAVELENGTH, size=33, radius=RADIUS)
+    one = lambda z: psf(unit(), z, size=33, radius=RADIUS)
     np.testing.assert_allclose(jax.vmap(one)(depths)[1], one(20.0), atol=1e-12)
 
 
@@ -208,15 +205,14 @@ def test_gradients(kind):
     smooth = jnp.cos(jnp.arange(17.0) / 5)
 
     @jax.jit
-    def moment(imager, depth, wavelength, field, offset, radius):
-        arguments = dict(wavelength=wavelength, size=17, field=field, offset=offset, radius=radius)
+    def moment(imager, depth, field, offset, radius):
+        arguments = dict(size=17, field=field, offset=offset, radius=radius)
         image = kind(imager, depth, **arguments)
         return smooth @ image @ smooth
 
     arguments = (
         unit(),
         jnp.array(20.0),
-        jnp.array(WAVELENGTH),
         jnp.array([0.6, -0.3]),
         jnp.array([0.2, 0.1]),
         jnp.array(0.4),
@@ -229,13 +225,13 @@ def test_gradients(kind):
 
 @pytest.mark.slow
 def test_gradient_of_the_strehl_ratio():
-    ratio = jax.jit(lambda imager, depth: strehl(imager, depth, wavelength=WAVELENGTH, radius=0.4, samples=64))
+    ratio = jax.jit(lambda imager, depth: strehl(imager, depth, radius=0.4, samples=64))
     check_grads(ratio, (unit(5.9), jnp.array(20.0)), order=1, eps=1e-7, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", SLOW_FIRST)
 def test_gradients_are_finite_for_an_ideal_lens_on_its_axis(kind):
-    total = jax.jit(lambda imager: jnp.sum(kind(imager, 20.0, wavelength=WAVELENGTH, size=9, radius=0.4) ** 2))
+    total = jax.jit(lambda imager: jnp.sum(kind(imager, 20.0, size=9, radius=0.4) ** 2))
     gradient = jax.jit(jax.grad(total))(in_focus())
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
@@ -246,4 +242,4 @@ def test_gradients_are_finite_for_an_ideal_lens_on_its_axis(kind):
 )
 def test_wrong_arguments_are_named(options, words):
     with pytest.raises(ValueError, match=words):
-        psf(unit(), 20.0, wavelength=WAVELENGTH, **options)
+        psf(unit(), 20.0, **options)

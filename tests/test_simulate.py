@@ -9,8 +9,6 @@ from gs_jax.base.progress import Progress
 from gs_jax.optics.unit import pupil_disc, unit_rays
 from gs_jax.simulation.scene import PSFS, psf_of_depth, simulate_points, simulate_volume
 
-WAVELENGTH = 520e-6
-
 
 def imager(sensor_distance=5.8, pixel=0.01):
     array = MicrolensArray([[0.0, 0.0], [0.2, 0.1]], aperture_diameter=0.3, size=(2.0, 2.0))
@@ -20,7 +18,7 @@ def imager(sensor_distance=5.8, pixel=0.01):
 @pytest.mark.parametrize("kind", PSFS)
 def test_a_point_is_a_small_voxel(kind):
     out_of_focus = imager(sensor_distance=4.8)  # a pixel is small beside the blur
-    options: dict[str, Any] = dict(wavelength=WAVELENGTH, kind=kind, progress=Progress())
+    options: dict[str, Any] = dict(kind=kind, progress=Progress())
     grid = Grid([19.0, 21.0], (5, 5), 0.01)
     volume = np.zeros((2, 5, 5), np.float32)
     volume[1, 3, 1] = 2
@@ -40,7 +38,7 @@ def test_the_window_holds_the_light(sensor_distance, pixel):
     """Near the focus of the rim's rays other zones land farther out: all rays that get through, counted one by one."""
     array = MicrolensArray([[0.0, 0.0]], aperture_diameter=1.6, size=(4.0, 4.0))
     wide = Imager(array, Sensor((64, 64), pixel), sensor_distance, 0.6)
-    window = psf_of_depth(wide, [20.0], WAVELENGTH, "geometric")(20.0).shape[0]
+    window = psf_of_depth(wide, [20.0], "geometric")(20.0).shape[0]
     points, weights = pupil_disc(0.8, rings=40)
     rays = unit_rays(wide, 20.0, points)
     inside = (np.abs(rays.landing) < window / 2 * pixel).all(1)
@@ -50,13 +48,13 @@ def test_the_window_holds_the_light(sensor_distance, pixel):
 def test_a_coarse_volume_has_no_dots():
     """Voxels three pixels apart on the sensor make an image as even as an even object does."""
     grid = Grid([20.0], (9, 9), 0.12)
-    image = simulate_volume(np.ones((1, 9, 9), np.float32), imager(), grid, wavelength=WAVELENGTH, progress=Progress())
+    image = simulate_volume(np.ones((1, 9, 9), np.float32), imager(), grid, progress=Progress())
     middle = image[40:56, 34:46]
     np.testing.assert_allclose(middle, middle.mean(), rtol=0.05)  # the envelope falls by 2 %, the raster's ripple by 3
 
 
 def test_dark_scenes_are_dark():
-    options: dict[str, Any] = dict(wavelength=WAVELENGTH, progress=Progress())
+    options: dict[str, Any] = dict(progress=Progress())
     grid = Grid([20.0], (5, 5), 0.05)
     assert not simulate_volume(np.zeros((1, 5, 5), np.float32), imager(), grid, **options).any()
     assert not simulate_points(np.zeros((0, 4)), imager(), **options).any()
@@ -68,7 +66,7 @@ def test_many_depths_share_stamps():
     """Between the depths of the stamps the PSF is interpolated: the image of a column of points stays smooth."""
     z = np.linspace(20, 20.5, 40)
     points = np.column_stack([np.zeros_like(z), np.zeros_like(z), z, np.ones_like(z)])
-    options: dict[str, Any] = dict(wavelength=WAVELENGTH, kind="geometric", progress=Progress())
+    options: dict[str, Any] = dict(kind="geometric", progress=Progress())
     together = simulate_points(points, imager(), **options)
     apart = np.sum([simulate_points(point[None], imager(), **options) for point in points[::4]], axis=0)
     np.testing.assert_allclose(
@@ -77,7 +75,7 @@ def test_many_depths_share_stamps():
 
 
 def test_what_cannot_be_simulated_is_refused():
-    options: dict[str, Any] = dict(wavelength=WAVELENGTH, progress=Progress())
+    options: dict[str, Any] = dict(progress=Progress())
     with pytest.raises(InputError, match="blurred over .* pixels of the sensor each way, allowed: 128"):
         simulate_points(np.array([[0.0, 0.0, 0.05, 1.0]]), imager(pixel=0.002), **options)
     with pytest.raises(InputError, match="found a voxel of -1, allowed: 0 or more"):

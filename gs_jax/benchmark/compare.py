@@ -65,7 +65,7 @@ def _dense(solver: str):
 
     def make(bench: Bench):
         imager, grid, psf, _ = bench
-        shape = (grid.depths.size, *grid.shape)
+        shape = grid.volume_shape
         size, pixels = math.prod(shape), math.prod(imager.sensor.shape)
         unit = lambda voxel: jnp.zeros(size, jnp.float32).at[voxel].set(1).reshape(shape)
         column = jax.jit(lambda voxel: forward_operator(imager, grid, jnp.asarray(psf)).mv(unit(voxel)).ravel())

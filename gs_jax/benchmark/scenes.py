@@ -51,7 +51,8 @@ def bench(side: int) -> Bench:
     centers = np.asarray(lens.centers)
     centers = centers[(np.abs(centers) < plate).all(axis=1)]
     pitch = WIDTH / side
-    imager = Imager(MicrolensArray(centers), Sensor((side, side), pitch), lens.sensor_distance, lens.field_radius)
+    whole = (lens.sensor_distance, lens.field_radius, lens.wavelength)
+    imager = Imager(MicrolensArray(centers), Sensor((side, side), pitch), *whole)
     grid = Grid([DEPTH], (side, side), pitch)
     single = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
     # The rays' blur is 0.1 mm and more: in pixels, and a pixel for what is beside it.
@@ -76,7 +77,7 @@ def case(bench: Bench, seed: int, progress: Progress) -> Case:
     emitters = (particles[:, None] + offsets[None]) * np.stack([*3 * [np.ones_like(weight)], weight], axis=1)[None]
     # Diffraction is finer than a coarse pixel by far, and would take a huge pupil there.
     kind = "diffraction" if imager.sensor.pixel_pitch < 0.02 else "geometric"
-    image = simulate_points(emitters.reshape(-1, 4), imager, wavelength=520e-6, kind=kind, progress=progress)
+    image = simulate_points(emitters.reshape(-1, 4), imager, kind=kind, progress=progress)
     camera = Camera(gain=1.0)
     counts = expose(jnp.asarray(image), camera, jax.random.key(seed), peak_electrons=PEAK_ELECTRONS)
     return Case(np.asarray(electrons(counts, camera)), particles, spots(particles, grid, width))
@@ -85,7 +86,7 @@ def case(bench: Bench, seed: int, progress: Progress) -> Case:
 def spots(points: Float[np.ndarray, "point 4"], grid: Grid, width: float) -> Float32[np.ndarray, "depth y x"]:
     """Points as Gaussians of standard deviation `width` in the nearest plane; their maximum is the intensity."""
     z = np.asarray(grid.depths)
-    volume = np.zeros((len(z), *grid.shape), np.float32)
+    volume = np.zeros(grid.volume_shape, np.float32)
     for px, py, pz, intensity in points:
         across, along = (np.exp(-((np.asarray(a) - p) ** 2) / (2 * width**2)) for a, p in ((grid.x, px), (grid.y, py)))
         volume[np.abs(z - pz).argmin()] += (intensity * along[:, None] * across[None]).astype(np.float32)
@@ -101,9 +102,7 @@ def peaks(volume: Float[Array | np.ndarray, "depth y x"], grid: Grid) -> Float[n
     volume = volume - np.median(volume, axis=(1, 2), keepdims=True)
     least = max(float(_PEAK * volume.max()), 0.0)
     found = peak_local_max(volume, min_distance=2, threshold_abs=least, exclude_border=False)
-    d, r, c = found.T
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
-    return np.column_stack([x[c], y[r], z[d], volume[d, r, c]])
+    return np.column_stack([grid.to_mm(found), volume[tuple(found.T)]])
 
 
 def scores(volume: Float[Array | np.ndarray, "depth y x"], case: Case, bench: Bench) -> dict[str, Any]:

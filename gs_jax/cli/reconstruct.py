@@ -68,10 +68,7 @@ def reconstruct(
         elif method == "backproject":
             volume = reconstruct_stack(image, imager, grid, progress)
         else:
-            wavelength = microscope.imaging.wavelength_nm * 1e-6
-            volume = reconstruct_iteratively(
-                image, imager, grid, method=method, steps=steps, wavelength=wavelength, progress=progress
-            )
+            volume = reconstruct_iteratively(image, imager, grid, method=method, steps=steps, progress=progress)
         if suppress == "unet":
             with progress.step("Suppressing the background"):
                 volume = without_background(volume, pretrained())

@@ -45,7 +45,7 @@ def random_scene(
         Standard deviation of a blob, mm.
     """
     where, bright = jax.random.split(key)
-    shape, dtype = (grid.depths.size, *grid.shape), grid.depths.dtype
+    shape, dtype = grid.volume_shape, grid.depths.dtype
     lit = jax.random.bernoulli(where, density, shape)
     points = jnp.where(lit, jax.random.uniform(bright, shape, dtype, 0.5, 1.0), 0)
     across = [_gaussian(n, width / grid.pitch, dtype) for n in grid.shape]

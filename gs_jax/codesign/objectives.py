@@ -50,7 +50,7 @@ class Term(NamedTuple):
 def lateral_resolution(c: Candidate) -> Float[Array, " depth"]:
     """In focus, without aberrations (Eq. 5)."""
     aperture = theory.numerical_aperture(c.imager.array.focal_length, c.clear_diameter)
-    return UM * theory.lateral_resolution(c.wavelength, aperture, c.imager.sensor.pixel_pitch, c.magnification)
+    return UM * theory.lateral_resolution(c.imager.wavelength, aperture, c.imager.sensor.pixel_pitch, c.magnification)
 
 
 def axial_resolution(c: Candidate) -> Float[Array, " depth"]:
@@ -91,12 +91,12 @@ def blur(c: Candidate) -> Float[Array, " depth"]:
 
 def log_strehl(c: Candidate) -> Float[Array, "depth field"]:
     """Logarithm of Eq. 9 with Eq. 10, sensor where it is, at four heights of the field."""
-    return aberrations.log_strehl(aberrations.linear_rms(_seidel(c)), c.wavelength)
+    return aberrations.log_strehl(aberrations.linear_rms(_seidel(c)), c.imager.wavelength)
 
 
 def wavefront(c: Candidate) -> Float[Array, "depth field"]:
     """RMS of the third-order wavefront with astigmatism and field curvature, in waves, at four heights."""
-    return aberrations.independent_rms(_seidel(c)) / c.wavelength
+    return aberrations.independent_rms(_seidel(c)) / c.imager.wavelength
 
 
 def _seidel(c: Candidate):
@@ -136,7 +136,7 @@ def psf_width(c: Candidate) -> Float[Array, " depth"]:
     landing, weight, lit = _spots(c)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
-    airy = _AIRY * c.wavelength * c.imager.sensor_distance / (c.clear_diameter / 2) / _FWHM
+    airy = _AIRY * c.imager.wavelength * c.imager.sensor_distance / (c.clear_diameter / 2) / _FWHM
     total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
     return UM * _FWHM * jnp.sqrt(total) / c.magnification
 

@@ -91,8 +91,8 @@ class Parent(eqx.Module):
     """A design with what its file does not say: where it is judged.
 
     `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm; 1 for one lens.
-    `middle`, `span`: of the depths that count, from the plate, mm. `depth_count`: how many they are. `wavelength`,
-    `confusion`: mm.
+    `middle`, `span`: of the depths that count, from the plate, mm. `depth_count`: how many they are. `confusion`:
+    mm.
     """
 
     imager: Imager
@@ -100,7 +100,6 @@ class Parent(eqx.Module):
     pitch: Float[Array, ""] = eqx.field(converter=as_float)
     middle: Float[Array, ""] = eqx.field(converter=as_float)
     span: Float[Array, ""] = eqx.field(converter=as_float)
-    wavelength: Float[Array, ""] = eqx.field(converter=as_float)
     confusion: Float[Array, ""] = eqx.field(converter=as_float)
     depth_count: int = eqx.field(static=True)
 
@@ -110,7 +109,7 @@ class Candidate(eqx.Module):
 
     `imager`: its own plate size is the parent's and means nothing here. `plate`: `(x, y)` of the scaled plate, mm.
     `clear_diameter`: of the disc whose area is the mean clear aperture, mm. `covered`: the share of the plate that is
-    clear aperture. `depths`: where it is judged, from the plate, mm. `wavelength`, `confusion`: mm.
+    clear aperture. `depths`: where it is judged, from the plate, mm. `confusion`: mm.
     """
 
     imager: Imager
@@ -118,7 +117,6 @@ class Candidate(eqx.Module):
     clear_diameter: Float[Array, ""]
     covered: Float[Array, ""]
     depths: Float[Array, " depth"]
-    wavelength: Float[Array, ""]
     confusion: Float[Array, ""]
 
     @property
@@ -167,7 +165,6 @@ def parent_of(
         pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
-        design.imaging.wavelength_nm * 1e-6,
         2 * imager.sensor.pixel_pitch if confusion is None else confusion,
         depth_count,
     )
@@ -234,7 +231,6 @@ def candidate(parent: Parent, values: Values) -> Candidate:
         scale * jnp.sqrt(4 / math.pi / count * area),
         area / math.prod(parent.imager.array.size),
         parent.middle + values["depth_span_mm"] * offsets,
-        parent.wavelength,
         parent.confusion,
     )
 

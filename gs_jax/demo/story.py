@@ -131,16 +131,16 @@ def _optimise(folder: Path, progress: Progress) -> list[dict]:
 
 def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict, Views]:
     """Three words at three depths: reconstructed in three ways, each against the truth."""
-    imager, wavelength = design.imager(), design.imaging.wavelength_nm * 1e-6
+    imager = design.imager()
     scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
     emitters = np.concatenate(
         [letters(word, depth=z, height=_LETTER_MM, pitch=_SCENE_MM) + (x, y, 0, 0) for z, word, (x, y) in WORDS]
     )
     scene = np.asarray(rasterize(emitters, scene_grid))
     grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
-    coarse = Grid(grid.depths[_COARSE], grid.shape, grid.pitch)
+    coarse = grid.at(grid.depths[_COARSE])
     with _timed(seconds, "simulating words"):
-        light = simulate_volume(scene, imager, scene_grid, wavelength=wavelength, progress=progress)
+        light = simulate_volume(scene, imager, scene_grid, progress=progress)
         image = _exposed(light, folder / "words.tif", seed=0)
     with _timed(seconds, "back-projection, compiled first"):
         plain = reconstruct_stack(image, imager, grid, progress)
@@ -149,7 +149,7 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
         write_volume(folder / "words.ome.tif", clean, grid)
     with _timed(seconds, "Richardson-Lucy"):
         iterated = reconstruct_iteratively(
-            image, imager, coarse, method="richardson-lucy", steps=_STEPS, wavelength=wavelength, progress=progress
+            image, imager, coarse, method="richardson-lucy", steps=_STEPS, progress=progress
         )
     # A voxel's blur, so that a shift by part of a voxel is not counted as an error.
     truth = gaussian_filter(np.asarray(rasterize(emitters, coarse)), (0, 1, 1))
@@ -170,8 +170,7 @@ def _points(folder: Path, design: Design, seconds: dict, progress: Progress):
     imager = design.imager()
     truth = random_points(_POINTS, (20.0, 20.0), (18.0, 22.0), seed=1)
     with _timed(seconds, "simulating points"):
-        wavelength = design.imaging.wavelength_nm * 1e-6
-        light = simulate_points(truth, imager, wavelength=wavelength, progress=progress)
+        light = simulate_points(truth, imager, progress=progress)
         image = _exposed(light, folder / "points.tif", seed=1)
     with _timed(seconds, "finding points"):
         grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError, shown
-from ..geometry import Imager, MicrolensArray, Sensor
+from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
 from ..io.disk import check_output, read_table, read_text, write_text
 from ..io.explain import one_line
 
@@ -29,6 +29,9 @@ MIN_SPACING_MM = 1e-3
 Length = Annotated[float, Field(ge=1e-6, le=1e4, description="a number of mm from 1e-6 to 1e4")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Pixels = Annotated[int, Field(ge=2, le=65536)]
+Wavelength = Annotated[
+    float, Field(ge=1e6 * SHORTEST, le=1e6 * LONGEST, description="a number of nanometres from 10 to 1e5")
+]
 # Strict as everything else, but a TOML array is a list and a frozen model wants tuples.
 Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False, description="[x, y] in mm, up to 1e4")]
 Size = Annotated[tuple[Length, Length], Field(strict=False, description="[x, y] in mm from 1e-6 to 1e4")]
@@ -80,7 +83,7 @@ class ImagingTable(_Table):
 
     sensor_distance_mm: Length
     working_distance_mm: Range
-    wavelength_nm: float = Field(ge=1, le=1e6, description="a number of nanometres from 1 to 1e6")
+    wavelength_nm: Wavelength
     field_radius_mm: Length
 
 
@@ -125,6 +128,7 @@ class Design(_Table):
             Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000),
             sensor_distance=imaging.sensor_distance_mm,
             field_radius=imaging.field_radius_mm,
+            wavelength=imaging.wavelength_nm * 1e-6,
             rotation=math.radians(calibration.rotation_deg),
             shift=calibration.shift_mm,
         )

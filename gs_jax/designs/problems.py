@@ -68,12 +68,12 @@ def _sharp_range(design: Design, sheet: dict[str, Any], confusion: float) -> str
 
 
 def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
-    imaging = design.imaging
-    wavelength, v, f = imaging.wavelength_nm * 1e-6, imaging.sensor_distance_mm, sheet["focal_length_mm"]
+    imager, f = design.imager(), sheet["focal_length_mm"]
+    wavelength, v = float(imager.wavelength), design.imaging.sensor_distance_mm
     pupil = f / sheet["f_number"] / 2
     reduced = np.array(sheet["depth_mm"]) + _plate(design)
     lens = (f, design.lens.refractive_index, pupil, reduced)
-    error = aberrations.of_array(design.imager().array, pupil, reduced, 0.0, v)
+    error = aberrations.of_array(imager.array, pupil, reduced, 0.0, v)
     waves = np.asarray(aberrations.linear_rms(error)) / wavelength
     if waves.max() <= _STREHL_DOMAIN:
         return []

@@ -46,7 +46,6 @@ def performance(
     *,
     diameter: Float[Array, ""] | float,
     field_radius: Float[Array, ""] | float,
-    wavelength: Float[Array, ""] | float,
     confusion: Float[Array, ""] | float,
 ) -> Performance:
     """Eqs. 1-11 for a microscope at these depths; differentiable in everything.
@@ -61,8 +60,8 @@ def performance(
         Of the clear aperture, mm: `gs_jax.optics.aperture.clear_diameter(imager.array)`.
     field_radius
         `sqrt(A_e / pi)`, mm.
-    wavelength, confusion
-        Wavelength and the diameter of the circle of confusion, mm.
+    confusion
+        Diameter of the circle of confusion, mm.
 
     Returns
     -------
@@ -81,7 +80,7 @@ def performance(
     f, reduced, m = array.focal_length, imager.reduced_depth(depths), imager.magnification(depths)
     front = imager.reduced_depth(0.0)
     f_number, aperture = theory.f_number(f, diameter), theory.numerical_aperture(f, diameter)
-    lateral = theory.lateral_resolution(wavelength, aperture, imager.sensor.pixel_pitch, m)
+    lateral = theory.lateral_resolution(imager.wavelength, aperture, imager.sensor.pixel_pitch, m)
     n_e = theory.lenses_per_point(float(array.centers.shape[0]), plate_area, field_radius)
     rms = aberrations.linear_rms(aberrations.of_array(array, diameter / 2, reduced, 0.0, v))
     return Performance(
@@ -95,7 +94,7 @@ def performance(
         lenses_per_point=n_e,
         occupancy=theory.occupancy(n_e, m),
         wavefront_rms=rms,
-        strehl_on_axis=aberrations.strehl(rms, wavelength),
+        strehl_on_axis=aberrations.strehl(rms, imager.wavelength),
         focus_distance=theory.focus_distance(f, reduced),
         blur=theory.blur(f, diameter, reduced, v),
     )
@@ -136,7 +135,6 @@ def datasheet(
         jnp.asarray(depths, float),
         diameter=diameter,
         field_radius=imaging.field_radius_mm,
-        wavelength=imaging.wavelength_nm * 1e-6,
         confusion=confusion,
     )
     distances = nearest_neighbour_distances(centers)

@@ -59,14 +59,14 @@ def write_volume(
     path = check_output(path, VOLUME_SUFFIXES)
     voxels = _as_float32(path, np.asarray(volume))
     depths = [float(str(depth)) for depth in np.asarray(grid.depths)]  # 18.1, not float32's 18.100000381
-    if voxels.shape != (len(depths), *grid.shape):
-        raise ValueError(f"`volume` must have the grid's shape {(len(depths), *grid.shape)}, got {voxels.shape}.")
+    if voxels.shape != grid.volume_shape:
+        raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
     if path.suffix.lower() == ".zarr":
-        _write_zarr(path, voxels, depths, grid.pitch)
+        _write_zarr(path, voxels, depths, grid)
     else:
-        _write_tiff(path, voxels, depths, grid.pitch)
+        _write_tiff(path, voxels, depths, grid)
 
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
@@ -76,7 +76,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "dept
     ------
     InputError
         If it cannot be read, is damaged, is not one image with the axes z, y, x, has values that float32 cannot
-        hold or that are not finite, or lacks the metadata: pitch, a depth above 0 for each plane, centred grid.
+        hold or that are not finite, or lacks the metadata: pitch, a depth above 0 for each plane.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in VOLUME_SUFFIXES:
@@ -106,9 +106,11 @@ def _mm(value: float, unit: float) -> float:
     return float(f"{value * unit:.12g}")
 
 
-def _first(n: int, pitch: float) -> float:
-    """The centre of the first of `n` voxels of a grid that is centred on the axis, mm."""
-    return -(n - 1) / 2 * pitch
+def _first_um(grid: Grid) -> tuple[float, float]:
+    """The centre of the first voxel of each plane, `(y, x)`, um, from what a float32 origin was meant to be."""
+    x, y = (float(str(at)) for at in np.asarray(grid.origin))
+    rows, columns = grid.shape
+    return _um(y - (rows - 1) / 2 * grid.pitch), _um(x - (columns - 1) / 2 * grid.pitch)
 
 
 def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
@@ -119,28 +121,29 @@ def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None
 
 
 def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
-    """The grid of `depths` and of pitches and first voxel centres, both `(y, x)`, mm; `first` None if unknown."""
+    """The grid of `depths` and of pitches and first voxel centres, both `(y, x)`, mm; centred if `first` is None."""
     pitch = pitches[1]
     if not (1e-6 <= pitch <= 1e4 and math.isclose(pitches[0], pitch, rel_tol=1e-6)):
         raise InputError(f"{path}: found voxels of {pitches} mm (y, x), allowed: squares from 1e-6 to 1e4 mm.")
     for depth in depths:
         if not 1e-6 <= depth <= 1e4:
             raise InputError(f"{path}: found a plane at the depth {depth} mm, allowed: from 1e-6 to 1e4 mm.")
-    expected = [_first(n, pitch) for n in shape]
-    if first is not None and any(not abs(a - b) < 0.01 * pitch for a, b in zip(first, expected, strict=True)):
-        advice = f"{expected}, a volume centred on the axis (was it cropped?)"
-        raise InputError(f"{path}: found the first voxel at {list(first)} mm (y, x), allowed: {advice}.")
-    return Grid(depths, shape, pitch)
+    if first is None:
+        return Grid(depths, shape, pitch)
+    if not all(abs(place) <= 1e4 for place in first):
+        raise InputError(f"{path}: found the first voxel at {list(first)} mm (y, x), allowed: up to 1e4 mm.")
+    # To a picometre: what is centred is exactly so.
+    y, x = (round(at + (n - 1) / 2 * pitch, 9) for at, n in zip(first, shape, strict=True))
+    return Grid(depths, shape, pitch, (x, y))
 
 
 # OME-TIFF
 
 
-def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], pitch: float) -> None:
-    planes = len(depths)
+def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid) -> None:
+    planes, pitch, (first_y, first_x) = len(depths), grid.pitch, _first_um(grid)
     plane: dict[str, Any] = {"PositionZ": [_um(depth) for depth in depths]}
-    plane["PositionX"] = [_um(_first(voxels.shape[2], pitch))] * planes
-    plane["PositionY"] = [_um(_first(voxels.shape[1], pitch))] * planes
+    plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
     metadata = {"axes": "ZYX", "PhysicalSizeX": _um(pitch), "PhysicalSizeY": _um(pitch), "Plane": plane}
     # Uneven depths: the mean step is what a viewer that knows one step only can show; the planes keep the truth.
     step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
@@ -214,14 +217,15 @@ def _length(path: Path, element: ElementTree.Element, name: str, default_unit: s
 # OME-Zarr
 
 
-def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], pitch: float) -> None:
+def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid) -> None:
+    pitch = grid.pitch
     # One plane has no step, and the format wants one: the lateral pitch, as of a cube.
     step = (depths[-1] - depths[0]) / (len(depths) - 1) if len(depths) > 1 else pitch
     even = np.abs(np.array(depths) - depths[0] - step * np.arange(len(depths))).max() <= 1e-6 * max(depths)
     if step <= 0 or not even:
         raise InputError(f"{path}: found uneven or descending depths, allowed in OME-Zarr: even steps; use .ome.tif.")
     scale = [_um(step), _um(pitch), _um(pitch)]
-    first = [_um(depths[0]), *(_um(_first(n, pitch)) for n in voxels.shape[1:])]
+    first = [_um(depths[0]), *_first_um(grid)]
     transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
     multiscale = {
         "version": "0.4",

@@ -95,7 +95,8 @@ def make_part(
     beside = {suffix: check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt")}
     findings = check_design(design, order.shape, chord=order.chord, resolution=order.resolution)
     refuse_errors(findings, f"design {design.name!r}")
-    array = design.imager().array
+    imager = design.imager()
+    array = imager.array
     surface = facet_surface(array, order.chord, progress)
     with progress.step("Building and checking the solid"):
         part = solid_of(surface, plate_thickness(array))
@@ -104,14 +105,11 @@ def make_part(
         mesh = printable(solid)
         findings += check_solid(mesh, expected, order.part, volume_tolerance(array, order.chord))
         _stop_at_fault(findings)
-    imaging = design.imaging
     # A part that is not the design does not get its name.
     with progress.step("Writing and measuring"), atomic_write(path) as temporary:
         write_mesh(temporary, mesh, f"{design.name} {order.part}")
         found = verify(read_mesh(temporary), array, scale=order.shape.scale)
-        measured = quality(
-            found, array, wavelength=imaging.wavelength_nm * 1e-6, sensor_distance=imaging.sensor_distance_mm
-        )
+        measured = quality(found, imager)
         findings += judge(measured, chord=order.chord, radius=design.lens.radius_of_curvature_mm)
         _stop_at_fault(findings)
     report = _report(design, order, path, mesh, expected, findings, measured, found)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from ..geometry import MicrolensArray
+from ..geometry import Imager, MicrolensArray
 from .caps import cap_sag
 from .mesh_files import Mesh
 from .solids import plate_thickness
@@ -176,7 +176,7 @@ def _facet_errors(corners, lens, sphere, radius):
     return offset, np.sqrt(mean((error - offset[lens, None]) ** 2 @ _WEIGHTS)), np.sqrt(mean(square_slope))
 
 
-def quality(found: Verification, array: MicrolensArray, *, wavelength: float, sensor_distance: float) -> dict[str, Any]:
+def quality(found: Verification, imager: Imager) -> dict[str, Any]:
     """A verification in numbers for a JSON file: deviations from the design, and what they do to the light.
 
     A surface that is off by `e` delays light by `(n - 1) e`; the Strehl ratio `exp(-(2 pi sigma / lambda)^2)`
@@ -187,11 +187,10 @@ def quality(found: Verification, array: MicrolensArray, *, wavelength: float, se
     ----------
     found
         Of the file.
-    array
+    imager
         The design's.
-    wavelength, sensor_distance
-        The design's, mm.
     """
+    array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.sensor_distance)
     bend = float(array.refractive_index) - 1
     shift = np.linalg.norm(found.center - np.asarray(array.centers, float), axis=1)
     larger = found.radius / float(array.radius_of_curvature) - 1

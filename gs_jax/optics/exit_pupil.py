@@ -40,7 +40,7 @@ class ExitPupil(NamedTuple):
     distance: Float[Array, ""]
 
 
-def exit_pupil(imager: Imager, depth, wavelength, field, radius, edges, count: int) -> ExitPupil:
+def exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitPupil:
     """The lens seen from the sensor: for each point of a grid the ray that comes from there, and its phase.
 
     The coordinate is `u = D - rho (e - e_0)` with the ray's end D from the chief ray's, its direction cosines e and
@@ -77,7 +77,7 @@ def exit_pupil(imager: Imager, depth, wavelength, field, radius, edges, count: i
     density = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
     lit = lit & (density > 0)
     amplitude = jnp.where(lit, share * jnp.sqrt(jnp.where(lit, density, 1)), 0)
-    phase = jnp.where(lit, 2 * np.pi / jnp.asarray(wavelength, radius.dtype) * path, 0)
+    phase = jnp.where(lit, 2 * np.pi / imager.wavelength * path, 0)
     amplitude, phase = amplitude.reshape(count, count), phase.reshape(count, count)
     return ExitPupil(coordinate, turned(amplitude, phase), amplitude, chief.landing, distance)
 

@@ -32,7 +32,6 @@ def psf(
     imager: Imager,
     depth: Scalar,
     *,
-    wavelength: Scalar,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
@@ -49,11 +48,9 @@ def psf(
     Parameters
     ----------
     imager
-        The lens, the sensor's pixels and its distance. Where the lenses are does not matter.
+        The lens, the light, the sensor's pixels and its distance. Where the lenses are does not matter.
     depth
         `z` of the object point, mm.
-    wavelength
-        mm.
     size
         Pixels along a side of the window, odd.
     field
@@ -75,7 +72,7 @@ def psf(
     ValueError
         If `size` is not odd and positive, or `samples` is not positive.
     """
-    pixels = _pixels(imager, depth, wavelength, size, field, offset, radius, edges, samples)
+    pixels = _pixels(imager, depth, size, field, offset, radius, edges, samples)
     return pixels / jnp.sum(pixels)
 
 
@@ -84,7 +81,6 @@ def window_fraction(
     imager: Imager,
     depth: Scalar,
     *,
-    wavelength: Scalar,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
@@ -93,7 +89,7 @@ def window_fraction(
     samples: int = 4,
 ) -> Float[Array, ""]:
     """Share of the light through the pupil that falls into the window of `psf`; same arguments."""
-    return jnp.sum(_pixels(imager, depth, wavelength, size, field, offset, radius, edges, samples))
+    return jnp.sum(_pixels(imager, depth, size, field, offset, radius, edges, samples))
 
 
 @partial(jax.jit, static_argnames=("size",))
@@ -101,7 +97,6 @@ def geometric_psf(
     imager: Imager,
     depth: Scalar,
     *,
-    wavelength: Scalar | None = None,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
@@ -110,7 +105,7 @@ def geometric_psf(
 ) -> Float[Array, "row column"]:
     """Density of rays, each shared by the four pixels around it, with the sum 1 unless no ray is in the window.
 
-    32768 rays, even over the pupil. Parameters are `psf`'s; the wavelength is not used.
+    32768 rays, even over the pupil. Parameters are `psf`'s.
 
     Raises
     ------
@@ -145,7 +140,6 @@ def gaussian_psf(
     imager: Imager,
     depth: Scalar,
     *,
-    wavelength: Scalar,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
@@ -170,7 +164,7 @@ def gaussian_psf(
     weights = (weights / jnp.sum(weights))[:, None]
     centroid = jnp.sum(weights * rays.landing, 0)
     spread = jnp.sum(weights * (rays.landing - centroid[None]) ** 2) / 2
-    airy = 0.5145 * jnp.asarray(wavelength, radius.dtype) * imager.sensor_distance / radius / np.sqrt(8 * np.log(2))
+    airy = 0.5145 * imager.wavelength * imager.sensor_distance / radius / np.sqrt(8 * np.log(2))
     sigma = jnp.sqrt(spread + airy**2)
     pitch = imager.sensor.pixel_pitch
     shift = centroid - _map(imager, depth, field, radius.dtype) + pitch * jnp.asarray(offset, radius.dtype)[::-1]
@@ -185,7 +179,6 @@ def strehl(
     imager: Imager,
     depth: Scalar,
     *,
-    wavelength: Scalar,
     field: Point = (0.0, 0.0),
     radius: Scalar | None = None,
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
@@ -197,20 +190,20 @@ def strehl(
 
     Parameters
     ----------
-    imager, depth, wavelength, field, radius, edges
+    imager, depth, field, radius, edges
         As for `psf`.
     samples
         Along a side of the pupil: enough for a blur of `samples / 2` times `wavelength v / (2 radius)`.
     """
-    pupil = exit_pupil(imager, depth, wavelength, field, radius, edges, samples)
-    wavelength = jnp.asarray(wavelength, pupil.distance.dtype)
-    turn = 2 * np.pi / (wavelength * pupil.distance)
+    pupil = exit_pupil(imager, depth, field, radius, edges, samples)
+    scale = imager.wavelength * pupil.distance
+    turn = 2 * np.pi / scale
 
     def irradiance(point):
         return _squared(_transform(pupil, point[:1], point[1:], turn))[0, 0] / jnp.sum(pupil.amplitude) ** 2
 
     # The peak's place needs no derivative: there, the irradiance's derivative by it is zero.
-    spacing = wavelength * pupil.distance / (2 * (pupil.coordinate[-1] - pupil.coordinate[0]))
+    spacing = scale / (2 * (pupil.coordinate[-1] - pupil.coordinate[0]))
     places = spacing * (jnp.arange(samples, dtype=spacing.dtype) - samples // 2)
     table = _squared(_transform(pupil, places, places, turn))
     row, column = jnp.unravel_index(jnp.argmax(table), table.shape)
@@ -225,19 +218,19 @@ def strehl(
     return irradiance(jax.lax.stop_gradient(peak))
 
 
-def _pixels(imager, depth, wavelength, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:
+def _pixels(imager, depth, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:
     """Energy on the pixels, as shares of what comes through the pupil."""
     _check(size)
     if samples < 1:
         raise ValueError(f"`samples` must be positive, got {samples}.")
     count = size * samples
-    pupil = exit_pupil(imager, depth, wavelength, field, radius, edges, count)
+    pupil = exit_pupil(imager, depth, field, radius, edges, count)
     dtype = pupil.distance.dtype
     pitch = imager.sensor.pixel_pitch / samples
     shift = pupil.chief - _map(imager, depth, field, dtype)
     shift = shift + imager.sensor.pixel_pitch * jnp.asarray(offset, dtype)[::-1]
     place = pitch * (jnp.arange(count, dtype=dtype) - (count - 1) / 2)
-    scale = jnp.asarray(wavelength, dtype) * pupil.distance
+    scale = imager.wavelength * pupil.distance
     light = _squared(_transform(pupil, place - shift[0], place - shift[1], 2 * np.pi / scale))
     pixels = light.reshape(size, samples, size, samples).sum((1, 3))
     # Parseval: the step of the pupil's grid over wavelength and distance, times the step on the sensor.

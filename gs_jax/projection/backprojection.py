@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,7 +45,7 @@ def backproject(
     Returns
     -------
     Array
-        `(len(depths), *grid.shape)`, of the image's type if it is floating, else of the imager's.
+        `grid.volume_shape`, of the image's type if it is floating, else of the imager's.
 
     Raises
     ------
@@ -58,7 +57,7 @@ def backproject(
     dtype = _type_of(image, imager)
 
     def some_depths(depths):
-        shapes, rays = _prepare(imager, eqx.tree_at(lambda g: g.depths, grid, depths), method, dtype)
+        shapes, rays = _prepare(imager, grid.at(depths), method, dtype)
         volume = image_to_volume(shapes, rays, image)
         if not normalize:
             return volume
@@ -82,7 +81,7 @@ def backproject_adjoint(
     Parameters
     ----------
     volume
-        `(len(depths), *grid.shape)`; integers count as the imager's type.
+        `grid.volume_shape`; integers count as the imager's type.
     imager, grid, method
         As for `backproject`.
 
@@ -96,14 +95,13 @@ def backproject_adjoint(
     ValueError
         If the volume is not of the grid's shape, or `method` is neither of the two.
     """
-    expected = (grid.depths.size, *grid.shape)
-    if volume.shape != expected:
-        raise ValueError(f"`volume` must be of the grid's shape {expected}, got {volume.shape}.")
+    if volume.shape != grid.volume_shape:
+        raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")
     volume = as_volume(volume, imager)
 
     def add_depths(image, group):
         depths, volume = group
-        shapes, rays = _prepare(imager, eqx.tree_at(lambda g: g.depths, grid, depths), method, volume.dtype)
+        shapes, rays = _prepare(imager, grid.at(depths), method, volume.dtype)
         return image + volume_to_image(shapes, rays, volume), None
 
     depths = _in_groups(grid.depths)
@@ -131,6 +129,5 @@ def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group some"]:
 def _prepare(imager: Imager, grid: Grid, method: str, dtype) -> tuple[Shapes, Rays]:
     if method not in ("linear", "nearest"):
         raise ValueError(f'`method` must be "linear" or "nearest", got {method!r}.')
-    shape = (grid.depths.size, *grid.shape)
     rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype)
-    return Shapes(imager.sensor.shape, shape, imager.field_radius), rays
+    return Shapes(imager.sensor.shape, grid.volume_shape, imager.field_radius), rays

@@ -34,7 +34,7 @@ def forward(
     Parameters
     ----------
     volume
-        `(len(depths), *grid.shape)`; integers count as the imager's type.
+        `grid.volume_shape`; integers count as the imager's type.
     imager, grid
         As for `backproject`.
     psf
@@ -71,8 +71,7 @@ def forward(
     @jax.checkpoint
     def add_depth(spectrum, plane):
         depth, voxels, kernel = plane
-        one = eqx.tree_at(lambda g: g.depths, grid, depth[None])
-        sharp = backproject_adjoint(voxels[None], imager, one)[1:-1, 1:-1]
+        sharp = backproject_adjoint(voxels[None], imager, grid.at(depth))[1:-1, 1:-1]
         return spectrum + transform(sharp) * transform(kernel), None
 
     dark = jnp.zeros((padded[0], padded[1] // 2 + 1), volume.dtype)

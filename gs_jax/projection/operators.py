@@ -21,7 +21,7 @@ def ray_operator(imager: Imager, grid: Grid, *, method: str = "linear") -> lx.Ab
     Returns
     -------
     lineax.AbstractLinearOperator
-        From `(len(depths), *grid.shape)` to `sensor.shape`, both of the imager's type. Matrix-free.
+        From `grid.volume_shape` to `sensor.shape`, both of the imager's type. Matrix-free.
     """
-    volume = jax.ShapeDtypeStruct((grid.depths.size, *grid.shape), imager.sensor_distance.dtype)
+    volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
     return lx.FunctionLinearOperator(eqx.Partial(backproject_adjoint, imager=imager, grid=grid, method=method), volume)

@@ -50,13 +50,13 @@ def trace(imager: Imager, grid: Grid, *, nearest: bool, dtype) -> Rays:
     limit = field_limit(imager.field_radius)
     x, y = imager.centers[_snake(imager.centers)].T
 
-    def axis(center, voxels, pixels):
+    def axis(center, origin, voxels, pixels):
         size = min(voxels, int(2 * limit / grid.pitch) + 1)
-        first = jnp.ceil((center - limit) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
+        first = jnp.ceil((center - origin - limit) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
         index = (start[:, None] + jnp.arange(size, dtype=jnp.int32)[None, :]).astype(center.dtype) - (voxels - 1) / 2
         pixel, fraction, offset = _project(
-            center, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
+            center, center - origin, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
@@ -65,20 +65,23 @@ def trace(imager: Imager, grid: Grid, *, nearest: bool, dtype) -> Rays:
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), origin)
 
     return Rays(
-        y=axis(y, grid.shape[0], imager.sensor.shape[0]),
-        x=axis(x, grid.shape[1], imager.sensor.shape[1]),
+        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0]),
+        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1]),
         spacing=jax.lax.stop_gradient(magnification * (grid.pitch / imager.sensor.pixel_pitch)),
         reduced_depth=reduced_depth.astype(dtype),
     )
 
 
-def _project(center, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
-    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the axis."""
+def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
+    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the axis.
+
+    `from_origin` is the lens's centre as seen from the grid's origin; voxels are counted from there.
+    """
     # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
     # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.
     whole = jax.lax.stop_gradient(jnp.round(center / pixel_pitch))
     center_here = _minus_multiple(center, whole, pixel_pitch)[:, None, None]
-    offset = _minus_multiple(center[:, None], index, voxel_pitch)
+    offset = _minus_multiple(from_origin[:, None], index, voxel_pitch)
     ray = chief_ray(center_here, center_here - offset[:, None, :], magnification[None, :, None])
     middle = (pixels - 1) / 2
     coordinate = ray / pixel_pitch + middle % 1

@@ -28,7 +28,7 @@ def forward_operator(
     imager: Imager, grid: Grid, psf: Float[Array | np.ndarray, "plane tall wide"]
 ) -> lx.AbstractLinearOperator:
     """`forward` with its PSF as a `lineax` operator, volume to image; build it inside the jitted function."""
-    volume = jax.ShapeDtypeStruct((grid.depths.size, *grid.shape), imager.sensor_distance.dtype)
+    volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
     return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, psf), volume)
 
 

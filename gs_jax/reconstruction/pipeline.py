@@ -55,9 +55,9 @@ def reconstruct_stack(
 ) -> Float32[np.ndarray, "depth y x"]:
     """`backproject`, some planes at a time."""
     image = jnp.asarray(image)
-    volume = np.empty((grid.depths.size, *grid.shape), np.float32)
+    volume = np.empty(grid.volume_shape, np.float32)
     for first in progress.track(range(0, grid.depths.size, _PLANES), "Back-projecting"):
-        planes = Grid(grid.depths[first : first + _PLANES], grid.shape, grid.pitch)
+        planes = grid.at(grid.depths[first : first + _PLANES])
         volume[first : first + _PLANES] = backproject(image, imager, planes)
     return volume
 
@@ -69,7 +69,6 @@ def reconstruct_iteratively(
     *,
     method: str,
     steps: int,
-    wavelength: float,
     progress: Progress,
 ) -> Float32[np.ndarray, "depth y x"]:
     """A volume by one of `methods.METHODS`, from the light above the camera's offset.
@@ -82,8 +81,6 @@ def reconstruct_iteratively(
         As for `backproject`.
     method, steps
         As for `methods.reconstruct`.
-    wavelength
-        mm.
 
     Raises
     ------
@@ -95,7 +92,7 @@ def reconstruct_iteratively(
     if method == "list-rl":
         psf = jnp.zeros((grid.depths.size, 1, 1))
     else:
-        kernel = psf_of_depth(imager, np.asarray(grid.depths), wavelength, "geometric")
+        kernel = psf_of_depth(imager, np.asarray(grid.depths), "geometric")
         psf = jnp.stack([kernel(z) for z in progress.track(np.asarray(grid.depths), "Point spread functions")])
     with progress.counter("Iterating", steps) as advance:
         volume = reconstruct(light, imager, grid, psf, method=method, steps=steps, callback=lambda *_: advance())

@@ -218,8 +218,9 @@ def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> F
 @jax.jit
 def _rasterize(emitters, grid):
     x, y, z, intensity = emitters.T
-    shape = (grid.depths.size, *grid.shape)
-    row, column = (at / grid.pitch + (n - 1) / 2 for at, n in zip((y, x), grid.shape, strict=True))
+    shape = grid.volume_shape
+    places = ((y - grid.origin[1], grid.shape[0]), (x - grid.origin[0], grid.shape[1]))
+    row, column = (at / grid.pitch + (n - 1) / 2 for at, n in places)
     axes = [_shares(index, n) for index, n in zip((_depth_index(z, grid), row, column), shape, strict=True)]
     volume = jnp.zeros(shape, emitters.dtype)
     for corner in product(*axes):

@@ -42,8 +42,8 @@ def simulate_scene(
     InputError
         As `read_points`, `read_volume` and the two functions below; it names the file.
     """
-    imager, wavelength = design.imager(), design.imaging.wavelength_nm * 1e-6
-    options: dict[str, Any] = dict(wavelength=wavelength, kind=kind, progress=progress)
+    imager = design.imager()
+    options: dict[str, Any] = dict(kind=kind, progress=progress)
     if path.suffix.lower() == ".csv":
         points = read_points(path)
         simulate = lambda: simulate_points(points, imager, **options)
@@ -59,7 +59,6 @@ def simulate_volume(
     imager: Imager,
     grid: Grid,
     *,
-    wavelength: float,
     kind: str = "diffraction",
     progress: Progress,
 ) -> Float[np.ndarray, "row column"]:
@@ -74,8 +73,6 @@ def simulate_volume(
         `(len(depths), *grid.shape)`, not negative.
     imager, grid
         As for `forward`.
-    wavelength
-        mm.
     kind
         Of the PSF: a key of `PSFS`.
 
@@ -95,13 +92,13 @@ def simulate_volume(
         )
     if np.min(volume) < 0:
         raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
-    kernel = psf_of_depth(imager, np.asarray(grid.depths), wavelength, kind)
+    kernel = psf_of_depth(imager, np.asarray(grid.depths), kind)
     image = jnp.zeros(imager.sensor.shape, jnp.float32)
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
             continue
         fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
-        one = Grid(depth[None], (rows, columns), grid.pitch / parts)
+        one = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
         image += forward(fine[None], imager, one, kernel(depth)[None])
     return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
 
@@ -110,7 +107,6 @@ def simulate_points(
     points: Float[np.ndarray, "point 4"],
     imager: Imager,
     *,
-    wavelength: float,
     kind: str = "diffraction",
     progress: Progress,
 ) -> Float[np.ndarray, "row column"]:
@@ -122,12 +118,12 @@ def simulate_points(
     if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
         depths = np.linspace(near, far, count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS)
-    kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, wavelength, kind, STEPS)
+    kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
     fine = np.stack([kernel(depth) for depth in progress.track(depths, "Point spread functions")])
     return forward_points(points, imager, stamps(depths, fine), progress)
 
 
-def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: int = 1):
+def psf_of_depth(imager: Imager, depths, kind: str, steps: int = 1):
     """Function from a depth to its PSF, in a window that holds the rays of all depths.
 
     Rays that the lens reflects totally do not count.
@@ -138,8 +134,6 @@ def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: in
         Its mean clear aperture is taken.
     depths
         Between the nearest and the farthest of them, mm.
-    wavelength
-        mm.
     kind
         Of the PSF: a key of `PSFS`.
     steps
@@ -165,6 +159,6 @@ def psf_of_depth(imager: Imager, depths, wavelength: float, kind: str, steps: in
     size = steps * (2 * math.ceil(pixels + _MARGIN) + 1)
     make = PSFS[kind]
     if kind == "diffraction":  # as fine as the aperture diffracts
-        sharp = 2 * radius * imager.sensor.pixel_pitch / (wavelength * imager.sensor_distance)
+        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
         make = partial(make, samples=math.ceil(sharp))
-    return lambda depth: make(imager, depth, wavelength=wavelength, size=size, radius=radius)
+    return lambda depth: make(imager, depth, size=size, radius=radius)

@@ -41,9 +41,8 @@ def cluster(
         If the volume is not of the grid's shape, or a threshold is out of range.
     """
     volume = np.asarray(volume, np.float32)
-    expected = (grid.depths.size, *grid.shape)
-    if volume.shape != expected:
-        raise ValueError(f"`volume` must be of the grid's shape {expected}, got {volume.shape}.")
+    if volume.shape != grid.volume_shape:
+        raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")
     if not all(0 < t < 1 for t in thresholds):
         raise ValueError(f"`thresholds` must be between 0 and 1, got {tuple(thresholds)}.")
     groups, peaks = [volume - np.median(volume, axis=(1, 2), keepdims=True)], set()
@@ -62,8 +61,7 @@ def cluster(
                 parts.append(part)
                 part_corners.append(at)
         groups, corners = parts, part_corners
-    depth, row, column = np.array(sorted(peaks), int).reshape(-1, 3).T
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
-    value = volume[depth, row, column] - np.median(volume, axis=(1, 2))[depth]
-    points = np.column_stack([x[column], y[row], z[depth], value]).astype(np.float64)
+    voxels = np.array(sorted(peaks), int).reshape(-1, 3)
+    value = volume[tuple(voxels.T)] - np.median(volume, axis=(1, 2))[voxels[:, 0]]
+    points = np.column_stack([grid.to_mm(voxels), value])
     return points[np.argsort(-points[:, 3], kind="stable")]

@@ -130,8 +130,8 @@ def _voxels(imager: Imager, grid: Grid) -> Grid:
 def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point"]:
     """Which points lie in the grid's voxels, the outer planes of which are a step thick."""
     x, y, z = points[:, :3].T
-    rows, columns = grid.shape
-    lateral = (np.abs(x) <= columns * grid.pitch / 2) & (np.abs(y) <= rows * grid.pitch / 2)
+    left, right, bottom, top = grid.extent
+    lateral = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
     near, far = float(grid.depths.min()), float(grid.depths.max())
     return lateral & (near - step / 2 <= z) & (z <= far + step / 2)
 
@@ -161,16 +161,15 @@ def _brightest_neighbour(light: Float[Array | np.ndarray, "row column"]) -> Floa
 def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) -> Places:
     """Local maxima of the summed logarithms, at voxels."""
     image = jnp.asarray(_brightness(rest.light, rest.noise))
-    x, y, z = (np.asarray(axis, np.float64) for axis in (voxels.x, voxels.y, voxels.depths))
+    last = voxels.depths.size - 1
     # Each part has a plane of its neighbours; the last is as long as the others, its planes after the end repeat.
     planes = np.arange(_PLANES)
     found = [np.zeros((0, 3))]
-    for first in progress.track(range(0, len(z) - 2, _PLANES - 2), "Searching for points"):
-        some = np.minimum(first + planes, len(z) - 1)
-        volume = backproject(image, imager, Grid(voxels.depths[some], voxels.shape, voxels.pitch))
-        depth, row, column = np.argwhere(np.asarray(_is_maximum(volume))).T + 1
-        inside = first + depth < len(z) - 1
-        found.append(np.column_stack([x[column], y[row], z[some[depth]]])[inside])
+    for first in progress.track(range(0, last - 1, _PLANES - 2), "Searching for points"):
+        some = np.minimum(first + planes, last)
+        volume = backproject(image, imager, voxels.at(voxels.depths[some]))
+        maxima = np.argwhere(np.asarray(_is_maximum(volume))) + (first + 1, 1, 1)
+        found.append(voxels.to_mm(maxima[maxima[:, 0] < last]))
     return np.concatenate(found)
 
 

@@ -196,7 +196,7 @@ def _capture(scene: np.ndarray, imager: Imager, grid: Grid, rng: np.random.Gener
 
 def _psf(imager: Imager, depth):
     radius = clear_diameter(imager.array) / 2
-    return geometric_psf(imager, depth, wavelength=520e-6, size=2 * _REACH + 1, radius=radius)
+    return geometric_psf(imager, depth, size=2 * _REACH + 1, radius=radius)
 
 
 def _shared_out(scene: np.ndarray, at: np.ndarray, depths: np.ndarray) -> Float32[np.ndarray, "depth y x"]:
