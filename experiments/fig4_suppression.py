@@ -32,7 +32,7 @@ from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.phantoms import rasterize
-from gs_jax.suppression.clustering import cluster
+from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.locate import find_points
 
 SHOWN = (18.0, 20.0, 22.0)  # mm
@@ -56,9 +56,10 @@ def _compare(truth, capture, design, grid, progress) -> dict:
     points = {
         "nothing": np.zeros((0, 4)),
         "threshold and peaks, the best": _best(lambda lowest: _peaks(volume, grid, lowest), truth),
-        "the paper's clustering": cluster(volume, grid),
+        "the paper's clustering": find_clusters(volume, grid, noise_floor=0),
         "clustering, the best": _best(
-            lambda lowest: cluster(volume, grid, thresholds=(lowest, 2 * lowest, 3 * lowest)), truth
+            lambda lowest: find_clusters(volume, grid, thresholds=(lowest, 2 * lowest, 3 * lowest), noise_floor=0),
+            truth,
         ),
         "find_points": find_points(capture, imager, grid, progress=progress),
     }

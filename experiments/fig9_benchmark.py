@@ -34,7 +34,6 @@ from skimage.feature import peak_local_max
 
 from gs_jax import Grid, Imager, Sensor
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.compare import paper_clusters
 from gs_jax.benchmark.measure import timed
 from gs_jax.benchmark.report import table
 from gs_jax.benchmark.scenes import FWHM, spots
@@ -46,6 +45,7 @@ from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
 from gs_jax.reconstruction.methods import reconstruct
 from gs_jax.simulation.phantoms import rasterize
+from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.consistency import local_levels
 from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress
@@ -106,8 +106,8 @@ def methods(s: Scene, steps: dict[str, int], progress: Progress) -> dict[str, Ca
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),
         "backproject": lambda: Result(solve("backproject")),
-        "backproject + cluster": lambda: of(find_points(s.image, s.imager, s.grid, progress=progress)),
-        "backproject + paper's clusters": lambda: of(paper_clusters(solve("backproject"), s.grid)),
+        "backproject + points": lambda: of(find_points(s.image, s.imager, s.grid, progress=progress)),
+        "backproject + clusters": lambda: of(find_clusters(solve("backproject"), s.grid)),
         "backproject + unet": lambda: Result(suppress(solve("backproject"), pretrained())),
         **{name: (lambda name=name: Result(solve(name))) for name in steps},
         "truth": lambda: Result(s.truth),

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark import compare, report
-from gs_jax.benchmark.compare import METHODS, obstacle, paper_clusters, run, slopes
+from gs_jax.benchmark.compare import METHODS, obstacle, run, slopes
 from gs_jax.benchmark.scenes import Case, bench, peaks, scores, spots
 from gs_jax.reconstruction.methods import forward_operator, reconstruct
 
@@ -36,7 +36,7 @@ def found():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "ProcessPoolExecutor", Here)
         patch.setattr(compare, "_REPEATS", 2)
-        names = ("backproject", "backproject + paper's clusters", "richardson-lucy", "richardson-lucy, dense")
+        names = ("backproject", "backproject + clusters", "richardson-lucy", "richardson-lucy, dense")
         return run((16,), methods=names, seeds=(0,), progress=Progress())
 
 
@@ -83,16 +83,6 @@ def test_spots_and_their_peaks():
     assert len(peaks(volume + 0.8 * weak, grid)) == 2  # 0.28
     between = spots(np.array([[0.4, -0.4, 20.0, 1.0]]), grid, 0.12)
     assert len(peaks(between, grid)) == 1  # not each of four equal voxels
-
-
-def test_clusters_of_noise_are_left_out():
-    _, grid = scene(voxels=(40, 36), pitch=0.1, depths=(20.0,))
-    noise = 0.02 * np.random.default_rng(0).standard_normal((1, 40, 36)).astype(np.float32)
-    # A maximum among 1440 Gaussian values exceeds five deviations once in 2000 times.
-    assert not len(paper_clusters(noise, grid))
-    points = np.array([[0.35, -0.45, 20.0, 2.0], [-0.55, 0.85, 20.0, 1.0]])
-    found = paper_clusters(spots(points, grid, 0.12) + noise, grid)
-    np.testing.assert_allclose(found[:, :2], points[:, :2], atol=0.051)  # half a voxel
 
 
 def test_slopes_are_those_of_the_papers_range():

@@ -19,7 +19,7 @@ from gs_jax.metrics import localization
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.clustering import cluster
+from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.locate import find_points
 
 from .helpers import needs
@@ -157,7 +157,8 @@ def test_what_only_half_of_the_lenses_see_is_a_ghost():
         image += simulate_points(point[None], half, kind="geometric", progress=Progress())
     capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=3000))
     assert len(find(capture)) == 0
-    assert len(cluster(backproject(capture.astype(np.float32), imager, grid), grid)) >= 2
+    volume = backproject(capture.astype(np.float32), imager, grid)
+    assert len(find_clusters(volume, grid, noise_floor=0)) >= 2
 
 
 def test_two_lenses_may_be_blocked():

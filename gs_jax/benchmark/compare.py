@@ -18,14 +18,12 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Float, Float32
 
 from ..base.errors import InputError
 from ..base.info import memory_bytes
 from ..base.progress import Progress
-from ..geometry import Grid
 from ..reconstruction.methods import SOLVERS, forward_operator, reconstruct
-from ..suppression.clustering import cluster
+from ..suppression.clustering import find_clusters
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
 from .measure import peak_mib, timed
@@ -35,8 +33,6 @@ from .scenes import Bench, Case, bench, case, scores, spots
 SIDES = (32, 56, 100, 212, 1024, 3200)
 STEPS = 30
 COSTS = ("seconds", "compile_seconds", "peak_mib")
-# The clusters that the paper's algorithm finds in noise are left out: what this many deviations do not exceed.
-_FLOOR = 5.0
 # A call that took longer than this is not repeated; one that would take longer than the limit is left out, seconds.
 _REPEAT, LIMIT = 1.0, 30.0
 _REPEATS = 5
@@ -98,17 +94,10 @@ def _clustered(bench: Bench):
     first = _compiled("backproject")(bench)
 
     def run(image):
-        points = paper_clusters(np.asarray(first(image)), bench.grid)
+        points = find_clusters(np.asarray(first(image)), bench.grid)
         return spots(points, bench.grid, bench.width)
 
     return run
-
-
-def paper_clusters(volume: Float32[np.ndarray, "depth y x"], grid: Grid) -> Float[np.ndarray, "point 4"]:
-    """`cluster`, but for what noise can be: five standard deviations, as the median deviation from the median tells."""
-    points = cluster(volume, grid)
-    deviation = np.abs(volume - np.median(volume, axis=(1, 2), keepdims=True))
-    return points[points[:, 3] > _FLOOR * 1.4826 * np.median(deviation)]
 
 
 def _network(bench: Bench):
@@ -118,8 +107,8 @@ def _network(bench: Bench):
 
 METHODS = {
     "backproject": Method(_compiled("backproject")),
-    "backproject + cluster": Method(_located),
-    "backproject + paper's clusters": Method(_clustered),
+    "backproject + points": Method(_located),
+    "backproject + clusters": Method(_clustered),
     "backproject + unet": Method(_network),
     "list-rl": Method(_compiled("list-rl")),
     "richardson-lucy": Method(_compiled("richardson-lucy")),

@@ -111,6 +111,26 @@ class Design(_Table):
             check(self)
         return self
 
+    def __repr__(self) -> str:
+        sensor, lens, array, imaging = self.sensor, self.lens, self.array, self.imaging
+        focal = (
+            f"f = {lens.focal_length_mm:g} mm" if lens.focal_length_mm else f"R = {lens.radius_of_curvature_mm:g} mm"
+        )
+        return "\n".join(
+            [
+                f"Design {self.name!r}",
+                f"  {len(array.centers_mm)} lenses, {focal}, n = {lens.refractive_index:g}, "
+                f"D = {lens.aperture_diameter_mm:g} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
+                f"{array.substrate_thickness_mm:g} mm thick",
+                f"  sensor of {sensor.shape[0]} x {sensor.shape[1]} pixels of {sensor.pixel_pitch_um:g} um "
+                f"at v = {imaging.sensor_distance_mm:g} mm",
+                f"  objects at z = {imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm, "
+                f"{imaging.wavelength_nm:g} nm, field radius {imaging.field_radius_mm:g} mm",
+            ]
+        )
+
+    __str__ = __repr__
+
     def imager(self) -> Imager:
         """The geometry of this design: mm and radians."""
         lens, imaging, calibration = self.lens, self.imaging, self.calibration

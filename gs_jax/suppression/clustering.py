@@ -12,9 +12,16 @@ from skimage.measure import label, regionprops
 from ..geometry import Grid
 from ..layouts.cells import Real
 
+# Standard deviation of a normal distribution over its median deviation from the median.
+_DEVIATION = 1.4826
 
-def cluster(
-    volume: Float[Array | np.ndarray, "depth y x"], grid: Grid, *, thresholds: Sequence[Real] = (0.05, 0.1, 0.15, 0.2)
+
+def find_clusters(
+    volume: Float[Array | np.ndarray, "depth y x"],
+    grid: Grid,
+    *,
+    thresholds: Sequence[Real] = (0.05, 0.1, 0.15, 0.2),
+    noise_floor: Real = 5.0,
 ) -> Float64[np.ndarray, "point 4"]:
     """The paper's particle clustering ("Background suppression through a particle clustering algorithm").
 
@@ -29,6 +36,9 @@ def cluster(
         A reconstruction and its voxels. The median of each plane is taken for its background and subtracted.
     thresholds
         Between 0 and 1, ascending.
+    noise_floor
+        Points are brighter than so many standard deviations of the volume's noise, as the median deviation from the
+        median tells it: noise too has clusters. The paper removes "system noise" by a threshold that it does not give.
 
     Returns
     -------
@@ -45,7 +55,8 @@ def cluster(
         raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")
     if not all(0 < t < 1 for t in thresholds):
         raise ValueError(f"`thresholds` must be between 0 and 1, got {tuple(thresholds)}.")
-    groups, peaks = [volume - np.median(volume, axis=(1, 2), keepdims=True)], set()
+    above = volume - np.median(volume, axis=(1, 2), keepdims=True)
+    groups, peaks = [above], set()
     corners = [np.zeros(3, int)]
     for threshold in thresholds:
         parts, part_corners = [], []
@@ -62,6 +73,6 @@ def cluster(
                 part_corners.append(at)
         groups, corners = parts, part_corners
     voxels = np.array(sorted(peaks), int).reshape(-1, 3)
-    value = volume[tuple(voxels.T)] - np.median(volume, axis=(1, 2))[voxels[:, 0]]
-    points = np.column_stack([grid.to_mm(voxels), value])
+    points = np.column_stack([grid.to_mm(voxels), above[tuple(voxels.T)]])
+    points = points[points[:, 3] > noise_floor * _DEVIATION * np.median(np.abs(above))]
     return points[np.argsort(-points[:, 3], kind="stable")]

@@ -124,7 +124,9 @@ def multislice_network(key: PRNGKeyArray) -> UNet:
     return UNet((-3, -2, -1, 0, 1, 2, 3), (16, 32, 64, 128), standardized=True, key=key)
 
 
-def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet) -> Float32[np.ndarray, "depth y x"]:
+def suppress(
+    volume: Float[Array | np.ndarray, "depth y x"], network: UNet | None = None
+) -> Float32[np.ndarray, "depth y x"]:
     """What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero.
 
     What the network sees is in its own unit (`standardized`), what it gives back in the volume's, above each plane's
@@ -135,15 +137,16 @@ def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet) -> F
     Parameters
     ----------
     volume
-        Of any size, finite; a stack as `reconstruct_stack` makes it.
+        Of any size, finite; back-projected.
     network
-        From `pretrained`, `read_weights` or training.
+        From `pretrained`, `read_weights` or training; by default ours, which comes with the package.
 
     Returns
     -------
     ndarray
         Of the volume's shape, not negative.
     """
+    network = pretrained() if network is None else network
     volume = np.asarray(volume, np.float32)
     result = np.zeros_like(volume)
     if not volume.size:

@@ -1,0 +1,75 @@
+"""A reconstruction to look at: maximum projections to scale, with points on them."""
+
+import numpy as np
+from jaxtyping import Array, Float, Num
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from .geometry import Grid
+
+# Darkest and brightest shown, percentiles: back-projection has a pedestal, which is no object, and a few bright voxels.
+_DARKEST, _BRIGHTEST = 50, 99.95
+
+
+def show(
+    volume: Num[Array | np.ndarray, "depth y x"],
+    grid: Grid,
+    *,
+    points: Float[Array | np.ndarray, "point 4"] | None = None,
+) -> Figure:
+    """Maximum projections of a volume along z, y and x, to scale in mm, with points as circles.
+
+    Parameters
+    ----------
+    volume, grid
+        `grid.volume_shape`, and where its voxels are; depths ascend.
+    points
+        `(x, y, z, intensity)`, as `find_points` returns them; coloured by depth.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A notebook shows it; `figure.savefig(path)` writes it.
+
+    Raises
+    ------
+    ValueError
+        If the volume is not of the grid's shape.
+    """
+    volume = np.asarray(volume)
+    if volume.shape != grid.volume_shape:
+        raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")
+    low, high = np.percentile(volume, _DARKEST), np.percentile(volume, _BRIGHTEST)
+    style = {"cmap": "magma", "vmin": low, "vmax": max(high, low + 1e-12)}
+    # As high as the plane is, so that it fills its place and the views beside it are in line with it.
+    figure = Figure(figsize=(8.2, 2.4 + 5.4 * grid.shape[0] / grid.shape[1]), layout="constrained")
+    axes = figure.subplots(2, 2, width_ratios=(4, 1), height_ratios=(4 * grid.shape[0] / grid.shape[1], 1))
+    plane, beside, below = axes[0, 0], axes[0, 1], axes[1, 0]
+    axes[1, 1].axis("off")
+
+    left, right, bottom, top = grid.extent
+    x, y = np.linspace(left, right, grid.shape[1] + 1), np.linspace(top, bottom, grid.shape[0] + 1)
+    z = _edges(np.asarray(grid.depths, float), grid.pitch)
+    image = plane.pcolormesh(x, y, volume.max(0), **style, rasterized=True)
+    beside.pcolormesh(z, y, volume.max(2).T, **style, rasterized=True)
+    below.pcolormesh(x, z, volume.max(1), **style, rasterized=True)
+    plane.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(left, right), ylim=(bottom, top))
+    beside.set(xlabel="z, mm", ylim=(bottom, top), xlim=(z[0], z[-1]))
+    below.set(xlabel="x, mm", ylabel="z, mm", xlim=(left, right), ylim=(z[0], z[-1]))
+    figure.colorbar(image, ax=axes[1, 1], label="intensity", fraction=0.6, location="left")
+    plane.set_title(" x ".join(map(str, volume.shape)) + " voxels (z, y, x), maxima")
+    if points is not None and len(points):
+        px, py, pz = np.asarray(points)[:, :3].T
+        colours = colormaps["winter"](np.clip((pz - z[0]) / (z[-1] - z[0]), 0, 1))
+        for axis, a, b in ((plane, px, py), (beside, pz, py), (below, px, pz)):
+            axis.scatter(a, b, s=30, facecolors="none", edgecolors=colours)
+        plane.set_title(f"{plane.get_title()}, {len(points)} points")
+    return figure
+
+
+def _edges(depths, pitch):
+    """Between the planes, and half a step beyond the first and the last; a single plane is as thick as a voxel."""
+    if len(depths) == 1:
+        return depths[0] + np.array([-0.5, 0.5]) * pitch
+    between = (depths[1:] + depths[:-1]) / 2
+    return np.concatenate([[2 * depths[0] - between[0]], between, [2 * depths[-1] - between[-1]]])
