@@ -1,16 +1,25 @@
-"""The image of points that lie anywhere: one stamp of PSF_o for each lens that sees a point. Host code."""
+"""The image of points that lie anywhere: one stamp of PSF_o for each lens that sees a point, a spot. Host code."""
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
 from ..base.progress import Progress
-from ..geometry import Imager, envelope, field_limit
+from ..geometry import Imager, chief_ray, envelope, field_limit
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
 STEPS = 5
+# Points and spots at a time (the built-in design has 15 spots for a point), which bounds the memory.
+_POINTS, _SPOTS = 2048, 32768
+# The image is added up in square tiles of so many pixels, which stay in the processor's cache.
+_TILE = 512
 
 
 class Stamps(NamedTuple):
@@ -38,19 +47,21 @@ def stamps(depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth f
     if (np.diff(depths) <= 0).any():
         raise ValueError(f"`depths` must ascend, got {depths}.")
     half = STEPS // 2
-    kernels = np.empty((len(depths), STEPS, STEPS, size, size), fine.dtype)
-    for i, j in np.ndindex(STEPS, STEPS):
-        moved = np.roll(fine, (i - half, j - half), (1, 2))
-        kernels[:, i, j] = moved.reshape(-1, size, STEPS, size, STEPS).sum((2, 4))
-    return Stamps(depths, kernels)
+    wide = np.pad(fine, ((0, 0), (half, half), (half, half)), "wrap")
+    # Pixels that begin at every fifth, along one axis after the other; a stamp that is moved up begins later.
+    for axis in (1, 2):
+        wide = sliding_window_view(wide, STEPS, axis).sum(-1)
+    pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
+    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)))
 
 
 def forward_points(
-    points: Float[Array | np.ndarray, "point 4"], imager: Imager, stamps: Stamps, progress: Progress
+    points: Float[Array | np.ndarray, "point 4"], imager: Imager, stamps: Stamps, progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
     """The image of points, Eq. (2): what `forward` does for voxels, without a grid.
 
-    The PSF is interpolated linearly between the depths of `stamps` and moved by fifths of a pixel.
+    The PSF is interpolated linearly between the depths of `stamps` and moved by fifths of a pixel. The memory that it
+    takes is three images and one more copy of the stamps, however many points there are.
 
     Parameters
     ----------
@@ -68,34 +79,72 @@ def forward_points(
     ndarray
         `sensor.shape`, of the type of the stamps.
     """
+    # In the order of depth, so that few stamps at a time are in use.
     points = np.asarray(points, np.float64)
-    pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])), np.float64)
-    size = stamps.kernels.shape[-1]
-    # A border for what spreads beyond the sensor; spots that are wholly beyond it are left out.
-    image = np.zeros([n + 2 * size for n in imager.sensor.shape], stamps.kernels.dtype)
-    tree = KDTree(np.asarray(imager.centers))
-    limit = field_limit(imager.field_radius)
-    for number in progress.track(range(len(points)), "Imaging points"):
-        x, y, z, intensity = points[number]
-        lenses = tree.query_ball_point((x, y), limit)
-        distance2 = ((tree.data[lenses] - (x, y)) ** 2).sum(1)
-        weights = intensity * np.asarray(envelope(distance2, float(imager.reduced_depth(z)), imager.field_radius))
-        (near, near_part), (far, far_part) = _between(stamps.depths, z)
-        for weight, place in zip(weights, pixels[lenses, number], strict=True):
-            fifths = np.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
-            (row, column), (i, j) = fifths // STEPS, fifths % STEPS
-            corner = np.array([row, column]) - size // 2 + size
-            if (corner < 0).any() or (corner > np.array(image.shape) - size).any():
-                continue
-            patch = image[corner[0] : corner[0] + size, corner[1] : corner[1] + size]
-            patch += (weight * near_part) * stamps.kernels[near, i, j]
-            if far_part:
-                patch += (weight * far_part) * stamps.kernels[far, i, j]
-    return image[size:-size, size:-size]
+    points = points[np.argsort(points[:, 2])]
+    # One spot after the other is work for a processor, whatever else there is.
+    imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), jax.devices("cpu")[0])
+    size = kernels.shape[-1]
+    rows, columns = _tiles(imager.sensor.shape, size)
+    side = _TILE + size - 1
+    tiles = jnp.zeros((rows * columns, side, side), kernels.dtype, device=kernels.device)
+    lenses, limit = KDTree(np.asarray(imager.centers)), field_limit(imager.field_radius)
+    starts = range(0, len(points), _POINTS)
+    for start in progress.track(starts, "Imaging points") if progress else starts:
+        some = points[start : start + _POINTS]
+        pairs = KDTree(some[:, :2]).sparse_distance_matrix(lenses, limit, output_type="ndarray")
+        for first in range(0, len(pairs), _SPOTS):
+            # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
+            spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
+            count = min(_SPOTS, len(pairs) - first)
+            tiles = _add_spots(tiles, count, some[spots["i"]], spots["j"], imager, depths, kernels)
+    image = np.zeros((rows * _TILE + size - 1, columns * _TILE + size - 1), stamps.kernels.dtype)
+    for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
+        image[row * _TILE :, column * _TILE :][:side, :side] += tile
+    return image[size - 1 :, size - 1 :][: imager.sensor.shape[0], : imager.sensor.shape[1]]
 
 
-def _between(depths: np.ndarray, depth: float):
-    """The two planes around a depth and their parts."""
-    place = float(np.interp(depth, depths, np.arange(len(depths))))
-    near = min(int(place), len(depths) - 1)
-    return (near, 1 - (place - near)), (min(near + 1, len(depths) - 1), place - near)
+def _tiles(shape: tuple[int, int], size: int) -> tuple[int, int]:
+    """Rows and columns of tiles. The first begins `size - 1` before the sensor, where the first stamps do."""
+    rows, columns = (-(-(n + size - 1) // _TILE) for n in shape)
+    return rows, columns
+
+
+@partial(jax.jit, donate_argnums=0)
+def _add_spots(
+    tiles: Float[Array, "tile side side"],
+    count: Int[ArrayLike, ""],
+    points: Float[Array | np.ndarray, "spot 4"],
+    lenses: Int[Array | np.ndarray, " spot"],
+    imager: Imager,
+    depths: Float[Array, " depth"],
+    kernels: Float[Array, "depth 5 5 size size"],
+) -> Float[Array, "tile side side"]:
+    """Adds the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
+    size, dtype = kernels.shape[-1], imager.sensor_distance.dtype
+    points = jnp.asarray(points, dtype)
+    center, point, depth = imager.centers[lenses], points[:, :2], points[:, 2]
+    weight = envelope(jnp.sum((center - point) ** 2, -1), imager.reduced_depth(depth), imager.field_radius)
+    weight = (points[:, 3] * weight).astype(kernels.dtype)
+    between = jnp.interp(depth, depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
+    near = between.astype(int)
+    far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
+
+    place = imager.sensor.to_pixels(chief_ray(center, point, imager.magnification(depth)[:, None]))
+    fifths = jnp.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
+    (i, j), corner = (fifths % STEPS).T, fifths // STEPS + size // 2
+    last = jnp.array(imager.sensor.shape) + size - 2
+    lit = (jnp.arange(len(points)) < count) & jnp.all((corner >= 0) & (corner <= last[None]), -1)
+    tile = corner // _TILE @ jnp.array([_tiles(imager.sensor.shape, size)[1], 1])
+    row, column = (corner % _TILE).T
+    # Those of a tile together, and after all those that do not reach the sensor.
+    order = jnp.argsort(jnp.where(lit, tile, len(tiles)))
+
+    def add(number, tiles):
+        n = order[number]
+        stamp = (1 - part[n]) * kernels[near[n], i[n], j[n]] + part[n] * kernels[far[n], i[n], j[n]]
+        at = tile[n], row[n], column[n]
+        patch = lax.dynamic_slice(tiles, at, (1, size, size))
+        return lax.dynamic_update_slice(tiles, patch + weight[n] * stamp[None], at)
+
+    return lax.fori_loop(0, jnp.sum(lit), add, tiles)
