@@ -33,6 +33,7 @@ from rich.table import Table
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.base.info import describe
+from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import peak_mib, status_mib, timed
 from gs_jax.io.disk import make_folder, write_json
@@ -89,9 +90,8 @@ def inputs(job: Job) -> Inputs:
     sensor = Sensor((job.pixels, job.pixels), FIELD_MM / job.pixels)
     imager = Imager(MicrolensArray(centers), sensor, job.sensor_distance_mm, field_radius=3.0)
     grid = Grid(np.linspace(18, 24, job.depths), (job.voxels, job.voxels), FIELD_MM / job.voxels)
-    single = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
     random = lambda *shape: jnp.asarray(rng.random(shape, dtype=np.float32))
-    return Inputs(random(*sensor.shape), random(job.depths, *grid.shape), single(imager), single(grid))
+    return Inputs(random(*sensor.shape), random(job.depths, *grid.shape), in_float32(imager), in_float32(grid))
 
 
 def bilinear_form(centers, sensor_distance, s: Inputs):
@@ -330,7 +330,7 @@ def markdown(found: dict) -> str:
 
 def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
     """Cost against each size, the others at full scale."""
-    figure = Figure(figsize=(8, 6.4), layout="constrained")
+    figure = Figure(figsize=(8, 6.4), dpi=110, layout="constrained")
     for axes, (axis, results) in zip(figure.subplots(2, 2, sharey=True).flat, study.items(), strict=False):
         x = [amount(axis, result) for result in results]
         for name, style in zip(IN_STUDY, ("o-", "s--", "^:"), strict=True):

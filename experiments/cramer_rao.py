@@ -137,7 +137,7 @@ def run(
 
 def picture(found: dict) -> Figure:
     """Errors and bounds against photons, along x and z; the layouts."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = Figure(figsize=(11, 3.6), dpi=100, layout="constrained")
     *plots, right = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1))
     for color, name in zip(("C0", "C3"), found["centers_mm"], strict=True):
         rows = [row for row in found["rows"] if row["layout"] == name]

@@ -138,7 +138,7 @@ def picture(pictures: dict[str, np.ndarray]) -> Figure:
     """The hand as each sees it, from zero to its 99.9th percentile."""
     columns = min(4, len(pictures))
     rows = -(-len(pictures) // columns)
-    figure = Figure(figsize=(3.2 * columns, 2.7 * rows), layout="constrained")
+    figure = Figure(figsize=(3.2 * columns, 2.7 * rows), dpi=90, layout="constrained")
     for axis in (axes := figure.subplots(rows, columns, squeeze=False)).flat[len(pictures) :]:
         axis.set_axis_off()
     for axis, (title, image) in zip(axes.flat, pictures.items(), strict=False):

@@ -22,8 +22,8 @@ from experiments.profiles import around_the_axis, dip, fwhm, through_peak
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.simulation.scene import simulate_points
 
 SCENES = {
@@ -64,7 +64,7 @@ def picture(found: dict) -> Figure:
     """The profiles, sources on top of each other."""
     panels = (("a", "x", "one point, laterally"), ("a", "z", "one point, axially"))
     panels += (("b", "x", "two points 40 um apart"), ("c", "z", "two points 300 um apart"))
-    figure = Figure(figsize=(9, 6), layout="constrained")
+    figure = Figure(figsize=(9, 6), dpi=100, layout="constrained")
     for axes, (scene, axis, title) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         for (source, result), style in zip(found.items(), ("-", "--"), strict=False):
             coordinate, profile = result["profiles"][scene][axis]

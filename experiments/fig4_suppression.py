@@ -27,8 +27,8 @@ from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.phantoms import rasterize
@@ -101,7 +101,7 @@ def picture(result: dict) -> Figure:
     """Rows are depths; columns the stack, the points and the truth. Points are shown a third of a mm wide."""
     planes, pitch = result["planes"], result["pitch"]
     half = planes["truth"].shape[1] * pitch / 2
-    figure = Figure(figsize=(9, 9.2), layout="constrained")
+    figure = Figure(figsize=(9, 9.2), dpi=90, layout="constrained")
     wide = 2 * round(0.15 / pitch) + 1
     for row, (depth, axes) in enumerate(zip(SHOWN, figure.subplots(3, 3, sharex=True, sharey=True), strict=True)):
         for axis, (name, stack) in zip(axes, planes.items(), strict=True):

@@ -23,8 +23,8 @@ from gs_jax import Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.simulation.scene import simulate_points
 
 CAPTURES = {18.0: "P1_i_18_c.tif", 20.0: "P1_a.tif", 22.0: "P1_i_22_c.tif"}
@@ -59,7 +59,7 @@ def _widths(image: np.ndarray, imager: Imager, depth: float) -> dict[str, float]
 
 def picture(found: dict) -> Figure:
     """Lateral and axial width against depth."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = Figure(figsize=(9, 3.6), dpi=100, layout="constrained")
     for axes, key, bar in zip(figure.subplots(1, 2), ("lateral_fwhm_um", "axial_fwhm_um"), (40, 300), strict=True):
         for (source, rows), style in zip(found.items(), ("o-", "s"), strict=False):
             axes.plot([row["depth_mm"] for row in rows], [row[key] for row in rows], style, label=source)

@@ -25,8 +25,8 @@ from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.scene import simulate_points
@@ -65,7 +65,7 @@ def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, 
 
 def picture(results: dict) -> Figure:
     """A row for each scene: the capture, and the points found (dots) and true (rings) from the front and the side."""
-    figure = Figure(figsize=(11, 3.6 * len(results)), layout="constrained")
+    figure = Figure(figsize=(11, 3.6 * len(results)), dpi=66, layout="constrained")
     rows = figure.subplots(len(results), 3, squeeze=False)
     for axes, (name, result) in zip(rows, results.items(), strict=True):
         capture, found, truth = result["capture"], result["found"], result["truth"]

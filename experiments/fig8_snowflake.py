@@ -29,8 +29,8 @@ from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.metrics import quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.camera import Camera, electrons, expose
@@ -201,7 +201,7 @@ def picture(scene: dict, depths: tuple[float, ...] = DEPTHS, shown: tuple[float,
     left, right = VOXEL_MM * np.array([crop[1].start - 0.5, crop[1].stop - 0.5]) - half[1]
     top, bottom = VOXEL_MM * np.array([crop[0].start - 0.5, crop[0].stop - 0.5]) - half[0]
     extent = (left, right, bottom, top)
-    figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(shown)), dpi=90, layout="constrained")
     for line, depth in zip(figure.subplots(len(shown), len(columns), squeeze=False), shown, strict=True):
         for axes, (name, volume) in zip(line, columns.items(), strict=True):
             plane = volume[int(np.argmin(np.abs(np.array(depths) - depth)))][crop]

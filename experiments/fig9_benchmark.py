@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
@@ -33,13 +32,14 @@ from scipy.ndimage import gaussian_filter
 from skimage.feature import peak_local_max
 
 from gs_jax import Grid, Imager, Sensor
+from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
 from gs_jax.benchmark.report import table
 from gs_jax.benchmark.scenes import FWHM, spots
 from gs_jax.designs.design import read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json, write_text
-from gs_jax.io.files import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
@@ -77,7 +77,7 @@ def read(data: Path, name: str, factor: int = BIN) -> Scene:
     imager = eqx.tree_at(lambda i: i.sensor, design, sensor)
     pitch = sensor.pixel_pitch / float(imager.magnification(20.0))
     grid = Grid.over(sensor, depths=DEPTHS[name], pitch=pitch)
-    imager, grid = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (imager, grid))
+    imager, grid = in_float32((imager, grid))
     if name == "d":
         points = np.array(json.loads((data / "d.json").read_text())["points_x_y_z_flux"])
         return Scene(image, imager, grid, spots(points, grid, pitch / FWHM), points)
@@ -158,7 +158,7 @@ def picture(pictures: dict[str, np.ndarray], half_mm: float) -> Figure:
     """Maxima over the depths, each up to its 99.9th percentile."""
     columns = 4
     rows = -(-len(pictures) // columns)
-    figure = Figure(figsize=(12, 3.1 * rows), layout="constrained")
+    figure = Figure(figsize=(12, 3.1 * rows), dpi=80, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat[len(pictures) :]:
         axis.set_axis_off()

@@ -87,7 +87,7 @@ def run(study: Mapping[str, Sequence[Job]] = STUDY, *, progress: Progress) -> di
 
 def picture(found: dict) -> Figure:
     """Time against each number, the others at full scale."""
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    figure = Figure(figsize=(10, 3.2), dpi=100, layout="constrained")
     for axes, (axis, rows) in zip(figure.subplots(1, 3, sharey=True), found["cost"].items(), strict=True):
         axes.loglog([row[axis] for row in rows], [row["median_s"] for row in rows], "o-")
         axes.set_xlabel("pixels along a side" if axis == "pixels" else axis)

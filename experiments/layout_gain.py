@@ -35,7 +35,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout
-from gs_jax.optics.psf import gaussian_psf, psf
+from gs_jax.optics.psf import diffraction_psf, gaussian_psf
 from gs_jax.optics.theory import occupancy
 
 NAMES = ("best", "ours", "rows", "hexagonal", "spread")
@@ -149,7 +149,7 @@ def best_of(
 
 def run(study: Study = Study(), seeds: int = 5, *, progress: Progress) -> dict:
     """Everything that `layout_gain.json` holds; units are in the keys."""
-    fine_psfs, psfs = psf_of(psf, study, study.fine_grid()), psf_of(gaussian_psf, study, study.grid())
+    fine_psfs, psfs = psf_of(diffraction_psf, study, study.fine_grid()), psf_of(gaussian_psf, study, study.grid())
     records = []
     for seed in range(seeds):
         layouts, keys = candidates(study, seed), jax.random.split(jax.random.key(10_000 + seed), study.scored_on)
@@ -206,7 +206,7 @@ def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float 
 
 def picture(found: dict) -> Figure:
     """Losses of the random layouts, the controls and ours; one seed's layouts."""
-    figure = Figure(figsize=(17, 3.8), layout="constrained")
+    figure = Figure(figsize=(17, 3.8), dpi=100, layout="constrained")
     left, *right = figure.subplots(1, 6, width_ratios=(1.6, 1, 1, 1, 1, 1))
     colors = "C0", "C3", "C1", "C2", "C4"
     titles = "best of the random", "optimised", "best of uneven rows", "hexagonal", "hexagonal, spread"

@@ -73,7 +73,7 @@ def _through_file(solid, path: Path) -> Mesh:
 def draw(design: Design, records: list[dict]) -> Figure:
     """The mold, facets of a few lenses, and what facets cost."""
     array = design.imager().array
-    figure = Figure(figsize=(15, 4.6), layout="constrained")
+    figure = Figure(figsize=(15, 4.6), dpi=110, layout="constrained")
     view = figure.add_subplot(1, 3, 1, projection="3d")
     shape = MoldShape(label=design.name)
     draw_solid(view, mold_solid(array, array_solid(array, 4e-3), shape), from_below=False)

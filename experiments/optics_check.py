@@ -28,11 +28,11 @@ from scipy.spatial import KDTree
 
 from gs_jax import Imager, MicrolensArray, Sensor, envelope
 from gs_jax.designs.design import read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.optics.aberrations import independent_rms, seidel
 from gs_jax.optics.aperture import aperture_area
-from gs_jax.optics.psf import geometric_psf, psf, strehl
+from gs_jax.optics.psf import diffraction_psf, geometric_psf, strehl
 from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
 
 WAVELENGTH = 520e-6
@@ -183,7 +183,7 @@ def _model(imager, depth, field, offset, edges, half: int) -> dict:
     # Lenses reach to 1 mm: 4 samples would fold the edge of their halo back into the window.
     return {
         "rays": geometric_psf(imager, depth, **arguments),
-        "diffraction": psf(imager, depth, samples=6, **arguments),
+        "diffraction": diffraction_psf(imager, depth, samples=6, **arguments),
     }
 
 
@@ -254,7 +254,7 @@ def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0))
 
 def curves(result: dict) -> Figure:
     """Wavefront error and Strehl ratio over field and depth."""
-    axes = (figure := Figure(figsize=(10, 6.5), layout="constrained")).subplots(2, 2)
+    axes = (figure := Figure(figsize=(10, 6.5), dpi=90, layout="constrained")).subplots(2, 2)
     for column, (name, label) in enumerate([("field", "field, mm"), ("depth", "depth, mm")]):
         at = lambda key, name=name: [row[key] for row in result[name]]
         x = at(f"{name}_mm")
@@ -276,7 +276,7 @@ def gallery(rows: list[dict], count: int = 5) -> Figure:
     """Spots from the point's nearest lens outward: capture, our rays, our diffraction."""
     ordered = sorted(rows, key=lambda row: row["field_mm"])
     rows = [ordered[round(i)] for i in np.linspace(0, len(rows) - 1, count)]
-    figure = Figure(figsize=(2.2 * count, 6.8), layout="constrained")
+    figure = Figure(figsize=(2.2 * count, 6.8), dpi=90, layout="constrained")
     for column, row in enumerate(rows):
         for line, (name, picture) in enumerate(zip(("capture", "rays", "diffraction"), row["pictures"], strict=True)):
             axis = figure.add_subplot(3, count, line * count + column + 1)

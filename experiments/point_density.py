@@ -83,7 +83,7 @@ def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
 
 def picture(rows: list) -> Figure:
     """F1 and errors against the number of points."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained")
     score, error = figure.subplots(1, 2)
     count = [row["points"] for row in rows]
     for name, style in (("gs_jax", "o-"), ("brightest peaks", "s--")):

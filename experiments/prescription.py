@@ -25,7 +25,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import atomic_write, make_folder, write_json
 from gs_jax.optics.aperture import clear_diameter
-from gs_jax.optics.psf import psf
+from gs_jax.optics.psf import diffraction_psf
 from gs_jax.simulation.scene import simulate_points
 
 FOLDER = Path(__file__).parents[1] / "design"
@@ -76,7 +76,7 @@ def _unit(imager: Imager, depth: float, height: float) -> float:
     radius = clear_diameter(imager.array) / 2
     sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
     options: dict[str, Any] = dict(size=WINDOW, field=(height, 0.0), radius=radius)
-    pixels = psf(imager, depth, samples=int(np.ceil(sharp)), **options)
+    pixels = diffraction_psf(imager, depth, samples=int(np.ceil(sharp)), **options)
     pitch = imager.sensor.pixel_pitch / float(imager.magnification(depth))
     return 1000 * encircled(np.asarray(pixels, np.float64), pitch, 0.8)
 
@@ -98,7 +98,7 @@ def contrast(spot: np.ndarray, axis: np.ndarray) -> float:
 
 def picture(found: dict[str, Any]) -> Figure:
     """Widths and contrast against depth, a colour for each design."""
-    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    figure = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     panels = {
         "fwhm_um": "width at half height, um",
         "most_of_light_um": "radius of 80 % of the light, um",

@@ -24,8 +24,8 @@ from scipy.spatial import KDTree
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import make_folder, write_json
-from gs_jax.io.files import read_capture
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 
 # A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
@@ -98,7 +98,7 @@ def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float 
     """The 120 points: maximum over the depths, and the truth."""
     truth = _truth(data, "d")
     half = projection.shape[0] * voxel_mm / 2
-    figure = Figure(figsize=(11, 5.4), layout="constrained")
+    figure = Figure(figsize=(11, 5.4), dpi=90, layout="constrained")
     for axis, lim, title in zip(figure.subplots(1, 2), (half, 2.5), ("whole field", "its middle"), strict=True):
         top = np.percentile(projection, 99.95)
         axis.imshow(projection, cmap="magma", extent=(-half, half, half, -half), vmin=0.1 * top, vmax=top)

@@ -8,7 +8,8 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.io.files import read_capture, read_points
+from gs_jax.io.captures import read_capture
+from gs_jax.io.points import read_points
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs

@@ -22,17 +22,10 @@ from PIL import Image
 
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
-from gs_jax.io.files import (
-    atomic_write,
-    check_output,
-    read_capture,
-    read_points,
-    read_volume,
-    write_capture,
-    write_json,
-    write_points,
-    write_volume,
-)
+from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.disk import atomic_write, check_output, write_json
+from gs_jax.io.points import read_points, write_points
+from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs
 
@@ -720,7 +713,7 @@ def test_a_refusal_prints_nothing_else(tmp_path):
     tiff(tmp_path / "a.tif")
     cut(tmp_path / "a.tif", 100)
     code = f"""
-from gs_jax.io.files import read_capture
+from gs_jax.io.captures import read_capture
 try:
     read_capture({str(tmp_path / "a.tif")!r})
 except ValueError as error:

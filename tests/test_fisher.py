@@ -12,7 +12,7 @@ from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.fisher import cramer_rao, fisher_information, localization_bound
 from gs_jax.geometry import envelope
-from gs_jax.optics.psf import psf
+from gs_jax.optics.psf import diffraction_psf
 
 POINT = np.array([0.05, -0.03, 20.0])
 OPTIONS: dict[str, Any] = dict(photons=800.0, spot=0.009, background=3.0, read_noise=2.0, size=15)
@@ -131,7 +131,7 @@ def test_a_psf_that_follows_from_the_imager_has_a_gradient():
     def bound(distance):
         base = random_imager()
         microscope = Imager(base.array, base.sensor, distance, base.field_radius)
-        spot = psf(microscope, 20.0, size=15, radius=0.3)
+        spot = diffraction_psf(microscope, 20.0, size=15, radius=0.3)
         return jnp.log(localization_bound(microscope, POINT[None], **OPTIONS | dict(spot=spot)))
 
     check_grads(jax.jit(bound), (jnp.array(5.8),), order=1, eps=1e-6, atol=1e-4, rtol=1e-4)

@@ -16,7 +16,7 @@ from gs_jax.designs.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make
 from gs_jax.mold.checks import Finding, array_volume, check_design, refuse_errors
-from gs_jax.mold.make import Order, make_part
+from gs_jax.mold.make import make_mold
 from gs_jax.mold.solids import MoldShape, plate_thickness
 
 DESIGN = """
@@ -103,7 +103,7 @@ def test_a_part_that_is_not_the_design_is_not_written(folder, monkeypatch):
     wrong = lambda *_, **__: [Finding("lenses", "error", "read back, lenses are elsewhere.")]
     monkeypatch.setattr(make, "judge", wrong)
     with pytest.raises(RuntimeError, match="lenses are elsewhere"):
-        make_part(read_design("design.toml"), "part.stl", Order(chord=2e-3))
+        make_mold(read_design("design.toml"), "part.stl", chord=2e-3)
     assert [path.name for path in folder.iterdir()] == ["design.toml"]
 
 
@@ -159,9 +159,18 @@ def test_a_wrong_number_is_refused(folder, option, value):
 )
 def test_a_design_that_cannot_be_made_is_refused(tmp_path, changes, message):
     with pytest.raises(InputError) as error:
-        make_part(design(**changes), tmp_path / "a.stl")
+        make_mold(design(**changes), tmp_path / "a.stl")
     assert message in str(error.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_design_file_is_read_and_named(folder):
+    report = make_mold("design.toml", "part.stl", positive=True, chord=6e-3)
+    assert report["part"] == "array" and report["design"] == "small $x"
+    with pytest.raises(InputError, match="^design.toml: the chord error: found 100 um, allowed: at most"):
+        make_mold("design.toml", "other.stl", chord=0.1)
+    with pytest.raises(InputError, match="missing.toml"):
+        make_mold("missing.toml", "other.stl")
 
 
 def test_what_is_doubtful_is_said():
@@ -192,7 +201,7 @@ def test_the_words_hold_the_numbers():
 
 
 def test_a_single_lens_is_made(tmp_path):
-    report = make_part(design(array={"centers_mm": [[0.1, 0.0]]}), tmp_path / "a.stl", Order(chord=6e-3))
+    report = make_mold(design(array={"centers_mm": [[0.1, 0.0]]}), tmp_path / "a.stl", chord=6e-3)
     assert report["verification"]["lenses_measured"] == 1
 
 

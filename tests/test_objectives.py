@@ -12,7 +12,7 @@ from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.sheet import datasheet
 from gs_jax.layouts.cells import largest_hole, nearest_neighbour_distances
-from gs_jax.optics.psf import psf
+from gs_jax.optics.psf import diffraction_psf
 
 # Off the raster of places, where a hole has a kink.
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))
@@ -104,7 +104,7 @@ def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     v = 1 / (1 / f - 1 / focused.imager.reduced_depth(20.5))
     where = lambda c: (c.imager.sensor_distance, c.clear_diameter)
     lens = eqx.tree_at(where, focused, (v, jnp.array(small)))
-    spot = psf(lens.imager, 20.5, size=31, radius=small / 2, samples=4)
+    spot = diffraction_psf(lens.imager, 20.5, size=31, radius=small / 2, samples=4)
     line = np.asarray(spot.sum(0))
     above = np.interp(line.max() / 2, line[:16], np.arange(16))
     width = 2 * (15 - above) * 4.5 / float(lens.imager.magnification(20.5))

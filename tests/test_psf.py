@@ -6,11 +6,11 @@ from jax.test_util import check_grads
 from scipy.special import j0, j1
 
 from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
-from gs_jax.optics.psf import gaussian_psf, geometric_psf, psf, strehl, window_fraction
+from gs_jax.optics.psf import diffraction_psf, gaussian_psf, geometric_psf, strehl, window_fraction
 from gs_jax.optics.unit import best_focus, unit_rays, wavefront_rms
 
 WAVELENGTH, RADIUS = 520e-6, 0.65
-KINDS = [psf, geometric_psf, gaussian_psf]
+KINDS = [diffraction_psf, geometric_psf, gaussian_psf]
 # Where compiling takes longer than ten seconds on a busy machine.
 SLOW_FIRST = [*(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[:2]), gaussian_psf]
 
@@ -33,7 +33,7 @@ def centroid(image):
 def test_a_thin_lens_in_focus_makes_airys_pattern():
     """On fine pixels, so that a pixel's middle stands for the pixel."""
     imager, radius = in_focus(pitch=0.0002), 0.3
-    image = psf(imager, 20.0, size=65, radius=radius, samples=4)
+    image = diffraction_psf(imager, 20.0, size=65, radius=radius, samples=4)
     rows, columns = (np.indices((65, 65)) - 32) * 0.0002
     x = 2 * np.pi * radius * np.hypot(rows, columns) / (WAVELENGTH * float(imager.sensor_distance))
     airy = (2 * j1(np.where(x, x, 1)) / np.where(x, x, 1)) ** 2
@@ -58,7 +58,7 @@ def test_what_is_outside_the_window_is_accounted_for():
 def test_far_from_focus_it_is_the_shadow_of_the_aperture(field):
     """Thin lens, v = 4 mm: a disc, a (1 - v/v') in radius, evenly lit, about the chief ray."""
     imager = unit(4.0, thin_lens_focal_length=4.65)
-    image = psf(imager, 20.0, size=129, radius=RADIUS, field=field)
+    image = diffraction_psf(imager, 20.0, size=129, radius=RADIUS, field=field)
     blur = RADIUS * (1 - 4 * (1 / 4.65 - 1 / (20 + 1 / 1.43))) / 0.0045
     distance = np.hypot(*(np.indices((129, 129)) - 64))
     # Fresnel fringes at the edge, a few pixels wide, are what is not geometric.
@@ -88,7 +88,7 @@ def test_huygens_principle_summed_directly(v, field):
         direct.append(abs(np.exp(2j * np.pi / WAVELENGTH * (total - total[0])).sum()) ** 2)
     direct = np.array(direct)
     tiny = unit(v, pitch=0.0045 / 4)
-    ours = psf(
+    ours = diffraction_psf(
         tiny,
         z,
         size=4 * size - 1 if size % 2 == 0 else 4 * size + 1,
@@ -164,7 +164,7 @@ def test_sum_centre_and_symmetry(kind):
     np.testing.assert_allclose(along_y, along_x.T, atol=20 * tolerance * float(along_x.max()))
 
 
-@pytest.mark.parametrize("kind", [psf, geometric_psf])
+@pytest.mark.parametrize("kind", [diffraction_psf, geometric_psf])
 def test_edges_cut_the_aperture(kind):
     """Half a lens far from focus makes half a disc, on the side where the lens is: before the image, no inversion."""
     imager = unit(4.0, thin_lens_focal_length=4.65)
@@ -180,7 +180,7 @@ def test_edges_cut_the_aperture(kind):
 )
 def test_float32(v, field, size):
     options = dict(size=size, field=field, radius=RADIUS)
-    exact, low = psf(unit(v), 20.0, **options), psf(unit(v, jnp.float32), 20.0, **options)
+    exact, low = diffraction_psf(unit(v), 20.0, **options), diffraction_psf(unit(v, jnp.float32), 20.0, **options)
     assert low.dtype == jnp.float32
     # Phases of 30 waves to a thousandth.
     np.testing.assert_allclose(low, exact, rtol=0, atol=2e-3 * float(exact.max()))
@@ -190,13 +190,13 @@ def test_float32(v, field, size):
 @pytest.mark.parametrize(("v", "size", "samples"), [(5.8, 65, 3), (4.0, 129, 4)])
 def test_more_samples_change_little(v, size, samples):
     """Parseval asks for 1.9 and 2.8. What is left is the aperture's edge, and light folded back."""
-    image, finer = (psf(unit(v), 20.0, samples=s, size=size, radius=RADIUS) for s in (samples, 6))
+    image, finer = (diffraction_psf(unit(v), 20.0, samples=s, size=size, radius=RADIUS) for s in (samples, 6))
     assert float(jnp.abs(image - finer).sum()) < 0.03
 
 
 def test_depths_map():
     depths = jnp.array([18.0, 20.0])
-    one = lambda z: psf(unit(), z, size=33, radius=RADIUS)
+    one = lambda z: diffraction_psf(unit(), z, size=33, radius=RADIUS)
     np.testing.assert_allclose(jax.vmap(one)(depths)[1], one(20.0), atol=1e-12)
 
 
@@ -242,4 +242,4 @@ def test_gradients_are_finite_for_an_ideal_lens_on_its_axis(kind):
 )
 def test_wrong_arguments_are_named(options, words):
     with pytest.raises(ValueError, match=words):
-        psf(unit(), 20.0, **options)
+        diffraction_psf(unit(), 20.0, **options)

@@ -7,7 +7,8 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.unit import pupil_disc, unit_rays
-from gs_jax.simulation.scene import PSFS, psf_of_depth, simulate_points, simulate_volume
+from gs_jax.optics.window import PSFS, psf_of_depth
+from gs_jax.simulation.scene import simulate_points, simulate_volume
 
 
 def imager(sensor_distance=5.8, pixel=0.01):

@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 
 @contextlib.contextmanager
-def about(path: object) -> Iterator[None]:
+def errors_name_file(path: object) -> Iterator[None]:
     """Around what does not know the file that its input came from: an `InputError` then names it."""
     try:
         yield
@@ -34,6 +34,6 @@ def about(path: object) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from error
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """What was found, short enough for a one-line message: `repr`, cut in length and depth."""
     return reprlib.repr(value)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ..base.info import describe
 from ..io.disk import atomic_write, write_json, write_text
+from ..io.figures import write_figure
 from .compare import slopes
 
 COLUMNS = ("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed")
@@ -44,8 +45,7 @@ def write(records: Records, left_out: Records, folder: Path) -> None:
         writer.writeheader()
         writer.writerows(records)
     write_text(folder / "benchmark.md", markdown(records, left_out), [".md"])
-    with atomic_write(folder / "benchmark.png") as path:
-        picture(records).savefig(path, dpi=100, format="png")
+    write_figure(folder / "benchmark.png", picture(records))
 
 
 def _of(records: Records, method: str, pairs: float, key: str) -> list[float]:
@@ -98,7 +98,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def picture(records: Records) -> Figure:
     """The panels of Fig. 9 and two more; lines through the means, bars for the standard deviation."""
-    figure = Figure(figsize=(12, 8), layout="constrained")
+    figure = Figure(figsize=(12, 8), dpi=100, layout="constrained")
     colours = {m: f"C{number % 10}" for number, m in enumerate(m for m in _unique(records, "method") if m != "zeros")}
     for axes, (key, label) in zip(figure.subplots(2, 3).flat, _PANELS.items(), strict=True):
         for method in _unique(records, "method"):

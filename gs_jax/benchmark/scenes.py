@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from skimage.feature import peak_local_max
 
+from ..base.precision import in_float32
 from ..base.progress import Progress
 from ..designs.builtin import geomscope
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
@@ -54,12 +55,11 @@ def bench(side: int) -> Bench:
     whole = (lens.sensor_distance, lens.field_radius, lens.wavelength)
     imager = Imager(MicrolensArray(centers), Sensor((side, side), pitch), *whole)
     grid = Grid([DEPTH], (side, side), pitch)
-    single = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
     # The rays' blur is 0.1 mm and more: in pixels, and a pixel for what is beside it.
     size = 2 * math.ceil(0.1 / pitch) + 3
     psf = geometric_psf(imager, DEPTH, size=size, radius=clear_diameter(imager.array) / 2)
     width = pitch / float(lens.magnification(DEPTH)) / FWHM
-    return Bench(single(imager), single(grid), np.asarray(psf, np.float32)[None], width)
+    return Bench(in_float32(imager), in_float32(grid), np.asarray(psf, np.float32)[None], width)
 
 
 def case(bench: Bench, seed: int, progress: Progress) -> Case:

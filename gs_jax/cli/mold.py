@@ -5,10 +5,10 @@ from pathlib import Path
 
 import click
 
-from ..base.errors import about
+from ..base.errors import errors_name_file
 from ..base.progress import Progress
 from ..designs.design import read_design
-from ..mold.make import Order, make_part, words
+from ..mold.make import make_mold, report_text
 from ..mold.solids import MoldShape
 from .options import Number
 
@@ -77,7 +77,14 @@ def mold(
         shrinkage=shrinkage_percent / 100,
         label=microscope.name if label else "",
     )
-    order = Order(positive=positive, shape=shape, chord=chord_um / 1000, resolution=resolution_um / 1000)
-    with Progress() as progress, about(design):
-        report = make_part(microscope, output, order, progress)
-    click.echo(words(report), nl=False)
+    with Progress() as progress, errors_name_file(design):
+        report = make_mold(
+            microscope,
+            output,
+            positive=positive,
+            shape=shape,
+            chord=chord_um / 1000,
+            resolution=resolution_um / 1000,
+            progress=progress,
+        )
+    click.echo(report_text(report), nl=False)

@@ -6,7 +6,7 @@ import click
 import jax
 from rich.console import Console
 
-from ..base.errors import about
+from ..base.errors import errors_name_file
 from ..base.progress import Progress
 from ..codesign.checkpoint import checkpoint_path
 from ..codesign.outcome import before_and_after, check_outputs, write_outcome
@@ -29,7 +29,7 @@ def optimize(design: Path, study: Path, resume: bool, output: Path):
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     question, parent, checkpoint = read_study(study), read_design(design), checkpoint_path(output)
-    with Progress() as progress, about(study):
+    with Progress() as progress, errors_name_file(study):
         outcome = optimise(parent, question, progress=progress, checkpoint=checkpoint, resume=resume)
     write_outcome(output, question, outcome, parent=str(design), source=str(study))
     checkpoint.unlink(missing_ok=True)

@@ -7,13 +7,14 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from ..base.errors import InputError, about
+from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..codesign.pareto import as_json, picture, sweep
 from ..codesign.search import problem_of
 from ..codesign.study import parent_path, read_study
 from ..designs.design import read_design
-from ..io.disk import atomic_write, check_output, make_folder, write_json
+from ..io.disk import check_output, make_folder, write_json
+from ..io.figures import write_figure
 
 
 @click.command()
@@ -30,15 +31,14 @@ def pareto(study: Path, out: Path):
     if not question.pareto:
         raise InputError(f"{study}: `pareto`: found nothing, allowed: one or two tables.")
     design = read_design(parent_path(study, question))
-    with about(study):
+    with errors_name_file(study):
         problem_of(design, question)
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
-    with Progress() as progress, about(study):
+    with Progress() as progress, errors_name_file(study):
         front = sweep(design, question, progress=progress)
     write_json(numbers, as_json(front))
-    with atomic_write(drawing) as path:
-        picture(front).savefig(path, format="png", dpi=110)
+    write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):
         status = "" if best else "dominated" if point.feasible else "misses a target"

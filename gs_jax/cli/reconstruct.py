@@ -8,8 +8,9 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import read_design
+from ..io.captures import read_capture
 from ..io.disk import check_output
-from ..io.files import read_capture, write_points
+from ..io.points import write_points
 from ..io.volumes import VOLUME_SUFFIXES, write_volume
 from ..reconstruction.methods import METHODS
 from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack, voxel_grid

@@ -9,10 +9,11 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import read_design
+from ..io.captures import CAPTURE_SUFFIXES, write_capture
 from ..io.disk import check_output
-from ..io.files import CAPTURE_SUFFIXES, write_capture
+from ..optics.window import PSFS
 from ..simulation.camera import Camera, expose
-from ..simulation.scene import PSFS, simulate_scene
+from ..simulation.scene import simulate_scene
 from .options import Number
 
 

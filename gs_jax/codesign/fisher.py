@@ -50,8 +50,8 @@ def mean_images(
     photons
         Electrons that a lens on its axis gets of a point of brightness 1; other lenses get the envelope C of them.
     spot
-        Standard deviation of a Gaussian image, mm, or a PSF on the sensor's pixels, as `gs_jax.optics.psf.psf` makes
-        it, of `size`. The PSF moves by cubic interpolation.
+        Standard deviation of a Gaussian image, mm, or a PSF on the sensor's pixels, as `diffraction_psf` makes it, of
+        `size`. The PSF moves by cubic interpolation.
     corners
         First `(row, column)` of each window.
     size

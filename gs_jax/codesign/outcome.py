@@ -14,7 +14,8 @@ from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
 from ..designs.design import Design, write_design
-from ..io.disk import atomic_write, check_output, write_json
+from ..io.disk import check_output, write_json
+from ..io.figures import write_figure
 from .objectives import TERMS, unit_of
 from .search import Outcome, best_end
 from .study import Study, TermTable, labels
@@ -59,8 +60,7 @@ def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, so
     paths = [path, path.with_suffix(".json"), path.with_suffix(".png")]
     history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
     write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
-    with atomic_write(paths[2]) as temporary:
-        picture(outcome.design, study, outcome).savefig(temporary, format="png", dpi=110)
+    write_figure(paths[2], picture(outcome.design, study, outcome))
     provenance = {
         "parent": Path(parent).name,
         "study": Path(source).name,
@@ -102,7 +102,7 @@ def _plain(record: dict[str, Any]) -> dict[str, Any]:
 
 def picture(design: Design, study: Study, outcome: Outcome) -> Figure:
     """The layout with its clear apertures, the cost, and the terms on their way to the targets, of the best start."""
-    figure = Figure(figsize=(12.5, 4.2), layout="constrained")
+    figure = Figure(figsize=(12.5, 4.2), dpi=110, layout="constrained")
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     _draw_layout(layout, design)
     steps = [step for step in outcome.log.steps if _is_best(step, outcome)]

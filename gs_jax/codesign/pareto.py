@@ -152,7 +152,7 @@ def as_json(front: Front) -> dict[str, Any]:
 
 def picture(front: Front) -> Figure:
     """The goal against the first limited term; a second limit makes lines of one colour each."""
-    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    figure = Figure(figsize=(6.4, 4.4), dpi=110, layout="constrained")
     axes = figure.subplots()
     goal, along, *third = front.objectives
     groups = np.round(front.values[:, 2], 9) if third else np.zeros(len(front.points))

@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..io.disk import read_text
 from ..io.explain import one_line
 from .objectives import TERMS
@@ -61,7 +61,7 @@ class TermTable(_Table):
     @model_validator(mode="after")
     def _says_one_thing(self) -> "TermTable":
         if self.name not in TERMS:
-            raise ValueError(f"found the name {shown(self.name)}, allowed: {', '.join(TERMS)}")
+            raise ValueError(f"found the name {short_repr(self.name)}, allowed: {', '.join(TERMS)}")
         found = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(found) != 1:
             raise ValueError(f"{self.name}: found {found or 'no kind'}, allowed: one of {', '.join(KINDS)}")
@@ -107,7 +107,7 @@ class LimitTable(_Table):
     @model_validator(mode="after")
     def _says_one_thing(self) -> "LimitTable":
         if self.name not in TERMS:
-            raise ValueError(f"found the name {shown(self.name)}, allowed: {', '.join(TERMS)}")
+            raise ValueError(f"found the name {short_repr(self.name)}, allowed: {', '.join(TERMS)}")
         if bool(self.at_most) == bool(self.at_least):
             found = "both" if self.at_most else "neither"
             raise ValueError(f"{self.name}: found {found}, allowed: one of at_most, at_least")
@@ -199,8 +199,8 @@ def _in_a_list(error: ValidationError) -> str | None:
         return f"{where}: {problem['msg'].removeprefix('Value error, ')}"
     field = table.model_fields.get(str(keys[0]))
     if field is None:
-        return f"{where}: found the key {shown(keys[0])}, allowed: {', '.join(table.model_fields)}"
-    found = "nothing" if problem["type"] == "missing" else shown(problem["input"])
+        return f"{where}: found the key {short_repr(keys[0])}, allowed: {', '.join(table.model_fields)}"
+    found = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
     return f"{where}, {keys[0]}: found {found}, allowed: {field.description}"
 
 
@@ -231,7 +231,7 @@ def _check_stages(study: Study) -> None:
             chosen = getattr(stage, key)
             wrong = [name for name in chosen or () if name not in names]
             if wrong or chosen == ():
-                found = shown(wrong[0]) if wrong else "nothing"
+                found = short_repr(wrong[0]) if wrong else "nothing"
                 raise ValueError(f"`stages.{key}`: found {found}, allowed: one or more of {', '.join(sorted(names))}")
 
 

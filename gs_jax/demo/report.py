@@ -21,7 +21,7 @@ class Views(NamedTuple):
 def views_picture(views: Views, design: Design) -> Figure:
     """The capture and its middle; and beside them a row for each volume, a column for each depth."""
     count = len(views.depths)
-    figure = Figure(figsize=(3.1 * (count + 1) + 0.8, 2.9 * len(views.volumes)), layout="constrained")
+    figure = Figure(figsize=(3.1 * (count + 1) + 0.8, 2.9 * len(views.volumes)), dpi=110, layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.25, count))
     _captures(halves[0].subplots(2, 1), views.image, design)
     size = [n * design.sensor.pixel_pitch_um / 2000 for n in design.sensor.shape]
@@ -55,7 +55,7 @@ def _captures(axes, image: np.ndarray, design: Design) -> None:
 
 def points_picture(found: np.ndarray, truth: np.ndarray, score: Localization) -> Figure:
     """True and found points in the plane, and the errors of the pairs."""
-    figure = Figure(figsize=(10, 4.4), layout="constrained")
+    figure = Figure(figsize=(10, 4.4), dpi=110, layout="constrained")
     plane, errors = figure.subplots(1, 2)
     plane.scatter(truth[:, 0], truth[:, 1], s=60, facecolors="none", edgecolors="0.4", label="true")
     drawn = plane.scatter(found[:, 0], found[:, 1], s=12, c=found[:, 2], cmap="viridis", label="found")

@@ -18,11 +18,13 @@ from ..designs.design import Design, write_design
 from ..designs.problems import findings
 from ..designs.sheet import datasheet
 from ..geometry import Grid
-from ..io.disk import atomic_write, make_folder, write_json, write_text
-from ..io.files import write_capture, write_points
+from ..io.captures import write_capture
+from ..io.disk import make_folder, write_json, write_text
+from ..io.figures import write_figure
+from ..io.points import write_points
 from ..io.volumes import write_volume
 from ..metrics import localization, quality
-from ..mold.make import make_part
+from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack
 from ..simulation.camera import Camera, expose
 from ..simulation.phantoms import letters, random_points, rasterize
@@ -110,11 +112,11 @@ def run(folder: Path, progress: Progress) -> Path:
         targets = _optimise(folder, progress)
     scores, views = _words(folder, design, seconds, progress)
     with progress.step("Drawing"):
-        _save(views_picture(views, design), folder / "words.png")
+        write_figure(folder / "words.png", views_picture(views, design))
     found = _points(folder, design, seconds, progress)
     with _timed(seconds, "mold"):
-        part = make_part(design, folder / "mold.stl", progress=progress)
-    text = report(design, findings(design, sheet), targets, scores, found, part, seconds)
+        mold = make_mold(design, folder / "mold.stl", progress=progress)
+    text = report(design, findings(design, sheet), targets, scores, found, mold, seconds)
     write_text(folder / "report.md", text, [".md"])
     return folder / "report.md"
 
@@ -178,7 +180,7 @@ def _points(folder: Path, design: Design, seconds: dict, progress: Progress):
     write_points(folder / "points-truth.csv", truth)
     write_points(folder / "points-found.csv", found)
     score = localization(found, truth)
-    _save(points_picture(found, truth, score), folder / "points.png")
+    write_figure(folder / "points.png", points_picture(found, truth, score))
     return score
 
 
@@ -186,11 +188,6 @@ def _exposed(light: np.ndarray, path: Path, seed: int) -> np.ndarray:
     counts = np.asarray(expose(light, Camera(), jax.random.key(seed), peak_electrons=_PEAK_ELECTRONS))
     write_capture(path, counts)
     return counts
-
-
-def _save(figure, path: Path) -> None:
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from scipy.spatial import KDTree
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
 from ..io.disk import check_output, read_table, read_text, write_text
 from ..io.explain import one_line
@@ -212,7 +212,7 @@ def _inline_centers(path: Path, data: dict[str, Any]) -> None:
     if "centers_mm" in array:
         raise InputError(f"{path}: found both `array.centers_file` and `array.centers_mm`, allowed: one of them.")
     if not isinstance(name, str) or not name:
-        raise InputError(f"{path}: `array.centers_file`: found {shown(name)}, allowed: the name of a CSV file.")
+        raise InputError(f"{path}: `array.centers_file`: found {short_repr(name)}, allowed: the name of a CSV file.")
     try:
         rows = read_table(path.parent / name, CENTERS_HEADER, MAX_LENSES)
     except InputError as error:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.table import Table
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
 from ..optics import aberrations, theory
@@ -227,7 +227,7 @@ def _checked(design: Design, depths: Sequence[float] | None) -> list[float]:
         return np.linspace(*design.imaging.working_distance_mm, _DEPTHS).tolist()
     found = [float(depth) for depth in depths]
     if not found or not all(0 < depth < math.inf for depth in found):
-        raise InputError(f"`depths` must be one or more positive lengths, mm, got {shown(found)}.")
+        raise InputError(f"`depths` must be one or more positive lengths, mm, got {short_repr(found)}.")
     return found
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 
 MAX_TEXT_BYTES = 2**26
 
@@ -79,7 +79,7 @@ def check_output(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: found the suffix {shown(path.suffix)}, allowed: {', '.join(suffixes)}.")
+        raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(suffixes)}.")
     _check_target(path)
     return path
 
@@ -138,7 +138,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(os.path.realpath(path))
     _check_target(path)
-    temporary = _beside(path)
+    temporary = _temporary_beside(path)
     try:
         yield temporary
         if not temporary.is_dir():
@@ -149,7 +149,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         _remove(temporary)
 
 
-def _beside(path: Path) -> Path:
+def _temporary_beside(path: Path) -> Path:
     # Not `tempfile`, whose files nobody else may read: the user's umask is to decide that.
     return path.with_name(f".gs-jax-{uuid.uuid4().hex[:12]}{path.suffix}")
 
@@ -158,7 +158,7 @@ def _replace(temporary: Path, path: Path) -> None:
     if not path.is_dir():
         os.replace(temporary, path)
         return
-    old = _beside(path)
+    old = _temporary_beside(path)
     os.rename(path, old)
     try:
         os.rename(temporary, path)
@@ -241,7 +241,7 @@ def read_table(path: str | os.PathLike[str], header: str, max_rows: int) -> Floa
     try:
         found = next(lines, [])
         if found != names:
-            raise InputError(f"{path}: found the header {shown(','.join(found))}, allowed: {header}.")
+            raise InputError(f"{path}: found the header {short_repr(','.join(found))}, allowed: {header}.")
         for line in lines:
             if line:
                 numbers.append(_numbers(f"{path}: line {lines.line_num}", names, line))
@@ -264,5 +264,5 @@ def _number(place: str, cell: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value) or "_" in cell:  # Python reads 1_000; nobody else does
-        raise InputError(f"{place}: found {shown(cell)}, allowed: a finite number.")
+        raise InputError(f"{place}: found {short_repr(cell)}, allowed: a finite number.")
     return value

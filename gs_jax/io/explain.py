@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from ..base.errors import shown
+from ..base.errors import short_repr
 
 Place = tuple[int | str, ...]
 
@@ -36,7 +36,7 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
             nearest = _nearest(place, _keys(model, also))
             lines.append(f"`{_dotted(place)}`: found a key that does not exist, allowed: {nearest}")
         else:
-            found = "nothing" if problem["type"] == "missing" else shown(found)
+            found = "nothing" if problem["type"] == "missing" else short_repr(found)
             lines.append(f"`{_dotted(place)}`: found {found}, allowed: {_allowed(place, model)}")
     more = len(problems) - len(lines)
     return "; ".join([*lines, f"and {more} more problems"] if more else lines)

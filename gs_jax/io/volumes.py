@@ -21,7 +21,7 @@ import tifffile
 import zarr
 from jaxtyping import Array, Float32, Shaped
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
 from .tiff import decode_page
@@ -80,7 +80,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "dept
     """
     suffix = Path(path).suffix.lower()
     if suffix not in VOLUME_SUFFIXES:
-        raise InputError(f"{path}: found the suffix {shown(suffix)}, allowed: {', '.join(VOLUME_SUFFIXES)}.")
+        raise InputError(f"{path}: found the suffix {short_repr(suffix)}, allowed: {', '.join(VOLUME_SUFFIXES)}.")
     voxels, grid = _read_zarr(Path(path)) if suffix == ".zarr" else _read_tiff(check_input(path))
     if not np.isfinite(voxels).all():
         raise InputError(f"{path}: found a NaN or an infinity among the voxels, allowed: finite numbers.")
@@ -210,7 +210,7 @@ def _length(path: Path, element: ElementTree.Element, name: str, default_unit: s
     try:
         return _mm(float(found or ""), _MM_PER_UNIT[unit])
     except (ValueError, KeyError) as error:
-        value = "nothing" if found is None else f"{shown(found)} in {shown(unit)}"
+        value = "nothing" if found is None else f"{short_repr(found)} in {short_repr(unit)}"
         raise InputError(f"{path}: OME-XML `{name}`: found {value}, allowed: a length in µm.") from error
 
 
@@ -256,7 +256,7 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
     with decoding(path, "OME-Zarr"):
         array = group[name]
     if not isinstance(array, zarr.Array):
-        raise InputError(f"{path}: found no array {shown(name)}, allowed: the one that the metadata names.")
+        raise InputError(f"{path}: found no array {short_repr(name)}, allowed: the one that the metadata names.")
     _check_declared(path, array.shape, array.dtype)
     depths, rows, columns = array.shape
     z = [_mm(first[0] + index * scale[0], 1.0) for index in range(depths)]

@@ -2,15 +2,14 @@
 
 import math
 import os
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..base.progress import Progress
-from ..designs.design import Design
+from ..designs.design import Design, read_design
 from ..io.disk import atomic_write, check_output, write_json, write_text
+from ..io.figures import write_figure
 from .caps import facet_surface
 from .checks import (
     Finding,
@@ -22,8 +21,8 @@ from .checks import (
     refuse_errors,
     volume_tolerance,
 )
-from .measurement import Verification, quality, verify
-from .mesh_files import MESH_SUFFIXES, Mesh, printable, read_mesh, write_mesh
+from .measurement import quality, verify
+from .mesh_files import MESH_SUFFIXES, printable, read_mesh, write_mesh
 from .pictures import preview
 from .solids import MoldShape, mold_solid, plate_thickness, solid_of
 
@@ -34,34 +33,15 @@ RADIUS_TOLERANCE = 1e-3
 GOOD_STREHL = 0.8
 
 
-@dataclass(frozen=True)
-class Order:
-    """What to make of a design.
-
-    Parameters
-    ----------
-    positive
-        The array itself, rather than its mold.
-    shape
-        Of the mold. Its shrinkage is made up for in the array too.
-    chord
-        The largest distance between a facet and its sphere, mm.
-    resolution
-        The smallest feature that the printer makes, mm.
-    """
-
-    positive: bool = False
-    shape: MoldShape = MoldShape()
-    chord: float = 5e-4
-    resolution: float = 0.025
-
-    @property
-    def part(self) -> str:
-        return "array" if self.positive else "mold"
-
-
-def make_part(
-    design: Design, output: str | os.PathLike[str], order: Order = Order(), progress: Progress | None = None
+def make_mold(
+    design: Design | str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    *,
+    positive: bool = False,
+    shape: MoldShape = MoldShape(),
+    chord: float = 5e-4,
+    resolution: float = 0.025,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Writes the mold or the array of a design, and beside it a picture (.png) and a report (.json, .txt).
 
@@ -70,13 +50,19 @@ def make_part(
     Parameters
     ----------
     design
-        The microscope.
-    output
+        The microscope, or its file.
+    path
         `.stl` or `.3mf`.
-    order
-        What to make of it.
+    positive
+        The array itself, rather than its mold.
+    shape
+        Of the mold. Its shrinkage is made up for in the array too.
+    chord
+        The largest distance between a facet and its sphere, mm.
+    resolution
+        The smallest feature that the printer makes, mm.
     progress
-        Shows how far it is.
+        Shows how far it is; nothing by default.
 
     Returns
     -------
@@ -86,45 +72,61 @@ def make_part(
     Raises
     ------
     InputError
-        If a file cannot be written, or the design cannot be made, before anything is written.
+        If a file cannot be read or written, or the design cannot be made, before anything is written.
     RuntimeError
         If the solid, or what was read back, is not the design: a fault of the program.
     """
     progress = progress or Progress()
-    path = check_output(output, MESH_SUFFIXES)
-    beside = {suffix: check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt")}
-    findings = check_design(design, order.shape, chord=order.chord, resolution=order.resolution)
-    refuse_errors(findings, f"design {design.name!r}")
+    path = check_output(path, MESH_SUFFIXES)
+    picture, record, text = (check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt"))
+    source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
+    design = design if isinstance(design, Design) else read_design(design)
+    findings = check_design(design, shape, chord=chord, resolution=resolution)
+    refuse_errors(findings, source)
     imager = design.imager()
     array = imager.array
-    surface = facet_surface(array, order.chord, progress)
+    surface = facet_surface(array, chord, progress)
     with progress.step("Building and checking the solid"):
         part = solid_of(surface, plate_thickness(array))
-        solid = part.scale([order.shape.scale] * 3) if order.positive else mold_solid(array, part, order.shape)
-        expected = _expected_volume(array, order)
+        solid = part.scale([shape.scale] * 3) if positive else mold_solid(array, part, shape)
+        volume = shape.scale**3 * array_volume(array) if positive else mold_volume(array, shape)
         mesh = printable(solid)
-        findings += check_solid(mesh, expected, order.part, volume_tolerance(array, order.chord))
+        name = "array" if positive else "mold"
+        findings += check_solid(mesh, volume, name, volume_tolerance(array, chord))
         _stop_at_fault(findings)
     # A part that is not the design does not get its name.
     with progress.step("Writing and measuring"), atomic_write(path) as temporary:
-        write_mesh(temporary, mesh, f"{design.name} {order.part}")
-        found = verify(read_mesh(temporary), array, scale=order.shape.scale)
-        measured = quality(found, imager)
-        findings += judge(measured, chord=order.chord, radius=design.lens.radius_of_curvature_mm)
+        write_mesh(temporary, mesh, f"{design.name} {name}")
+        lenses = verify(read_mesh(temporary), array, scale=shape.scale)
+        measured = quality(lenses, imager)
+        findings += judge(measured, chord=chord, radius=design.lens.radius_of_curvature_mm)
         _stop_at_fault(findings)
-    report = _report(design, order, path, mesh, expected, findings, measured, found)
-    with progress.step("Drawing"), atomic_write(beside[".png"]) as temporary:
-        figure = preview(array, None if order.positive else order.shape, design.name)
-        figure.savefig(temporary, format="png", dpi=110)
-    write_json(beside[".json"], report)
-    write_text(beside[".txt"], words(report), [".txt"])
+    report = {
+        "design": design.name,
+        "part": name,
+        "file": path.name,
+        "unit": "mm",
+        "frame": "x, y as the sensor's, z toward the object; plano face at z = 0, lenses toward -z",
+        "size_mm": np.ptp(mesh.vertices.astype(float), axis=0).round(6).tolist(),
+        "facets": len(mesh.facets),
+        "file_bytes": path.stat().st_size,
+        "volume_mm3": mesh.solid().volume(),
+        "analytic_volume_mm3": volume,
+        "chord_um": 1000 * chord,
+        "printer_resolution_um": 1000 * resolution,
+        "shrinkage_percent": 100 * shape.shrinkage,
+        "draft_deg": math.degrees(shape.draft),
+        "checks": plain(findings),
+        "verification": measured,
+        "lens_center_deviation_um": (1000 * (lenses.center - np.asarray(array.centers, float))).tolist(),
+        "lens_radius_mm": lenses.radius.tolist(),
+        "lens_surface_error_rms_um": (1000 * lenses.surface_rms).tolist(),
+    }
+    with progress.step("Drawing"):
+        write_figure(picture, preview(array, None if positive else shape, design.name))
+    write_json(record, report)
+    write_text(text, report_text(report), [".txt"])
     return report
-
-
-def _expected_volume(array, order: Order) -> float:
-    if order.positive:
-        return order.shape.scale**3 * array_volume(array)
-    return mold_volume(array, order.shape)
 
 
 def _stop_at_fault(findings: list[Finding]) -> None:
@@ -154,34 +156,7 @@ def judge(measured: dict[str, Any], *, chord: float, radius: float) -> list[Find
     return [*findings, Finding("facets' wavefront", "warning", f"{text}; {advice}.")]
 
 
-def _report(design, order: Order, path: Path, mesh: Mesh, expected, findings, measured, found: Verification):
-    array = design.imager().array
-    size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
-    centers = np.asarray(array.centers, float)
-    return {
-        "design": design.name,
-        "part": order.part,
-        "file": path.name,
-        "unit": "mm",
-        "frame": "x, y as the sensor's, z toward the object; plano face at z = 0, lenses toward -z",
-        "size_mm": size.round(6).tolist(),
-        "facets": len(mesh.facets),
-        "file_bytes": path.stat().st_size,
-        "volume_mm3": mesh.solid().volume(),
-        "analytic_volume_mm3": expected,
-        "chord_um": 1000 * order.chord,
-        "printer_resolution_um": 1000 * order.resolution,
-        "shrinkage_percent": 100 * order.shape.shrinkage,
-        "draft_deg": math.degrees(order.shape.draft),
-        "checks": plain(findings),
-        "verification": measured,
-        "lens_center_deviation_um": (1000 * (found.center - centers)).tolist(),
-        "lens_radius_mm": found.radius.tolist(),
-        "lens_surface_error_rms_um": (1000 * found.surface_rms).tolist(),
-    }
-
-
-def words(report: dict[str, Any]) -> str:
+def report_text(report: dict[str, Any]) -> str:
     """A report to read."""
     title = f"{report['design']}: {report['part']}, {report['file']}"
     size = " x ".join(f"{side:.4g}" for side in report["size_mm"])

@@ -18,7 +18,6 @@ from trimesh.exchange.threemf import export_3MF
 from ..base.errors import InputError
 from ..io.disk import atomic_write, check_input, check_output, decoding
 
-MESH_SUFFIXES = (".stl", ".3mf")
 # Of a file to be read back: 50 bytes a facet, a few million facets.
 MAX_MESH_BYTES = 2**31
 
@@ -65,13 +64,24 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, name: str) -> None:
     """
     path = check_output(path, MESH_SUFFIXES)
     solid = trimesh.Trimesh(mesh.vertices, mesh.facets, process=False)
-    if path.suffix.lower() == ".stl":
-        header = f"gs_jax, unit: mm, {name}".encode("ascii", "replace")[:80].ljust(80)
-        data = header + export_stl(solid)[80:]
-    else:
-        data = export_3MF(trimesh.Scene({_plain(name): solid}))
+    data = _WRITERS[path.suffix.lower()](solid, name)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
+
+
+def _stl(solid: trimesh.Trimesh, name: str) -> bytes:
+    header = f"gs_jax, unit: mm, {name}".encode("ascii", "replace")[:80].ljust(80)
+    return header + export_stl(solid)[80:]
+
+
+def _3mf(solid: trimesh.Trimesh, name: str) -> bytes:
+    plain = "".join(c for c in name if c.isprintable()) or "part"
+    return export_3MF(trimesh.Scene({plain: solid}))
+
+
+# To add a format that trimesh reads, add its suffix with what it is written by.
+_WRITERS = {".stl": _stl, ".3mf": _3mf}
+MESH_SUFFIXES = tuple(_WRITERS)
 
 
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
@@ -101,7 +111,3 @@ def _corners(path: Path) -> np.ndarray:
         mesh.units = scene.units
         mesh.convert_units("millimeters")
     return np.asarray(mesh.triangles)
-
-
-def _plain(name: str) -> str:
-    return "".join(c for c in name if c.isprintable()) or "part"

@@ -30,7 +30,7 @@ def preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> Figure
     name
         Of the design.
     """
-    figure = Figure(figsize=(12, 5.6), layout="constrained")
+    figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
     heights = figure.add_subplot(1, 2, 1)
     _draw_heights(figure, heights, array, "array" if shape is None else "cavity of the mold, before shrinkage")
     view = figure.add_subplot(1, 2, 2, projection="3d")

@@ -46,7 +46,7 @@ def exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitP
     The coordinate is `u = D - rho (e - e_0)` with the ray's end D from the chief ray's, its direction cosines e and
     the chief ray's length rho: the point of the lens, but for the third order. The phase is that of the path
     less `e D - D^2 / (2 rho)`. By Hamilton's theorem its slope is `-D / rho`, which makes up for what `_lens_points`
-    leaves. Parameters are `gs_jax.optics.psf.psf`'s, with `count` samples along a side.
+    leaves. Parameters are `gs_jax.optics.psf.diffraction_psf`'s, with `count` samples along a side.
     """
     radius = pupil_radius(imager, radius)
     reach = _MARGIN * radius
@@ -79,7 +79,7 @@ def exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitP
     amplitude = jnp.where(lit, share * jnp.sqrt(jnp.where(lit, density, 1)), 0)
     phase = jnp.where(lit, 2 * np.pi / imager.wavelength * path, 0)
     amplitude, phase = amplitude.reshape(count, count), phase.reshape(count, count)
-    return ExitPupil(coordinate, turned(amplitude, phase), amplitude, chief.landing, distance)
+    return ExitPupil(coordinate, phasor(amplitude, phase), amplitude, chief.landing, distance)
 
 
 def _lens_points(known: Array, found: Array, weights: Array, count: int) -> list[Float[Array, "point 2"]]:
@@ -117,6 +117,6 @@ def inside(points: Float[Array, "point 2"], radius: Array, edges, step: Array) -
     return jnp.clip(inward / step + 0.5, 0, 1)
 
 
-def turned(length: ArrayLike, phase: Array) -> Complex[Array, "..."]:
+def phasor(length: ArrayLike, phase: Array) -> Complex[Array, "..."]:
     """`length exp(i phase)`, in the phase's precision."""
     return jax.lax.complex(length * jnp.cos(phase), length * jnp.sin(phase))

@@ -1,9 +1,9 @@
 """The point spread function of one lens unit on the sensor: PSF_o of Eq. (2).
 
-`psf` is scalar diffraction with the exact wavefront of `gs_jax.optics.unit`; `geometric_psf` counts rays and
-`gaussian_psf` is a Gaussian, for a fraction of the time. They return `(size, size)` pixels `[row, column]` with the
-sum 1, however little of the light falls into the window (`window_fraction` says how much). In the middle is the chief
-ray of `gs_jax.geometry`, not the true one: what the map gets wrong (distortion, coma) is in the PSF.
+`diffraction_psf` is scalar diffraction with the exact wavefront of `gs_jax.optics.unit`; `geometric_psf` counts rays
+and `gaussian_psf` is a Gaussian, for a fraction of the time. They return `(size, size)` pixels `[row, column]` with
+the sum 1, however little of the light falls into the window (`window_fraction` says how much). In the middle is the
+chief ray of `gs_jax.geometry`, not the true one: what the map gets wrong (distortion, coma) is in the PSF.
 
 The field of `gs_jax.optics.exit_pupil` goes to the sensor by a Fourier transform, done by two small matrix products
 (Soummer et al., Opt. Express 15, 15935, 2007).
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import Imager, chief_ray
-from .exit_pupil import ExitPupil, exit_pupil, inside, turned
+from .exit_pupil import ExitPupil, exit_pupil, inside, phasor
 from .unit import Point, pupil_disc, pupil_radius, unit_rays
 
 _RAYS = 2**15
@@ -28,7 +28,7 @@ Scalar = Float[ArrayLike, ""]
 
 
 @partial(jax.jit, static_argnames=("size", "samples"))
-def psf(
+def diffraction_psf(
     imager: Imager,
     depth: Scalar,
     *,
@@ -88,7 +88,7 @@ def window_fraction(
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
     samples: int = 4,
 ) -> Float[Array, ""]:
-    """Share of the light through the pupil that falls into the window of `psf`; same arguments."""
+    """Share of the light through the pupil that falls into the window of `diffraction_psf`; same arguments."""
     return jnp.sum(_pixels(imager, depth, size, field, offset, radius, edges, samples))
 
 
@@ -105,7 +105,7 @@ def geometric_psf(
 ) -> Float[Array, "row column"]:
     """Density of rays, each shared by the four pixels around it, with the sum 1 unless no ray is in the window.
 
-    32768 rays, even over the pupil. Parameters are `psf`'s.
+    32768 rays, even over the pupil. Parameters are `diffraction_psf`'s.
 
     Raises
     ------
@@ -145,11 +145,11 @@ def gaussian_psf(
     offset: Point = (0.0, 0.0),
     radius: Scalar | None = None,
 ) -> Float[Array, "row column"]:
-    """Round Gaussian about the rays' centroid, integrated over the pixels, with the sum 1. Parameters as for `psf`.
+    """Round Gaussian about the rays' centroid, integrated over the pixels, with the sum 1.
 
-    The aperture is round: it has no `edges`. The variance along an axis is the rays' (half the mean squared distance
-    from their centroid) plus that of the Gaussian as wide at half its height as the Airy disc of the pupil: full width
-    `0.5145 wavelength v / radius`.
+    Parameters are `diffraction_psf`'s; the aperture is round: it has no `edges`. The variance along an axis is the
+    rays' (half the mean squared distance from their centroid) plus that of the Gaussian as wide at half its height as
+    the Airy disc of the pupil: full width `0.5145 wavelength v / radius`.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def strehl(
     Parameters
     ----------
     imager, depth, field, radius, edges
-        As for `psf`.
+        As for `diffraction_psf`.
     samples
         Along a side of the pupil: enough for a blur of `samples / 2` times `wavelength v / (2 radius)`.
     """
@@ -240,8 +240,8 @@ def _pixels(imager, depth, size, field, offset, radius, edges, samples) -> Float
 
 def _transform(pupil: ExitPupil, x: Array, y: Array, turn: Array) -> Array:
     """The field at sensor points `(x, y)` from the chief ray's end."""
-    rows = turned(1, -turn * y[:, None] * pupil.coordinate[None])
-    columns = turned(1, -turn * pupil.coordinate[:, None] * x[None])
+    rows = phasor(1, -turn * y[:, None] * pupil.coordinate[None])
+    columns = phasor(1, -turn * pupil.coordinate[:, None] * x[None])
     return rows @ pupil.field @ columns
 
 

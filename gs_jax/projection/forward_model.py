@@ -38,8 +38,8 @@ def forward(
     imager, grid
         As for `backproject`.
     psf
-        PSF_o at each depth on the sensor's pixels, as `gs_jax.optics.psf.psf` makes it: `(len(depths), size, size)`,
-        odd size. By default a point, which makes this the adjoint of `backproject`.
+        PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`: `(len(depths), size, size)`, odd size. By
+        default a point, which makes this the adjoint of `backproject`.
 
     Returns
     -------

@@ -8,8 +8,8 @@ from ..base.errors import InputError
 from ..base.info import memory_bytes
 from ..base.progress import Progress
 from ..geometry import Grid, Imager
+from ..optics.window import psf_of_depth
 from ..projection.backprojection import backproject
-from ..simulation.scene import psf_of_depth
 from .methods import reconstruct
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.

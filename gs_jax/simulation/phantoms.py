@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 from PIL import Image, ImageDraw, ImageFont
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..geometry import Grid
 from ..layouts.cells import Real, check_positive, half_size
 
@@ -209,7 +209,7 @@ def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> F
     """
     emitters = jnp.asarray(emitters, grid.depths.dtype)
     if _surely_not((jnp.diff(grid.depths) > 0).all()):
-        raise ValueError(f"`grid.depths` must ascend, got {shown(grid.depths.tolist())}.")
+        raise ValueError(f"`grid.depths` must ascend, got {short_repr(grid.depths.tolist())}.")
     if _surely_not((finite := jnp.isfinite(emitters).all(axis=1)).all()):
         raise ValueError(f"`emitters` must be finite, got {emitters[jnp.argmin(finite)].tolist()}.")
     return _rasterize(emitters, grid)

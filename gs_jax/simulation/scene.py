@@ -1,7 +1,6 @@
 """From a scene to the image on the sensor, as the command line does it."""
 
 import math
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.errors import InputError, about
+from ..base.errors import InputError, errors_name_file
 from ..base.info import memory_bytes
 from ..base.progress import Progress
 from ..designs.design import Design
 from ..geometry import Grid, Imager, Sensor
-from ..io.files import read_points
+from ..io.points import read_points
 from ..io.volumes import read_volume
-from ..optics.aperture import clear_diameter
-from ..optics.psf import gaussian_psf, geometric_psf, psf
-from ..optics.unit import unit_rays
+from ..optics.window import psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.points import STEPS, forward_points, stamps
 
-PSFS = {"diffraction": psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
-# Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.
-_MARGIN, _FARTHEST = 16, 128
-# Rays along the aperture's radius that are asked how far they reach.
-_ZONES = 65
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
 
@@ -50,7 +42,7 @@ def simulate_scene(
     else:
         volume, grid = read_volume(path)
         simulate = lambda: simulate_volume(volume, imager, grid, **options)
-    with about(path):
+    with errors_name_file(path):
         return simulate()
 
 
@@ -74,7 +66,7 @@ def simulate_volume(
     imager, grid
         As for `forward`.
     kind
-        Of the PSF: a key of `PSFS`.
+        Of the PSF: a key of `gs_jax.optics.window.PSFS`.
 
     Raises
     ------
@@ -121,44 +113,3 @@ def simulate_points(
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
     fine = np.stack([kernel(depth) for depth in progress.track(depths, "Point spread functions")])
     return forward_points(points, imager, stamps(depths, fine), progress)
-
-
-def psf_of_depth(imager: Imager, depths, kind: str, steps: int = 1):
-    """Function from a depth to its PSF, in a window that holds the rays of all depths.
-
-    Rays that the lens reflects totally do not count.
-
-    Parameters
-    ----------
-    imager
-        Its mean clear aperture is taken.
-    depths
-        Between the nearest and the farthest of them, mm.
-    kind
-        Of the PSF: a key of `PSFS`.
-    steps
-        As many pixels of the sensor as make a pixel that is meant: the margins of the window grow with them.
-
-    Raises
-    ------
-    InputError
-        If the rays reach farther than 128 pixels.
-    """
-    radius = clear_diameter(imager.array) / 2
-    # All zones: near the focus of the rim's rays those of other zones land farther out.
-    fan = radius * jnp.linspace(0, 1, _ZONES)[:, None] * jnp.array([[1.0, 0.0]])
-    ends = [unit_rays(imager, depth, fan) for depth in (min(depths), max(depths))]
-    reaches = [float(jnp.where(rays.valid, jnp.abs(rays.landing[:, 0]), 0).max()) for rays in ends]
-    pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
-    if not pixels <= _FARTHEST:
-        depth = (min(depths), max(depths))[int(np.argmax(reaches))]
-        raise InputError(
-            f"found an object at {depth:g} mm, blurred over {pixels:.3g} pixels of the sensor each way, "
-            f"allowed: {_FARTHEST}."
-        )
-    size = steps * (2 * math.ceil(pixels + _MARGIN) + 1)
-    make = PSFS[kind]
-    if kind == "diffraction":  # as fine as the aperture diffracts
-        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
-        make = partial(make, samples=math.ceil(sharp))
-    return lambda depth: make(imager, depth, size=size, radius=radius)

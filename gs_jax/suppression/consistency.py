@@ -108,7 +108,7 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     return Readings(pixels, light, noise, np.where(seen, weight, 0), seen)
 
 
-def taken(readings: Readings, which) -> Readings:
+def select_readings(readings: Readings, which) -> Readings:
     """The readings of some points, by index, slice or mask."""
     return Readings(*(part[which] for part in readings))
 

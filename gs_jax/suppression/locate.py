@@ -25,10 +25,10 @@ from .consistency import (
     agreed_level,
     log_false_alarms,
     readings,
+    select_readings,
     signal,
     spot_profile,
     survival,
-    taken,
     without_spots,
 )
 
@@ -215,7 +215,7 @@ def _consistent(
     """
     seen = readings(candidates, signal, imager)
     order = np.argsort(-agreed_level(seen.light, seen.seen, _SHARE), kind="stable")
-    candidates, seen = candidates[order], taken(seen, order)
+    candidates, seen = candidates[order], select_readings(seen, order)
     as_bright, tests = survival(signal.light), _count(voxels)
     profile = spot_profile(seen, signal.light)
     spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
@@ -225,7 +225,7 @@ def _consistent(
     for number, mine in enumerate(seen.seen):
         if (np.linalg.norm(places[height > 0] - places[number], axis=1) < 1).any():
             continue
-        one = taken(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
+        one = select_readings(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
         bright = agreed_level(one.light, one.seen, _SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
         if not (bright and _lit(one, as_bright, tests)[0]):
             continue
@@ -235,7 +235,7 @@ def _consistent(
             distance = np.hypot(*(spots[others] - pixel).T)
             left[tuple(owner[others].T)] -= height[number] * np.interp(distance, np.arange(REACH + 1), profile)
     points = height > 0
-    return candidates[points], taken(seen, points), (left + height[:, None])[points]
+    return candidates[points], select_readings(seen, points), (left + height[:, None])[points]
 
 
 def _intensity(

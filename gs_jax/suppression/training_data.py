@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Float16, Float32
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
+from ..base.precision import in_float32
 from ..base.progress import Progress
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..io.disk import atomic_write, decoding, make_folder
@@ -101,10 +102,10 @@ def simulated_stack(seed: int, number: int) -> Stack:
     pixel, pitch = SIZES[number % len(SIZES)]
     imager, lit = _microscope(rng, pixel)
     depths = rng.uniform(18.5, 22.5) + rng.uniform(0.15, 0.6) * (np.arange(PLANES) - PLANES // 2)
-    grid = _in_float32(Grid.over(imager.sensor, depths=depths, pitch=pitch))
+    grid = in_float32(Grid.over(imager.sensor, depths=depths, pitch=pitch))
     beyond = 2 * (depths[1] - depths[0])
     between = np.sort(rng.uniform(depths[0] - beyond, depths[-1] + beyond, SCENE_PLANES))
-    fine = _in_float32(Grid(between, (2 * grid.shape[0], 2 * grid.shape[1]), pitch / 2))
+    fine = in_float32(Grid(between, (2 * grid.shape[0], 2 * grid.shape[1]), pitch / 2))
     scene = np.zeros((SCENE_PLANES, *fine.shape), np.float32) if number % 16 == 15 else _scene(fine.shape, rng)
     image = _capture(scene, lit, fine, rng)
     volume, unit = standardized(np.asarray(backproject(image, imager, grid)))
@@ -174,11 +175,7 @@ def _microscope(rng: np.random.Generator, pixel: float) -> tuple[Imager, Imager]
     centers = random_layout(count, (plate, plate), diameter=None, seed=int(rng.integers(2**31)))
     distance = rng.uniform(5.6, 6.0)
     make = lambda radius: Imager(MicrolensArray(centers), Sensor((PIXELS, PIXELS), pixel), distance, radius)
-    return _in_float32(make(FIELD_RADIUS)), _in_float32(make(LIT_RADIUS))
-
-
-def _in_float32(tree):
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+    return in_float32(make(FIELD_RADIUS)), in_float32(make(LIT_RADIUS))
 
 
 def _capture(scene: np.ndarray, imager: Imager, grid: Grid, rng: np.random.Generator) -> Float[Array, "row column"]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
-from ..base.errors import InputError, shown
+from ..base.errors import InputError, short_repr
 from ..io.disk import atomic_write, check_input, check_output, decoding
 
 # The networks that come with the package, and what a file of weights may hold at most.
@@ -229,7 +229,7 @@ def pretrained(name: str = "multislice") -> UNet:
         If there is none of that name.
     """
     if name not in PRETRAINED:
-        raise InputError(f"found the network {shown(name)}, allowed: {', '.join(PRETRAINED)}.")
+        raise InputError(f"found the network {short_repr(name)}, allowed: {', '.join(PRETRAINED)}.")
     with resources.as_file(resources.files("gs_jax") / "weights" / f"{name}.npz") as path:
         return _read(path)
 

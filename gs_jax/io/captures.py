@@ -1,7 +1,7 @@
-"""Captures, volumes, points and JSON on disk; designs are in `designs`. Lengths are mm, as everywhere.
+"""Captures on disk: 2-D greyscale TIFF, PNG or .npy of uint8, uint16 or float32.
 
-A capture is a 2-D greyscale TIFF, PNG or .npy of uint8, uint16 or float32. Its size and type are checked on the
-file's own declaration, before a pixel is decoded. Points are CSV.
+Their size and type are checked on the file's own declaration, before a pixel is decoded. To add a format, add its
+suffix to `_FORMATS` with a function that reads it and one that writes it.
 """
 
 import contextlib
@@ -9,31 +9,20 @@ import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import tifffile
-from jaxtyping import Array, Float, Float32, Float64, Shaped, UInt8, UInt16
+from jaxtyping import Array, Float32, Shaped, UInt8, UInt16
 from PIL import Image
 
-from ..base.errors import InputError, shown
-from .disk import (
-    atomic_write as atomic_write,
-    check_input as check_input,
-    check_output as check_output,
-    decoding,
-    read_table,
-    write_json as write_json,
-    write_text,
-)
+from ..base.errors import InputError, short_repr
+from .disk import atomic_write, check_input, check_output, decoding
 from .tiff import decode_page
-from .volumes import VOLUME_SUFFIXES as VOLUME_SUFFIXES, read_volume as read_volume, write_volume as write_volume
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
 
 MAX_PIXELS = 10**9
-MAX_POINTS = 1_000_000
-POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
-CAPTURE_SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 _DTYPES = ("uint8", "uint16", "float32")
 _COLOURS = {2: "colour (RGB)", 3: "a colour palette", 4: "grey with transparency", 6: "colour with transparency"}
 _PHOTOMETRIC = {0: "grey with 0 as white", 2: "colour (RGB)", 3: "a colour palette", 32803: "a colour filter mosaic"}
@@ -56,15 +45,42 @@ def read_capture(path: str | os.PathLike[str], shape: tuple[int, int] | None = N
         `shape` or over 1e9 pixels, of another type, or holds a NaN or an infinity.
     """
     path = check_input(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: found the suffix {shown(path.suffix)}, allowed: {', '.join(CAPTURE_SUFFIXES)}.")
-    pixels = reader(path, shape)
+    form = _FORMATS.get(path.suffix.lower())
+    if form is None:
+        raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(CAPTURE_SUFFIXES)}.")
+    pixels = form.read(path, shape)
     pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         row, column = np.argwhere(~np.isfinite(pixels))[0].tolist()
         raise InputError(f"{path}: found {pixels[row, column]} at pixel ({row}, {column}), allowed: finite numbers.")
     return pixels
+
+
+def write_capture(path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"]) -> None:
+    """Writes a capture as it is, by its suffix an uncompressed TIFF, a PNG or an .npy; whole or not at all.
+
+    Parameters
+    ----------
+    image
+        `(row, column)` of uint8, uint16 or float32.
+
+    Raises
+    ------
+    InputError
+        As `check_output`, and for float32 in PNG, which cannot hold it.
+    ValueError
+        If the image has another type.
+    """
+    path = check_output(path, CAPTURE_SUFFIXES)
+    pixels = np.asarray(image)
+    if pixels.dtype.name not in _DTYPES:
+        raise ValueError(f"`image` must be one of {', '.join(_DTYPES)}, got {pixels.dtype.name}.")
+    form = _FORMATS[path.suffix.lower()]
+    if pixels.dtype.name not in form.dtypes:
+        allowed = f"{', '.join(form.dtypes)} in {path.suffix}; use .tif or .npy"
+        raise InputError(f"{path}: found pixels of type {pixels.dtype.name}, allowed: {allowed}.")
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        form.write(file, pixels)
 
 
 def _check_declared(path: Path, size: tuple[int, ...], dtype: str, shape: tuple[int, int] | None) -> None:
@@ -124,72 +140,30 @@ def _read_npy(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
     return np.array(pixels)
 
 
-_READERS: dict[str, Callable[[Path, tuple[int, int] | None], np.ndarray]] = {
-    ".tif": _read_tiff,
-    ".tiff": _read_tiff,
-    ".png": _read_png,
-    ".npy": _read_npy,
+def _write_tiff(file: BinaryIO, pixels: np.ndarray) -> None:
+    tifffile.imwrite(file, pixels, photometric="minisblack")
+
+
+def _write_png(file: BinaryIO, pixels: np.ndarray) -> None:
+    Image.fromarray(pixels).save(file, format="PNG")
+
+
+def _write_npy(file: BinaryIO, pixels: np.ndarray) -> None:
+    np.save(file, pixels, allow_pickle=False)
+
+
+class _Format(NamedTuple):
+    """How files of one suffix are read, given the size that they must have, and written, and what they can hold."""
+
+    read: Callable[[Path, tuple[int, int] | None], np.ndarray]
+    write: Callable[[BinaryIO, np.ndarray], None]
+    dtypes: tuple[str, ...] = _DTYPES
+
+
+_FORMATS = {
+    ".tif": _Format(_read_tiff, _write_tiff),
+    ".tiff": _Format(_read_tiff, _write_tiff),
+    ".png": _Format(_read_png, _write_png, ("uint8", "uint16")),
+    ".npy": _Format(_read_npy, _write_npy),
 }
-
-
-def write_capture(path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"]) -> None:
-    """Writes a capture as it is, by its suffix an uncompressed TIFF, a PNG or an .npy; whole or not at all.
-
-    Parameters
-    ----------
-    image
-        `(row, column)` of uint8, uint16 or float32.
-
-    Raises
-    ------
-    InputError
-        As `check_output`, and for float32 in PNG, which cannot hold it.
-    ValueError
-        If the image has another type.
-    """
-    path = check_output(path, CAPTURE_SUFFIXES)
-    pixels = np.asarray(image)
-    if pixels.dtype.name not in _DTYPES:
-        raise ValueError(f"`image` must be one of {', '.join(_DTYPES)}, got {pixels.dtype.name}.")
-    if path.suffix.lower() == ".png" and pixels.dtype.kind == "f":
-        raise InputError(f"{path}: found float32 pixels for a PNG, allowed: uint8, uint16; use .tif or .npy.")
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        match path.suffix.lower():
-            case ".png":
-                Image.fromarray(pixels).save(file, format="PNG")
-            case ".npy":
-                np.save(file, pixels, allow_pickle=False)
-            case _:
-                tifffile.imwrite(file, pixels, photometric="minisblack")
-
-
-def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
-    """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`.
-
-    Raises
-    ------
-    InputError
-        As `read_table`, and if a depth is not above 0 or an intensity is below 0.
-    """
-    points = read_table(path, POINTS_HEADER, MAX_POINTS)
-    for column, wrong, allowed in ((2, points[:, 2] <= 0, "a depth above 0"), (3, points[:, 3] < 0, "0 or more")):
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            name = POINTS_HEADER.split(",")[column]
-            found = shown(float(points[row, column]))
-            raise InputError(f"{path}: point {row + 1}, {name}: found {found}, allowed: {allowed}.")
-    return points
-
-
-def write_points(path: str | os.PathLike[str], points: Float[Array | np.ndarray, "point 4"]) -> None:
-    """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal.
-
-    Raises
-    ------
-    InputError
-        As `check_output`, for `.csv`.
-    """
-    rows = np.asarray(points)
-    # `str` of the array's own scalars: the shortest digits that read back as the same float32 or float64.
-    lines = [POINTS_HEADER, *(",".join(str(value) for value in row) for row in rows)]
-    write_text(path, "\n".join(lines) + "\n", [".csv"])
+CAPTURE_SUFFIXES = tuple(_FORMATS)
