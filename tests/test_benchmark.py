@@ -114,7 +114,7 @@ def test_every_method_reconstructs_and_a_wrong_one_is_named():
 
 
 def test_command(found, tmp_path, monkeypatch):
-    from gs_jax.cli.benchmark import benchmark as command
+    from gs_jax.cli.benchmark import command
 
     monkeypatch.setattr("gs_jax.cli.benchmark.run", lambda progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])

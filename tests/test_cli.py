@@ -82,7 +82,7 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
     design = DESIGN.replace("[96, 80]", "[480, 400]").replace("_um = 20.0", "_um = 4.5")
     (folder / "design.toml").write_text(design)
     (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n")
-    run(monkeypatch, capsys, "simulate", "design.toml", "points.csv", "-o", "capture.tif")
+    run(monkeypatch, capsys, "simulate", "points.csv", "design.toml", "-o", "capture.tif")
     options = (
         "--depths",
         "19:21:0.25",
@@ -121,7 +121,7 @@ POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"
 
 def test_simulate_points(folder, monkeypatch, capsys):
     (folder / "points.csv").write_text(POINTS)
-    command = ("simulate", "design.toml", "points.csv", "-o", "c.tif")
+    command = ("simulate", "points.csv", "design.toml", "-o", "c.tif")
     status, out, err = run(monkeypatch, capsys, *command)
     assert (status, err) == (0, "") and out.startswith("c.tif: 96 x 80 pixels, uint16, from 1")
     first = read_capture(folder / "c.tif", (96, 80))
@@ -142,14 +142,14 @@ WRONG_SCENES = [
 @pytest.mark.parametrize(("content", "words"), WRONG_SCENES)
 def test_wrong_scenes_give_one_line_and_status_2(folder, monkeypatch, capsys, content, words):
     (folder / "points.csv").write_text(content)
-    status, out, err = run(monkeypatch, capsys, "simulate", "design.toml", "points.csv", "-o", "c.tif")
+    status, out, err = run(monkeypatch, capsys, "simulate", "points.csv", "design.toml", "-o", "c.tif")
     assert (status, out) == (2, "") and not (folder / "c.tif").exists()
     assert re.fullmatch(r"gs-jax: points\.csv[^\n]+\n", err) and words in err
 
 
 def test_a_negative_voxel_names_the_file(folder, monkeypatch, capsys):
     write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
-    status, _, err = run(monkeypatch, capsys, "simulate", "design.toml", "scene.ome.tif", "-o", "c.tif")
+    status, _, err = run(monkeypatch, capsys, "simulate", "scene.ome.tif", "design.toml", "-o", "c.tif")
     assert (status, err) == (2, "gs-jax: scene.ome.tif: found a voxel of -1, allowed: 0 or more.\n")
 
 
@@ -158,7 +158,7 @@ def test_simulate_a_volume_and_reconstruct_it(folder, monkeypatch, capsys):
     voxels = np.zeros((3, 9, 9), np.float32)
     voxels[1, 6, 3] = 1
     write_volume(folder / "scene.zarr", voxels, grid)
-    simulate = ("simulate", "design.toml", "scene.zarr", "--psf", "gaussian", "--no-noise", "-o", "capture.tif")
+    simulate = ("simulate", "scene.zarr", "design.toml", "--psf", "gaussian", "--no-noise", "-o", "capture.tif")
     status, out, _ = run(monkeypatch, capsys, *simulate)
     assert status == 0 and "float32, from 0 to" in out
     options = ("--depths", "20:20:1", "--voxel-um", "50", "-o", "v.tif")
@@ -223,14 +223,14 @@ WRONG_ARGUMENTS = [
     (("layout", "--count", "9", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "`count` must be"),
     (("layout", "--count", "200", "--size-mm", "20", "20", "--pitch-mm", "1", "--seed", "-1", "-o", "c.csv"), "--seed"),
     (("demo", "--out", "design.toml"), "design.toml"),
-    (("simulate", "design.toml", "-o", "c.tif"), "SCENE"),
-    (("simulate", "design.toml", "missing.csv", "-o", "c.tif"), "missing.csv"),
-    (("simulate", "design.toml", "capture.tif", "-o", "c.tif"), "capture.tif"),
-    (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "design.toml: found the suffix"),
-    (("simulate", "design.toml", "missing.csv", "-o", "c.jpg"), "c.jpg: found the suffix"),
-    (("simulate", "design.toml", "missing.csv", "-o", "c.png", "--no-noise"), "c.png: found .png for --no-noise"),
-    (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--psf", "round"), "'round' is not"),
-    (("simulate", "design.toml", "missing.csv", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
+    (("simulate", "points.csv", "-o", "c.tif"), "DESIGN"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.tif"), "missing.csv"),
+    (("simulate", "capture.tif", "design.toml", "-o", "c.tif"), "capture.tif"),
+    (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "design.toml: found a design in the place of SCENE"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "c.jpg: found the suffix"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.png", "--no-noise"), "c.png: found .png for --no-noise"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--psf", "round"), "'round' is not"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from experiments import mold_check
 from gs_jax.base.errors import InputError
-from gs_jax.cli.mold import mold
+from gs_jax.cli.mold import command as mold
 from gs_jax.designs.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.cli.train import train as command
+from gs_jax.cli.train import command
 from gs_jax.suppression import training_data
 from gs_jax.suppression.training import Recipe, read_checkpoint, start, train, write_checkpoint
 from gs_jax.suppression.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks

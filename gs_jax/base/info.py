@@ -12,6 +12,7 @@ from .. import __version__
 
 def describe() -> dict[str, str]:
     """Versions, devices and memory, name to value."""
+    memory = psutil.virtual_memory()
     return {
         "gs-jax": __version__,
         "python": platform.python_version(),
@@ -19,10 +20,10 @@ def describe() -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         "devices": ", ".join(f"{d.device_kind} ({d.platform} {d.id})" for d in jax.devices()),
         "cores": str(os.cpu_count()),
-        "memory": f"{memory_bytes() / 2**30:.1f} GiB",
+        "memory": f"{memory.total / 2**30:.1f} GiB, {memory.available / 2**30:.1f} free",
     }
 
 
-def memory_bytes() -> int:
-    """Physical memory of the machine."""
-    return psutil.virtual_memory().total
+def available_memory() -> int:
+    """Bytes that may be taken now without swapping; other programs have the rest of the machine's."""
+    return psutil.virtual_memory().available

@@ -20,7 +20,7 @@ import lineax as lx
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.info import memory_bytes
+from ..base.info import available_memory
 from ..base.progress import Progress
 from ..reconstruction.methods import SOLVERS, forward_operator, reconstruct
 from ..suppression.clustering import find_clusters
@@ -148,7 +148,7 @@ def obstacle(name: str, side: int, last: dict[str, Any] | None, limit: float) ->
     """Why a method is not run at a size: too much memory, or time; None if nothing is in its way."""
     method, pairs = METHODS[name], float(side) ** 4
     # The matrix, and its copy while it is made.
-    if method.dense and 8 * pairs > (room := memory_bytes() / 4):
+    if method.dense and 8 * pairs > (room := available_memory() / 4):
         return f"two copies of the matrix take {8 * pairs / 2**30:.3g} GiB, allowed: {room / 2**30:.3g} GiB"
     if last and (forecast := last["seconds"] * (pairs / last["pairs"]) ** method.growth) > limit:
         return f"would take {forecast:.3g} s an image, allowed: {limit:g} s"

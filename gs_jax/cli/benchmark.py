@@ -10,9 +10,9 @@ from ..benchmark.report import write
 from ..io.disk import make_folder
 
 
-@click.command()
+@click.command("benchmark")
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
-def benchmark(out: Path):
+def command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
     folder = make_folder(out)
     with Progress() as progress:

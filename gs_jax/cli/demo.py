@@ -8,9 +8,9 @@ from ..base.progress import Progress
 from ..demo.story import run
 
 
-@click.command()
+@click.command("demo")
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
-def demo(out: Path):
+def command(out: Path):
     """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with a report."""
     with Progress() as progress:
         report = run(out, progress)

@@ -5,8 +5,8 @@ import click
 from ..base.info import describe
 
 
-@click.command()
-def info():
+@click.command("info")
+def command():
     """Show versions, devices and memory."""
     for name, value in describe().items():
         click.echo(f"{name:<12} {value}")

@@ -11,14 +11,14 @@ from ..layouts.patterns import random_layout
 from .options import MM
 
 
-@click.command()
+@click.command("layout")
 @click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
 @click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
 @click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
 @click.option("--diameter-mm", type=MM, default=2.0, show_default=True, help="Of the lenses; they leave no hole.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
-def layout(count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path):
+def command(count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path):
     """Make a random layout of lenses, for the key `centers_file` of a design."""
     check_output(output, [".csv"])
     centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)

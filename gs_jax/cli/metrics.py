@@ -12,12 +12,12 @@ from ..io.disk import check_output, write_json
 from .options import UM, Depths
 
 
-@click.command()
+@click.command("metrics")
 @click.argument("design", type=Path)
 @click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
 @click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
-def metrics(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
+def command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
     """Show what the microscope of the file DESIGN promises (the paper's Eqs. 1-11), and what is out of focus."""
     if output:
         check_output(output, [".json"])

@@ -13,7 +13,7 @@ from ..mold.solids import MoldShape
 from .options import Number
 
 
-@click.command()
+@click.command("mold")
 @click.argument("design", type=Path)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
 @click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
@@ -53,7 +53,7 @@ from .options import Number
     help="Smallest feature that the printer makes.",
 )
 @click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
-def mold(
+def command(
     design: Path,
     output: Path,
     positive: bool,

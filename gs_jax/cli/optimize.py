@@ -15,12 +15,12 @@ from ..codesign.study import read_study
 from ..designs.design import read_design
 
 
-@click.command()
+@click.command("optimize")
 @click.argument("design", type=Path)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
 @click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")
-def optimize(design: Path, study: Path, resume: bool, output: Path):
+def command(design: Path, study: Path, resume: bool, output: Path):
     """Search for a better microscope than that of the file DESIGN, and show before and after.
 
     Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).

@@ -17,10 +17,10 @@ from ..io.disk import check_output, make_folder, write_json
 from ..io.figures import write_figure
 
 
-@click.command()
+@click.command("pareto")
 @click.argument("study", type=Path)
 @click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
-def pareto(study: Path, out: Path):
+def command(study: Path, out: Path):
     """Show the trade-off that the file STUDY asks for: its one goal against one or two moving limits.
 
     The folder gets pareto.json, the designs' numbers, and pareto.png.

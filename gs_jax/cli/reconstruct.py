@@ -20,7 +20,7 @@ from ..suppression.unet import pretrained, suppress as without_background
 from .options import UM, Depths, depth_range
 
 
-@click.command()
+@click.command("reconstruct")
 @click.argument("capture", type=Path)
 @click.argument("design", type=Path)
 @click.option("--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included.")
@@ -36,7 +36,7 @@ from .options import UM, Depths, depth_range
 )
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
-def reconstruct(
+def command(
     capture: Path,
     design: Path,
     depths: list[float],

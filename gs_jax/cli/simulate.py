@@ -6,26 +6,26 @@ import click
 import jax
 import numpy as np
 
-from ..base.errors import InputError
+from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..designs.design import read_design
 from ..io.captures import CAPTURE_SUFFIXES, write_capture
 from ..io.disk import check_output
 from ..optics.window import PSFS
 from ..simulation.camera import Camera, expose
-from ..simulation.scene import simulate_scene
+from ..simulation.scene import read_scene, simulate
 from .options import Number
 
 
-@click.command()
-@click.argument("design", type=Path)
+@click.command("simulate")
 @click.argument("scene", type=Path)
+@click.argument("design", type=Path)
 @click.option("--psf", type=click.Choice(list(PSFS)), default="diffraction", show_default=True)
 @click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
 @click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
-def simulate(design: Path, scene: Path, psf: str, peak_electrons: float, noise: bool, seed: int, output: Path):
+def command(scene: Path, design: Path, psf: str, peak_electrons: float, noise: bool, seed: int, output: Path):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
     SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
@@ -34,9 +34,13 @@ def simulate(design: Path, scene: Path, psf: str, peak_electrons: float, noise: 
     check_output(output, CAPTURE_SUFFIXES)
     if not noise and output.suffix.lower() == ".png":
         raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
+    if scene.suffix.lower() == ".toml":
+        raise InputError(f"{scene}: found a design in the place of SCENE, allowed: SCENE first, then DESIGN.")
     microscope = read_design(design)
     with Progress() as progress:
-        image = simulate_scene(scene, microscope, kind=psf, progress=progress)
+        light, grid = read_scene(scene)
+        with errors_name_file(scene):
+            image = simulate(light, microscope.imager(), grid, psf=psf, progress=progress)
         if noise:
             with progress.step("Exposing"):
                 image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))

@@ -27,13 +27,13 @@ _STACKS = 96
 _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
-@click.command()
+@click.command("train")
 @click.option("--network", type=click.Choice(PRETRAINED), default="multislice", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
-def train(network: str, steps: int | None, seed: int, resume: bool, output: Path):
+def command(network: str, steps: int | None, seed: int, resume: bool, output: Path):
     """Train a network for background suppression: the paper's, or ours, which looks at seven slices.
 
     Beside WEIGHTS.npz it keeps WEIGHTS.checkpoint, which an interrupt leaves there, and WEIGHTS.json, the losses; for

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float32, Shaped
 
 from ..base.errors import InputError
-from ..base.info import memory_bytes
+from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Grid, Imager
 from ..optics.window import psf_of_depth
@@ -41,7 +41,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
     grid = Grid.over(imager.sensor, depths=jnp.array(depths), pitch=pitch)
     size = 4 * len(depths) * grid.shape[0] * grid.shape[1]
     # The volume, the copy that is being computed, and room for the image.
-    if 2.5 * size > (memory := memory_bytes()):
+    if 2.5 * size > (memory := available_memory()):
         shape = " x ".join(map(str, (len(depths), *grid.shape)))
         raise InputError(
             f"--voxel-um, --depths: found {pitch * 1000:g} um and {len(depths)} depths, a volume of {shape} voxels or "

@@ -1,22 +1,21 @@
-"""From a scene to the image on the sensor, as the command line does it."""
+"""From a scene to the image on the sensor."""
 
 import math
+import os
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.errors import InputError, errors_name_file
-from ..base.info import memory_bytes
+from ..base.errors import InputError, short_repr
+from ..base.info import available_memory
 from ..base.progress import Progress
-from ..designs.design import Design
 from ..geometry import Grid, Imager, Sensor
 from ..io.points import read_points
 from ..io.volumes import read_volume
-from ..optics.window import psf_of_depth
+from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.points import STEPS, forward_points, stamps
 
@@ -24,26 +23,54 @@ from ..projection.points import STEPS, forward_points, stamps
 _STEP = 0.1
 
 
-def simulate_scene(
-    path: Path, design: Design, *, kind: str = "diffraction", progress: Progress
-) -> Float[np.ndarray, "row column"]:
-    """The image of a file: points if it is a CSV, else a volume.
+def read_scene(path: str | os.PathLike[str]) -> tuple[np.ndarray, Grid | None]:
+    """A scene from a file: points `(point, 4)` if it is a CSV, else a volume with its grid.
 
     Raises
     ------
     InputError
-        As `read_points`, `read_volume` and the two functions below; it names the file.
+        As `read_points` and `read_volume`.
     """
-    imager = design.imager()
-    options: dict[str, Any] = dict(kind=kind, progress=progress)
-    if path.suffix.lower() == ".csv":
-        points = read_points(path)
-        simulate = lambda: simulate_points(points, imager, **options)
-    else:
-        volume, grid = read_volume(path)
-        simulate = lambda: simulate_volume(volume, imager, grid, **options)
-    with errors_name_file(path):
-        return simulate()
+    if Path(path).suffix.lower() == ".csv":
+        return read_points(path), None
+    return read_volume(path)
+
+
+def simulate(
+    scene: Float[Array | np.ndarray, "..."],
+    imager: Imager,
+    grid: Grid | None = None,
+    *,
+    psf: str = "diffraction",
+    progress: Progress | None = None,
+) -> Float[np.ndarray, "row column"]:
+    """The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s.
+
+    Parameters
+    ----------
+    scene
+        Points `(point, 4)`, `(x, y, z, intensity)` in mm; or, with a grid, a volume of `grid.volume_shape`. Neither is
+        negative.
+    imager
+        What sees it.
+    grid
+        Of a volume.
+    psf
+        Of a lens: "diffraction", "geometric" (rays alone) or "gaussian"; the quicker ones last.
+    progress
+        Shows how far it is.
+
+    Raises
+    ------
+    InputError
+        If there is no such PSF, a voxel is negative, the work would not fit into the memory, or a depth is blurred over
+        more than 128 pixels each way.
+    """
+    if psf not in PSFS:
+        raise InputError(f"`psf`: found {short_repr(psf)}, allowed: {', '.join(PSFS)}.")
+    if grid is None:
+        return simulate_points(np.asarray(scene, np.float64), imager, kind=psf, progress=progress)
+    return simulate_volume(scene, imager, grid, kind=psf, progress=progress)
 
 
 def simulate_volume(
@@ -52,7 +79,7 @@ def simulate_volume(
     grid: Grid,
     *,
     kind: str = "diffraction",
-    progress: Progress,
+    progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of a volume whose voxels are evenly lit boxes, one plane after the other.
 
@@ -62,7 +89,7 @@ def simulate_volume(
     Parameters
     ----------
     volume
-        `(len(depths), *grid.shape)`, not negative.
+        `grid.volume_shape`, not negative.
     imager, grid
         As for `forward`.
     kind
@@ -77,10 +104,10 @@ def simulate_volume(
     finest = float(imager.magnification(grid.depths).max()) * grid.pitch / imager.sensor.pixel_pitch
     parts = math.ceil(2 * finest)
     rows, columns = (n * parts for n in grid.shape)
-    if 16 * rows * columns > (memory := memory_bytes()):
+    if 16 * rows * columns > (memory := available_memory()):
         raise InputError(
             f"found planes of {grid.shape} voxels of {grid.pitch * 1000:g} um, which divided to half a pixel take "
-            f"{16 * rows * columns / 2**30:.3g} GiB, allowed: {memory / 2**30:.3g} GiB on this machine."
+            f"{16 * rows * columns / 2**30:.3g} GiB, allowed: the {memory / 2**30:.3g} GiB that are free."
         )
     if np.min(volume) < 0:
         raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
@@ -100,7 +127,7 @@ def simulate_points(
     imager: Imager,
     *,
     kind: str = "diffraction",
-    progress: Progress,
+    progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate_volume`."""
     if not len(points):
