@@ -23,8 +23,8 @@ from PIL import Image
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.disk import atomic_write, check_output, write_json
-from gs_jax.io.points import read_points, write_points
+from gs_jax.io.disk import atomic_write, check_output, read_table, write_json
+from gs_jax.io.points import POINTS_HEADER, read_points, write_points
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs
@@ -275,6 +275,60 @@ def test_points_file_is_the_contracts(tmp_path):
     (tmp_path / "a.csv").write_bytes(b'\xef\xbb\xbf"x_mm","y_mm",z_mm,intensity\r\n1, 2,3e0,4\r\n')
     np.testing.assert_array_equal(read_points(tmp_path / "a.csv"), [[1, 2, 3, 4]])
     refusal(write_points, tmp_path / "a.txt", np.zeros((0, 4)), words=["'.txt'", ".csv"])
+
+
+def read_or_refusal(path):
+    try:
+        return read_table(path, "a,b", 3).tolist()
+    except InputError as error:
+        return str(error)
+
+
+CELLS = st.sampled_from(
+    [
+        "1",
+        "-2.5",
+        " 3",
+        "4\t",
+        "+1e-3",
+        ".5",
+        "5.",
+        "1e400",
+        "nan",
+        "1_0",
+        "x",
+        "",
+        '"6"',
+        "1e",
+        "\x1c7",
+        "٣",
+        "1\r",
+        "#",
+    ]
+)
+LINES = st.lists(st.one_of(st.tuples(CELLS, CELLS).map(",".join), CELLS), max_size=5)
+HEADERS = st.sampled_from(["a,b\n", "a,b\r\n", "a,b", "a,b\r", "b,a\n", '"a",b\n', "\ufeffa,b\n", "\n"])
+
+
+@FUZZ
+@given(header=HEADERS, lines=LINES, end=st.sampled_from(["\n", "\r\n", "\n\n", "\r"]))
+def test_plain_tables_are_read_as_all_others(tmp_path, header, lines, end):
+    """What NumPy reads at once, and what is read line by line to say what is wrong: equal numbers, equal words."""
+    path = tmp_path / "a.csv"
+    path.write_text(header + end.join(lines), encoding="utf-8", newline="")
+    found = read_or_refusal(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gs_jax.io.disk._plain_table", lambda *_: None)
+        assert read_or_refusal(path) == found
+
+
+def test_a_million_points_with_all_their_digits(tmp_path):
+    path = tmp_path / "a.csv"
+    line = "-1.2345678901234567,-9.876543210987654,18.123456789012344,0.1234567890123456\n"
+    path.write_text(POINTS_HEADER + "\n" + 1_000_000 * line)
+    points = read_points(path)
+    assert points.shape == (1_000_000, 4)
+    np.testing.assert_array_equal(points[[0, -1]], 2 * [[float(cell) for cell in line.split(",")]])
 
 
 # Volumes

@@ -8,7 +8,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
-from gs_jax.base.progress import Progress
+from gs_jax.benchmark.measure import peak_mib, timed
 from gs_jax.geometry import envelope
 from gs_jax.projection.points import STEPS, forward_points, stamps
 
@@ -62,7 +62,7 @@ def test_light_of_chief_rays_beside_the_sensor():
     beside = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((41, 41), 0.01), 5.0, 3.0, shift=(0.22, 0.0))
     fine = np.zeros((1, 55, 55))
     fine[0, 20:35, 20:35] = 1 / 225
-    point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, stamps(np.array([20.0]), fine), Progress())
+    point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, stamps(np.array([20.0]), fine))
     kernel = jnp.asarray(fine.reshape(1, 11, 5, 11, 5).sum((2, 4)))
     np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
 
@@ -209,7 +209,7 @@ def test_points_are_gaussians_where_the_chief_rays_land():
     points = np.array([[0.03, 0.01, 20.0, 2.0], [-0.11, 0.12, 21.0, 1.0], [1.45, 0.3, 20.5, 1.0]])
     width = np.array([0.03, 0.05])
     fine = np.stack([gaussian(w, 25 * STEPS, 0.02 / STEPS) for w in width])
-    image = forward_points(points, imager, stamps(np.array([20.0, 22.0]), fine), Progress())
+    image = forward_points(points, imager, stamps(np.array([20.0, 22.0]), fine))
     expected = np.zeros((120, 100))
     pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
     for (x, y, z, intensity), places in zip(points, pixels.swapaxes(0, 1), strict=True):
@@ -223,10 +223,63 @@ def test_points_are_gaussians_where_the_chief_rays_land():
     np.testing.assert_allclose(image.sum(), expected.sum(), rtol=1e-3)  # what is beyond the stamp's window
 
 
+def spots_one_by_one(points, imager, depths, fine):
+    """`forward_points` as it is told, without stamps: on pixels a fifth as large, which are then summed."""
+    size = fine.shape[-1]
+    rows, columns = (n * STEPS for n in imager.sensor.shape)
+    image = np.zeros((rows + 2 * size, columns + 2 * size))
+    pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
+    distance2 = ((np.asarray(imager.centers)[:, None] - points[None, :, :2]) ** 2).sum(-1)
+    weights = points[:, 3] * np.asarray(
+        envelope(distance2, imager.reduced_depth(points[:, 2])[None], imager.field_radius)
+    )
+    planes = np.interp(points[:, 2], depths, np.arange(len(depths)))
+    for lens, number in zip(*np.nonzero(weights), strict=True):
+        near = min(int(planes[number]), len(depths) - 2)
+        part = planes[number] - near
+        row, column = np.floor(pixels[lens, number] * STEPS + 0.5).astype(int) + STEPS // 2 - size // 2 + size
+        if 0 <= row <= rows + size and 0 <= column <= columns + size:
+            spot = (1 - part) * fine[near] + part * fine[near + 1]
+            image[row : row + size, column : column + size] += weights[lens, number] * spot
+    inner = image[size:-size, size:-size].reshape(rows // STEPS, STEPS, columns // STEPS, STEPS)
+    return inner.sum((1, 3))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_many_points_are_spots_one_by_one(dtype):
+    """More points, spots and pixels than are taken at a time; some beside the sensor, before and behind the depths."""
+    rng = np.random.default_rng(5)
+    imager, _ = scene(dtype, shape=(530, 40))
+    points = rng.uniform([-1, -1.5, 17, 0.5], [1, 1.5, 24, 2.0], (2500, 4))
+    points[0, :2] = imager.centers[0]
+    depths, fine = np.array([18.0, 19.0, 22.0]), np.zeros((3, 5 * STEPS, 5 * STEPS))
+    fine[:, 2:-2, 2:-2] = rng.uniform(0, 1, (3, 21, 21))  # a margin for what moves
+    image = forward_points(points.astype(dtype), imager, stamps(depths, fine.astype(dtype)))
+    assert image.dtype == dtype
+    expected = spots_one_by_one(points.astype(dtype), imager, depths, fine)
+    if dtype == jnp.float64:
+        np.testing.assert_allclose(image, expected, atol=1e-12 * expected.max())
+    else:  # where a chief ray lands half-way between two fifths, rounding decides
+        np.testing.assert_allclose(image.sum(), expected.sum(), rtol=1e-5)
+        assert np.abs(image - expected).sum() < 2e-3 * expected.sum()
+
+
+def test_many_points_take_little_memory_and_time():
+    """200 lenses by 50 000 points are 160 MB; 3 of 4 points are seen by no lens, the others by one."""
+    centers = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0)), -1).reshape(-1, 2)
+    imager = Imager(MicrolensArray(centers), Sensor((64, 64), 0.3), 5.8, 0.25)
+    points = np.random.default_rng(6).uniform([0, 0, 20, 1], [20, 10, 22, 2], (50_000, 4))
+    kernels = stamps(np.array([20.0, 22.0]), np.ones((2, 15, 15)))
+    forward_points(points[:10], imager, kernels)
+    memory, (seconds, image) = peak_mib(lambda: timed(lambda: forward_points(points, imager, kernels)))
+    assert image.any() and seconds < 15
+    assert not memory > 100  # NaN where it is not known
+
+
 def test_no_points_give_a_dark_image():
     imager, _ = scene()
     kernels = stamps(np.array([20.0]), gaussian(0.03, 3 * STEPS, 0.004)[None])
-    image = forward_points(np.zeros((0, 4)), imager, kernels, Progress())
+    image = forward_points(np.zeros((0, 4)), imager, kernels)
     assert image.shape == imager.sensor.shape and not image.any()
 
 

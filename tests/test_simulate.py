@@ -75,6 +75,16 @@ def test_many_depths_share_stamps():
     )
 
 
+def test_depths_are_taken_some_at_a_time(monkeypatch):
+    """A long column of points, one of them on the border of two slabs, is the sum of its images in one slab."""
+    z = np.append(np.linspace(15, 16.3, 30), 15.5)
+    points = np.column_stack([0 * z, 0 * z, z, np.ones_like(z)])
+    options: dict[str, Any] = dict(kind="gaussian", progress=Progress())
+    whole = simulate_points(points, imager(), **options)
+    monkeypatch.setattr("gs_jax.simulation.scene._SLAB", 5)
+    np.testing.assert_allclose(simulate_points(points, imager(), **options), whole, atol=1e-12 * whole.max())
+
+
 def test_what_cannot_be_simulated_is_refused():
     options: dict[str, Any] = dict(progress=Progress())
     with pytest.raises(InputError, match="blurred over .* pixels of the sensor each way, allowed: 128"):

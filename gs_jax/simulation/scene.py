@@ -21,6 +21,8 @@ from ..projection.points import STEPS, forward_points, stamps
 
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
+# As many of these depths at a time, which bounds the memory.
+_SLAB = 48
 
 
 def read_scene(path: str | os.PathLike[str]) -> tuple[np.ndarray, Grid | None]:
@@ -138,5 +140,11 @@ def simulate_points(
         depths = np.linspace(near, far, count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS)
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
-    fine = np.stack([kernel(depth) for depth in progress.track(depths, "Point spread functions")])
-    return forward_points(points, imager, stamps(depths, fine), progress)
+    # Each point between two depths of its slab, the last of which is the first of the next slab.
+    between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))
+    slabs, image = between // _SLAB, 0
+    for slab in np.unique(slabs):
+        some = depths[slab * _SLAB :][: _SLAB + 1]
+        fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])
+        image = image + forward_points(points[slabs == slab], imager, stamps(some, fine), progress)
+    return np.asarray(image)
