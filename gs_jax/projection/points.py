@@ -16,7 +16,7 @@ from ..geometry import Imager, chief_ray, envelope, field_limit
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
 STEPS = 5
-# Points and spots at a time (the built-in design has 15 spots for a point), which bounds the memory.
+# Points and spots at a time (the built-in design has 13 spots for a point), which bounds the memory.
 _POINTS, _SPOTS = 2048, 32768
 # The image is added up in square tiles of so many pixels, which stay in the processor's cache.
 _TILE = 512

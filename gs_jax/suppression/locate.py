@@ -89,8 +89,8 @@ def find_points(
     Returns
     -------
     ndarray
-        `(point, 4)`, brightest first. The intensity is that of `stamps.forward_points` in the image's unit: the light
-        of one lens's spot, over the envelope.
+        `(point, 4)`, brightest first. The intensity is that of `forward_points` in the image's unit: the light of one
+        lens's spot, over the envelope.
 
     Raises
     ------
