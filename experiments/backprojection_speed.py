@@ -10,7 +10,6 @@ cores. Compilation is timed apart.
 writes `speed.json`, `speed.md` and `speed.png`; about six minutes on two cores.
 """
 
-import argparse
 import os
 import sys
 import time
@@ -18,7 +17,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,17 +24,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import Report, main, table
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.base.info import describe
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import peak_mib, status_mib, timed
-from gs_jax.io.disk import make_folder, write_json
+from gs_jax.benchmark.report import markdown_table
 from gs_jax.layouts.patterns import random_layout
 
 PAPER_S = 18.0
@@ -322,9 +318,7 @@ def markdown(found: dict) -> str:
         "Warm medians. In ours: the median of the ratio to gs_jax in the same round. A pair is a voxel and a lens that "
         "sees it. Memory: what a fresh process that has the inputs adds at its peak while it compiles and runs.",
     ]
-    for title, columns, rows in tables(found):
-        lines = [columns, ["---"] + ["---:"] * (len(columns) - 1), *rows]
-        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines))
+    parts += [f"## {title}\n\n{markdown_table(columns, rows)}" for title, columns, rows in tables(found)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -343,29 +337,12 @@ def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
     return figure
 
 
-def write(found: dict, folder: Path) -> None:
-    write_json(folder / "speed.json", found)
-    (folder / "speed.md").write_text(markdown(found))
-    picture(found["study"]).savefig(folder / "speed.png", dpi=110)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/backprojection_speed"))
-    folder = make_folder(parser.parse_args().out)
-    with Progress() as progress:
-        found = run(progress=progress)
-    write(found, folder)
-    console = Console()
-    for title, columns, rows in tables(found):
-        table = Table(title=title, title_justify="left", box=box.SIMPLE)
-        for number, column in enumerate(columns):
-            table.add_column(column, justify="right" if number else "left", no_wrap=not number)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-    console.print(f"Wrote {folder}/speed.json, speed.md and speed.png.")
+def report(progress: Progress, **sizes: Any) -> Report:
+    """With the arguments of `run`."""
+    found = run(progress=progress, **sizes)
+    files = {"speed.json": found, "speed.md": markdown(found), "speed.png": picture(found["study"])}
+    return Report(files, [table(columns, rows, title) for title, columns, rows in tables(found)])
 
 
 if __name__ == "__main__":
-    main()
+    main(report)

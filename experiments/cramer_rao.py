@@ -10,10 +10,8 @@ bound is right, the ratio of the error to it is 1, and the better layout is bett
 writes `cramer_rao.json` and `cramer_rao.png`; about two minutes on two cores.
 """
 
-import argparse
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,13 +20,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.layouts.patterns import poisson_disc_layout
 from gs_jax.simulation.camera import poisson
@@ -153,22 +149,18 @@ def picture(found: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/cramer_rao"))
-    out = make_folder(parser.parse_args().out)
+def report(progress: Progress) -> Report:
     # Second derivatives of a bright point's likelihood differ from each other by more than float32 resolves.
     jax.config.update("jax_enable_x64", True)
-    with Progress() as progress:
-        found = run(progress=progress)
-    write_json(out / "cramer_rao.json", found)
-    picture(found).savefig(out / "cramer_rao.png", dpi=100)
-    table = Table("layout", "photons", "bound x, y, z, um", "error x, y, z, um", "ratio x, y, z")
-    for row in found["rows"]:
-        triples = (" ".join(f"{x:.3g}" for x in row[key]) for key in ("bound_um", "error_um", "ratio"))
-        table.add_row(row["layout"], str(row["photons"]), *triples)
-    Console(width=120).print(table)
+    found = run(progress=progress)
+    triple = lambda row, key: " ".join(f"{x:.3g}" for x in row[key])
+    rows = [
+        [row["layout"], str(row["photons"]), *(triple(row, key) for key in ("bound_um", "error_um", "ratio"))]
+        for row in found["rows"]
+    ]
+    shown = table(("layout", "photons", "bound x, y, z, um", "error x, y, z, um", "ratio x, y, z"), rows)
+    return Report({"cramer_rao.json": found, "cramer_rao.png": picture(found)}, [shown])
 
 
 if __name__ == "__main__":
-    main()
+    main(report)

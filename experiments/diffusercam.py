@@ -10,7 +10,6 @@ steps, in turns with ours.
 writes `diffusercam.json` and `diffusercam.png`; about three minutes on two cores.
 """
 
-import argparse
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -23,13 +22,11 @@ import numpy as np
 import tifffile
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import Report, main, table
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.solvers.admm import admm_convolution
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import fista
@@ -150,24 +147,17 @@ def picture(pictures: dict[str, np.ndarray]) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--peer", help="Python of an environment with LenslessPiCam (its NumPy solver runs).")
-    parser.add_argument("--out", type=Path, default=Path("out/diffusercam"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    with Progress() as progress:
-        found, pictures = run(arguments.data, peer=arguments.peer, progress=progress)
-    write_json(out / "diffusercam.json", found)
-    picture(pictures).savefig(out / "diffusercam.png", dpi=90)
-    table = Table("factor", "method", "code", "steps", "ms a step", "fastest", "final cost")
+def report(data: Path, peer: str | None, progress: Progress) -> Report:
+    found, pictures = run(data, peer=peer, progress=progress)
+    rows = []
     for row in found["rows"]:
         cost = "" if row["final_cost"] is None else f"{row['final_cost']:.3e}"
         times = f"{row['ms_a_step']:.1f}", f"{row['fastest_ms_a_step']:.1f}"
-        table.add_row(str(row["factor"]), row["method"], row["code"], str(row["steps"]), *times, cost)
-    Console().print(table)
+        rows.append([str(row["factor"]), row["method"], row["code"], str(row["steps"]), *times, cost])
+    shown = table(("factor", "method", "code", "steps", "ms a step", "fastest", "final cost"), rows)
+    return Report({"diffusercam.json": found, "diffusercam.png": picture(pictures)}, [shown])
 
 
 if __name__ == "__main__":
-    main()
+    peer = {"help": "Python of an environment with LenslessPiCam (its NumPy solver runs)."}
+    main(report, {"data": {"type": Path}, "--peer": peer})

@@ -10,20 +10,16 @@ dip to about 85 %.
 DATA holds `P1.toml` and `P1_a.tif`, `P1_b.tif`, `P1_c.tif`. Without it the built-in design is taken.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.profiles import around_the_axis, dip, fwhm, through_peak
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.simulation.scene import simulate_points
 
 SCENES = {
@@ -80,22 +76,12 @@ def numbers(found: dict) -> dict:
     return {source: {key: result[key] for key in BARS} for source, result in found.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/fig3_resolution"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
-    with Progress() as progress:
-        found = run(design, arguments.data, progress=progress)
-    write_json(out / "fig3.json", numbers(found))
-    picture(found).savefig(out / "fig3.png", dpi=100)
-    table = Table("", "at most", *found, title="Resolution of back-projection at 20 mm")
-    for key, bar in BARS.items():
-        table.add_row(key, f"{bar:g}", *(f"{result[key]:.3g}" for result in found.values()))
-    Console().print(table)
+def report(data: Path | None, progress: Progress) -> Report:
+    found = run(design_of(data), data, progress=progress)
+    rows = [[key, f"{bar:g}", *(f"{result[key]:.3g}" for result in found.values())] for key, bar in BARS.items()]
+    shown = table(("", "at most", *found), rows, "Resolution of back-projection at 20 mm")
+    return Report({"fig3.json": numbers(found), "fig3.png": picture(found)}, [shown])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

@@ -10,25 +10,20 @@ read noise), and, if DATA is given, from an independent ray tracer, with haze an
 DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is taken.
 """
 
-import argparse
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from scipy.ndimage import maximum_filter
 from skimage.feature import peak_local_max
 
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
 from experiments.point_density import scene
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.metrics import localization, quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.phantoms import rasterize
@@ -45,7 +40,7 @@ def run(design: Design, data: Path | None, *, count=120, voxel=0.03, step=0.25, 
     grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, step), pitch=voxel)
     captures = {"simulated": scene(count, 0, design, progress)}
     if data is not None:
-        truth = np.array(json.loads((data / "d.json").read_text())["points_x_y_z_flux"])
+        truth = points_of(data, "d")
         captures["ray-traced"] = truth, read_capture(data / "P1_d.tif", design.imager().sensor.shape)
     return {source: _compare(*both, design, grid, progress) for source, both in captures.items()}
 
@@ -116,24 +111,21 @@ def picture(result: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/fig4_suppression"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
-    with Progress() as progress:
-        results = run(design, arguments.data, progress=progress)
-    write_json(out / "fig4.json", {source: result["scores"] for source, result in results.items()})
-    picture(list(results.values())[-1]).savefig(out / "fig4.png", dpi=90)
-    for source, result in results.items():
-        columns = ("found", "precision", "recall", "f1", "lateral_rmse_um", "axial_rmse_um", "psnr_db", "ssim")
-        table = Table("", *columns, title=f"{result['points']} points, {source}")
-        for name, scores in result["scores"].items():
-            table.add_row(name, *(f"{scores[column]:.4g}" if column in scores else "" for column in columns))
-        Console(width=140).print(table)
+def report(data: Path | None, progress: Progress) -> Report:
+    results = run(design_of(data), data, progress=progress)
+    columns = ("found", "precision", "recall", "f1", "lateral_rmse_um", "axial_rmse_um", "psnr_db", "ssim")
+    line = lambda scores: (f"{scores[column]:.4g}" if column in scores else "" for column in columns)
+    shown = [
+        table(
+            ("", *columns),
+            [[name, *line(scores)] for name, scores in result["scores"].items()],
+            f"{result['points']} points, {source}",
+        )
+        for source, result in results.items()
+    ]
+    scores = {source: result["scores"] for source, result in results.items()}
+    return Report({"fig4.json": scores, "fig4.png": picture(list(results.values())[-1])}, shown)
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

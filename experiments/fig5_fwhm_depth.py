@@ -9,22 +9,18 @@ ray-traced captures at 18, 20 and 22 mm. The paper measures a width that is stab
 DATA holds `P1.toml` and `P1_i_18_c.tif`, `P1_a.tif`, `P1_i_22_c.tif`. Without it the built-in design is taken.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.profiles import around_the_axis, fwhm, through_peak
 from gs_jax import Imager
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.simulation.scene import simulate_points
 
 CAPTURES = {18.0: "P1_i_18_c.tif", 20.0: "P1_a.tif", 22.0: "P1_i_22_c.tif"}
@@ -69,23 +65,14 @@ def picture(found: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/fig5_fwhm_depth"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
-    with Progress() as progress:
-        found = run(design, arguments.data, progress=progress)
-    write_json(out / "fig5.json", found)
-    picture(found).savefig(out / "fig5.png", dpi=100)
-    for source, rows in found.items():
-        table = Table(*(key.replace("_", " ") for key in rows[0]), title=source)
-        for row in rows:
-            table.add_row(*(f"{value:.4g}" for value in row.values()))
-        Console().print(table)
+def report(data: Path | None, progress: Progress) -> Report:
+    found = run(design_of(data), data, progress=progress)
+    shown = [
+        table([key.replace("_", " ") for key in rows[0]], [[f"{x:.4g}" for x in row.values()] for row in rows], source)
+        for source, rows in found.items()
+    ]
+    return Report({"fig5.json": found, "fig5.png": picture(found)}, shown)
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

@@ -9,24 +9,19 @@ imaged with the diffraction PSF and exposed with shot and read noise; the recons
 DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is taken.
 """
 
-import argparse
-import json
 from pathlib import Path
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from skimage.measure import block_reduce
 
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
 from experiments.point_density import scores
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.scene import simulate_points
@@ -42,7 +37,7 @@ def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> 
     """Truth, capture, found points and scores of each scene."""
     scenes = {"beads, simulated": _beads(design, count, progress)}
     if data is not None:
-        truth = np.array(json.loads((data / "d.json").read_text())["points_x_y_z_flux"])
+        truth = points_of(data, "d")
         scenes["points, ray-traced"] = truth, read_capture(data / "P1_d.tif", design.imager().sensor.shape)
     grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, 0.25), pitch=0.03)
     results = {}
@@ -86,22 +81,13 @@ def picture(results: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/fig7_beads"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
-    with Progress() as progress:
-        results = run(design, arguments.data, progress=progress)
-    write_json(out / "fig7.json", {name: result["scores"] for name, result in results.items()})
-    picture(results).savefig(out / "fig7.png", dpi=66)
-    table = Table("", "points", "found", "F1", "precision", "recall", "lateral, um", "axial, um")
-    for name, result in results.items():
-        table.add_row(name, *(f"{value:.4g}" for value in result["scores"].values()))
-    Console().print(table)
+def report(data: Path | None, progress: Progress) -> Report:
+    results = run(design_of(data), data, progress=progress)
+    scores = {name: result["scores"] for name, result in results.items()}
+    columns = ("", "points", "found", "F1", "precision", "recall", "lateral, um", "axial, um")
+    shown = table(columns, [[name, *(f"{x:.4g}" for x in score.values())] for name, score in scores.items()])
+    return Report({"fig7.json": scores, "fig7.png": picture(results)}, [shown])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

@@ -12,25 +12,23 @@ DATA holds `P1.toml`, `P1_h.tif`, `P1_f.tif` and their scenes `h.json`, `f.json`
 taken, and the simulated captures alone.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
+from rich.json import JSON
 from scipy.ndimage import gaussian_filter
 
+from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.metrics import quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.camera import Camera, electrons, expose
@@ -211,29 +209,21 @@ def picture(scene: dict, depths: tuple[float, ...] = DEPTHS, shown: tuple[float,
     return figure
 
 
-def main() -> None:
-    """Tables on the terminal; JSON and pictures in the folder."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/fig8_snowflake"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.data / "P1.toml") if arguments.data else geomscope()
-    with Progress() as progress:
-        found = run(design, arguments.data, progress=progress)
-    write_json(out / "fig8.json", numbers(found))
-    console = Console()
+def report(data: Path | None, progress: Progress) -> Report:
+    found = run(design_of(data), data, progress=progress)
+    files: dict[str, Any] = {"fig8.json": numbers(found)}
+    tables = []
     for name, scene in found["scenes"].items():
         shown = (18.0,) if "USAF" in name else (18.0, 20.0, 22.0)
-        picture(scene, shown=shown).savefig(out / f"{name.replace(', ', '_').replace(' ', '_')}.png", dpi=90)
-        table = Table("method", "PSNR, dB", "SSIM", "MSE", "MSE, of back-projection's", title=name)
+        files[f"{name.replace(', ', '_').replace(' ', '_')}.png"] = picture(scene, shown=shown)
         base = scene["scores"]["back-projection"]["mse"]
-        for method, score in scene["scores"].items():
-            gain = f"{score['mse'] / base:.3f}"
-            table.add_row(method, f"{score['psnr_db']:.2f}", f"{score['ssim']:.4f}", f"{score['mse']:.3g}", gain)
-        console.print(table)
-    console.print_json(data={key: found[key] for key in ("noise", "seconds_per_slice")})
+        rows = [
+            [method, f"{s['psnr_db']:.2f}", f"{s['ssim']:.4f}", f"{s['mse']:.3g}", f"{s['mse'] / base:.3f}"]
+            for method, s in scene["scores"].items()
+        ]
+        tables.append(table(("method", "PSNR, dB", "SSIM", "MSE", "MSE, of back-projection's"), rows, name))
+    return Report(files, [*tables, JSON.from_data({key: found[key] for key in ("noise", "seconds_per_slice")})])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

@@ -16,8 +16,6 @@ laterally and 0.6 mm axially: the pixels are coarse. Writes `captures.json`, `ca
 minutes on two cores.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,19 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
 from matplotlib.figure import Figure
-from rich.console import Console
 from scipy.ndimage import gaussian_filter
 from skimage.feature import peak_local_max
 
+from experiments.common import Report, main, points_of
 from gs_jax import Grid, Imager, Sensor
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
-from gs_jax.benchmark.report import table
+from gs_jax.benchmark.report import markdown_table
 from gs_jax.benchmark.scenes import FWHM, spots
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json, write_text
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
@@ -79,7 +76,7 @@ def read(data: Path, name: str, factor: int = BIN) -> Scene:
     grid = Grid.over(sensor, depths=DEPTHS[name], pitch=pitch)
     imager, grid = in_float32((imager, grid))
     if name == "d":
-        points = np.array(json.loads((data / "d.json").read_text())["points_x_y_z_flux"])
+        points = points_of(data, "d")
         return Scene(image, imager, grid, spots(points, grid, pitch / FWHM), points)
     emitters = np.load(data / "h_emitters.npz")["emitters"]
     truth = np.asarray(rasterize(emitters, grid), np.float32)
@@ -151,7 +148,7 @@ def markdown(found: dict) -> str:
     pretty = lambda value, form: "-" if value is None else format(value, form)
     forms = {"steps": "d", "seconds": ".1f", "psnr_db": ".2f", "ssim": ".3f", "mse": ".2e", "f1": ".2f"}
     rows = [[r["scene"], r["method"], *(pretty(r[key], form) for key, form in forms.items())] for r in found["rows"]]
-    return table(head, rows) + "\n"
+    return markdown_table(head, rows) + "\n"
 
 
 def picture(pictures: dict[str, np.ndarray], half_mm: float) -> Figure:
@@ -172,19 +169,12 @@ def picture(pictures: dict[str, np.ndarray], half_mm: float) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("out/fig9"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    with Progress() as progress:
-        found, pictures = run(arguments.data, progress=progress)
-    write_json(out / "captures.json", found)
-    write_text(out / "captures.md", markdown(found), [".md"])
-    picture(pictures, 5120 * 0.0045 / 2).savefig(out / "captures.png", dpi=80)
-    Console().print(markdown(found))
+def report(data: Path, progress: Progress) -> Report:
+    found, pictures = run(data, progress=progress)
+    text = markdown(found)
+    files = {"captures.json": found, "captures.md": text, "captures.png": picture(pictures, 5120 * 0.0045 / 2)}
+    return Report(files, [text])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": {"type": Path}}, folder="fig9")

@@ -10,25 +10,21 @@ Voronoi cell, so the departure follows from the envelope alone.
 writes `forward.json` and `forward.png`; about three minutes on two cores.
 """
 
-import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from scipy.spatial import KDTree
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
+from experiments.common import Report, main, table
 from gs_jax import Imager, forward
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.geometry import envelope
-from gs_jax.io.disk import make_folder, write_json
 
 STUDY = {
     "depths": [Job(depths=n) for n in (1, 4, 13, 40)],
@@ -96,21 +92,15 @@ def picture(found: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/forward_model"))
-    out = make_folder(parser.parse_args().out)
-    with Progress() as progress:
-        found = run(progress=progress)
-    write_json(out / "forward.json", found)
-    picture(found).savefig(out / "forward.png", dpi=100)
-    for axis, rows in found["cost"].items():
-        table = Table(axis, "time, s", "compile, s", "memory, MiB")
-        for row in rows:
-            table.add_row(str(row[axis]), f"{row['median_s']:.2f}", f"{row['compile_s']:.1f}", f"{row['mib']:.0f}")
-        Console().print(table)
-    Console().print(found["zones"])
+def report(progress: Progress) -> Report:
+    found = run(progress=progress)
+    numbers = lambda row: (f"{row['median_s']:.2f}", f"{row['compile_s']:.1f}", f"{row['mib']:.0f}")
+    shown = [
+        table((axis, "time, s", "compile, s", "memory, MiB"), [[str(row[axis]), *numbers(row)] for row in rows])
+        for axis, rows in found["cost"].items()
+    ]
+    return Report({"forward.json": found, "forward.png": picture(found)}, [*shown, str(found["zones"])])
 
 
 if __name__ == "__main__":
-    main()
+    main(report)

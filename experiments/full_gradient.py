@@ -9,21 +9,17 @@ that the ratio holds on a busy machine too; memory is what XLA plans beside the 
 writes `full_gradient.json`; about two minutes on two cores.
 """
 
-import argparse
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
+from experiments.common import Report, main
 from experiments.forward_model import PSF_PIXELS
 from gs_jax import backproject, forward
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import misfit_db
-from gs_jax.io.disk import make_folder, write_json
 
 
 def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:
@@ -56,17 +52,10 @@ def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/full_gradient"))
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    with Progress() as progress:
-        found = run(rounds=arguments.rounds, progress=progress)
-    write_json(out / "full_gradient.json", found)
-    Console().print({key: found[key] for key in ("seconds", "ratio", "mib")})
+def report(rounds: int, progress: Progress) -> Report:
+    found = run(rounds=rounds, progress=progress)
+    return Report({"full_gradient.json": found}, [str({key: found[key] for key in ("seconds", "ratio", "mib")})])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"--rounds": {"type": int, "default": 3}})

@@ -16,9 +16,7 @@ Richardson-Lucy on the same pixel-voxel lists.
 writes `layout_gain.json` and `layout_gain.png`; half an hour on two cores.
 """
 
-import argparse
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +24,11 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from scipy import stats
 
+from experiments.common import Report, main, table
 from experiments.layout_scenes import METHODS, Centers, Study, judge, loss, overlap, psf_of
 from gs_jax.base.progress import Progress
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout
 from gs_jax.optics.psf import diffraction_psf, gaussian_psf
@@ -231,25 +227,19 @@ def picture(found: dict) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/layout_gain"))
-    parser.add_argument("--seeds", type=int, default=5)
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    with Progress() as progress:
-        found = run(seeds=arguments.seeds, progress=progress)
-    write_json(out / "layout_gain.json", found)
-    picture(found).savefig(out / "layout_gain.png", dpi=100)
-    table = Table("seed", "random: loss, dB", *(f"{name}, dB" for name in NAMES), *(f"{n}: PSNR, dB" for n in NAMES))
+def report(seeds: int, progress: Progress) -> Report:
+    found = run(seeds=seeds, progress=progress)
+    rows = []
     for row in found["seeds"]:
         losses = row["random_loss_db"]
         numbers = [min(losses), row["ours_loss_db"], min(row["rows_loss_db"]), *row["hexagonal_loss_db"]]
         numbers += [np.mean(row["scores"][name]["backproject_psnr_db"]) for name in NAMES]
         spread = f"{np.mean(losses):.2f} +- {np.std(losses):.2f}"
-        table.add_row(str(row["seed"]), spread, *(f"{x:.2f}" for x in numbers))
-    Console(width=160).print(table, found["gains_db"])
+        rows.append([str(row["seed"]), spread, *(f"{x:.2f}" for x in numbers)])
+    columns = "seed", "random: loss, dB", *(f"{name}, dB" for name in NAMES), *(f"{n}: PSNR, dB" for n in NAMES)
+    files = {"layout_gain.json": found, "layout_gain.png": picture(found)}
+    return Report(files, [table(columns, rows), str(found["gains_db"])])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"--seeds": {"type": int, "default": 5}})

@@ -6,7 +6,6 @@ radii of the lenses, and the wavefront error of the facets. Without the authors'
     python -m experiments.mold_check [--out DIR]
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Sequence
@@ -14,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import Report, main, table
 from gs_jax import MicrolensArray
 from gs_jax.base.progress import Progress
+from gs_jax.benchmark.report import markdown_table
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.mold.caps import facet_surface
 from gs_jax.mold.checks import array_volume, mold_volume
 from gs_jax.mold.measurement import quality, verify
@@ -127,23 +125,13 @@ def rows(records: list[dict]) -> list[list[str]]:
     return [[form.format(record[key]) for key, (_, form) in COLUMNS.items()] for record in records]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/mold"))
-    out = make_folder(parser.parse_args().out)
+def report(progress: Progress) -> Report:
     design = read_design(CENTERS) if CENTERS.exists() else geomscope()
-    with Progress() as progress:
-        records = run(design, progress=progress)
-    write_json(out / "mold.json", records)
-    draw(design, records).savefig(out / "mold.png", dpi=110)
-    titles = [title for title, _ in COLUMNS.values()]
-    lines = [titles, ["---:"] * len(titles), *rows(records)]
-    (out / "mold.md").write_text("".join(f"| {' | '.join(line)} |\n" for line in lines))
-    table = Table(*titles)
-    for row in rows(records):
-        table.add_row(*row)
-    Console().print(table)
+    records = run(design, progress=progress)
+    titles, lines = [title for title, _ in COLUMNS.values()], rows(records)
+    text = markdown_table(titles, lines) + "\n"
+    return Report({"mold.json": records, "mold.md": text, "mold.png": draw(design, records)}, [table(titles, lines)])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, folder="mold")

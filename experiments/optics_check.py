@@ -10,26 +10,25 @@ point are compared with our PSF in place, size and brightness.
 DATA holds `P1.toml`, `P2.toml`, `P1_a.tif`, `P2_a.tif`, `P1_i_*.tif` and the scenes' `*.json`.
 """
 
-import argparse
-import json
 import warnings
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
+from rich.json import JSON
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Imager, MicrolensArray, Sensor, envelope
+from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.optics.aberrations import independent_rms, seidel
 from gs_jax.optics.aperture import aperture_area
 from gs_jax.optics.psf import diffraction_psf, geometric_psf, strehl
@@ -150,7 +149,7 @@ def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: flo
     """
     imager = read_design(data / f"{design}.toml").imager()
     image = 10 * (read_capture(data / f"{design}_{scene}.tif", imager.sensor.shape).astype(float) - 16)
-    ((x, y, z, _),) = json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"]
+    ((x, y, z, _),) = points_of(data, scene)
     centers, areas = np.asarray(imager.centers), np.asarray(aperture_area(imager.array))
     pixels = np.asarray(imager.sensor.to_pixels(imager.project(np.array([[x, y, z]]))[:, 0]))
     rows = []
@@ -285,34 +284,24 @@ def gallery(rows: list[dict], count: int = 5) -> Figure:
     return figure
 
 
-def main() -> None:
-    """Tables on the terminal; JSON and pictures in the folder."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/optics_check"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
+def report(data: Path | None, progress: Progress) -> Report:
     with jax.enable_x64(True):  # paths to 1e-11 waves
         result = run() | {"breakdown": breakdown()}
-    curves(result).savefig(out / "curves.png", dpi=90)
-    table = Table("depth, mm", "field, mm", "largest difference to Optiland: landing, nm", "path, waves")
-    for row in result["field"] + result["depth"]:
-        numbers = (row[k] for k in ("depth_mm", "field_mm", "landing_difference_nm", "path_difference_waves"))
-        table.add_row(*(f"{number:.3g}" for number in numbers))
-    Console().print(table)
-    table = Table("pupil radius, mm", "wavefront error, waves RMS", "Strehl ratio of the PSF", "Eq. (9)")
-    for row in result["breakdown"]:
-        table.add_row(*(f"{number:.3g}" for number in row.values()))
-    Console().print(table)
-    if arguments.data is not None:
-        found = {f"P1_{scene}": spots(arguments.data, scene) for scene in SPOTS}
-        found["P2_a"] = spots(arguments.data, "a", "P2")
-        for name in ("P1_i_20_c", "P1_i_18_px", "P2_a"):
-            gallery(found[name]).savefig(out / f"spots_{name}.png", dpi=90)
+    keys = ("depth_mm", "field_mm", "landing_difference_nm", "path_difference_waves")
+    columns = ("depth, mm", "field, mm", "largest difference to Optiland: landing, nm", "path, waves")
+    rows = [[f"{row[key]:.3g}" for key in keys] for row in result["field"] + result["depth"]]
+    broken = [[f"{number:.3g}" for number in row.values()] for row in result["breakdown"]]
+    limits = ("pupil radius, mm", "wavefront error, waves RMS", "Strehl ratio of the PSF", "Eq. (9)")
+    files: dict[str, Any] = {"curves.png": curves(result), "result.json": result}
+    shown = [table(columns, rows), table(limits, broken)]
+    if data is not None:
+        found = {f"P1_{scene}": spots(data, scene) for scene in progress.track(SPOTS, "Captures")}
+        found["P2_a"] = spots(data, "a", "P2")
+        files |= {f"spots_{name}.png": gallery(found[name]) for name in ("P1_i_20_c", "P1_i_18_px", "P2_a")}
         result["captures"] = {name: summary(rows) for name, rows in found.items()}
-        Console().print_json(data=result["captures"])
-    write_json(out / "result.json", result)
+        return Report(files, [*shown, JSON.from_data(result["captures"])])
+    return Report(files, shown)
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": OPTIONAL_PATH})

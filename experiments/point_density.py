@@ -9,21 +9,18 @@ the ray-traced captures of `fig4_suppression` have both.
     python -m experiments.point_density [DESIGN.toml] [--out DIR]
 """
 
-import argparse
 from pathlib import Path
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from skimage.feature import peak_local_max
 
+from experiments.common import OPTIONAL_PATH, Report, main, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.metrics import localization
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.camera import Camera, expose
@@ -100,24 +97,13 @@ def picture(rows: list) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("design", type=Path, nargs="?")
-    parser.add_argument("--out", type=Path, default=Path("out/point_density"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    design = read_design(arguments.design) if arguments.design else geomscope()
-    with Progress() as progress:
-        rows = run(design, progress=progress)
-    write_json(out / "point_density.json", rows)
-    picture(rows).savefig(out / "point_density.png", dpi=110)
-    table = Table("points", "captures", "F1", "precision", "recall", "lateral, um", "axial, um", "F1 of peaks")
-    for row in rows:
-        numbers = row["gs_jax"].values()
-        peaks = row["brightest peaks"]["f1"]
-        table.add_row(str(row["points"]), str(row["captures"]), *(f"{n:.3f}" for n in numbers), f"{peaks:.3f}")
-    Console().print(table)
+def report(design: Path | None, progress: Progress) -> Report:
+    results = run(read_design(design) if design else geomscope(), progress=progress)
+    columns = ("points", "captures", "F1", "precision", "recall", "lateral, um", "axial, um", "F1 of peaks")
+    numbers = lambda row: (f"{n:.3f}" for n in (*row["gs_jax"].values(), row["brightest peaks"]["f1"]))
+    shown = table(columns, [[str(row["points"]), str(row["captures"]), *numbers(row)] for row in results])
+    return Report({"point_density.json": results, "point_density.png": picture(results)}, [shown])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"design": OPTIONAL_PATH})

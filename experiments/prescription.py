@@ -8,7 +8,6 @@ integral.
     python -m experiments.prescription [--out DIR]
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,12 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
+from experiments.common import Report, main, table
 from experiments.profiles import fwhm
 from gs_jax import Grid, Imager, Sensor, backproject
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import Design, read_design
-from gs_jax.io.disk import atomic_write, make_folder, write_json
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
 from gs_jax.simulation.scene import simulate_points
@@ -115,21 +112,14 @@ def picture(found: dict[str, Any]) -> Figure:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/prescription"))
-    out = make_folder(parser.parse_args().out)
-    with Progress() as progress:
-        found = run(progress=progress)
-    write_json(out / "prescription.json", found)
-    with atomic_write(out / "prescription.png") as path:
-        picture(found).savefig(path, format="png", dpi=110)
-    for name, records in found.items():
-        table = Table(*records[0], title=name, title_justify="left", box=None, pad_edge=False)
-        for record in records:
-            table.add_row(*(f"{value:.3g}" for value in record.values()))
-        Console(width=160).print(table)
+def report(progress: Progress) -> Report:
+    found = run(progress=progress)
+    shown = [
+        table(records[0], [[f"{value:.3g}" for value in record.values()] for record in records], name)
+        for name, records in found.items()
+    ]
+    return Report({"prescription.json": found, "prescription.png": picture(found)}, shown)
 
 
 if __name__ == "__main__":
-    main()
+    main(report)

@@ -9,23 +9,20 @@ with its design file as it stands, uncalibrated, and the brightest voxels are co
 DATA holds `P1.toml`, `P1_*.tif` and the scenes' `*.json`.
 """
 
-import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
+from rich.json import JSON
 from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
 
+from experiments.common import Report, main, points_of, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 
 # A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
@@ -46,12 +43,8 @@ def run(
     return {"single_points": rows, "many_points": many}, projection
 
 
-def _truth(data: Path, scene: str) -> np.ndarray:
-    return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
-
-
 def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: Progress) -> dict:
-    ((x, y, z, _),) = _truth(data, scene)
+    ((x, y, z, _),) = points_of(data, scene)
     grid = Grid.over(imager.sensor, depths=z + np.arange(-0.5, 0.51, 0.05), pitch=voxel_mm)
     volume = reconstruct_stack(read_capture(data / f"P1_{scene}.tif", imager.sensor.shape), imager, grid, progress)
     d, r, c = np.unravel_index(int(volume.argmax()), volume.shape)
@@ -60,7 +53,7 @@ def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: P
 
 
 def _many(data: Path, imager: Imager, voxel_mm: float, step_mm: float, progress: Progress) -> tuple[dict, np.ndarray]:
-    truth = _truth(data, "d")[:, :3]
+    truth = points_of(data, "d")[:, :3]
     grid = Grid.over(imager.sensor, depths=np.arange(17.6, 22.41, step_mm), pitch=voxel_mm)
     volume = reconstruct_stack(read_capture(data / "P1_d.tif", imager.sensor.shape), imager, grid, progress)
     peaks, brightness = _peaks(volume, grid)
@@ -96,7 +89,7 @@ def _peaks(volume: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
 
 def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float = 0.02) -> Figure:
     """The 120 points: maximum over the depths, and the truth."""
-    truth = _truth(data, "d")
+    truth = points_of(data, "d")
     half = projection.shape[0] * voxel_mm / 2
     figure = Figure(figsize=(11, 5.4), dpi=90, layout="constrained")
     for axis, lim, title in zip(figure.subplots(1, 2), (half, 2.5), ("whole field", "its middle"), strict=True):
@@ -108,23 +101,16 @@ def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float 
     return figure
 
 
-def main() -> None:
-    """Tables on the terminal; JSON and picture in the folder."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--out", type=Path, default=Path("out/ray_traced_captures"))
-    arguments = parser.parse_args()
-    out = make_folder(arguments.out)
-    with Progress() as progress:
-        result, projection = run(arguments.data, progress=progress)
-    picture(projection, arguments.data).savefig(out / "points.png", dpi=90)
-    write_json(out / "result.json", result)
-    table = Table("scene", "lateral error, um", "axial error, um", title="Single points")
-    for row in result["single_points"]:
-        table.add_row(row["scene"], f"{row['lateral_error_um']:.0f}", f"{row['axial_error_um']:+.0f}")
-    Console().print(table)
-    Console().print_json(data=result["many_points"])
+def report(data: Path, progress: Progress) -> Report:
+    result, projection = run(data, progress=progress)
+    rows = [
+        [row["scene"], f"{row['lateral_error_um']:.0f}", f"{row['axial_error_um']:+.0f}"]
+        for row in result["single_points"]
+    ]
+    shown = table(("scene", "lateral error, um", "axial error, um"), rows, "Single points")
+    files = {"points.png": picture(projection, data), "result.json": result}
+    return Report(files, [shown, JSON.from_data(result["many_points"])])
 
 
 if __name__ == "__main__":
-    main()
+    main(report, {"data": {"type": Path}})

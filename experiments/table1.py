@@ -5,19 +5,16 @@ Ours are computed for the same lens with the sensor at the printed 4 mm, and at 
     python -m experiments.table1 [--out DIR]
 """
 
-import argparse
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy.optimize import root_scalar
 
+from experiments.common import Report, main, table
+from gs_jax.base.progress import Progress
+from gs_jax.benchmark.report import markdown_table
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design
 from gs_jax.designs.sheet import datasheet
-from gs_jax.io.disk import make_folder, write_json
 from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 
@@ -162,26 +159,18 @@ def _counted(design: Design) -> str:
 
 def markdown(found: dict[str, list[dict[str, str]]]) -> str:
     """Both tables."""
-    parts = []
-    for rows in found.values():
-        lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
-    return "\n\n".join(parts) + "\n"
+    return (
+        "\n\n".join(markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in found.values())
+        + "\n"
+    )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("out/table1"))
-    out = make_folder(parser.parse_args().out)
-    found = run()
-    write_json(out / "table1.json", found)
-    (out / "table1.md").write_text(markdown(found))
-    for rows in found.values():
-        table = Table(*rows[0])
-        for row in rows:
-            table.add_row(*row.values())
-        Console().print(table)
+def report(progress: Progress) -> Report:
+    with progress.step("Datasheets"):
+        found = run()
+    shown = [table(rows[0], [row.values() for row in rows]) for rows in found.values()]
+    return Report({"table1.json": found, "table1.md": markdown(found)}, shown)
 
 
 if __name__ == "__main__":
-    main()
+    main(report)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.backprojection_speed import Job, memory, run, write
+from experiments.backprojection_speed import Job, memory, report
+from experiments.common import write
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import backproject
 from gs_jax.base.progress import Progress
@@ -44,8 +45,9 @@ def test_pairs_are_those_within_the_field_whose_ray_is_on_the_sensor(case):
 def test_run_at_toy_size(tmp_path):
     sizes = [Job(voxels=n, pixels=120, lenses=9, depths=2) for n in (8, 20)]
     names = ("gs_jax", "numba, the paper's loop", "numba, lens patches", "NumPy", "gs_jax, adjoint")
-    found = run(sizes[1:], {"voxels": sizes}, names=names, rounds=1, memory_of=(), progress=Progress())
-    write(found, tmp_path)
+    made = report(Progress(), jobs=sizes[1:], study={"voxels": sizes}, names=names, rounds=1, memory_of=())
+    write(tmp_path, made)
+    found = made.files["speed.json"]
     assert json.loads((tmp_path / "speed.json").read_text()).keys() == {"machine", "jobs", "study", "slopes", "bars"}
     assert found["jobs"][0]["contestants"].keys() == set(names)
     assert found["jobs"][0]["contestants"]["gs_jax"].keys() == {

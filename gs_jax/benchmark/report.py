@@ -79,18 +79,18 @@ def markdown(records: Records, left_out: Records) -> str:
         ("F1 of the peaks", "f1", ".2f", methods),
     ):
         body = [[m, *(spread(_of(records, m, p, key), form) for p in sizes)] for m in rows]
-        parts += [f"**{title}**", table(["pairs", *(f"{p:.1e}" for p in sizes)], body)]
+        parts += [f"**{title}**", markdown_table(["pairs", *(f"{p:.1e}" for p in sizes)], body)]
     found = slopes(records)
     limit = lambda m: {1.0: "1", 0.5: "< 0.5"}.get(_PAPER.get(m, 0.0), "-")
     parts += ["**Exponent of time in pairs, 1e6 to 2e9**"]
-    parts += [table(["method", "found", "paper"], [[m, f"{s:.2f}", limit(m)] for m, s in found.items()])]
+    parts += [markdown_table(["method", "found", "paper"], [[m, f"{s:.2f}", limit(m)] for m, s in found.items()])]
     if left_out:
         rows = [[r["method"], f"{r['pairs']:.1e}", r["reason"]] for r in left_out]
-        parts += ["**Left out**", table(["method", "pairs", "why"], rows)]
+        parts += ["**Left out**", markdown_table(["method", "pairs", "why"], rows)]
     return "\n\n".join(parts) + "\n"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """In Markdown."""
     line = lambda cells: "| " + " | ".join(cells) + " |"
     return "\n".join([line(head), "|" + " --- |" * len(head), *map(line, rows)])

@@ -1,0 +1,94 @@
+"""What the experiments share: their command line, the files that they leave, and the ray-traced captures.
+
+An experiment has `run`, which a test calls at a small size, and `report`, which takes the values of the command line,
+runs it at its own size and says what to write and to print; the last line of the script is `main(report)`.
+"""
+
+import argparse
+import inspect
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console, RenderableType
+from rich.table import Table
+
+from gs_jax.base.progress import Progress
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import Design, read_design
+from gs_jax.io.disk import make_folder, write_json, write_text
+from gs_jax.io.figures import write_figure
+
+OPTIONAL_PATH = {"type": Path, "nargs": "?"}
+
+
+class Report(NamedTuple):
+    """What an experiment leaves.
+
+    Parameters
+    ----------
+    files
+        Contents by file name: a figure for `.png`, text for `.md`, and anything that JSON holds for `.json`.
+    shown
+        Tables and text for the terminal.
+    """
+
+    files: dict[str, Any]
+    shown: Sequence[RenderableType] = ()
+
+
+def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | None = None, folder: str = "") -> None:
+    """The command line of the script that `report` is in; `--out DIR` is where its files go.
+
+    Parameters
+    ----------
+    report
+        Takes the values of the arguments by name, and `progress`.
+    arguments
+        Of the script, beside `--out`: their name, and the options of `add_argument`.
+    folder
+        Below `out/`, by default the name of the script.
+    """
+    explanation = inspect.getdoc(inspect.getmodule(report)) or ""
+    parser = argparse.ArgumentParser(description=explanation.splitlines()[0])
+    for name, options in (arguments or {}).items():
+        parser.add_argument(name, **options)
+    parser.add_argument("--out", type=Path, default=Path("out") / (folder or Path(inspect.getfile(report)).stem))
+    values = vars(parser.parse_args())
+    out = make_folder(values.pop("out"))
+    with Progress() as progress:
+        found = report(**values, progress=progress)
+    write(out, found)
+    Console(width=160).print(*found.shown, sep="\n")
+
+
+def write(folder: Path, report: Report) -> None:
+    """The files of a report, each whole or not at all."""
+    for name, content in report.files.items():
+        if isinstance(content, Figure):
+            write_figure(folder / name, content)
+        elif isinstance(content, str):
+            write_text(folder / name, content, [".md"])
+        else:
+            write_json(folder / name, content)
+
+
+def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> Table:
+    """For the terminal."""
+    made = Table(*columns, title=title, title_justify="left")
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def design_of(data: Path | None) -> Design:
+    """What the captures in a folder were traced with; without one, the built-in design."""
+    return read_design(data / "P1.toml") if data else geomscope()
+
+
+def points_of(data: Path, scene: str) -> np.ndarray:
+    """The points `(x, y, z, flux)` of a ray-traced scene, mm."""
+    return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
