@@ -10,7 +10,7 @@ HERE = Path(__file__).parent
 
 def main() -> None:
     """Both differ in the sensor distance only."""
-    paper = "Tian, Hu, Yang: GEOMScope, Table 1; layout: gs_jax.layouts.random_layout, seed 0"
+    paper = "Tian, Hu, Yang: GEOMScope, Table 1; layout: gs_jax.random_layout, seed 0"
     for name, distance, note in (
         ("geomscope", 5.8, "sensor where traced rays from 20 mm are sharpest"),
         ("geomscope-table1", 4.0, "sensor distance as printed: a point at 20 mm is out of focus"),

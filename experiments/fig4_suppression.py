@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.ndimage import maximum_filter
-from skimage.feature import peak_local_max
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of, table
 from experiments.point_density import scene
+from experiments.profiles import local_maxima
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import Design
@@ -74,9 +74,7 @@ def _best(method: Callable[[float], np.ndarray], truth: np.ndarray) -> np.ndarra
 def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
     """Local maxima of what exceeds a part of the highest, above the median of each plane."""
     above = volume - np.median(volume, axis=(1, 2), keepdims=True)
-    depth, row, column = peak_local_max(above, threshold_rel=threshold, exclude_border=False).T
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
-    return np.column_stack([x[column], y[row], z[depth], above[depth, row, column]])
+    return local_maxima(above, grid, threshold_rel=threshold)
 
 
 def _scores(found, truth, expected, grid) -> dict:

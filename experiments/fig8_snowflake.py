@@ -27,12 +27,13 @@ from scipy.ndimage import gaussian_filter
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
+from gs_jax.demo.scene import words
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
 from gs_jax.reconstruction.pipeline import reconstruct_stack
 from gs_jax.simulation.camera import Camera, electrons, expose
-from gs_jax.simulation.phantoms import letters, rasterize, snowflake
+from gs_jax.simulation.phantoms import rasterize, snowflake
 from gs_jax.simulation.scene import simulate_points
 from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress
@@ -41,7 +42,6 @@ DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04
 # Distance of emitters: the simulated image has no dots, and the truth no raster.
 EMITTERS_MM = 0.03
-WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))
 PEAK_ELECTRONS = 10_000
 # Half the side of the square that the resolution target is judged in.
 _TARGET_MM = 2.8
@@ -105,8 +105,7 @@ def _back_projected(counts: np.ndarray, imager: Imager, grid: Grid, progress: Pr
 def simulated_scenes() -> dict[str, np.ndarray]:
     """Emitters of an inclined snowflake, and of a word on each of three planes."""
     flake = snowflake((18.0, 22.0), size=14.0, tilt=0.4, width=0.5, pitch=EMITTERS_MM)
-    words = [letters(text, depth=z, height=2.5, pitch=EMITTERS_MM) + (x, y, 0, 0) for z, text, (x, y) in WORDS]
-    return {"snowflake, simulated": flake, "letters, simulated": np.concatenate(words)}
+    return {"snowflake, simulated": flake, "letters, simulated": words(EMITTERS_MM)}
 
 
 def _simulations(design: Design, progress: Progress) -> dict[str, tuple[np.ndarray, np.ndarray]]:

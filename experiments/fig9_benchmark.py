@@ -26,9 +26,9 @@ import numpy as np
 from jaxtyping import Float32
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
-from skimage.feature import peak_local_max
 
 from experiments.common import Report, main, points_of
+from experiments.profiles import local_maxima
 from gs_jax import Grid, Imager, Sensor
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
@@ -115,16 +115,12 @@ def best_f1(result: Result, s: Scene) -> float | None:
     """F1 of the number of brightest points that scores best."""
     if s.points is None:
         return None
-    found = result.points if result.points is not None else _peaks(result.volume, s.grid)
+    found = result.points
+    if found is None:
+        found = local_maxima(result.volume, s.grid, min_distance=1, threshold_rel=DARKEST)
     found = found[np.argsort(-found[:, 3], kind="stable")]
     numbers = np.unique(np.geomspace(1, max(len(found), 1), 100).round().astype(int))
     return max(localization(found[:n], s.points, axial=0.6).f1 for n in numbers)
-
-
-def _peaks(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    d, r, c = peak_local_max(volume, min_distance=1, threshold_rel=DARKEST, exclude_border=False).T
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
-    return np.column_stack([x[c], y[r], z[d], volume[d, r, c]])
 
 
 def run(

@@ -14,9 +14,9 @@ from pathlib import Path
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from skimage.feature import peak_local_max
 
 from experiments.common import OPTIONAL_PATH, Report, main, table
+from experiments.profiles import local_maxima
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
@@ -59,9 +59,7 @@ def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np
 def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int, progress: Progress) -> np.ndarray:
     """The highest local maxima of the plain back-projection, `(x, y, z, value)`."""
     volume = reconstruct_stack(capture, imager, grid, progress)
-    depth, row, column = peak_local_max(volume, min_distance=1, num_peaks=count, exclude_border=False).T
-    x, y, z = (np.asarray(axis, np.float64) for axis in (grid.x, grid.y, grid.depths))
-    return np.column_stack([x[column], y[row], z[depth], volume[depth, row, column]])
+    return local_maxima(volume, grid, min_distance=1, num_peaks=count)
 
 
 def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:

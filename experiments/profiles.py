@@ -1,6 +1,7 @@
-"""Profiles through reconstructed points, and their widths."""
+"""Local maxima of a reconstruction, profiles through them, and their widths."""
 
 import numpy as np
+from skimage.feature import peak_local_max
 
 from gs_jax import Grid, Imager, backproject
 
@@ -9,6 +10,12 @@ def around_the_axis(image: np.ndarray, imager: Imager, depth: float) -> tuple[np
     """Back-projection about the point `(0, 0, depth)`: voxels of 2 um laterally and 20 um axially."""
     grid = Grid(depth + np.arange(-0.8, 0.801, 0.02), (101, 101), 0.002)
     return np.asarray(backproject(image, imager, grid)), grid
+
+
+def local_maxima(volume: np.ndarray, grid: Grid, **options) -> np.ndarray:
+    """`(x, y, z, value)` of the voxels that scikit-image's `peak_local_max` finds with these options, mm."""
+    voxels = peak_local_max(volume, exclude_border=False, **options)
+    return np.column_stack([grid.to_mm(voxels), volume[tuple(voxels.T)]])
 
 
 def through_peak(volume: np.ndarray, grid: Grid) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -82,9 +82,8 @@ def _many(data: Path, imager: Imager, voxel_mm: float, step_mm: float, progress:
 def _peaks(volume: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Local maxima `(x, y, z)`, mm, among the brightest 1e-4 of the voxels."""
     high = volume > np.quantile(volume[::3, ::7, ::7], 1 - 1e-4)
-    d, r, c = np.nonzero(high & (maximum_filter(volume, size=5) == volume))
-    x, y, z = (np.asarray(a) for a in (grid.x, grid.y, grid.depths))
-    return np.column_stack([x[c], y[r], z[d]]), volume[d, r, c]
+    voxels = np.argwhere(high & (maximum_filter(volume, size=5) == volume))
+    return grid.to_mm(voxels), volume[tuple(voxels.T)]
 
 
 def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float = 0.02) -> Figure:

@@ -7,8 +7,8 @@ import pytest
 
 from experiments import fig3_resolution, fig5_fwhm_depth, forward_model, table1
 from experiments.backprojection_speed import Job
-from experiments.profiles import dip, fwhm
-from gs_jax import Imager, MicrolensArray, Sensor
+from experiments.profiles import dip, fwhm, local_maxima
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 
@@ -22,6 +22,13 @@ def test_the_width_of_a_gaussian_and_the_dip_of_two():
     assert dip(x, np.exp(-((x - 0.3) ** 2) / 2)) == 1
     two = np.exp(-((x - 1.5) ** 2) / 2) + np.exp(-((x + 1.5) ** 2) / 2)
     assert dip(x, two) == pytest.approx(two[200] / two.max(), rel=1e-6)
+
+
+def test_local_maxima_are_in_mm_and_have_their_values():
+    grid, volume = Grid([18.0, 20.0], (5, 7), 0.1, (1.0, -1.0)), np.zeros((2, 5, 7))
+    volume[1, 4, 0], volume[0, 2, 3] = 3.0, 2.0
+    np.testing.assert_allclose(local_maxima(volume, grid), [[0.7, -0.8, 20, 3], [1, -1, 18, 2]])
+    assert len(local_maxima(volume, grid, threshold_rel=0.9)) == 1
 
 
 def test_table_1_has_every_row_of_the_paper():

@@ -70,7 +70,7 @@ def points_picture(found: np.ndarray, truth: np.ndarray, score: Localization) ->
     return figure
 
 
-def report(
+def report_text(
     design: Design,
     sentences: list[str],
     targets: list[dict[str, Any]],

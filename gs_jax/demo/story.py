@@ -27,15 +27,13 @@ from ..metrics import localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack
 from ..simulation.camera import Camera, expose
-from ..simulation.phantoms import letters, random_points, rasterize
+from ..simulation.phantoms import random_points, rasterize
 from ..simulation.scene import simulate_points, simulate_volume
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
-from .report import Views, points_picture, report, views_picture
+from .report import Views, points_picture, report_text, views_picture
+from .scene import WORDS, words
 
-# What is written at which depth (mm), and where its middle is (mm).
-WORDS = ((18.0, "near", (-4.0, -5.0)), (20.0, "focus", (0.0, 0.0)), (22.0, "far", (4.0, 5.0)))
-_LETTER_MM = 2.5
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
 _DEPTHS = np.arange(17.0, 23.01, 0.5)
 _VOXEL_MM = 0.0415
@@ -116,7 +114,7 @@ def run(folder: Path, progress: Progress) -> Path:
     found = _points(folder, design, seconds, progress)
     with _timed(seconds, "mold"):
         mold = make_mold(design, folder / "mold.stl", progress=progress)
-    text = report(design, findings(design, sheet), targets, scores, found, mold, seconds)
+    text = report_text(design, findings(design, sheet), targets, scores, found, mold, seconds)
     write_text(folder / "report.md", text, [".md"])
     return folder / "report.md"
 
@@ -135,9 +133,7 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
     """Three words at three depths: reconstructed in three ways, each against the truth."""
     imager = design.imager()
     scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
-    emitters = np.concatenate(
-        [letters(word, depth=z, height=_LETTER_MM, pitch=_SCENE_MM) + (x, y, 0, 0) for z, word, (x, y) in WORDS]
-    )
+    emitters = words(_SCENE_MM)
     scene = np.asarray(rasterize(emitters, scene_grid))
     grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
     coarse = grid.at(grid.depths[_COARSE])

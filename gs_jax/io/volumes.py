@@ -7,13 +7,16 @@ OME-Zarr is written in version 0.4 (Zarr 2), not 0.5 (Zarr 3): every reader of F
 and of napari knows 0.4, while 0.5 needs recent versions of each; both are read here. Chunks are compressed with
 Blosc (LZ4), the default of bioformats2raw and ome-zarr-py and several times as fast as zlib; they are one plane deep,
 as planes are what a viewer asks for.
+
+To add a format, add its suffix to `_FORMATS` at the end with a function that reads it and one that writes it.
 """
 
 import contextlib
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,7 +29,6 @@ from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
 from .tiff import decode_page
 
-VOLUME_SUFFIXES = (".tif", ".tiff", ".zarr")
 MAX_VOXELS = 10**10
 CHUNK = 1024
 
@@ -63,10 +65,7 @@ def write_volume(
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
-    if path.suffix.lower() == ".zarr":
-        _write_zarr(path, voxels, depths, grid)
-    else:
-        _write_tiff(path, voxels, depths, grid)
+    _FORMATS[path.suffix.lower()].write(path, voxels, depths, grid)
 
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
@@ -81,7 +80,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "dept
     suffix = Path(path).suffix.lower()
     if suffix not in VOLUME_SUFFIXES:
         raise InputError(f"{path}: found the suffix {short_repr(suffix)}, allowed: {', '.join(VOLUME_SUFFIXES)}.")
-    voxels, grid = _read_zarr(Path(path)) if suffix == ".zarr" else _read_tiff(check_input(path))
+    voxels, grid = _FORMATS[suffix].read(Path(path))
     if not np.isfinite(voxels).all():
         raise InputError(f"{path}: found a NaN or an infinity among the voxels, allowed: finite numbers.")
     return voxels, grid
@@ -165,6 +164,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid)
 
 
 def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
+    check_input(path)
     with contextlib.ExitStack() as stack:
         with decoding(path, "OME-TIFF"):
             # The pages of this file in their order: tifffile's own view of OME opens further files.
@@ -283,3 +283,15 @@ def _ngff(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], lis
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         allowed = "NGFF 0.4 or 0.5, axes z, y, x in micrometer, one scale and one translation"
         raise InputError(f"{path}: found other `multiscales` metadata ({error!r:.80}), allowed: {allowed}.") from error
+
+
+class _Format(NamedTuple):
+    """How a volume is read, and how voxels of float32 are written with their depths (mm) and grid."""
+
+    read: Callable[[Path], tuple[np.ndarray, Grid]]
+    write: Callable[[Path, np.ndarray, list[float], Grid], None]
+
+
+_TIFF, _ZARR = _Format(_read_tiff, _write_tiff), _Format(_read_zarr, _write_zarr)
+_FORMATS = {".tif": _TIFF, ".tiff": _TIFF, ".zarr": _ZARR}
+VOLUME_SUFFIXES = tuple(_FORMATS)

@@ -262,8 +262,3 @@ def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUM
 
 def _judged(check: str, passed: bool, text: str) -> Finding:
     return Finding(check, "ok" if passed else "error", f"{text}." if passed else f"found untrue: {text}.")
-
-
-def plain(findings: list[Finding]) -> list[dict[str, str]]:
-    """Findings for JSON."""
-    return [{"check": f.check, "level": f.level, "text": f.text} for f in findings]

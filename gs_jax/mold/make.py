@@ -2,6 +2,7 @@
 
 import math
 import os
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from .checks import (
     check_design,
     check_solid,
     mold_volume,
-    plain,
     refuse_errors,
     volume_tolerance,
 )
@@ -116,7 +116,7 @@ def make_mold(
         "printer_resolution_um": 1000 * resolution,
         "shrinkage_percent": 100 * shape.shrinkage,
         "draft_deg": math.degrees(shape.draft),
-        "checks": plain(findings),
+        "checks": [asdict(finding) for finding in findings],
         "verification": measured,
         "lens_center_deviation_um": (1000 * (lenses.center - np.asarray(array.centers, float))).tolist(),
         "lens_radius_mm": lenses.radius.tolist(),

@@ -40,7 +40,7 @@ class ExitPupil(NamedTuple):
     distance: Float[Array, ""]
 
 
-def exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitPupil:
+def trace_exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitPupil:
     """The lens seen from the sensor: for each point of a grid the ray that comes from there, and its phase.
 
     The coordinate is `u = D - rho (e - e_0)` with the ray's end D from the chief ray's, its direction cosines e and

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import Imager, chief_ray
-from .exit_pupil import ExitPupil, exit_pupil, inside, phasor
+from .exit_pupil import ExitPupil, inside, phasor, trace_exit_pupil
 from .unit import Point, pupil_disc, pupil_radius, unit_rays
 
 _RAYS = 2**15
@@ -195,7 +195,7 @@ def strehl(
     samples
         Along a side of the pupil: enough for a blur of `samples / 2` times `wavelength v / (2 radius)`.
     """
-    pupil = exit_pupil(imager, depth, field, radius, edges, samples)
+    pupil = trace_exit_pupil(imager, depth, field, radius, edges, samples)
     scale = imager.wavelength * pupil.distance
     turn = 2 * np.pi / scale
 
@@ -224,7 +224,7 @@ def _pixels(imager, depth, size, field, offset, radius, edges, samples) -> Float
     if samples < 1:
         raise ValueError(f"`samples` must be positive, got {samples}.")
     count = size * samples
-    pupil = exit_pupil(imager, depth, field, radius, edges, count)
+    pupil = trace_exit_pupil(imager, depth, field, radius, edges, count)
     dtype = pupil.distance.dtype
     pitch = imager.sensor.pixel_pitch / samples
     shift = pupil.chief - _map(imager, depth, field, dtype)
