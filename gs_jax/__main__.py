@@ -8,7 +8,7 @@ from importlib import import_module
 
 import click
 
-from . import __version__
+from ._version import __version__
 from .base.errors import InputError
 
 # Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.

@@ -7,7 +7,7 @@ from importlib.metadata import version
 import jax
 import psutil
 
-from .. import __version__
+from .._version import __version__
 
 
 def describe() -> dict[str, str]:

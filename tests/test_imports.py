@@ -1,0 +1,93 @@
+"""The direction of imports and the shape of modules, read from the syntax trees."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted((ROOT / "gs_jax").rglob("*.py"))
+# Whatever stands here imports from what stands before it.
+ORDER = (
+    "_version base geometry metrics pictures projection optics layouts io simulation designs solvers suppression "
+    "reconstruction codesign mold benchmark demo cli __main__"
+).split()
+# Where `from .name import name` hides the module behind what it defines. To be renamed; nothing new comes here.
+NAMED_AS_ITS_CONTENT = {
+    "demo/report.py",
+    "optics/exit_pupil.py",
+    "solvers/admm.py",
+    "solvers/fista.py",
+    "solvers/richardson_lucy.py",
+    "solvers/total_variation.py",
+}
+
+
+def imported(path: Path, root: Path = ROOT) -> Iterator[list[str]]:
+    """The parts of each dotted name that a module imports, wherever in it: `from ..a import b` in c/d/e.py is c.a.b."""
+    package = path.relative_to(root).parent.parts
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (name.name.split(".") for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) + 1 - node.level] if node.level else ()
+            module = node.module.split(".") if node.module else []
+            yield from ([*above, *module, name.name] for name in node.names)
+
+
+def names(paths) -> list[str]:
+    return [str(path.relative_to(ROOT / "gs_jax")) for path in paths]
+
+
+def defined(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text())
+    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+
+
+def top(path: Path) -> str:
+    return path.relative_to(ROOT / "gs_jax").parts[0].removesuffix(".py")
+
+
+def test_relative_imports_are_resolved(tmp_path):
+    (tmp_path / "c/d").mkdir(parents=True)
+    (tmp_path / "c/d/e.py").write_text("import a.b\ndef f():\n    from ..a import b\n    from . import g\n")
+    assert sorted(imported(tmp_path / "c/d/e.py", tmp_path)) == [["a", "b"], ["c", "a", "b"], ["c", "d", "g"]]
+
+
+def test_the_order_names_every_module():
+    assert {top(path) for path in MODULES} == {*ORDER, "__init__"}
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if top(path) != "__init__"], ids=lambda path: path.stem)
+def test_imports_point_one_way(path):
+    """Thus without a cycle. The front door imports what it shows, and nothing imports the front door."""
+    here = top(path)
+    below = {here, *ORDER[: ORDER.index(here)]}
+    ours = [name for name in imported(path) if name[0] == "gs_jax"]
+    assert not [".".join(name) for name in ours if len(name) < 2 or name[1] not in below]
+
+
+def test_the_package_stands_without_what_is_made_with_it():
+    """`design`, `experiments` and `tests` are not installed."""
+    outside = {"design", "experiments", "tests"}
+    assert not names(path for path in MODULES if any(name[0] in outside for name in imported(path)))
+
+
+def test_jaxopt_has_one_place():
+    """It is no longer maintained: what replaces it replaces one module."""
+    assert len(names(path for path in MODULES if any(name[0] == "jaxopt" for name in imported(path)))) == 1
+
+
+def test_no_module_is_named_as_what_it_defines():
+    found = set(names(path for path in MODULES if path.stem in defined(path)))
+    assert found == NAMED_AS_ITS_CONTENT
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if path.name == "__init__.py"], ids=top)
+def test_a_folder_is_a_docstring_and_names(path):
+    docstring, *rest = ast.parse(path.read_text()).body
+    assert isinstance(docstring, ast.Expr) and isinstance(docstring.value, ast.Constant)
+    for node in rest:
+        is_all = isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["__all__"]
+        assert isinstance(node, ast.ImportFrom) or is_all, ast.unparse(node)
