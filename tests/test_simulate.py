@@ -49,7 +49,7 @@ def test_the_window_holds_the_light(sensor_distance, pixel):
 def test_a_coarse_volume_has_no_dots():
     """Voxels three pixels apart on the sensor make an image as even as an even object does."""
     grid = Grid([20.0], (9, 9), 0.12)
-    image = simulate_volume(np.ones((1, 9, 9), np.float32), imager(), grid, progress=Progress())
+    image = simulate_volume(np.ones((1, 9, 9), np.float32), imager(), grid)
     middle = image[40:56, 34:46]
     np.testing.assert_allclose(middle, middle.mean(), rtol=0.05)  # the envelope falls by 2 %, the raster's ripple by 3
 
@@ -79,7 +79,7 @@ def test_depths_are_taken_some_at_a_time(monkeypatch):
     """A long column of points, one of them on the border of two slabs, is the sum of its images in one slab."""
     z = np.append(np.linspace(15, 16.3, 30), 15.5)
     points = np.column_stack([0 * z, 0 * z, z, np.ones_like(z)])
-    options: dict[str, Any] = dict(kind="gaussian", progress=Progress())
+    options: dict[str, Any] = dict(kind="gaussian")
     whole = simulate_points(points, imager(), **options)
     monkeypatch.setattr("gs_jax.simulation.scene._SLAB", 5)
     np.testing.assert_allclose(simulate_points(points, imager(), **options), whole, atol=1e-12 * whole.max())
