@@ -9,13 +9,22 @@ import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 
+# Cropped captures that ship with the tests.
+CAPTURES = Path(__file__).parent / "data"
+# Whole ones, and what others publish, lie beside the repository: too large, or not ours, to ship.
 DATA = Path(__file__).parents[2] / "shared" / "data"
+SOURCES = {
+    "geomscope": "the lens centres that the paper's authors publish",
+    "oracle": "whole captures by the ray tracer of tests/data",
+    "diffusercam": "real captures of Waller Lab's DiffuserCam tutorial",
+}
 
 
 def needs(path: str) -> Path:
-    """A file of the shared data, or skip."""
+    """A file of `DATA`, or skip and say what is missing and where it comes from."""
     if not (DATA / path).exists():
-        pytest.skip(f"{DATA / path} is not on this machine")
+        folder = path.split("/")[0]
+        pytest.skip(f"no ../shared/data/{folder}: {SOURCES[folder]}")
     return DATA / path
 
 
