@@ -8,7 +8,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
-from gs_jax.benchmark.measure import peak_mib, timed
+from gs_jax.benchmark.measure import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.projection.points import STEPS, forward_points, stamps
 
@@ -264,16 +264,15 @@ def test_many_points_are_spots_one_by_one(dtype):
         assert np.abs(image - expected).sum() < 2e-3 * expected.sum()
 
 
-def test_many_points_take_little_memory_and_time():
+def test_many_points_take_little_memory():
     """200 lenses by 50 000 points are 160 MB; 3 of 4 points are seen by no lens, the others by one."""
     centers = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0)), -1).reshape(-1, 2)
     imager = Imager(MicrolensArray(centers), Sensor((64, 64), 0.3), 5.8, 0.25)
     points = np.random.default_rng(6).uniform([0, 0, 20, 1], [20, 10, 22, 2], (50_000, 4))
     kernels = stamps(np.array([20.0, 22.0]), np.ones((2, 15, 15)))
     forward_points(points[:10], imager, kernels)
-    memory, (seconds, image) = peak_mib(lambda: timed(lambda: forward_points(points, imager, kernels)))
-    assert image.any() and seconds < 15
-    assert not memory > 100  # NaN where it is not known
+    memory, image = peak_mib(lambda: forward_points(points, imager, kernels))
+    assert image.any() and not memory > 100  # NaN where it is not known
 
 
 def test_no_points_give_a_dark_image():
