@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from ..base.errors import InputError
 from ..designs.design import Design
 from ..geometry import Imager, MicrolensArray, as_float
-from ..io.explain import one_line
+from ..io.tables import one_line
 from ..layouts.cells import cell_edges
 from ..optics.aperture import aperture_area, pitch, wedge
 

@@ -23,11 +23,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, short_repr
 from ..io.disk import read_text
-from ..io.explain import one_line
+from ..io.tables import Table, one_line
 from .objectives import TERMS
 from .parameters import NAMES
 
@@ -39,11 +39,7 @@ Range = Annotated[tuple[float, float], Field(strict=False)]
 Depths = Annotated[tuple[Positive, Positive], Field(strict=False, description="[near, far] in mm, near below far")]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class TermTable(_Table):
+class TermTable(Table):
     """`[[terms]]`: one of the kinds, and how much a miss counts beside the other terms.
 
     `at_most`, `at_least`, `equal`: a target, for every entry of the term. `minimise`, `maximise`: the size of a value
@@ -81,7 +77,7 @@ class TermTable(_Table):
         return self.kind in ("minimise", "maximise")
 
 
-class StageTable(_Table):
+class StageTable(Table):
     """`[[stages]]`: a solver on some of the parameters and terms, all by default. Stages follow each other.
 
     `learning_rate`: of Adam, at the start; it falls to zero over the steps.
@@ -94,7 +90,7 @@ class StageTable(_Table):
     terms: tuple[str, ...] | None = Field(default=None, strict=False, description="names of terms in [[terms]]")
 
 
-class LimitTable(_Table):
+class LimitTable(Table):
     """`[[pareto]]`: a term whose limit is moved from value to value, each with a weight of 30.
 
     It takes the place of the term of that name and kind, if there is one.
@@ -122,7 +118,7 @@ class LimitTable(_Table):
         return self.at_most or self.at_least or ()
 
 
-class Study(_Table):
+class Study(Table):
     """A study, with the tables and keys of its file; the module's docstring has one.
 
     `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.

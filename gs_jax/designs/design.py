@@ -13,13 +13,13 @@ from typing import Annotated, Any
 import numpy as np
 import tomli_w
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError, short_repr
 from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
 from ..io.disk import check_output, read_table, read_text, write_text
-from ..io.explain import one_line
+from ..io.tables import Table, one_line
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000
@@ -50,18 +50,14 @@ Centers = Annotated[
 ]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class SensorTable(_Table):
+class SensorTable(Table):
     """`[sensor]`: the camera."""
 
     pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="a number of micrometres from 1e-3 to 1e4")
     shape: Shape
 
 
-class LensTable(_Table):
+class LensTable(Table):
     """`[lens]`: one plano-convex microlens. `focal_length_mm` overrides the radius, for a thin-lens study."""
 
     radius_of_curvature_mm: Length
@@ -70,7 +66,7 @@ class LensTable(_Table):
     focal_length_mm: Length | None = None
 
 
-class ArrayTable(_Table):
+class ArrayTable(Table):
     """`[array]`: the plate and where its lenses are. `centers_file` is replaced by its content on reading."""
 
     size_mm: Size
@@ -78,7 +74,7 @@ class ArrayTable(_Table):
     centers_mm: Centers
 
 
-class ImagingTable(_Table):
+class ImagingTable(Table):
     """`[imaging]`: where the sensor and the object are."""
 
     sensor_distance_mm: Length
@@ -87,14 +83,14 @@ class ImagingTable(_Table):
     field_radius_mm: Length
 
 
-class CalibrationTable(_Table):
+class CalibrationTable(Table):
     """`[calibration]`: the array as found on the sensor, rotated about its centre (+x toward +y), then shifted."""
 
     rotation_deg: float = Field(default=0.0, ge=-360, le=360, description="a number of degrees from -360 to 360")
     shift_mm: Point = (0.0, 0.0)
 
 
-class Design(_Table):
+class Design(Table):
     """A microscope, with the tables and keys of its file."""
 
     name: str = Field(description="a string")

@@ -1,14 +1,20 @@
-"""From pydantic's errors to one line that names the key, what was found and what is allowed."""
+"""Tables of TOML files, and their problems in one line: the key, what was found and what is allowed."""
 
 import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..base.errors import short_repr
 
 Place = tuple[int | str, ...]
+
+
+class Table(BaseModel):
+    """A table whose keys are its fields: no other keys, no other types, no infinities. It does not change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> str:
