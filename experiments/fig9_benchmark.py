@@ -34,12 +34,13 @@ from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
 from gs_jax.benchmark.report import markdown_table
-from gs_jax.benchmark.scenes import FWHM, spots
+from gs_jax.benchmark.scenes import spots
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
+from gs_jax.optics.theory import FWHM
 from gs_jax.reconstruction.methods import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 from gs_jax.suppression.clustering import find_clusters

@@ -38,6 +38,24 @@ def scene(dtype=jnp.float64, *, shape=(96, 80), voxels=(21, 17), depths=(18.0, 2
     return jax.tree.map(cast, imager), jax.tree.map(cast, grid)
 
 
+def aperture_edge(array, angles):
+    """Distance `(lens, angle)` from each lens's vertex to the edge of its clear aperture, lens by lens.
+
+    In the direction `e` the nearest of the disc, of the bisectors `|d|^2 / (2 d.e)` with neighbours at `d`, `d.e > 0`,
+    and of the plate's sides.
+    """
+    centers, direction = np.asarray(array.centers), np.stack([np.cos(angles), np.sin(angles)])
+    edges = []
+    for center in centers:
+        offset = centers - center
+        toward = np.concatenate([offset @ direction, direction, -direction])
+        room = [(np.array(array.size) / 2 - sign * center) for sign in (1, -1)]
+        lines = np.concatenate([np.sum(offset**2, axis=1) / 2, *room])
+        distance = np.where(toward > 0, lines[:, None] / np.where(toward > 0, toward, 1), np.inf)
+        edges.append(np.minimum(distance.min(axis=0), float(array.aperture_diameter) / 2))
+    return np.stack(edges)
+
+
 def backproject_loop(image, imager, grid, method="linear"):
     """The paper's sum as it is told: for each voxel, for each lens, find the pixel. Returns it and the weights' sum."""
     image = np.asarray(image, np.float64)

@@ -8,7 +8,9 @@ from scipy.spatial.distance import cdist
 
 from gs_jax import MicrolensArray
 from gs_jax.layouts.cells import coverage, nearest_neighbour_distances
-from gs_jax.optics.aperture import aperture_area, aperture_edge, clear_diameter, pitch
+from gs_jax.optics.aperture import aperture_area, clear_diameter, pitch
+
+from .helpers import aperture_edge
 
 gradient_of_diameter = jax.jit(jax.grad(clear_diameter))
 
@@ -30,8 +32,8 @@ def nearest_lens_inside(lenses, points):
 
 
 def test_the_edge_is_where_points_change_hands():
-    lenses, angles = array(layout(32)), jnp.linspace(0, 2 * np.pi, 73)[:-1]
-    edge = np.asarray(aperture_edge(lenses, angles))
+    lenses, angles = array(layout(32)), np.linspace(0, 2 * np.pi, 73)[:-1]
+    edge = aperture_edge(lenses, angles)
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     for factor, inside in [(1 - 1e-9, True), (1 + 1e-9, False)]:
         points = np.asarray(lenses.centers)[:, None] + factor * edge[..., None] * direction
@@ -54,8 +56,8 @@ def test_areas_add_up_to_the_exact_coverage(count, seed, diameter):
 
 def test_area_is_the_integral_of_the_edge():
     lenses, count = array(layout(32)), 4096
-    angles = (jnp.arange(float(count)) + 0.5) * (2 * np.pi / count)
-    integral = jnp.sum(aperture_edge(lenses, angles) ** 2, axis=1) * np.pi / count
+    angles = (np.arange(count) + 0.5) * (2 * np.pi / count)
+    integral = np.sum(aperture_edge(lenses, angles) ** 2, axis=1) * np.pi / count
     # The midpoint rule at corners, and at jumps where a lens is close to the plate's edge.
     np.testing.assert_allclose(aperture_area(lenses), integral, rtol=2e-4)
 
@@ -82,8 +84,6 @@ def test_closed_forms_and_degenerate_layouts(lenses, expected):
     np.testing.assert_allclose(aperture_area(lenses)[: len(expected)], expected, rtol=1e-13)
     gradient = gradient_of_diameter(lenses)
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
-    edge = aperture_edge(lenses, jnp.linspace(0, 6, 7))
-    assert jnp.all(jnp.isfinite(edge)) and jnp.all(edge >= 0)
 
 
 def test_a_lens_on_the_plates_edge_feels_it():
@@ -121,8 +121,7 @@ def test_gradients(size):
     @jax.jit
     def values(centers, diameter):
         lenses = array(centers, size, diameter)
-        edge = aperture_edge(lenses, jnp.array([0.1, 2.0, 4.4]))
-        return aperture_area(lenses), clear_diameter(lenses), edge, pitch(centers)
+        return aperture_area(lenses), clear_diameter(lenses), pitch(centers)
 
     # Steps of 1e-6 mm stay within a piece: edges, neighbours and who is nearest change only at special layouts.
     check_grads(values, (jnp.asarray(layout(32)), jnp.array(2.0)), order=1, eps=1e-6, atol=1e-6, rtol=1e-6)

@@ -16,12 +16,11 @@ from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..metrics import localization, quality
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
+from ..optics.theory import FWHM
 from ..simulation.camera import Camera, electrons, expose
 from ..simulation.scene import simulate_points
 
 WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
-# A full width at half maximum, in standard deviations.
-FWHM = 2.355
 # Emitters across a particle.
 _ACROSS = 6
 # A peak exceeds this part of the largest value: particles differ by a factor of 2.

@@ -171,10 +171,8 @@ def parent_of(
 
 
 def _cells(design: Design) -> Cells:
-    _, start, end = cell_edges(np.array(design.array.centers_mm), design.array.size_mm)
-    along = (end - start) / np.hypot(*(end - start).T)[:, None]
-    height = np.abs(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0])
-    return Cells(height, (start * along).sum(1), (end * along).sum(1))
+    edges = cell_edges(np.array(design.array.centers_mm), design.array.size_mm)
+    return Cells(edges.height, edges.low, edges.high)
 
 
 def _clear_area(cells: Cells | None, array: MicrolensArray) -> Float[Array, ""]:

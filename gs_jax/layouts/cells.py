@@ -8,9 +8,10 @@ rests on this.
 import math
 from collections.abc import Sequence
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, KDTree, Voronoi
 
 from ..base.errors import InputError
@@ -37,17 +38,15 @@ def coverage(centers: Float[np.ndarray, "lens 2"], size: Sequence[Real], *, diam
         If the diameter is not positive or a centre lies outside the plate.
     """
     check_positive("diameter", diameter)
-    _, start, end = cell_edges(centers, size)
-    length = np.hypot(*(end - start).T)
-    along = (end - start) / length[:, None]
-    height, radius = np.abs(cross(start, along)), diameter / 2
+    edges = cell_edges(centers, size)
+    height, radius = edges.height, diameter / 2
     half_chord = np.sqrt(np.maximum(radius**2 - height**2, 0))
 
     def wedge(t):  # what the disc shares with the triangle from its centre to the edge's line, from the foot to t
         inner = np.clip(t, -half_chord, half_chord)
         return height * inner / 2 + radius**2 / 2 * (np.arctan2(t, height) - np.arctan2(inner, height))
 
-    area = wedge((end * along).sum(axis=1)) - wedge((start * along).sum(axis=1))
+    area = wedge(edges.high) - wedge(edges.low)
     return min(1.0, float(area.sum() / math.prod(size)))
 
 
@@ -92,8 +91,22 @@ def _reflected(centers, half, reach=math.inf):
     return np.concatenate(points), np.concatenate(owners)
 
 
-def cell_edges(centers, size):
-    """Edges of the cells within the plate: their lens, and where they start and end as seen from its centre."""
+class Edges(NamedTuple):
+    """Edges of Voronoi cells, each once for every cell: their lens, and where they are as seen from its centre, mm.
+
+    `start`, `end`: points. `height`: distance of the edge's line. `low`, `high`: the ends along it, from the foot.
+    """
+
+    lens: Int[np.ndarray, " edge"]
+    start: Float[np.ndarray, "edge 2"]
+    end: Float[np.ndarray, "edge 2"]
+    height: Float[np.ndarray, " edge"]
+    low: Float[np.ndarray, " edge"]
+    high: Float[np.ndarray, " edge"]
+
+
+def cell_edges(centers, size) -> Edges:
+    """Edges of the cells within the plate."""
     _check_inside(centers, half := half_size(size))
     points, _ = _reflected(centers, half)
     diagram = Voronoi(points)
@@ -102,7 +115,9 @@ def cell_edges(centers, size):
     ends = diagram.vertices[vertices]
     kept = (lens < len(centers)) & (ends[:, 0] != ends[:, 1]).any(axis=1)
     lens, ends = lens[kept], ends[kept] - points[lens[kept], None]
-    return lens, ends[:, 0], ends[:, 1]
+    start, end = ends[:, 0], ends[:, 1]
+    along = (end - start) / np.hypot(*(end - start).T)[:, None]
+    return Edges(lens, start, end, np.abs(cross(start, along)), (start * along).sum(axis=1), (end * along).sum(axis=1))
 
 
 def cross(a, b):

@@ -169,7 +169,7 @@ def lloyd_relaxed(
         If a centre lies outside the plate or on another one.
     """
     for _ in range(iterations):
-        lens, start, end = cell_edges(centers, size)
+        lens, start, end, *_ = cell_edges(centers, size)
         area = np.abs(cross(start, end)) / 2
         total = np.bincount(lens, area, len(centers))
         if not total.all():

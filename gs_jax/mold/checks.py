@@ -13,7 +13,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..designs.design import Design
 from ..geometry import MicrolensArray
-from ..layouts.cells import cell_edges, coverage, cross, largest_hole, nearest_neighbour_distances
+from ..layouts.cells import cell_edges, coverage, largest_hole, nearest_neighbour_distances
 from .caps import COARSEST, MAX_FACETS, cap_sag, estimated_facets
 from .mesh_files import Mesh
 from .solids import STEEPEST, MoldShape, engravings, mold_block, plate_thickness, widest_aperture
@@ -129,12 +129,10 @@ def _spacing(array: MicrolensArray, resolution: float) -> Finding:
 def _ridges(array: MicrolensArray, resolution: float) -> Finding:
     """The mold's ridges between lenses are sharp: a printer rounds them to its resolution."""
     centers, reach = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
-    lens, start, end = cell_edges(centers, array.size)
-    along = (end - start) / np.hypot(*(end - start).T)[:, None]
-    half = np.sqrt(np.maximum(reach**2 - cross(start, along) ** 2, 0))
-    first, last = (np.clip((point * along).sum(axis=1), -half, half) for point in (start, end))
-    side = np.array(array.size) / 2
-    between = (np.abs(centers[lens] + (start + end) / 2) < side * (1 - 1e-6)).all(axis=1)
+    edges, side = cell_edges(centers, array.size), np.array(array.size) / 2
+    half = np.sqrt(np.maximum(reach**2 - edges.height**2, 0))
+    first, last = (np.clip(t, -half, half) for t in (edges.low, edges.high))
+    between = (np.abs(centers[edges.lens] + (edges.start + edges.end) / 2) < side * (1 - 1e-6)).all(axis=1)
     # Each ridge is an edge of two cells.
     total = float((last - first)[between].sum()) / 2
     share = total * resolution / math.prod(array.size)
@@ -182,13 +180,10 @@ def caps_volume(array: MicrolensArray, nodes: int = 64) -> float:
     """
     radius, reach = float(array.radius_of_curvature), float(array.aperture_diameter) / 2
     held = lambda r2: (radius**3 - (radius**2 - r2) ** 1.5) / 3 - math.sqrt(radius**2 - reach**2) * r2 / 2
-    _, start, end = cell_edges(np.asarray(array.centers, float), array.size)
-    along = (end - start) / np.hypot(*(end - start).T)[:, None]
-    off = np.abs(cross(start, along))
+    edges = cell_edges(np.asarray(array.centers, float), array.size)
     # An edge through the vertex has no sector.
-    start, end, along, off = (x[off > 1e-12] for x in (start, end, along, off))
+    off, *ends = (x[edges.height > 1e-12] for x in (edges.height, edges.low, edges.high))
     half = np.sqrt(np.maximum(reach**2 - off**2, 0))
-    ends = [(point * along).sum(axis=1) for point in (start, end)]
     within = [np.clip(t, -half, half) for t in ends]
     at_rim = (
         np.arctan2(ends[1], off) - np.arctan2(ends[0], off) - np.arctan2(within[1], off) + np.arctan2(within[0], off)

@@ -117,7 +117,7 @@ class _Ends:
 
 def _welded_edges(centers, size) -> tuple[np.ndarray, _Ends]:
     """The cells' edges, sorted by lens, as pairs of points that all cells share."""
-    lens, start, end = cell_edges(centers, size)
+    lens, start, end, *_ = cell_edges(centers, size)
     order = np.argsort(lens, kind="stable")
     lens, start, end = lens[order], start[order], end[order]
     everywhere = np.concatenate([centers[lens] + start, centers[lens] + end])

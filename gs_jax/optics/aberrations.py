@@ -105,20 +105,6 @@ def of_array(
     return Wavefront(nothing, nothing, nothing, nothing, nothing + error.defocus)
 
 
-def unbalanced_rms(error: Wavefront) -> Terms:
-    """RMS of each term alone over the pupil; `defocus` is that of W020 and W220 together.
-
-    `2 W040 / (3 sqrt 5)`, `W131 / (2 sqrt 2)`, `W222 / 4`, `(W020 + W220) / (2 sqrt 3)` (Mahajan, Optical Imaging and
-    Aberrations).
-    """
-    return Terms(
-        jnp.abs(error.spherical) * 2 / (3 * math.sqrt(5)),
-        jnp.abs(error.coma) / (2 * math.sqrt(2)),
-        jnp.abs(error.astigmatism) / 4,
-        jnp.abs(error.defocus + error.field_curvature) / (2 * math.sqrt(3)),
-    )
-
-
 def balanced_rms(error: Wavefront) -> Terms:
     """RMS of each term with the tilt and defocus that balance it, and of the defocus that is left.
 
@@ -185,39 +171,5 @@ def linear_field_radius(
     error = seidel(*lens, 1.0, sensor_distance, plano_to_object=plano_to_object)
     slope = balanced_rms(error).coma
     axis = linear_rms(error) - slope
-    drop = _half_strehl(wavelength)
+    drop = math.log(2) * (jnp.asarray(wavelength) / (2 * math.pi)) ** 2
     return safe_quotient(drop, slope * (axis + jnp.sqrt(axis**2 + drop)))
-
-
-def independent_field_radius(
-    focal_length: Real,
-    refractive_index: Real,
-    pupil_radius: Real,
-    reduced_depth: Real,
-    sensor_distance: Real,
-    wavelength: Real,
-    *,
-    plano_to_object: bool = True,
-) -> Result:
-    """The same height with `independent_rms` for the error, so with astigmatism and field curvature, mm.
-
-    Coma grows with `h`, the others with `h^2`: a quadratic in `h^2` with one positive root. It may be large, or small,
-    where field curvature undoes the defocus of the axis.
-    """
-    lens = (focal_length, refractive_index, pupil_radius, reduced_depth)
-    error = seidel(*lens, 1.0, sensor_distance, plano_to_object=plano_to_object)
-    terms = balanced_rms(error)
-    axis = (error.defocus + error.spherical) / (2 * math.sqrt(3))
-    bent = (error.field_curvature + error.astigmatism / 2) / (2 * math.sqrt(3))
-    fourth, second = terms.astigmatism**2 + bent**2, terms.coma**2 + 2 * axis * bent
-    drop = _half_strehl(wavelength)
-    root = jnp.sqrt(second**2 + 4 * fourth * drop)
-    # Of the two forms of the root, the one that does not cancel.
-    rising = second > 0
-    squared = jnp.where(rising, 2 * drop / jnp.where(rising, second + root, 1), (root - second) / (2 * fourth))
-    return jnp.sqrt(squared)
-
-
-def _half_strehl(wavelength):
-    """By how much the squared error grows while the Strehl ratio halves."""
-    return math.log(2) * (jnp.asarray(wavelength) / (2 * math.pi)) ** 2

@@ -24,41 +24,6 @@ _NEIGHBOURS = 64
 
 
 @jax.jit
-def aperture_edge(array: MicrolensArray, angles: Float[Array, " angle"]) -> Float[Array, "lens angle"]:
-    """Distance from each lens's vertex to the edge of its clear aperture.
-
-    In the direction `e` it is the smallest of `D/2`, of `|d|^2 / (2 d.e)` for each neighbour at `d` with `d.e > 0`
-    (the bisector), and of the distance to the plate's edge. Lenses at one place do not bound each other.
-
-    Parameters
-    ----------
-    array
-        Lenses on a plate, which may be infinite.
-    angles
-        Directions, radians from +x toward +y.
-
-    Returns
-    -------
-    Array
-        Distances, mm. Zero in the directions that leave the plate at once.
-    """
-    direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)])
-
-    def edge(lens):
-        normal, height = _bisectors(array.centers - array.centers[lens][None], array.aperture_diameter)
-        # Reciprocal distances: a bisector that is parallel to the direction, or behind, needs no exception.
-        nearest = 1 / jnp.maximum(jnp.max((normal / height[:, None]) @ direction, axis=0), 2 / array.aperture_diameter)
-        for side, center, along in zip(array.size, array.centers[lens], direction, strict=True):
-            if math.isfinite(side):
-                leaving = jnp.abs(along) > 0
-                room = (side / 2 - jnp.sign(along) * center) / jnp.where(leaving, jnp.abs(along), 1)
-                nearest = jnp.where(leaving, jnp.minimum(nearest, room), nearest)
-        return jnp.maximum(nearest, 0)
-
-    return _for_each_lens(edge, array.centers)
-
-
-@jax.jit
 def aperture_area(array: MicrolensArray) -> Float[Array, " lens"]:
     """Area of each lens's clear aperture, `1/2 int r^2 dphi` over its edge `r(phi)`, mm^2.
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import Imager, chief_ray
 from .exit_pupil import ExitPupil, inside, phasor, trace_exit_pupil
+from .theory import airy_deviation
 from .unit import Point, pupil_disc, pupil_radius, unit_rays
 
 _RAYS = 2**15
@@ -149,7 +150,7 @@ def gaussian_psf(
 
     Parameters are `diffraction_psf`'s; the aperture is round: it has no `edges`. The variance along an axis is the
     rays' (half the mean squared distance from their centroid) plus that of the Gaussian as wide at half its height as
-    the Airy disc of the pupil: full width `0.5145 wavelength v / radius`.
+    the Airy disc of the pupil: full width `1.029 wavelength v / diameter`.
 
     Raises
     ------
@@ -164,7 +165,7 @@ def gaussian_psf(
     weights = (weights / jnp.sum(weights))[:, None]
     centroid = jnp.sum(weights * rays.landing, 0)
     spread = jnp.sum(weights * (rays.landing - centroid[None]) ** 2) / 2
-    airy = 0.5145 * imager.wavelength * imager.sensor_distance / radius / np.sqrt(8 * np.log(2))
+    airy = airy_deviation(imager.wavelength, imager.sensor_distance, 2 * radius)
     sigma = jnp.sqrt(spread + airy**2)
     pitch = imager.sensor.pixel_pitch
     shift = centroid - _map(imager, depth, field, radius.dtype) + pitch * jnp.asarray(offset, radius.dtype)[::-1]

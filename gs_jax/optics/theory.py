@@ -16,6 +16,9 @@ from ..base.safe import Real, safe_quotient
 
 Result = Float[Array, "..."]
 
+# Full width at half maximum of a Gaussian, in standard deviations.
+FWHM = math.sqrt(8 * math.log(2))
+
 
 def f_number(focal_length: Real, diameter: Real) -> Result:
     """F-number `F = f/D` (below Eq. 8)."""
@@ -38,22 +41,14 @@ def diffraction_limit(wavelength: Real, numerical_aperture: Real, magnification:
 def lateral_resolution(wavelength: Real, numerical_aperture: Real, pixel: Real, magnification: Real) -> Result:
     """Lateral resolution, in the object: `max(lambda / (2 NA), d_p) / M` (Eq. 5), mm.
 
-    In focus and without aberrations. Its derivative jumps where the spot is as large as the pixel;
-    `smooth_lateral_resolution` has none of that.
+    In focus and without aberrations. Its derivative jumps where the spot is as large as the pixel.
     """
-    return jnp.maximum(jnp.asarray(wavelength) / (2 * numerical_aperture), pixel) / magnification
+    return jnp.maximum(diffraction_limit(wavelength, numerical_aperture, 1), pixel) / magnification
 
 
-def smooth_lateral_resolution(
-    wavelength: Real, numerical_aperture: Real, pixel: Real, magnification: Real, *, power: float = 8.0
-) -> Result:
-    """Eq. 5 with the `p`-norm of spot and pixel for their maximum, mm; for optimisation.
-
-    It is too large by the factor `(1 + r^p)^(1/p)`, `r` the ratio of the smaller to the larger: for `p = 8` by 9.1 %
-    where the two are equal, by less than 0.1 % where one is twice the other.
-    """
-    spot = jnp.asarray(wavelength) / (2 * numerical_aperture)
-    return jnp.exp(jnp.logaddexp(power * jnp.log(spot), power * jnp.log(pixel)) / power) / magnification
+def airy_deviation(wavelength: Real, distance: Real, diameter: Real) -> Result:
+    """Standard deviation of the Gaussian as wide at half its height as the Airy disc, `1.029 lambda v / D`, mm."""
+    return 1.029 * jnp.asarray(wavelength) * distance / diameter / FWHM
 
 
 def axial_resolution(lateral: Real, reduced_depth: Real, field_radius: Real) -> Result:
@@ -69,11 +64,6 @@ def focus_distance(focal_length: Real, reduced_depth: Real) -> Result:
 def depth_in_focus(focal_length: Real, sensor_distance: Real) -> Result:
     """Reduced depth whose thin-lens image is on the sensor, `1/z' = 1/f - 1/v`, mm; infinite for `v <= f`."""
     return focus_distance(focal_length, sensor_distance)
-
-
-def focus_error(focal_length: Real, reduced_depth: Real, sensor_distance: Real) -> Result:
-    """How far behind the sensor the image forms, `v_f - v`, mm; negative if before it."""
-    return focus_distance(focal_length, reduced_depth) - sensor_distance
 
 
 def blur(focal_length: Real, diameter: Real, reduced_depth: Real, sensor_distance: Real) -> Result:
