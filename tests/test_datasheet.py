@@ -12,9 +12,11 @@ from rich.console import Console
 from gs_jax import Imager, MicrolensArray
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import read_design
+from gs_jax.designs.microscope import Microscope
 from gs_jax.designs.problems import findings
-from gs_jax.designs.sheet import datasheet, performance, summary, tables
+from gs_jax.designs.sheet import datasheet, summary, tables
 from gs_jax.optics import theory
+from gs_jax.optics.aberrations import linear_rms
 from gs_jax.optics.aperture import clear_diameter, pitch
 
 from .helpers import scene
@@ -152,7 +154,8 @@ def test_wrong_arguments_are_named(table1, arguments, words):
 def test_an_infinite_plate_has_no_density():
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
-        performance(imager, grid.depths, diameter=1.0, field_radius=1.0, confusion=0.009)
+        one = jnp.array(1.0)
+        Microscope(imager, grid.depths, one, one, confusion=one, plate_scale=one)
 
 
 def test_gradients_by_everything_that_is_continuous():
@@ -169,14 +172,28 @@ def test_gradients_by_everything_that_is_continuous():
             substrate_thickness=thickness,
             size=(2.0, 2.0),
         )
-        result = performance(
+        m = Microscope(
             Imager(moved, imager.sensor, v, 1.0, um * 1e-3),
             depths,
-            diameter=clear_diameter(moved),
+            clear_diameter=clear_diameter(moved),
             field_radius=field_radius,
             confusion=um * 1e-2,
+            plate_scale=um,
         )
-        return result.scale, *jax.tree.leaves(result), jnp.log(result.lateral_resolution), pitch(centers)
+        sharp = m.depth_of_field, m.approximate_depth_of_field, m.near_limit, m.far_limit, m.middle.depth_of_field
+        focus = m.focus_distance, m.blur, m.object_blur, linear_rms(m.wavefront(jnp.array([0.0, 0.1])))
+        resolution = m.lateral_resolution, m.axial_resolution, jnp.log(m.lateral_resolution)
+        return (
+            m.magnification,
+            m.scale,
+            m.lenses_per_point,
+            m.occupancy,
+            m.coverage,
+            sharp,
+            focus,
+            resolution,
+            pitch(centers),
+        )
 
     one = jnp.array
     arguments = (array.centers, one(2.0), one(1.43), one(0.5), one(1.0), one(5.8), grid.depths, one(0.4), one(0.52))

@@ -3,9 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gs_jax.codesign import layout_terms
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.designs.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable
+from gs_jax.geometry import field_limit
 from gs_jax.layouts.patterns import hexagonal_layout
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
@@ -13,10 +15,10 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um
 NAMES = ["ghosts", "lens_shortage", "spectral_flatness", "condition_number", *SLOW]
 
 
-def small_design(centers, side, field_radius, pixel):
+def small_design(centers, side, field_radius, pixel, shape=(96, 80)):
     return Design(
         name="small",
-        sensor=SensorTable(pixel_pitch_um=pixel, shape=(96, 80)),
+        sensor=SensorTable(pixel_pitch_um=pixel, shape=shape),
         lens=LensTable(radius_of_curvature_mm=2.0, refractive_index=1.43, aperture_diameter_mm=0.4),
         array=ArrayTable(size_mm=(side, side), substrate_thickness_mm=1.0, centers_mm=tuple(map(tuple, centers))),
         imaging=ImagingTable(
@@ -28,7 +30,7 @@ def small_design(centers, side, field_radius, pixel):
 @pytest.fixture(scope="module")
 def parent():
     """Five lenses on a plate of 1.2 mm, a sensor of 96 x 80 pixels."""
-    return parent_of(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, lenses_move=True)
+    return parent_of(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, free={"centers_mm": (-10.0, 10.0)})
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -45,6 +47,25 @@ def test_values_and_gradients_are_finite(parent, name):
     value, slopes = jax.jit(jax.value_and_grad(total))(values)
     assert np.isfinite(value) and all(np.isfinite(slope).all() for slope in slopes.values())
     assert np.abs(slopes["centers_mm"]).max() > 0
+
+
+@pytest.mark.parametrize("distance", [5.8, 14.0])
+def test_scenes_are_imaged_whole(monkeypatch, distance):
+    """However far the sensor may move: all images of a scene's corners by the lenses that see them."""
+    design, found = small_design(CENTERS, 1.2, 0.05, 2.0, (800, 600)), {}
+    monkeypatch.setattr(
+        layout_terms, "reconstruction_loss", lambda *_, **options: found.update(options) or jnp.ones(())
+    )
+    free = {"sensor_distance_mm": (2.0, distance)}
+    far = candidate(parent_of(design, free=free), {"sensor_distance_mm": jnp.array(distance)})
+    TERMS["reconstruction_error"].function(far, jax.random.key(0))
+    (rows, columns), grid = found["window"], found["grid"]
+    reach, corner = field_limit(0.05), np.array([grid.x[-1], grid.y[-1]])
+    # The lens that is farthest from the corner, away from the scene's middle.
+    image = corner + reach + float(far.magnification.max()) * reach
+    assert (image <= np.array([columns, rows]) * 0.002 / 2 + 1e-9).all()
+    # And no more: a window costs time.
+    assert (image >= np.array([columns, rows]) * 0.002 / 2 * 0.97).all()
 
 
 @pytest.mark.slow

@@ -125,7 +125,9 @@ def test_manufacture(design, focused, terms):
 
 
 def small_parent(depth_count):
-    return parent_of(small_design(), depths_mm=(18.0, 23.0), depth_count=depth_count, lenses_move=True)
+    return parent_of(
+        small_design(), depths_mm=(18.0, 23.0), depth_count=depth_count, free={"centers_mm": (-10.0, 10.0)}
+    )
 
 
 @pytest.mark.slow

@@ -1,3 +1,5 @@
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,8 @@ from gs_jax.codesign.parameters import NAMES, Bounds, candidate, new_design, par
 from gs_jax.designs.builtin import geomscope
 from gs_jax.layouts.cells import coverage
 from gs_jax.optics.aperture import clear_diameter, pitch
+
+MOVING = {"centers_mm": (-10.0, 10.0)}
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +59,12 @@ def test_without_values_it_is_the_parent(design, parent):
     # Two exact computations of the same areas: from the Voronoi cells' edges, and lens by lens.
     np.testing.assert_allclose(found.clear_diameter, clear_diameter(imager.array), rtol=1e-9)
     np.testing.assert_allclose(found.depths, [18, 19, 20, 21, 22, 23], rtol=1e-12)
-    np.testing.assert_allclose(found.covered, coverage(np.array(design.array.centers_mm), (20.0, 20.0), diameter=2.0))
+    np.testing.assert_allclose(found.coverage, coverage(np.array(design.array.centers_mm), (20.0, 20.0), diameter=2.0))
 
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
-    parent = parent_of(design, lenses_move=moving)
+    parent = parent_of(design, free=MOVING if moving else {})
     values = {"pitch_mm": 1.1 * parent.pitch, "aperture_diameter_mm": jnp.array(1.3)}
     found = candidate(parent, values)
     scaled = new_design(design, parent, values)
@@ -76,14 +80,25 @@ def test_everything_has_gradients(moving):
     small = geomscope().model_copy(
         update={"array": geomscope().array.model_copy(update={"centers_mm": ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))})}
     )
-    parent = parent_of(small, lenses_move=moving)
+    parent = parent_of(small, free=MOVING if moving else {})
     values = {name: x for name, x in start_values(parent).items() if moving or name != "centers_mm"}
 
     def what(values):
         found = candidate(parent, values)
-        return found.clear_diameter, found.covered, found.plate, found.magnification, found.lenses_per_point
+        return found.clear_diameter, found.coverage, found.plate, found.magnification, found.lenses_per_point
 
     check_grads(jax.jit(what), (values,), order=1, eps=1e-5)
+
+
+def test_no_candidate_magnifies_more(design):
+    """Whatever is free within its bounds: over their corners, and the design itself."""
+    free = {"sensor_distance_mm": (2.0, 5.0), "refractive_index": (1.3, 1.8), "depth_span_mm": (1.0, 20.0)}
+    parent = parent_of(design, depths_mm=(18.0, 23.0), free=free)
+    corners = [dict(zip(free, map(jnp.array, corner), strict=True)) for corner in itertools.product(*free.values())]
+    # A sensor at 5.8 mm in the design, beyond the bound: it is judged too.
+    found = max(float(candidate(parent, corner).magnification.max()) for corner in ({}, *corners))
+    assert found <= parent.largest_magnification
+    np.testing.assert_allclose(parent.largest_magnification, 5.8 / (10.5 + 1 / 1.8), rtol=1e-12)
 
 
 def test_a_new_design_holds_the_values(design, parent):

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..geometry import Grid
+from ..designs.microscope import Microscope
+from ..geometry import Grid, field_limit
 from .comb import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import localization_bound
-from .parameters import Candidate
 
 # Points whose ghosts are looked for, and places where; points that are located or whose combs are looked at; light of
 # one, electrons a lens.
@@ -28,7 +28,7 @@ _RASTER = 15
 _VOXELS, _DENSITY, _SCENES = 99, 0.008, 2
 
 
-def ghosts(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+def ghosts(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
     """RMS ghost of a point at random other places, over its own image; a pixel is the width of a tooth."""
     near, far = jax.random.split(key)
     sources, targets = _points(c, near, _SOURCES), _points(c, far, _TARGETS)
@@ -38,7 +38,7 @@ def ghosts(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
     return sidelobes(c.imager, sources, targets, width=pixel, lateral=size, axial=axial).rms
 
 
-def shortage(c: Candidate) -> Float[Array, ""]:
+def shortage(c: Microscope) -> Float[Array, ""]:
     """`comb.lens_shortage` over the whole plate, at the middle depth."""
     side = jnp.linspace(-0.5, 0.5, _RASTER, dtype=c.plate.dtype)
     places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * c.plate[None]
@@ -46,17 +46,17 @@ def shortage(c: Candidate) -> Float[Array, ""]:
     return lens_shortage(c.imager, jnp.concatenate([places, depth], 1))
 
 
-def flatness(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+def flatness(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
     """`comb.spectral_flatness` of random points' combs, at random frequencies of `_spectrum`."""
     return spectral_flatness(_spectrum(c, key))
 
 
-def conditioning(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+def conditioning(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
     """`comb.condition_number` of the same."""
     return condition_number(_spectrum(c, key))
 
 
-def _spectrum(c: Candidate, key: PRNGKeyArray) -> Float[Array, "point frequency"]:
+def _spectrum(c: Microscope, key: PRNGKeyArray) -> Float[Array, "point frequency"]:
     """Power from one over the field radius to the Nyquist frequency, evenly over its logarithm and all directions."""
     place, size, angle = jax.random.split(key, 3)
     low, high = 1 / c.imager.field_radius, 0.5 / c.imager.sensor.pixel_pitch
@@ -66,13 +66,13 @@ def _spectrum(c: Candidate, key: PRNGKeyArray) -> Float[Array, "point frequency"
     return comb_spectrum(c.imager, _points(c, place, _POINTS), frequencies)
 
 
-def localization(c: Candidate, key: PRNGKeyArray) -> Float[Array, "3"]:
+def localization(c: Microscope, key: PRNGKeyArray) -> Float[Array, "3"]:
     """Cramer-Rao bound of x, y, z at random points, um; a spot of one pixel's standard deviation."""
     points, spot = _points(c, key, _POINTS), c.imager.sensor.pixel_pitch
     return 1000 * localization_bound(c.imager, points, photons=_PHOTONS, spot=spot)
 
 
-def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
+def log_error(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
     """Logarithm of the relative error, `sqrt(1 - <a,b>^2 / (<a,a> <b,b>))`, of reconstructed random scenes.
 
     Three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate: sub-images overlap
@@ -81,9 +81,9 @@ def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
     sensor, reach = c.imager.sensor, c.imager.field_radius
     depths = jnp.stack([c.depths[0], (c.depths[0] + c.depths[-1]) / 2, c.depths[-1]])
     pitch = 2 * reach / _VOXELS
-    # The lenses that see the scene, and their images of it, magnified by up to 0.4.
-    side = math.ceil(2 * 2.4 * reach / sensor.pixel_pitch)
-    window = min(side, sensor.shape[0]), min(side, sensor.shape[1])
+    # A voxel is imaged up to this far beside it, by the lens that is as far away as one can be that sees it.
+    beside = (1 + c.largest_magnification) * field_limit(reach)
+    rows, columns = (math.ceil(min(n, 2 * (reach + beside) / sensor.pixel_pitch)) for n in sensor.shape)
     height, width = (max(0.0, n * sensor.pixel_pitch - 4 * reach) for n in sensor.shape)
     found = reconstruction_loss(
         c.imager,
@@ -93,13 +93,13 @@ def log_error(c: Candidate, key: PRNGKeyArray) -> Float[Array, ""]:
         density=_DENSITY,
         width=pitch,
         background_width=4 * pitch,
-        window=window,
+        window=(rows, columns),
         field=(width, height),
     )
     return found * jnp.log(jnp.asarray(10.0, found.dtype)) / 20
 
 
-def _points(c: Candidate, key: PRNGKeyArray, count: int) -> Float[Array, "point 3"]:
+def _points(c: Microscope, key: PRNGKeyArray, count: int) -> Float[Array, "point 3"]:
     """Points evenly over the depths and the field, a field radius from the plate's edge where it is that large."""
     inner = jnp.maximum(c.plate - 2 * c.imager.field_radius, c.plate / 4)
     middle = jnp.stack([0 * inner[0], 0 * inner[0], (c.depths[0] + c.depths[-1]) / 2])

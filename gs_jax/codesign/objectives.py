@@ -1,4 +1,4 @@
-"""What a design is wanted to do: named terms, each a pure function of a `Candidate`.
+"""What a design is wanted to do: named terms, each a pure function of a `Microscope`.
 
 A term has a name with its unit, and gives a number or an array of them (over depths, lenses, places) in that unit.
 Lengths are mm everywhere else in the package; here they are what a study file says. All are differentiable in
@@ -6,7 +6,6 @@ everything that may be free, and finite where lenses coincide or rays do not get
 Bare equation numbers mean the GEOMScope paper.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,18 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_sqrt
+from ..designs.microscope import Microscope
 from ..geometry import envelope
 from ..optics import aberrations, theory
 from ..optics.unit import pupil_disc, unit_rays
 from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
-from .parameters import Candidate
 
 Result = Float[Array, "..."]
 
 UM = 1000.0
-# Full width at half height of a Gaussian over its standard deviation; and of the Airy disc over wavelength v / radius.
-_FWHM = math.sqrt(8 * math.log(2))
-_AIRY = 0.5145
 # Heights at which a lens is judged over its field, at the middles of rings of equal area.
 _FIELDS = 4
 _ENCIRCLED = 0.8
@@ -47,34 +43,7 @@ class Term(NamedTuple):
     random: bool = False
 
 
-def lateral_resolution(c: Candidate) -> Float[Array, " depth"]:
-    """In focus, without aberrations (Eq. 5)."""
-    aperture = theory.numerical_aperture(c.imager.array.focal_length, c.clear_diameter)
-    return UM * theory.lateral_resolution(c.imager.wavelength, aperture, c.imager.sensor.pixel_pitch, c.magnification)
-
-
-def axial_resolution(c: Candidate) -> Float[Array, " depth"]:
-    """In focus, without aberrations (Eq. 6)."""
-    return theory.axial_resolution(lateral_resolution(c), c.reduced, c.imager.field_radius)
-
-
-def depth_of_field(c: Candidate) -> Float[Array, ""]:
-    """Of a sensor focused on the middle of the depths (Eq. 8); infinite from the hyperfocal distance on."""
-    return theory.depth_of_field(*_focused(c))
-
-
-def approximate_depth_of_field(c: Candidate) -> Float[Array, ""]:
-    """The same by Eq. 7."""
-    return theory.approximate_depth_of_field(*_focused(c))
-
-
-def _focused(c: Candidate):
-    f = c.imager.array.focal_length
-    middle = c.imager.reduced_depth((c.depths[0] + c.depths[-1]) / 2)
-    return f, theory.f_number(f, c.clear_diameter), middle, c.confusion
-
-
-def focus_offset(c: Candidate) -> Float[Array, ""]:
+def focus_offset(c: Microscope) -> Float[Array, ""]:
     """How far the depth in focus (thin lens) is from the middle of the depths: 1 at the nearest and the farthest.
 
     In vergence, where focus at infinity and beyond is nothing special.
@@ -84,49 +53,34 @@ def focus_offset(c: Candidate) -> Float[Array, ""]:
     return jnp.abs(2 * in_focus - 1 / near - 1 / far) / (1 / near - 1 / far)
 
 
-def blur(c: Candidate) -> Float[Array, " depth"]:
-    """Diameter of the thin lens's patch, seen in the object."""
-    return UM * theory.object_blur(c.imager.array.focal_length, c.clear_diameter, c.reduced, c.imager.sensor_distance)
-
-
-def log_strehl(c: Candidate) -> Float[Array, "depth field"]:
+def log_strehl(c: Microscope) -> Float[Array, "depth field"]:
     """Logarithm of Eq. 9 with Eq. 10, sensor where it is, at four heights of the field."""
-    return aberrations.log_strehl(aberrations.linear_rms(_seidel(c)), c.imager.wavelength)
+    return aberrations.log_strehl(aberrations.linear_rms(c.wavefront(_heights(c))), c.imager.wavelength)
 
 
-def wavefront(c: Candidate) -> Float[Array, "depth field"]:
+def wavefront(c: Microscope) -> Float[Array, "depth field"]:
     """RMS of the third-order wavefront with astigmatism and field curvature, in waves, at four heights."""
-    return aberrations.independent_rms(_seidel(c)) / c.imager.wavelength
+    return aberrations.independent_rms(c.wavefront(_heights(c))) / c.imager.wavelength
 
 
-def _seidel(c: Candidate):
-    place = c.reduced[:, None], _heights(c)[None]
-    return aberrations.of_array(c.imager.array, c.clear_diameter / 2, *place, c.imager.sensor_distance)
-
-
-def occupancy(c: Candidate) -> Float[Array, " depth"]:
-    """`V = N_e M^2` (Eq. 11)."""
-    return theory.occupancy(c.lenses_per_point, c.magnification)
-
-
-def light(c: Candidate) -> Float[Array, " depth"]:
+def light(c: Microscope) -> Float[Array, " depth"]:
     """Share of a point's light that its `N_e` lenses take, `N_e pi a^2 / (4 pi z'^2)` for a clear radius `a`."""
     return 100 * c.lenses_per_point * (c.clear_diameter / 4 / c.reduced) ** 2
 
 
-def field_of_view(c: Candidate) -> Float[Array, "depth axis"]:
+def field_of_view(c: Microscope) -> Float[Array, "depth axis"]:
     """Width of the object that is seen at all, along x and y."""
     sensor = c.imager.sensor
     widths = jnp.array(sensor.shape[::-1], c.plate.dtype) * sensor.pixel_pitch
     return theory.field_of_view(c.plate[None], widths[None], c.magnification[:, None], c.imager.field_radius)
 
 
-def thickness(c: Candidate) -> Float[Array, ""]:
+def thickness(c: Microscope) -> Float[Array, ""]:
     """From the plate's front to the sensor, `t + v`."""
     return c.imager.sensor_distance + c.imager.array.substrate_thickness
 
 
-def psf_width(c: Candidate) -> Float[Array, " depth"]:
+def psf_width(c: Microscope) -> Float[Array, " depth"]:
     """Width of the spot on the sensor, seen in the object: that of a Gaussian of the same variance, at half height.
 
     Exact rays through the clear aperture, with all that defocus and aberrations do, averaged over the lens's field
@@ -136,12 +90,12 @@ def psf_width(c: Candidate) -> Float[Array, " depth"]:
     landing, weight, lit = _spots(c)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
-    airy = _AIRY * c.imager.wavelength * c.imager.sensor_distance / (c.clear_diameter / 2) / _FWHM
+    airy = theory.airy_deviation(c.imager.wavelength, c.imager.sensor_distance, c.clear_diameter)
     total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
-    return UM * _FWHM * jnp.sqrt(total) / c.magnification
+    return UM * theory.FWHM * jnp.sqrt(total) / c.magnification
 
 
-def encircled_radius(c: Candidate) -> Float[Array, " depth"]:
+def encircled_radius(c: Microscope) -> Float[Array, " depth"]:
     """Radius about the rays' centroid that holds 80 % of them, seen in the object; rays as for `psf_width`.
 
     A ray counts as within by a logistic curve half a pixel wide: without it the radius would have a kink wherever
@@ -175,7 +129,7 @@ def _quantile(x: Float[Array, " entry"], share: Float[Array, " entry"], width: f
     return at - jnp.where(lit, below(at) / jnp.where(lit, slope, 1), 0)
 
 
-def _spots(c: Candidate):
+def _spots(c: Microscope):
     """Where rays land, `(depth, field, ray, 2)`; the share of each height, and of each ray of it."""
     points, weights = pupil_disc(c.clear_diameter / 2)
     heights = _heights(c)
@@ -191,12 +145,12 @@ def _centroid(landing, lit):
     return jnp.sum(lit[..., None] * landing, -2, keepdims=True)
 
 
-def _heights(c: Candidate) -> Float[Array, " field"]:
+def _heights(c: Microscope) -> Float[Array, " field"]:
     rings = (np.arange(_FIELDS) + 0.5) / _FIELDS
     return c.imager.field_radius * jnp.sqrt(jnp.asarray(rings, c.depths.dtype))
 
 
-def spacing(c: Candidate) -> Float[Array, " lens"]:
+def spacing(c: Microscope) -> Float[Array, " lens"]:
     """Distance of each lens from its nearest neighbour; infinite for a single lens."""
     centers = c.imager.array.centers
     squared = jnp.sum((centers[:, None] - centers[None]) ** 2, -1)
@@ -204,7 +158,7 @@ def spacing(c: Candidate) -> Float[Array, " lens"]:
     return safe_sqrt(nearest)
 
 
-def web(c: Candidate) -> Float[Array, " lens"]:
+def web(c: Microscope) -> Float[Array, " lens"]:
     """What is left between apertures that do not touch, `nearest neighbour - D`; negative where they overlap.
 
     The least feature of a mask that stops the light between the lenses.
@@ -212,7 +166,7 @@ def web(c: Candidate) -> Float[Array, " lens"]:
     return spacing(c) - c.imager.array.aperture_diameter
 
 
-def hole(c: Candidate) -> Float[Array, " place"]:
+def hole(c: Microscope) -> Float[Array, " place"]:
     """Distance of places of the plate, 41 x 41 from edge to edge, from the nearest lens."""
     side = jnp.linspace(-0.5, 0.5, _PLACES, dtype=c.plate.dtype)
     places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * c.plate[None]
@@ -220,29 +174,29 @@ def hole(c: Candidate) -> Float[Array, " place"]:
     return safe_sqrt(jnp.min(squared, 1))
 
 
-def sag(c: Candidate) -> Float[Array, ""]:
+def sag(c: Microscope) -> Float[Array, ""]:
     """Height of a whole lens, `R - sqrt(R^2 - D^2/4)`: the deepest that the mold can be."""
     radius, half = c.imager.array.radius_of_curvature, c.imager.array.aperture_diameter / 2
     return half**2 / (radius + safe_sqrt(radius**2 - half**2))
 
 
-def edge_slope(c: Candidate) -> Float[Array, ""]:
+def edge_slope(c: Microscope) -> Float[Array, ""]:
     """Slope of the surface at the rim of the clear disc, `asin(a / R)`, degrees; at most 90."""
     sine = jnp.minimum(c.clear_diameter / 2 / c.imager.array.radius_of_curvature, 1 - 1e-6)
     return jnp.rad2deg(jnp.arcsin(sine))
 
 
 TERMS: dict[str, Term] = {
-    "lateral_resolution_um": Term("lateral resolution in focus (Eq. 5)", lateral_resolution),
-    "axial_resolution_um": Term("axial resolution in focus (Eq. 6)", axial_resolution),
-    "depth_of_field_mm": Term("depth of field (Eq. 8)", depth_of_field),
-    "depth_of_field_eq7_mm": Term("depth of field (Eq. 7)", approximate_depth_of_field),
+    "lateral_resolution_um": Term("lateral resolution in focus (Eq. 5)", lambda c: UM * c.lateral_resolution),
+    "axial_resolution_um": Term("axial resolution in focus (Eq. 6)", lambda c: UM * c.axial_resolution),
+    "depth_of_field_mm": Term("depth of field (Eq. 8)", lambda c: c.middle.depth_of_field[0]),
+    "depth_of_field_eq7_mm": Term("depth of field (Eq. 7)", lambda c: c.middle.approximate_depth_of_field[0]),
     "focus_offset": Term("focus from the middle of the depths, 1 at their ends", focus_offset),
-    "blur_um": Term("diameter of the thin lens's blur, in the object", blur),
+    "blur_um": Term("diameter of the thin lens's blur, in the object", lambda c: UM * c.object_blur),
     "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", log_strehl, log=True),
     "wavefront_waves": Term("RMS wavefront error over the field", wavefront),
     "lenses_per_point": Term("lenses that see a point, N_e", lambda c: c.lenses_per_point),
-    "occupancy": Term("occupancy V (Eq. 11)", occupancy),
+    "occupancy": Term("occupancy V (Eq. 11)", lambda c: c.occupancy),
     "light_percent": Term("share of a point's light that is used", light),
     "field_of_view_mm": Term("width of the field of view", field_of_view),
     "thickness_mm": Term("thickness, plate and sensor distance", thickness),
@@ -252,7 +206,7 @@ TERMS: dict[str, Term] = {
     "spacing_mm": Term("distance of nearest lenses", spacing),
     "web_mm": Term("mask left between neighbouring apertures", web),
     "hole_mm": Term("distance of a place on the plate from a lens", hole),
-    "coverage": Term("share of the plate that is clear aperture", lambda c: c.covered),
+    "coverage": Term("share of the plate that is clear aperture", lambda c: c.coverage),
     "sag_mm": Term("height of a whole lens", sag),
     "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True),
     "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage),

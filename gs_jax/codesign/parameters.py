@@ -8,6 +8,8 @@ solver that keeps bounds by itself, to its share of the way between them.
 """
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +19,7 @@ from pydantic import ValidationError
 
 from ..base.errors import InputError
 from ..designs.design import Design
+from ..designs.microscope import Microscope
 from ..geometry import Imager, MicrolensArray, as_float
 from ..io.tables import one_line
 from ..layouts.cells import cell_edges
@@ -102,38 +105,7 @@ class Parent(eqx.Module):
     span: Float[Array, ""] = eqx.field(converter=as_float)
     confusion: Float[Array, ""] = eqx.field(converter=as_float)
     depth_count: int = eqx.field(static=True)
-
-
-class Candidate(eqx.Module):
-    """A microscope to be judged.
-
-    `imager`: its own plate size is the parent's and means nothing here. `plate`: `(x, y)` of the scaled plate, mm.
-    `clear_diameter`: of the disc whose area is the mean clear aperture, mm. `covered`: the share of the plate that is
-    clear aperture. `depths`: where it is judged, from the plate, mm. `confusion`: mm.
-    """
-
-    imager: Imager
-    plate: Float[Array, "2"]
-    clear_diameter: Float[Array, ""]
-    covered: Float[Array, ""]
-    depths: Float[Array, " depth"]
-    confusion: Float[Array, ""]
-
-    @property
-    def reduced(self) -> Float[Array, " depth"]:
-        """`z'` of the depths."""
-        return self.imager.reduced_depth(self.depths)
-
-    @property
-    def magnification(self) -> Float[Array, " depth"]:
-        """Of the depths (Eq. 3)."""
-        return self.imager.magnification(self.depths)
-
-    @property
-    def lenses_per_point(self) -> Float[Array, ""]:
-        """`N_e`: lenses on the plate over its area, times `A_e`."""
-        area = math.pi * self.imager.field_radius**2
-        return self.imager.array.centers.shape[0] * area / jnp.prod(self.plate)
+    largest_magnification: float = eqx.field(static=True)
 
 
 def parent_of(
@@ -142,7 +114,7 @@ def parent_of(
     depths_mm: tuple[float, float] | None = None,
     confusion: float | None = None,
     depth_count: int = 6,
-    lenses_move: bool = False,
+    free: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Parent:
     """A design as an optimisation sees it.
 
@@ -154,20 +126,30 @@ def parent_of(
         Diameter of the circle of confusion, mm; by default two pixels.
     depth_count
         Depths between them, both included.
-    lenses_move
-        Whether lens centres will be replaced. It takes longer.
+    free
+        Between which bounds parameters will be replaced. Lens centres that may move take longer.
     """
     near, far = depths_mm or design.imaging.working_distance_mm
     imager = design.imager()
     return Parent(
         imager,
-        None if lenses_move else _cells(design),
+        None if "centers_mm" in free else _cells(design),
         pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
         2 * imager.sensor.pixel_pitch if confusion is None else confusion,
         depth_count,
+        _largest_magnification(design, near, far, free),
     )
+
+
+def _largest_magnification(design: Design, near: float, far: float, free: Mapping[str, tuple[float, float]]) -> float:
+    """`v / z'` (Eq. 3) with the farthest sensor, nearest depth and highest index, of the design and of the bounds."""
+    most = lambda name, own: max(own, free.get(name, (own, own))[1])
+    index = most("refractive_index", design.lens.refractive_index)
+    nearest = (near + far - most("depth_span_mm", far - near)) / 2
+    distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
+    return distance / (nearest + design.array.substrate_thickness_mm / index)
 
 
 def _cells(design: Design) -> Cells:
@@ -197,7 +179,7 @@ def start_values(parent: Parent) -> Values:
     }
 
 
-def candidate(parent: Parent, values: Values) -> Candidate:
+def candidate(parent: Parent, values: Values) -> Microscope:
     """The parent with some of its parameters replaced; differentiable in all of them.
 
     Parameters
@@ -215,21 +197,21 @@ def candidate(parent: Parent, values: Values) -> Candidate:
         i.array.refractive_index,
         i.sensor_distance,
     )
-    # Areas before scaling: a plate of a size that is traced has no place in `MicrolensArray`.
+    # Areas before scaling, on the plate as it is: its size cannot be traced.
     names = "radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "sensor_distance_mm"
     radius, diameter, index, distance = (values[name] for name in names)
     unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, index, distance))
     area, count = _clear_area(parent.cells, unscaled.array), parent.imager.array.centers.shape[0]
     imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, index, distance))
-    plate = scale * jnp.array(parent.imager.array.size, scale.dtype)
     offsets = jnp.linspace(-0.5, 0.5, parent.depth_count, dtype=scale.dtype)
-    return Candidate(
+    return Microscope(
         imager,
-        plate,
-        scale * jnp.sqrt(4 / math.pi / count * area),
-        area / math.prod(parent.imager.array.size),
         parent.middle + values["depth_span_mm"] * offsets,
-        parent.confusion,
+        clear_diameter=scale * jnp.sqrt(4 / math.pi / count * area),
+        field_radius=jnp.array(imager.field_radius, scale.dtype),
+        confusion=parent.confusion,
+        plate_scale=scale,
+        largest_magnification=parent.largest_magnification,
     )
 
 

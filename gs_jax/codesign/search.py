@@ -85,7 +85,7 @@ def problem_of(design: Design, study: Study) -> Problem:
         depths_mm=study.depths_mm,
         confusion=confusion,
         depth_count=study.depth_count,
-        lenses_move="centers_mm" in study.free,
+        free=study.free,
     )
     return Problem(parent, study)
 

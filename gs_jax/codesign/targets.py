@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from ..designs.microscope import Microscope
 from .objectives import TERMS
-from .parameters import Candidate
 from .study import TermTable
 
 # The worst of a term's entries, smoothly: their mean's power.
@@ -29,14 +29,14 @@ class Row(NamedTuple):
     met: bool | None
 
 
-def evaluate(name: str, candidate: Candidate, key: Key[Array, ""]) -> Float[Array, " entry"]:
+def evaluate(name: str, candidate: Microscope, key: Key[Array, ""]) -> Float[Array, " entry"]:
     """The entries of a term in its own unit."""
     entries = _entries(name, candidate, key)
     return jnp.exp(entries) if TERMS[name].log else entries
 
 
 def residual(
-    table: TermTable, target: Float[Array, ""], candidate: Candidate, key: Key[Array, ""], *, margin: float
+    table: TermTable, target: Float[Array, ""], candidate: Microscope, key: Key[Array, ""], *, margin: float
 ) -> Float[Array, " entry"]:
     """What a term lacks, relative to its target: zero where a limit holds, so that its square is smooth.
 

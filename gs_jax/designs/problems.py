@@ -1,12 +1,15 @@
 """What is wrong with a design, in words: its datasheet against what its formulas assume."""
 
+import dataclasses
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..optics import aberrations, theory
 from .design import Design
-from .sheet import confusion_of
+from .microscope import Microscope
+from .sheet import confusion_of, microscope_of
 
 # Eq. 9 holds below this RMS wavefront error, in waves.
 _STREHL_DOMAIN = 0.1
@@ -28,12 +31,13 @@ def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None =
         As `datasheet`.
     """
     confusion = confusion_of(design, confusion)
-    checks = (_focus(design, sheet, confusion), _strehl(design, sheet), _pixels(design, sheet), _pitch(sheet))
+    m = microscope_of(design, sheet["depth_mm"], confusion=confusion, coverage=sheet["coverage"])
+    checks = (_focus(design, sheet, m), _strehl(design, sheet, m), _pixels(design, sheet), _pitch(sheet))
     return [sentence for check in (*checks, _occupancy(sheet)) for sentence in check]
 
 
-def _focus(design: Design, sheet: dict[str, Any], confusion: float) -> list[str]:
-    v, blurs = design.imaging.sensor_distance_mm, sheet["blur_um"]
+def _focus(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
+    v, blurs, confusion = design.imaging.sensor_distance_mm, sheet["blur_um"], float(m.confusion)
     outside = [i for i, blur in enumerate(blurs) if blur > confusion * 1000]
     if not outside:
         return []
@@ -41,7 +45,7 @@ def _focus(design: Design, sheet: dict[str, Any], confusion: float) -> list[str]
     return [
         *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
         f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
-        _sharp_range(design, sheet, confusion),
+        _sharp_range(design, m),
     ]
 
 
@@ -54,30 +58,27 @@ def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
     return f"At {depth:g} mm the image forms {_length(abs(image - v))} {side} the sensor: {patch}."
 
 
-def _sharp_range(design: Design, sheet: dict[str, Any], confusion: float) -> str:
-    v, f, f_number = design.imaging.sensor_distance_mm, sheet["focal_length_mm"], sheet["f_number"]
+def _sharp_range(design: Design, m: Microscope) -> str:
+    v, f = design.imaging.sensor_distance_mm, float(m.focal_length)
     if v <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
-    reduced, plate = theory.depth_in_focus(f, v), _plate(design)
-    near = max(float(theory.near_limit(f, f_number, reduced, confusion)) - plate, 0)
-    far = float(theory.far_limit(f, f_number, reduced, confusion)) - plate
+    in_focus = theory.depth_in_focus(f, v) - m.imager.reduced_depth(0.0)
+    focused = dataclasses.replace(m, depths=in_focus[None])
+    near, far = max(float(focused.near_limit[0]), 0), float(focused.far_limit[0])
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
     if far <= 0:
         return f"The sensor at {v:g} mm is so far that only points within the plate are in focus; {working}."
     return f"In focus are {near:.4g} to {far:.4g} mm; {working}."
 
 
-def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
-    imager, f = design.imager(), sheet["focal_length_mm"]
-    wavelength, v = float(imager.wavelength), design.imaging.sensor_distance_mm
-    pupil = f / sheet["f_number"] / 2
-    reduced = np.array(sheet["depth_mm"]) + _plate(design)
-    lens = (f, design.lens.refractive_index, pupil, reduced)
-    error = aberrations.of_array(imager.array, pupil, reduced, 0.0, v)
-    waves = np.asarray(aberrations.linear_rms(error)) / wavelength
+def _strehl(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
+    wavelength, pupil = float(m.imager.wavelength), float(m.clear_diameter) / 2
+    lens = (m.focal_length, m.imager.array.refractive_index, pupil, m.reduced, m.imager.sensor_distance)
+    error = m.wavefront(jnp.zeros(1))
+    waves = np.asarray(aberrations.linear_rms(error))[:, 0] / wavelength
     if waves.max() <= _STREHL_DOMAIN:
         return []
-    half = np.asarray(aberrations.linear_field_radius(*lens, v, wavelength)) * 1000
+    half = np.asarray(aberrations.linear_field_radius(*lens, wavelength)) * 1000
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
         "the Strehl ratios only say that the image is far from diffraction-limited.",
@@ -88,12 +89,9 @@ def _strehl(design: Design, sheet: dict[str, Any]) -> list[str]:
         f"By Eqs. 9 and 10 the Strehl ratio halves {_span(half)} um beside the axis, "
         f"not at the field radius of {_length(sheet['field_radius_mm'])}.",
     )
-    spherical, paraxial = np.asarray(error.spherical), sheet["focus_distance_mm"]
-    if (
-        paraxial[0] is not None
-        and np.asarray(aberrations.balanced_rms(error).spherical)[0] > _STREHL_DOMAIN * wavelength
-    ):
-        sharpest = 1 / (1 / paraxial[0] + 2 * spherical[0] / pupil**2)
+    paraxial = sheet["focus_distance_mm"]
+    if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:
+        sharpest = 1 / (1 / paraxial[0] + 2 * float(error.spherical[0, 0]) / pupil**2)
         found.append(
             "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "
             f"{sheet['depth_mm'][0]:g} mm toward the lens, by up to {_length(paraxial[0] - sharpest)}."
@@ -125,10 +123,6 @@ def _occupancy(sheet: dict[str, Any]) -> list[str]:
     if occupancy <= 1:
         return []
     return [f"At {depth:g} mm the occupancy is {occupancy:.2g}: sub-images of an object that fills the field overlap."]
-
-
-def _plate(design: Design) -> float:
-    return design.array.substrate_thickness_mm / design.lens.refractive_index
 
 
 def _length(mm: float) -> str:

@@ -1,102 +1,36 @@
-"""What a design promises, Eqs. 1-11 over its working distance, and what is wrong with it, in words."""
+"""What a design promises, Eqs. 1-11 over its working distance, as numbers and as tables."""
 
 import math
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from rich.table import Table
 
 from ..base.errors import InputError, short_repr
-from ..geometry import Imager
+from ..geometry import as_float
 from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
-from ..optics import aberrations, theory
+from ..optics import aberrations
 from .design import Design
+from .microscope import Microscope
 
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7
 
 
-class Performance(eqx.Module):
-    """The paper's metrics of a microscope, one entry a depth, in mm; the near and far limits are depths `z`."""
-
-    magnification: Float[Array, " depth"]
-    scale: Float[Array, " depth"]
-    lateral_resolution: Float[Array, " depth"]
-    axial_resolution: Float[Array, " depth"]
-    depth_of_field: Float[Array, " depth"]
-    near_limit: Float[Array, " depth"]
-    far_limit: Float[Array, " depth"]
-    lenses_per_point: Float[Array, ""]
-    occupancy: Float[Array, " depth"]
-    wavefront_rms: Float[Array, " depth"]
-    strehl_on_axis: Float[Array, " depth"]
-    focus_distance: Float[Array, " depth"]
-    blur: Float[Array, " depth"]
-
-
-@jax.jit
-def performance(
-    imager: Imager,
-    depths: Float[Array, " depth"],
-    *,
-    diameter: Float[Array, ""] | float,
-    field_radius: Float[Array, ""] | float,
-    confusion: Float[Array, ""] | float,
-) -> Performance:
-    """Eqs. 1-11 for a microscope at these depths; differentiable in everything.
-
-    Parameters
-    ----------
-    imager
-        The microscope, on a plate of finite size. Its own `field_radius` decides shapes and cannot be traced.
-    depths
-        From the plate, mm.
-    diameter
-        Of the clear aperture, mm: `gs_jax.optics.aperture.clear_diameter(imager.array)`.
-    field_radius
-        `sqrt(A_e / pi)`, mm.
-    confusion
-        Diameter of the circle of confusion, mm.
-
-    Returns
-    -------
-    Performance
-        The Strehl ratio is that of the sensor where it is, by Eqs. 9 and 10 as printed.
-
-    Raises
-    ------
-    ValueError
-        If the plate is infinite: it has no density of lenses.
-    """
-    array, v = imager.array, imager.sensor_distance
-    plate_area = math.prod(array.size)
-    if not math.isfinite(plate_area):
-        raise ValueError(f"`imager.array.size` must be finite, got {array.size}.")
-    f, reduced, m = array.focal_length, imager.reduced_depth(depths), imager.magnification(depths)
-    front = imager.reduced_depth(0.0)
-    f_number, aperture = theory.f_number(f, diameter), theory.numerical_aperture(f, diameter)
-    lateral = theory.lateral_resolution(imager.wavelength, aperture, imager.sensor.pixel_pitch, m)
-    n_e = theory.lenses_per_point(float(array.centers.shape[0]), plate_area, field_radius)
-    rms = aberrations.linear_rms(aberrations.of_array(array, diameter / 2, reduced, 0.0, v))
-    return Performance(
-        magnification=m,
-        scale=imager.scale(depths),
-        lateral_resolution=lateral,
-        axial_resolution=theory.axial_resolution(lateral, reduced, field_radius),
-        depth_of_field=theory.depth_of_field(f, f_number, reduced, confusion),
-        near_limit=theory.near_limit(f, f_number, reduced, confusion) - front,
-        far_limit=theory.far_limit(f, f_number, reduced, confusion) - front,
-        lenses_per_point=n_e,
-        occupancy=theory.occupancy(n_e, m),
-        wavefront_rms=rms,
-        strehl_on_axis=aberrations.strehl(rms, imager.wavelength),
-        focus_distance=theory.focus_distance(f, reduced),
-        blur=theory.blur(f, diameter, reduced, v),
+def microscope_of(
+    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float, coverage: float
+) -> Microscope:
+    """A design as it is judged at these depths, mm; `coverage` of its plate says how wide a lens is."""
+    count, area = len(design.array.centers_mm), math.prod(design.array.size_mm)
+    return Microscope(
+        design.imager(),
+        as_float(depths),
+        clear_diameter=as_float(math.sqrt(4 / math.pi * coverage * area / count)),
+        field_radius=as_float(design.imaging.field_radius_mm),
+        confusion=as_float(confusion),
+        plate_scale=as_float(1.0),
     )
 
 
@@ -108,7 +42,8 @@ def datasheet(
     Parameters
     ----------
     design
-        The microscope. Its clear aperture is what the lenses' discs cover of the plate, divided by their number.
+        The microscope. Its clear diameter is that of a disc as large as a lens's mean clear aperture: what the lenses'
+        discs cover of the plate, by their number.
     depths
         From the plate, mm; by default seven over the working distance.
     confusion
@@ -125,40 +60,33 @@ def datasheet(
         If a depth or the confusion is not positive and finite, or there is no depth.
     """
     depths = _checked(design, depths)
-    confusion = confusion_of(design, confusion)
     centers, size = np.array(design.array.centers_mm), design.array.size_mm
     covered = coverage(centers, size, diameter=design.lens.aperture_diameter_mm)
-    diameter = math.sqrt(4 / math.pi * covered * math.prod(size) / len(centers))
-    imager, imaging = design.imager(), design.imaging
-    metrics = performance(
-        imager,
-        jnp.asarray(depths, float),
-        diameter=diameter,
-        field_radius=imaging.field_radius_mm,
-        confusion=confusion,
-    )
-    distances = nearest_neighbour_distances(centers)
-    f = float(imager.array.focal_length)
+    m = microscope_of(design, depths, confusion=confusion_of(design, confusion), coverage=covered)
+    distances, axis = nearest_neighbour_distances(centers), jnp.zeros(1)
+    columns = {
+        "magnification": m.magnification,
+        "scale": m.scale,
+        "lateral_resolution_um": m.lateral_resolution * 1000,
+        "axial_resolution_um": m.axial_resolution * 1000,
+        "depth_of_field_mm": m.depth_of_field,
+        "near_limit_mm": m.near_limit,
+        "far_limit_mm": m.far_limit,
+        "lenses_per_point": jnp.broadcast_to(m.lenses_per_point, len(depths)),
+        "occupancy": m.occupancy,
+        "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(m.wavefront(axis))[:, 0], m.imager.wavelength),
+        "focus_distance_mm": m.focus_distance,
+        "blur_um": m.blur * 1000,
+    }
     return {
         "depth_mm": depths,
-        "magnification": _rounded(metrics.magnification),
-        "scale": _rounded(metrics.scale),
-        "lateral_resolution_um": _rounded(metrics.lateral_resolution * 1000),
-        "axial_resolution_um": _rounded(metrics.axial_resolution * 1000),
-        "depth_of_field_mm": _rounded(metrics.depth_of_field),
-        "near_limit_mm": _rounded(metrics.near_limit),
-        "far_limit_mm": _rounded(metrics.far_limit),
-        "lenses_per_point": _rounded(jnp.broadcast_to(metrics.lenses_per_point, len(depths))),
-        "occupancy": _rounded(metrics.occupancy),
-        "strehl_on_axis": _rounded(metrics.strehl_on_axis),
-        "focus_distance_mm": _rounded(metrics.focus_distance),
-        "blur_um": _rounded(metrics.blur * 1000),
-        "f_number": _round(f / diameter),
-        "numerical_aperture": _round(diameter / (2 * f)),
-        "focal_length_mm": _round(f),
+        **{name: [_round(value) for value in column.tolist()] for name, column in columns.items()},
+        "f_number": _round(float(m.f_number)),
+        "numerical_aperture": _round(float(m.numerical_aperture)),
+        "focal_length_mm": _round(float(m.focal_length)),
         "pitch_mm": _round(float(distances.mean())),
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
-        "field_radius_mm": imaging.field_radius_mm,
+        "field_radius_mm": design.imaging.field_radius_mm,
         "coverage": _round(covered),
     }
 
@@ -216,10 +144,6 @@ def _plain(value: float | None) -> str:
 def _round(value: float) -> float | None:
     """Six digits, more than any of the formulas is worth."""
     return float(f"{value:.6g}") if math.isfinite(value) else None
-
-
-def _rounded(values: Float[Array, " depth"]) -> list[float | None]:
-    return [_round(value) for value in values.tolist()]
 
 
 def _checked(design: Design, depths: Sequence[float] | None) -> list[float]:

@@ -1,0 +1,167 @@
+"""What the paper's formulas promise of a microscope, Eqs. 1-11, differentiable in everything.
+
+A datasheet and the terms of a co-design are both made of this.
+"""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..geometry import Imager
+from ..optics import aberrations, theory
+from ..optics.aberrations import Wavefront
+
+
+class Microscope(eqx.Module):
+    """An imager and where it is judged. Results are lengths in mm, one for each depth.
+
+    Parameters
+    ----------
+    imager
+        On a plate of finite size. Its own `field_radius` decides shapes and cannot be traced.
+    depths
+        From the plate, mm.
+    clear_diameter
+        Of the disc whose area is the mean clear aperture, mm: `gs_jax.optics.aperture.clear_diameter(imager.array)`.
+    field_radius
+        `sqrt(A_e / pi)`, mm.
+    confusion
+        Diameter of the circle of confusion, mm.
+    plate_scale
+        The plate's size over that of the imager's array, which cannot be traced.
+    largest_magnification
+        What magnifications stay below whatever is free, for windows that have to hold all images.
+
+    Raises
+    ------
+    ValueError
+        If the plate is infinite: it has no density of lenses.
+    """
+
+    imager: Imager
+    depths: Float[Array, " depth"]
+    clear_diameter: Float[Array, ""]
+    field_radius: Float[Array, ""]
+    confusion: Float[Array, ""]
+    plate_scale: Float[Array, ""]
+    largest_magnification: float = eqx.field(static=True, default=math.inf)
+
+    def __check_init__(self):
+        if not math.isfinite(math.prod(self.imager.array.size)):
+            raise ValueError(f"`imager.array.size` must be finite, got {self.imager.array.size}.")
+
+    @property
+    def plate(self) -> Float[Array, "2"]:
+        """`(x, y)` of the plate."""
+        return self.plate_scale * jnp.array(self.imager.array.size, self.plate_scale.dtype)
+
+    @property
+    def middle(self) -> "Microscope":
+        """The same at the middle of the depths alone."""
+        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2)
+
+    @property
+    def focal_length(self) -> Float[Array, ""]:
+        """Of a lens in air."""
+        return self.imager.array.focal_length
+
+    @property
+    def f_number(self) -> Float[Array, ""]:
+        """Of the clear aperture (below Eq. 8)."""
+        return theory.f_number(self.focal_length, self.clear_diameter)
+
+    @property
+    def numerical_aperture(self) -> Float[Array, ""]:
+        """Of the clear aperture, on the sensor's side."""
+        return theory.numerical_aperture(self.focal_length, self.clear_diameter)
+
+    @property
+    def reduced(self) -> Float[Array, " depth"]:
+        """The depths as the optics sees them, `z'`."""
+        return self.imager.reduced_depth(self.depths)
+
+    @property
+    def magnification(self) -> Float[Array, " depth"]:
+        """`M_z` (Eq. 3)."""
+        return self.imager.magnification(self.depths)
+
+    @property
+    def scale(self) -> Float[Array, " depth"]:
+        """`s_z` (Eq. 1)."""
+        return self.imager.scale(self.depths)
+
+    @property
+    def lateral_resolution(self) -> Float[Array, " depth"]:
+        """In focus, without aberrations (Eq. 5)."""
+        pixel = self.imager.sensor.pixel_pitch
+        return theory.lateral_resolution(self.imager.wavelength, self.numerical_aperture, pixel, self.magnification)
+
+    @property
+    def axial_resolution(self) -> Float[Array, " depth"]:
+        """In focus, without aberrations (Eq. 6)."""
+        return theory.axial_resolution(self.lateral_resolution, self.reduced, self.field_radius)
+
+    @property
+    def _sharp(self):
+        return self.focal_length, self.f_number, self.reduced, self.confusion
+
+    @property
+    def depth_of_field(self) -> Float[Array, " depth"]:
+        """Of a sensor that is focused on the depth (Eq. 8); infinite from the hyperfocal distance on."""
+        return theory.depth_of_field(*self._sharp)
+
+    @property
+    def approximate_depth_of_field(self) -> Float[Array, " depth"]:
+        """The same by Eq. 7."""
+        return theory.approximate_depth_of_field(*self._sharp)
+
+    @property
+    def near_limit(self) -> Float[Array, " depth"]:
+        """The nearest depth `z` that is sharp then."""
+        return theory.near_limit(*self._sharp) - self.imager.reduced_depth(0.0)
+
+    @property
+    def far_limit(self) -> Float[Array, " depth"]:
+        """The farthest depth `z` that is sharp then."""
+        return theory.far_limit(*self._sharp) - self.imager.reduced_depth(0.0)
+
+    @property
+    def lenses_per_point(self) -> Float[Array, ""]:
+        """`N_e`: lenses on the plate over its area, times `A_e`."""
+        count = float(self.imager.array.centers.shape[0])
+        return theory.lenses_per_point(count, jnp.prod(self.plate), self.field_radius)
+
+    @property
+    def occupancy(self) -> Float[Array, " depth"]:
+        """`V = N_e M^2` (Eq. 11)."""
+        return theory.occupancy(self.lenses_per_point, self.magnification)
+
+    @property
+    def coverage(self) -> Float[Array, ""]:
+        """Share of the plate that is clear aperture."""
+        count = self.imager.array.centers.shape[0]
+        return count * math.pi / 4 * self.clear_diameter**2 / jnp.prod(self.plate)
+
+    def wavefront(self, heights: Float[Array, " field"]) -> Wavefront:
+        """Third-order errors at heights beside a lens's axis, sensor where it is: `(depth, field)`, or broadcast."""
+        array, v = self.imager.array, self.imager.sensor_distance
+        return aberrations.of_array(array, self.clear_diameter / 2, self.reduced[:, None], heights[None], v)
+
+    @property
+    def focus_distance(self) -> Float[Array, " depth"]:
+        """Where a thin lens images the depth; infinite if it does not."""
+        return theory.focus_distance(self.focal_length, self.reduced)
+
+    @property
+    def blur(self) -> Float[Array, " depth"]:
+        """Diameter of the thin lens's patch on the sensor where it is."""
+        return theory.blur(self.focal_length, self.clear_diameter, self.reduced, self.imager.sensor_distance)
+
+    @property
+    def object_blur(self) -> Float[Array, " depth"]:
+        """The same as seen in the object."""
+        v = self.imager.sensor_distance
+        return theory.object_blur(self.focal_length, self.clear_diameter, self.reduced, v)
