@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
-from gs_jax.codesign import search
+from gs_jax.codesign import search, stages
 from gs_jax.codesign.checkpoint import Log, read_checkpoint
 from gs_jax.codesign.outcome import before_and_after, check_outputs, picture, write_outcome
 from gs_jax.codesign.parameters import start_values
-from gs_jax.codesign.search import optimise, problem_of, random_start
+from gs_jax.codesign.search import optimize
 from gs_jax.codesign.solve import NOT_FINITE
-from gs_jax.codesign.study import Study
+from gs_jax.codesign.stages import problem_of, random_start
+from gs_jax.codesign.study import Study, read_study
 from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import read_design
+from gs_jax.designs.design import read_design, write_design
 
 TERMS = [
     {"name": "lateral_resolution_um", "at_most": 40.0},
@@ -38,8 +38,7 @@ def table1():
 
 @pytest.fixture(scope="module")
 def outcome(table1):
-    with Progress() as progress:
-        return optimise(table1, study(starts=2), progress=progress)
+    return optimize(table1, study(starts=2))
 
 
 def test_from_table_1_to_the_targets(table1, outcome):
@@ -65,7 +64,7 @@ def test_only_what_is_free_changes(table1, outcome):
 def test_files(table1, outcome, tmp_path):
     path = tmp_path / "new.toml"
     check_outputs(path)
-    paths = write_outcome(path, study(starts=2), outcome, parent="a/table1.toml", source="b/study.toml")
+    paths = write_outcome(path, outcome, parent="a/table1.toml", source="b/study.toml")
     assert [p.name for p in paths] == ["new.toml", "new.json", "new.png"] and all(p.exists() for p in paths)
     written = read_design(path)
     assert written.provenance["parent"] == "table1.toml" and written.provenance["study"] == "study.toml"
@@ -73,7 +72,7 @@ def test_files(table1, outcome, tmp_path):
     numbers = json.loads(paths[1].read_text())
     assert [term["met_after"] for term in numbers["terms"]] == [True] * 4
     assert len(numbers["starts"]) == 2 and numbers["steps"][0]["step"] == 1
-    assert before_and_after(study(starts=2), outcome).row_count == 4
+    assert before_and_after(outcome).row_count == 4
 
 
 def interrupted(table1, question, path, monkeypatch, *, writes):
@@ -87,8 +86,8 @@ def interrupted(table1, question, path, monkeypatch, *, writes):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(search, "write_checkpoint", counted)
-    with pytest.raises(KeyboardInterrupt), Progress() as progress:
-        optimise(table1, question, progress=progress, checkpoint=path, every=0.0)
+    with pytest.raises(KeyboardInterrupt):
+        optimize(table1, question, checkpoint=path, every=0.0)
     monkeypatch.setattr(search, "write_checkpoint", write)
 
 
@@ -99,35 +98,32 @@ def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
     terms = [{"name": "thickness_mm", "minimise": 5.0}, TERMS[0]]
     free = {"sensor_distance_mm": [2.0, 6.0]}
     question = study(starts=2, stages=stages, terms=terms, free=free, depth_count=2)
-    with Progress() as progress:
-        whole = optimise(table1, question, progress=progress)
+    whole = optimize(table1, question)
     path = tmp_path / "a.checkpoint"
     interrupted(table1, question, path, monkeypatch, writes=writes)
     assert len(read_checkpoint(path, question, table1)[0].steps) == writes
-    with Progress() as progress:
-        resumed = optimise(table1, question, progress=progress, checkpoint=path, resume=True)
+    resumed = optimize(table1, question, checkpoint=path, resume=True)
     assert resumed.design == whole.design and resumed.log == whole.log
 
 
 def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path = tmp_path / "a.checkpoint"
-    with Progress() as progress:
-        with pytest.raises(InputError, match="cannot be read"):
-            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
-        path.write_bytes(b"{}\n")
-        with pytest.raises(InputError, match="no checkpoint of a search"):
-            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
-        path.write_bytes(b'{"format": "gs-jax checkpoint 2", "of": "", "log": {"steps": 1, "ends": 2}}\n')
-        with pytest.raises(InputError, match="no checkpoint of a search"):
-            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
-        interrupted(table1, study(), path, monkeypatch, writes=1)
-        whole = path.read_bytes()
-        path.write_bytes(whole[:-30])
-        with pytest.raises(InputError, match="a.checkpoint: not a whole and valid checkpoint"):
-            optimise(table1, study(), progress=progress, checkpoint=path, resume=True)
-        path.write_bytes(whole)
-        with pytest.raises(InputError, match="of another study or design"):
-            optimise(table1, study(seed=1), progress=progress, checkpoint=path, resume=True)
+    with pytest.raises(InputError, match="cannot be read"):
+        optimize(table1, study(), checkpoint=path, resume=True)
+    path.write_bytes(b"{}\n")
+    with pytest.raises(InputError, match="no checkpoint of a search"):
+        optimize(table1, study(), checkpoint=path, resume=True)
+    path.write_bytes(b'{"format": "gs-jax checkpoint 3", "of": "", "log": {"steps": 1, "ends": 2}}\n')
+    with pytest.raises(InputError, match="no checkpoint of a search"):
+        optimize(table1, study(), checkpoint=path, resume=True)
+    interrupted(table1, study(), path, monkeypatch, writes=1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-30])
+    with pytest.raises(InputError, match="a.checkpoint: not a whole and valid checkpoint"):
+        optimize(table1, study(), checkpoint=path, resume=True)
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match="of another study or design"):
+        optimize(table1, study(seed=1), checkpoint=path, resume=True)
 
 
 def test_random_starts(table1):
@@ -146,16 +142,15 @@ def test_lens_centres_can_be_free():
     centers = ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))
     design = design.model_copy(update={"array": design.array.model_copy(update={"centers_mm": centers})})
     question = study(free={"centers_mm": [-4.0, 4.0]}, terms=[{"name": "spacing_mm", "at_least": 2.0}])
-    with Progress() as progress:
-        found = optimise(design, question, progress=progress)
+    found = optimize(design, question)
     assert not found.before[0].met and found.after[0].met
     assert np.abs(found.design.array.centers_mm).max() < 4
 
 
 def test_a_thin_lens_has_no_radius_to_free(table1):
     thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
-    with pytest.raises(InputError, match="free.radius_of_curvature_mm"), Progress() as progress:
-        optimise(thin, study(), progress=progress)
+    with pytest.raises(InputError, match="free.radius_of_curvature_mm"):
+        optimize(thin, study())
 
 
 def test_a_single_lens(table1):
@@ -163,39 +158,52 @@ def test_a_single_lens(table1):
     array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),), "size_mm": (2.0, 2.0)})
     single = table1.model_copy(update={"array": array})
     free = {"sensor_distance_mm": [2.0, 7.0]}
-    with Progress() as progress:
-        found = optimise(single, study(free=free, terms=[TERMS[1]]), progress=progress)
-        with pytest.raises(InputError, match="free.pitch_mm.*one lens"):
-            optimise(single, study(), progress=progress)
+    found = optimize(single, study(free=free, terms=[TERMS[1]]))
+    with pytest.raises(InputError, match="free.pitch_mm.*one lens"):
+        optimize(single, study())
     assert found.after[0].met and found.design.array == array
 
 
 def test_depths_stay_before_the_plate(table1):
-    with pytest.raises(InputError, match=r"depth_span_mm.*below 41"), Progress() as progress:
-        optimise(table1, study(free={"depth_span_mm": [0.5, 60.0]}), progress=progress)
+    with pytest.raises(InputError, match=r"depth_span_mm.*below 41"):
+        optimize(table1, study(free={"depth_span_mm": [0.5, 60.0]}))
 
 
 def test_the_record_is_that_of_the_start_that_won():
     ends = [
-        {"stage": 0, "start": 0, "cost": float("nan"), "reason": NOT_FINITE},
-        {"stage": 0, "start": 1, "cost": 1.0, "reason": "won"},
-        {"stage": 0, "start": 2, "cost": 2.0, "reason": "lost"},
+        {"stage": 0, "start": 0, "cost": float("nan"), "met": True, "reason": NOT_FINITE},
+        {"stage": 0, "start": 1, "cost": 1.0, "met": True, "reason": "won"},
+        {"stage": 0, "start": 2, "cost": 2.0, "met": True, "reason": "lost"},
+        {"stage": 0, "start": 3, "cost": 0.5, "met": False, "reason": "missed"},
     ]
-    assert search.best_end(Log(ends=ends), 0)["reason"] == "won"
+    assert stages.best_end(Log(ends=ends), 0)["reason"] == "won"
 
 
 def test_both_limits_of_a_term_are_recorded(table1):
     terms = [{"name": "occupancy", "at_most": 0.5}, {"name": "occupancy", "at_least": 0.2}]
     question = study(terms=terms, free={"sensor_distance_mm": [2.0, 6.0]})
-    with Progress() as progress:
-        found = optimise(table1, question, progress=progress)
+    found = optimize(table1, question)
     last = found.log.steps[-1]
     np.testing.assert_allclose(last["occupancy at_most"], found.after[0].high, rtol=1e-3)
     np.testing.assert_allclose(last["occupancy at_least"], found.after[0].low, rtol=1e-3)
-    assert picture(found.design, question, found).axes
+    assert picture(found).axes
 
 
 def test_no_start_that_ends_anywhere(table1, monkeypatch):
-    monkeypatch.setattr(search, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
-    with pytest.raises(InputError, match="no start came to a finite cost"), Progress() as progress:
-        optimise(table1, study(), progress=progress)
+    monkeypatch.setattr(stages, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
+    with pytest.raises(InputError, match="no start came to a finite cost"):
+        optimize(table1, study())
+
+
+def test_files_and_objects_are_the_same(table1, tmp_path):
+    """A path is read; what is wrong with the study then names its file."""
+    write_design(tmp_path / "a.toml", table1)
+    text = "[free]\nsensor_distance_mm = [2.0, 6.0]\n[[terms]]\nname = 'occupancy'\nat_most = 0.5\n"
+    (tmp_path / "b.toml").write_text(text + "[[stages]]\nsolver = 'levenberg-marquardt'\n")
+    found = optimize(str(tmp_path / "a.toml"), tmp_path / "b.toml")
+    assert found.parent == table1 and found.study == read_study(tmp_path / "b.toml")
+    assert found.design == optimize(table1, found.study).design
+    array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
+    (tmp_path / "b.toml").write_text((tmp_path / "b.toml").read_text().replace("sensor_distance", "pitch"))
+    with pytest.raises(InputError, match="b.toml: `free.pitch_mm`"):
+        optimize(table1.model_copy(update={"array": array}), tmp_path / "b.toml")

@@ -3,9 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from gs_jax.base.progress import Progress
-from gs_jax.codesign import pareto as module
-from gs_jax.codesign.pareto import as_json, non_dominated, picture, sweep
+from gs_jax.base.errors import InputError
+from gs_jax.codesign import stages
+from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
+from gs_jax.codesign.search import optimize
 from gs_jax.codesign.study import Study
 from gs_jax.designs.builtin import geomscope
 
@@ -34,8 +35,7 @@ def test_equal_points_do_not_beat_each_other():
 
 @pytest.fixture(scope="module")
 def front():
-    with Progress() as progress:
-        return sweep(geomscope(), Study.model_validate(STUDY), progress=progress)
+    return trade_off(geomscope(), Study.model_validate(STUDY))
 
 
 def test_light_against_depth_of_field(front):
@@ -57,7 +57,7 @@ def test_light_against_depth_of_field(front):
 
 
 def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
-    calls, run = [0], module.run
+    calls, run = [0], stages.run
 
     def first_lost(steps, state, *arguments, **options):
         calls[0] += 1
@@ -65,10 +65,63 @@ def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
             state = state._replace(cost=state.cost * np.nan)
         return run(steps, state, *arguments, **options)
 
-    monkeypatch.setattr(module, "run", first_lost)
-    with Progress() as progress:
-        found = sweep(geomscope(), Study.model_validate(STUDY), progress=progress)
+    monkeypatch.setattr(stages, "run", first_lost)
+    found = trade_off(geomscope(), Study.model_validate(STUDY))
     assert np.isfinite(found.values).all() and found.best[1:].all()
+
+
+# Focus by the distance of the sensor; then the widest lens with that depth of field.
+SPLIT = STUDY | {
+    "free": {"sensor_distance_mm": [2.0, 6.5], "aperture_diameter_mm": [0.1, 1.5]},
+    "terms": [
+        {"name": "focus_offset", "at_most": 0.2},
+        {"name": "light_percent", "maximise": 0.001},
+        {"name": "depth_of_field_mm", "at_least": 3.0, "weight": 30.0},
+    ],
+    "stages": [
+        {"solver": "levenberg-marquardt", "free": ["sensor_distance_mm"], "terms": ["focus_offset"]},
+        {
+            "solver": "levenberg-marquardt",
+            "free": ["aperture_diameter_mm"],
+            "terms": ["light_percent", "depth_of_field_mm"],
+        },
+    ],
+}
+
+
+def test_stages_keep_what_the_one_before_found():
+    """Stages that free different parameters; each search ends where `optimize` does with the same limit."""
+    start = geomscope(sensor_distance_mm=4.0)
+    found = trade_off(start, Study.model_validate(SPLIT))
+    for point, wanted in zip(found.points, (3.0, 6.0, 12.0), strict=True):
+        offset, light, depth = point.rows
+        assert point.feasible and offset.high <= 0.2 and depth.low >= wanted
+        limit = {"name": "depth_of_field_mm", "at_least": wanted, "weight": 30.0}
+        alone = Study.model_validate(SPLIT | {"pareto": [], "terms": [*SPLIT["terms"][:2], limit]})
+        np.testing.assert_allclose(light.low, optimize(start, alone).after[1].low, rtol=1e-2)
+
+
+def test_every_stage_compiles_once(monkeypatch):
+    """However many limits there are, and whatever the stage before it found."""
+    calls, candidate = [0], stages.candidate
+
+    def counted(*arguments):
+        calls[0] += 1
+        return candidate(*arguments)
+
+    monkeypatch.setattr(stages, "candidate", counted)
+    start, traced = geomscope(sensor_distance_mm=4.0), []
+    for limits in ([3.0], [3.0, 6.0, 12.0]):
+        study = SPLIT | {"pareto": [{"name": "depth_of_field_mm", "at_least": limits}]}
+        calls[0] = 0
+        trade_off(start, Study.model_validate(study))
+        traced.append(calls[0])
+    assert traced[0] == traced[1] > 0
+
+
+def test_a_study_without_limits_that_move():
+    with pytest.raises(InputError, match="`pareto`: found nothing, allowed: one or two tables"):
+        trade_off(geomscope(), Study.model_validate(STUDY | {"pareto": []}))
 
 
 def test_numbers_and_picture(front, tmp_path):

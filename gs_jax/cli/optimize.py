@@ -6,13 +6,10 @@ import click
 import jax
 from rich.console import Console
 
-from ..base.errors import errors_name_file
 from ..base.progress import Progress
+from ..codesign import search
 from ..codesign.checkpoint import checkpoint_path
 from ..codesign.outcome import before_and_after, check_outputs, write_outcome
-from ..codesign.search import optimise
-from ..codesign.study import read_study
-from ..designs.design import read_design
 
 
 @click.command("optimize")
@@ -28,12 +25,12 @@ def command(design: Path, study: Path, resume: bool, output: Path):
     check_outputs(output)
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
-    question, parent, checkpoint = read_study(study), read_design(design), checkpoint_path(output)
-    with Progress() as progress, errors_name_file(study):
-        outcome = optimise(parent, question, progress=progress, checkpoint=checkpoint, resume=resume)
-    write_outcome(output, question, outcome, parent=str(design), source=str(study))
+    checkpoint = checkpoint_path(output)
+    with Progress() as progress:
+        outcome = search.optimize(design, study, progress=progress, checkpoint=checkpoint, resume=resume)
+    write_outcome(output, outcome, parent=design, source=study)
     checkpoint.unlink(missing_ok=True)
-    Console().print(before_and_after(question, outcome))
+    Console().print(before_and_after(outcome))
     for end in outcome.log.ends:
         click.echo(f"stage {end['stage'] + 1}, start {end['start']}: {end['reason']} ({end['steps']} steps)")
-    click.echo(f"{output}: {outcome.design.name}, from {parent.name} in {outcome.seconds:.0f} s")
+    click.echo(f"{output}: {outcome.design.name}, from {outcome.parent.name} in {outcome.seconds:.0f} s")

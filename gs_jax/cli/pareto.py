@@ -7,12 +7,10 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..codesign.pareto import as_json, picture, sweep
-from ..codesign.search import problem_of
+from ..codesign.pareto import as_json, picture, sweep_of, trade_off
+from ..codesign.search import opened
 from ..codesign.study import parent_path, read_study
-from ..designs.design import read_design
 from ..io.disk import check_output, make_folder, write_json
 from ..io.figures import write_figure
 
@@ -27,16 +25,13 @@ def command(study: Path, out: Path):
     """
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
-    question = read_study(study)
-    if not question.pareto:
-        raise InputError(f"{study}: `pareto`: found nothing, allowed: one or two tables.")
-    design = read_design(parent_path(study, question))
-    with errors_name_file(study):
-        problem_of(design, question)
+    design = parent_path(study, read_study(study))
+    with opened(design, study) as (parent, question):
+        sweep_of(parent, question)
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
-    with Progress() as progress, errors_name_file(study):
-        front = sweep(design, question, progress=progress)
+    with Progress() as progress:
+        front = trade_off(design, study, progress=progress)
     write_json(numbers, as_json(front))
     write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)

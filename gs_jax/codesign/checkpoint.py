@@ -16,7 +16,7 @@ from ..io.disk import atomic_write, check_input, decoding
 from .solve import State
 from .study import Study
 
-_FORMAT = "gs-jax checkpoint 2"
+_FORMAT = "gs-jax checkpoint 3"
 
 
 @dataclass
@@ -24,7 +24,7 @@ class Log:
     """What a search has done.
 
     `steps`: one record a step, with the worst entry of each term. `ends`: one record for each finished start of a
-    stage, with the reason for stopping and the free parameters.
+    stage, with the reason for stopping, whether all targets are met, and the free parameters.
     """
 
     steps: list[dict[str, Any]] = field(default_factory=list)

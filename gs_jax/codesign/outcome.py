@@ -2,7 +2,6 @@
 
 import datetime
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +16,16 @@ from ..designs.design import Design, write_design
 from ..io.disk import check_output, write_json
 from ..io.figures import write_figure
 from .objectives import TERMS, unit_of
-from .search import Outcome, best_end
-from .study import Study, TermTable, labels
+from .search import Outcome, PathLike
+from .stages import best_end
+from .study import TermTable, labels
 from .targets import SIGNS, Row
 
 
-def before_and_after(study: Study, outcome: Outcome) -> Table:
+def before_and_after(outcome: Outcome) -> Table:
     """The study's terms before and after."""
     table = Table("term", "target", "before", "after", "", box=None, pad_edge=False)
-    for term, old, new in zip(study.terms, outcome.before, outcome.after, strict=True):
+    for term, old, new in zip(outcome.study.terms, outcome.before, outcome.after, strict=True):
         table.add_row(term.name, wanted(term), span(old), span(new), {True: "met", False: "MISSED", None: ""}[new.met])
     return table
 
@@ -41,7 +41,7 @@ def span(row: Row) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, source: str) -> list[Path]:
+def write_outcome(path: PathLike, outcome: Outcome, *, parent: PathLike, source: PathLike) -> list[Path]:
     """Writes the design with its provenance, and beside it the numbers (.json) and a picture (.png).
 
     Parameters
@@ -56,11 +56,11 @@ def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, so
     list
         Of the files.
     """
-    records = as_records(study.terms, outcome)
+    path, study, records = Path(path), outcome.study, as_records(outcome)
     paths = [path, path.with_suffix(".json"), path.with_suffix(".png")]
     history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
     write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
-    write_figure(paths[2], picture(outcome.design, study, outcome))
+    write_figure(paths[2], picture(outcome))
     provenance = {
         "parent": Path(parent).name,
         "study": Path(source).name,
@@ -73,7 +73,7 @@ def write_outcome(path: Path, study: Study, outcome: Outcome, *, parent: str, so
     return paths
 
 
-def as_records(terms: Sequence[TermTable], outcome: Outcome) -> list[dict[str, Any]]:
+def as_records(outcome: Outcome) -> list[dict[str, Any]]:
     """Before and after for a JSON file; `None` stands for infinity."""
     ends = lambda row: [_finite(row.low), _finite(row.high)]
     return [
@@ -88,7 +88,7 @@ def as_records(terms: Sequence[TermTable], outcome: Outcome) -> list[dict[str, A
             "met_before": old.met,
             "met_after": new.met,
         }
-        for term, old, new in zip(terms, outcome.before, outcome.after, strict=True)
+        for term, old, new in zip(outcome.study.terms, outcome.before, outcome.after, strict=True)
     ]
 
 
@@ -100,16 +100,17 @@ def _plain(record: dict[str, Any]) -> dict[str, Any]:
     return {key: _finite(x) if isinstance(x, float) else x for key, x in record.items()}
 
 
-def picture(design: Design, study: Study, outcome: Outcome) -> Figure:
+def picture(outcome: Outcome) -> Figure:
     """The layout with its clear apertures, the cost, and the terms on their way to the targets, of the best start."""
     figure = Figure(figsize=(12.5, 4.2), dpi=110, layout="constrained")
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
-    _draw_layout(layout, design)
+    _draw_layout(layout, outcome.design)
+    asked = outcome.study.terms
     steps = [step for step in outcome.log.steps if _is_best(step, outcome)]
     places = np.arange(1, len(steps) + 1)
     cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
     cost.set(xlabel="step", ylabel="cost", title="best start")
-    for number, (term, label) in enumerate(zip(study.terms, labels(study.terms, study), strict=True)):
+    for number, (term, label) in enumerate(zip(asked, labels(asked, outcome.study), strict=True)):
         values = np.array([step.get(label, np.nan) for step in steps], float)
         style = "-" if term.is_goal else ("--", ":")[number >= 10]
         terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=f"C{number % 10}", label=label)

@@ -1,11 +1,12 @@
 """Trade-offs between two or three things that are wanted: what one costs in the others.
 
 The epsilon constraint (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971): one term is the goal,
-and limits on one or two others move from value to value. Each search starts from where the one before ended, and from
-as many random points as the study asks for, less one. Every point is a design that a search found, so the true front
+and limits on one or two others move from value to value. Each search is that of `gs_jax.codesign.search`, from where
+the one before ended. Every point is a design that a search found, so the true front
 may be better, not worse.
 """
 
+import contextlib
 import itertools
 from typing import Any, NamedTuple
 
@@ -14,14 +15,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
+from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import Design
+from .checkpoint import Log
 from .objectives import unit_of
 from .parameters import NAMES, Values, start_values
-from .search import Stage, entries_of, make_stage, problem_of, random_start, targets_of
-from .solve import NOT_FINITE, run
+from .search import PathLike, opened
+from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
-from .targets import Row, assess, worst_of
+from .targets import Row, worst_of
 
 
 class Point(NamedTuple):
@@ -29,7 +32,6 @@ class Point(NamedTuple):
 
     values: Values
     rows: list[Row]
-    cost: float
 
     @property
     def feasible(self) -> bool:
@@ -57,39 +59,56 @@ def non_dominated(losses: Float[np.ndarray, "point objective"]) -> Bool[np.ndarr
     return np.logical_not((no_worse & better).any(0))
 
 
-def sweep(design: Design, study: Study, *, progress: Progress) -> Front:
-    """The trade-off that a study asks for.
+def trade_off(design: Design | PathLike, study: Study | PathLike, *, progress: Progress | None = None) -> Front:
+    """What a study's one goal costs in its one or two moving limits.
 
     Parameters
     ----------
     design
-        To start from.
+        To start from, or its file.
     study
-        With one term to minimise or maximise and one or two `[[pareto]]` tables. Its stages run one after the other
-        for each combination of limits.
+        With one term to minimise or maximise and one or two `[[pareto]]` tables, or its file. Its stages run one after
+        the other for each combination of limits. Its own `design` is not looked at.
 
     Raises
     ------
     InputError
-        If the study does not fit the design.
+        If a file cannot be read, the study does not fit the design or moves no limit.
     """
+    with opened(design, study) as (parent, question):
+        return _trade_off(sweep_of(parent, question), progress or Progress())
+
+
+class Sweep(NamedTuple):
+    """The problem of a study whose limits move: its terms are those that stay and those that move, in this order."""
+
+    problem: Problem
+    kept: list[TermTable]
+    moving: list[TermTable]
+
+
+def sweep_of(design: Design, study: Study) -> Sweep:
+    """The sweep that a study poses for a design; `InputError` if it does not fit the design or moves no limit."""
+    if not study.pareto:
+        raise InputError("`pareto`: found nothing, allowed: one or two tables.")
     moving = [_term(limit) for limit in study.pareto]
     kept = [term for term in study.terms if term.is_goal or all(not _same(term, limit) for limit in moving)]
     wider = study.model_copy(update={"terms": (*kept, *moving)})
-    problem = problem_of(design, wider)
-    values = start_values(problem.parent)
-    stages = [make_stage(problem, index, values) for index in range(len(study.stages))]
-    entries = entries_of(problem.parent, [*kept, *moving])
+    return Sweep(problem_of(design, wider), kept, moving)
+
+
+def _trade_off(sweep: Sweep, progress: Progress) -> Front:
+    problem, kept, moving = sweep
+    study, entries = problem.study, entries_of(problem.parent, [*kept, *moving])
+    stages = [make_stage(problem, index) for index in range(len(study.stages))]
+    points, last = [], start_values(problem.parent)
     combinations = list(itertools.product(*(limit.targets for limit in study.pareto)))
-    points, last = [], values
     for limits in progress.track(combinations, "Trade-off"):
         now = _with_targets(kept, moving, limits)
-        starts = [last, *(random_start(problem, values, start) for start in range(1, study.starts))]
-        found = [_search(stages, start, now, entries) for start in starts]
-        # A design that misses a target counts only if none meets them.
-        best = min(found, key=lambda point: (not point.feasible, point.cost))
-        points.append(best)
-        last = best.values
+        # A search that comes to no number spoils no other: its point is the one before.
+        with contextlib.suppress(InputError):
+            last = run_stages(problem, stages, now, last, log=Log())
+        points.append(Point(last, rows_of(now, entries, last)))
     return _front([*kept, *moving], [next(t for t in kept if t.is_goal), *moving], points)
 
 
@@ -104,24 +123,6 @@ def _same(term: TermTable, other: TermTable) -> bool:
 def _with_targets(kept, moving, limits) -> list[TermTable]:
     moved = [term.model_copy(update={term.kind: limit}) for term, limit in zip(moving, limits, strict=True)]
     return [*kept, *moved]
-
-
-def _search(stages: list[Stage], values: Values, terms: list[TermTable], entries) -> Point:
-    """All stages from these parameters, with the terms' targets; a stage that ends in no number is not counted."""
-    cost = float("inf")
-    for stage in stages:
-        names = [(term.name, term.kind) for term in stage.terms]
-        targets = targets_of([term for term in terms if (term.name, term.kind) in names])
-        begin = stage.steps.begin(stage.free(values), targets)
-        state, reason = run(stage.steps, begin, targets, limit=stage.limit, enough=stage.enough)
-        if reason == NOT_FINITE:
-            return Point(values, _assessed(terms, entries, values), float("inf"))
-        values, cost = stage.values(state.free), float(state.cost)
-    return Point(values, _assessed(terms, entries, values), cost)
-
-
-def _assessed(terms: list[TermTable], entries, values: Values) -> list[Row]:
-    return [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
 
 
 def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Point]) -> Front:

@@ -11,8 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..base.progress import Progress
 from ..codesign.outcome import as_records, write_outcome
-from ..codesign.search import optimise
-from ..codesign.study import read_study
+from ..codesign.search import optimize
 from ..designs.builtin import geomscope
 from ..designs.design import Design, write_design
 from ..designs.problems import findings
@@ -122,11 +121,11 @@ def run(folder: Path, progress: Progress) -> Path:
 def _optimise(folder: Path, progress: Progress) -> list[dict]:
     """From the design as the paper prints it, out of focus, to one that meets the paper's targets."""
     write_text(folder / "study.toml", _STUDY, [".toml"])
-    printed, study = geomscope(sensor_distance_mm=4.0), read_study(folder / "study.toml")
+    printed = geomscope(sensor_distance_mm=4.0)
     write_design(folder / "printed.toml", printed)
-    outcome = optimise(printed, study, progress=progress)
-    write_outcome(folder / "optimized.toml", study, outcome, parent="printed.toml", source="study.toml")
-    return as_records(study.terms, outcome)
+    outcome = optimize(printed, folder / "study.toml", progress=progress)
+    write_outcome(folder / "optimized.toml", outcome, parent="printed.toml", source="study.toml")
+    return as_records(outcome)
 
 
 def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict, Views]:

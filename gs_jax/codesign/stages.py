@@ -1,0 +1,235 @@
+"""The stages of a search: solvers that run one after the other, each on some of what is free.
+
+`gs_jax.codesign.search` runs them once, `gs_jax.codesign.pareto` once for each combination of limits.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..designs.design import Design
+from .checkpoint import Log, restored
+from .parameters import Bounds, Box, Parent, Values, candidate, parent_of, start_values
+from .solve import NOT_FINITE, State, Stepper, run, stepper
+from .study import StageTable, Study, TermTable, labels
+from .targets import Row, assess, evaluate, residual, worst_of
+
+
+class Problem(NamedTuple):
+    """A design and a study as a solver sees them."""
+
+    parent: Parent
+    study: Study
+
+
+class Stage(NamedTuple):
+    """A stage that is ready to run, compiled once for all starts, targets and values of what it does not free.
+
+    `labels`: of its terms, for the log. `free`: from parameters to what the solver moves. `values`: back, given the
+    parameters that it does not move. `watch`: the worst entry of each term, of the same arguments. `enough`: a cost at
+    which all targets are met.
+    """
+
+    number: int
+    table: StageTable
+    labels: list[str]
+    steps: Stepper
+    free: Callable[[Values], Values]
+    values: Callable[[Values, Values], Values]
+    watch: Callable[[Values, Values], list[Array]]
+    enough: float
+
+
+def problem_of(design: Design, study: Study) -> Problem:
+    """The problem that a study poses for a design.
+
+    Raises
+    ------
+    InputError
+        If what is free does not exist in the design, or depths may come to lie behind the plate.
+    """
+    _check_free(design, study)
+    confusion = None if study.confusion_um is None else study.confusion_um / 1000
+    parent = parent_of(
+        design, depths_mm=study.depths_mm, confusion=confusion, depth_count=study.depth_count, free=study.free
+    )
+    return Problem(parent, study)
+
+
+def _check_free(design: Design, study: Study) -> None:
+    if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
+        raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
+    twice = sum(study.depths_mm or design.imaging.working_distance_mm)
+    if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
+        found = f"`free.depth_span_mm`: found {list(study.free['depth_span_mm'])}"
+        raise InputError(f"{found}, allowed: below {twice:g}, twice the middle of the depths.")
+    of_lens = {"radius_of_curvature_mm", "refractive_index"} & set(study.free)
+    if design.lens.focal_length_mm is not None and of_lens:
+        raise InputError(
+            f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
+        )
+
+
+def make_stage(problem: Problem, index: int) -> Stage:
+    """The solver of a stage."""
+    parent, study = problem
+    table = study.stages[index]
+    between = Box if table.solver == "lbfgsb" else Bounds
+    bounds = {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
+    terms = terms_of(table, study.terms)
+    to_free = lambda values: {name: bound.free(values[name]) for name, bound in bounds.items()}
+    to_values = lambda free, values: values | {name: bound.value(free[name]) for name, bound in bounds.items()}
+
+    def residuals(free, given, key):
+        targets, values = given
+        found = candidate(parent, to_values(free, values))
+        pairs = zip(terms, targets, strict=True)
+        return jnp.concatenate([residual(term, x, found, key, margin=study.margin) for term, x in pairs])
+
+    def watch(free, values):
+        found = candidate(parent, to_values(free, values))
+        return [worst_of(term, evaluate(term.name, found, key)) for term in terms]
+
+    key = jax.random.fold_in(jax.random.key(study.seed), index)
+    values = start_values(parent)
+    return Stage(
+        number=index,
+        table=table,
+        labels=labels(terms, study),
+        steps=stepper(residuals, to_free(values), (targets_of(terms), values), table, key),
+        free=to_free,
+        values=to_values,
+        watch=jax.jit(watch),
+        enough=_enough(problem, terms),
+    )
+
+
+def terms_of(stage: StageTable, terms: Sequence[TermTable]) -> list[TermTable]:
+    """Those of the terms that a stage looks at."""
+    return [term for term in terms if stage.terms is None or term.name in stage.terms]
+
+
+def targets_of(terms: Sequence[TermTable]) -> Float[Array, " term"]:
+    """The targets of the terms, in order."""
+    return jnp.array([term.target for term in terms], float)
+
+
+def _enough(problem: Problem, terms: Sequence[TermTable]) -> float:
+    """A cost at which all targets are met: half the margin is missing of one entry. Zero if there is a goal."""
+    if any(term.is_goal for term in terms):
+        return 0.0
+    sizes = jax.eval_shape(entries_of(problem.parent, terms), start_values(problem.parent))
+    least = min(term.weight / math.sqrt(size.size) for term, size in zip(terms, sizes, strict=True))
+    return (least * problem.study.margin / 2) ** 2 / 2
+
+
+def entries_of(parent: Parent, terms: Sequence[TermTable]) -> Callable[[Values], list[Float[Array, " entry"]]]:
+    """The function from parameters to the entries of each term, compiled. Of what is random it is one draw."""
+
+    @jax.jit
+    def entries(values: Values):
+        found = candidate(parent, values)
+        return [evaluate(term.name, found, jax.random.key(0)) for term in terms]
+
+    return entries
+
+
+def rows_of(
+    terms: Sequence[TermTable], entries: Callable[[Values], list[Float[Array, " entry"]]], values: Values
+) -> list[Row]:
+    """What terms say of parameters; `entries` is of `entries_of`, for terms of the same names."""
+    return [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
+
+
+def random_start(problem: Problem, values: Values, start: int) -> Values:
+    """Parameters drawn evenly between their bounds, others for each `start`; lens centres stay. 0 is the design."""
+    if start == 0:
+        return values
+    rng = np.random.default_rng([problem.study.seed, start])
+    drawn = {name: rng.uniform(*limits) for name, limits in problem.study.free.items() if name != "centers_mm"}
+    return values | {name: jnp.asarray(x, values[name].dtype) for name, x in drawn.items()}
+
+
+def run_stages(
+    problem: Problem,
+    stages: Iterable[Stage],
+    terms: Sequence[TermTable],
+    values: Values,
+    *,
+    log: Log,
+    progress: Progress | None = None,
+    each: Callable[[Stage, int, Values, State], None] = lambda *_: None,
+    saved: tuple[Path, bytes] | None = None,
+) -> Values:
+    """The parameters that the stages come to, one after the other; each keeps what the one before it found.
+
+    Parameters
+    ----------
+    terms
+        The study's, with the targets that count.
+    values
+        To start from.
+    log
+        Ends are added to it; what already ended according to it is not run again.
+    each
+        Called after every step, with the stage, the number of the start, the parameters before the stage, the state.
+    saved
+        A checkpoint, to go on from.
+
+    Raises
+    ------
+    InputError
+        If no start of a stage comes to a finite cost.
+    """
+    progress = progress or Progress()
+    for stage in stages:
+        wanted = terms_of(stage.table, terms)
+        given = targets_of(wanted), values
+        done = sum(end["stage"] == stage.number for end in log.ends)
+        starts = range(done, problem.study.starts if stage.number == 0 else 1)
+        for start in progress.track(starts, f"Stage {stage.number + 1}, {stage.table.solver}"):
+            state = stage.steps.begin(stage.free(random_start(problem, values, start)), given)
+            if saved is not None:
+                state, saved = restored(*saved, state), None
+            after_step, limit = partial(each, stage, start, values), stage.table.steps
+            state, reason = run(stage.steps, state, given, limit=limit, enough=stage.enough, each=after_step)
+            worst = zip(wanted, stage.watch(state.free, values), strict=True)
+            log.ends.append(
+                {
+                    "stage": stage.number,
+                    "start": start,
+                    "steps": int(state.step),
+                    "cost": float(state.cost),
+                    "met": all(assess(term, np.asarray(x)[None]).met is not False for term, x in worst),
+                    "reason": reason,
+                    "free": {name: np.asarray(x).tolist() for name, x in state.free.items()},
+                }
+            )
+        free = best_end(log, stage.number)["free"]
+        values = stage.values({name: jnp.asarray(x, values[name].dtype) for name, x in free.items()}, values)
+    return values
+
+
+def best_end(log: Log, stage: int) -> dict[str, Any]:
+    """The record of the start of a stage that came to the least cost; one that misses a target only if all do.
+
+    Of Adam's costs, which are random, there is only one: it runs from one start unless it is the first stage.
+
+    Raises
+    ------
+    InputError
+        If none came to a finite one.
+    """
+    ends = [end for end in log.ends if end["stage"] == stage and end["reason"] != NOT_FINITE]
+    if not ends:
+        raise InputError(f"stage {stage + 1}: no start came to a finite cost, allowed: other bounds or terms.")
+    return min(ends, key=lambda end: (not end["met"], end["cost"]))
