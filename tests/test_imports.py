@@ -15,8 +15,6 @@ ORDER = (
 ).split()
 # Where `from .name import name` hides the module behind what it defines. To be renamed; nothing new comes here.
 NAMED_AS_ITS_CONTENT = {
-    "demo/report.py",
-    "optics/exit_pupil.py",
     "solvers/admm.py",
     "solvers/fista.py",
     "solvers/richardson_lucy.py",

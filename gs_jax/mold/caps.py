@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from ..base.progress import Progress
 from ..geometry import MicrolensArray
+from ..layouts.cells import cross
 from .outlines import Plan, draw_plan
 
 # How often facets that are too large are split. One or two rounds are enough; more would mean that none is.
@@ -201,7 +202,7 @@ def _upper_hull(vertices, ring):
     hull = ConvexHull(vertices)
     facets = hull.simplices[hull.equations[:, 2] > 1e-9]
     a, b, c = (vertices[facets[:, k], :2] for k in range(3))
-    clockwise = _cross(b - a, c - a) < 0
+    clockwise = cross(b - a, c - a) < 0
     facets = np.where(clockwise[:, None], facets[:, ::-1], facets)
     # Rounding error may leave a facet standing over an edge of the ring, outside it.
     n = len(vertices)
@@ -244,14 +245,10 @@ def _mean_depth(points, facets, centers, radius):
     corners = _on_sphere((points[facets] - centers[:, None]).reshape(-1, 2), radius).reshape(-1, 3, 3)
     centroid = (corners.mean(axis=1) ** 2).sum(axis=1)
     a, b, c = corners[..., :2].transpose(1, 0, 2)
-    area = _cross(b - a, c - a)
+    area = cross(b - a, c - a)
     return float((area * 3 * (radius**2 - centroid)).sum() / (area.sum() * 8 * radius))
 
 
 def _facet_flat(points, polygon):
     index = np.concatenate(polygon)
     return index[manifold3d.triangulate([points[ring] for ring in polygon])]
-
-
-def _cross(a, b):
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
