@@ -27,11 +27,12 @@ from experiments.common import Report, main, table
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.measure import timed
-from gs_jax.solvers.admm import admm_convolution
 from gs_jax.solvers.convolution import Convolution
-from gs_jax.solvers.fista import fista
-from gs_jax.solvers.richardson_lucy import richardson_lucy
-from gs_jax.solvers.total_variation import differences, total_variation
+from gs_jax.solvers.convolution_admm import ConvolutionADMM
+from gs_jax.solvers.fista import FISTA
+from gs_jax.solvers.iteration import solve
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
+from gs_jax.solvers.variation import differences, total_variation
 
 TV = 1e-4
 Image = Float[Array, "row column"]
@@ -47,15 +48,16 @@ def read(folder: Path, factor: int) -> tuple[np.ndarray, np.ndarray]:
     return psf, image
 
 
-def solve(psf: Image, image: Image, *, method: str, steps: int):
-    """The estimate and the costs of one method."""
+def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
+    """The scene by one method."""
     rows, columns = image.shape
     system = Convolution.of(psf[None], (rows, columns))
+    A = system.operator
     if method == "ADMM":
-        return admm_convolution(system, image, steps=steps, tv=TV)
-    # Noise in the dark would be negative light.
-    solver = {"Richardson-Lucy": partial(richardson_lucy, accelerate=True), "FISTA": fista}[method]
-    return solver(system.operator, image, steps=steps)
+        tv = TV / jnp.max(A.T.mv(image))  # the solver's unit
+        return solve(system, image, ConvolutionADMM(steps, sparsity=0.0, tv=tv)).x
+    solver = RichardsonLucy(steps, accelerate=True) if method == "Richardson-Lucy" else FISTA(steps, sparsity=0.0)
+    return solve(A, image, solver).x
 
 
 @jax.jit
@@ -68,7 +70,7 @@ def objective(psf: Image, image: Image, scene: Image) -> Float[Array, ""]:
 
 def ours(psf: np.ndarray, image: np.ndarray, method: str, steps: int):
     """A warm call, and what it takes to compile it."""
-    run = jax.jit(partial(solve, method=method, steps=steps))
+    run = jax.jit(partial(estimate, method=method, steps=steps))
     compile_s, call = timed(lambda: run.lower(jnp.asarray(psf), jnp.asarray(image)).compile())
     return compile_s, lambda: jax.block_until_ready(call(jnp.asarray(psf), jnp.asarray(image)))
 
@@ -104,7 +106,7 @@ def run(
             with progress.step(f"{method}, 1/{factor}"):
                 compile_s, call = ours(psf, image, method, some)
                 spent, found = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
-            scene = np.asarray(found["gs_jax"].x[0])
+            scene = np.asarray(found["gs_jax"][0])
             common = {"factor": factor, "pixels": image.size, "steps": some, "method": method}
             place = Convolution.of(psf[None], image.shape).place
             for name, seconds in spent.items():

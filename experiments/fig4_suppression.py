@@ -25,7 +25,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
-from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.locate import find_points
@@ -47,7 +47,7 @@ def run(design: Design, data: Path | None, *, count=120, voxel=0.03, step=0.25, 
 
 def _compare(truth, capture, design, grid, progress) -> dict:
     imager = design.imager()
-    volume = reconstruct_stack(capture, imager, grid, progress)
+    volume = reconstruct(capture, imager, grid, progress=progress)
     points = {
         "nothing": np.zeros((0, 4)),
         "threshold and peaks, the best": _best(lambda lowest: _peaks(volume, grid, lowest), truth),

@@ -31,7 +31,7 @@ from gs_jax.demo.scene import words
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
-from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.simulation.phantoms import rasterize, snowflake
 from gs_jax.simulation.scene import simulate_points
@@ -99,7 +99,7 @@ def _judged(volume: np.ndarray, truth: np.ndarray) -> dict:
 
 
 def _back_projected(counts: np.ndarray, imager: Imager, grid: Grid, progress: Progress) -> np.ndarray:
-    return reconstruct_stack(electrons(counts, Camera()), imager, grid, progress)
+    return reconstruct(electrons(counts, Camera()), imager, grid, progress=progress)
 
 
 def simulated_scenes() -> dict[str, np.ndarray]:

@@ -41,7 +41,8 @@ from gs_jax.metrics import localization, quality
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import geometric_psf
 from gs_jax.optics.theory import FWHM
-from gs_jax.reconstruction.methods import reconstruct
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.consistency import local_levels
@@ -96,10 +97,8 @@ def methods(s: Scene, steps: dict[str, int], progress: Progress) -> dict[str, Ca
     """Every method, as a call without arguments."""
     radius = clear_diameter(s.imager.array) / 2
     psf = jnp.stack([geometric_psf(s.imager, z, size=PSF_PIXELS, radius=radius) for z in s.grid.depths])
-    light = jnp.asarray(np.maximum(s.image - local_levels(s.image)[0], 0))
-    solve = lambda name: np.asarray(
-        reconstruct(light, s.imager, s.grid, psf, method=name, steps=steps.get(name, 1)), np.float32
-    )
+    light = np.maximum(s.image - local_levels(s.image)[0], 0)
+    solve = lambda name: reconstruct(light, s.imager, s.grid, METHODS[name](steps.get(name, 1)), psf=psf)
     of = lambda points: Result(spots(points, s.grid, float(s.grid.pitch) / FWHM), points)
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),

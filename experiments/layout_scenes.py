@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward, forward_operator
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
 from gs_jax.simulation.camera import Camera, electrons, expose
-from gs_jax.solvers.richardson_lucy import list_richardson_lucy
+from gs_jax.solvers.iteration import solve
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 # Standard deviation of a blob and of the local background, mm.
 WIDTH, BACKGROUND = 0.06, 0.2
@@ -111,7 +112,7 @@ def _reconstructed(image, centers, study, method):
     image = jnp.asarray(image, centers.dtype)
     if method == "backproject":
         return reconstruct(image, study.imager(centers), study.grid(), background_width=BACKGROUND)
-    return list_richardson_lucy(image, study.imager(centers), study.grid(), steps=10).x
+    return solve(forward_operator(study.imager(centers), study.grid()), image, RichardsonLucy(steps=10)).x
 
 
 def judge(

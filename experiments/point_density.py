@@ -22,7 +22,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
 from gs_jax.metrics import localization
-from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.scene import simulate_points
@@ -58,7 +58,7 @@ def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np
 
 def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int, progress: Progress) -> np.ndarray:
     """The highest local maxima of the plain back-projection, `(x, y, z, value)`."""
-    volume = reconstruct_stack(capture, imager, grid, progress)
+    volume = reconstruct(capture, imager, grid, progress=progress)
     return local_maxima(volume, grid, min_distance=1, num_peaks=count)
 
 

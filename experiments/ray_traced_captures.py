@@ -23,7 +23,7 @@ from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.reconstruction.pipeline import reconstruct_stack
+from gs_jax.reconstruction.pipeline import reconstruct
 
 # A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
 LATERAL, AXIAL = 0.04, 0.3
@@ -46,7 +46,7 @@ def run(
 def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: Progress) -> dict:
     ((x, y, z, _),) = points_of(data, scene)
     grid = Grid.over(imager.sensor, depths=z + np.arange(-0.5, 0.51, 0.05), pitch=voxel_mm)
-    volume = reconstruct_stack(read_capture(data / f"P1_{scene}.tif", imager.sensor.shape), imager, grid, progress)
+    volume = reconstruct(read_capture(data / f"P1_{scene}.tif", imager.sensor.shape), imager, grid, progress=progress)
     d, r, c = np.unravel_index(int(volume.argmax()), volume.shape)
     lateral = np.hypot(float(grid.x[c]) - x, float(grid.y[r]) - y)
     return {"lateral_error_um": 1000 * lateral, "axial_error_um": 1000 * (float(grid.depths[d]) - z)}
@@ -55,7 +55,7 @@ def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: P
 def _many(data: Path, imager: Imager, voxel_mm: float, step_mm: float, progress: Progress) -> tuple[dict, np.ndarray]:
     truth = points_of(data, "d")[:, :3]
     grid = Grid.over(imager.sensor, depths=np.arange(17.6, 22.41, step_mm), pitch=voxel_mm)
-    volume = reconstruct_stack(read_capture(data / "P1_d.tif", imager.sensor.shape), imager, grid, progress)
+    volume = reconstruct(read_capture(data / "P1_d.tif", imager.sensor.shape), imager, grid, progress=progress)
     peaks, brightness = _peaks(volume, grid)
     scale = np.array([LATERAL, LATERAL, AXIAL])
     near = KDTree(truth / scale).query(peaks / scale)

@@ -1,14 +1,76 @@
-"""Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
+"""Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses.
 
-from ._version import __version__ as __version__
-from .geometry import (
-    Grid as Grid,
-    Imager as Imager,
-    MicrolensArray as MicrolensArray,
-    Sensor as Sensor,
-    chief_ray as chief_ray,
-    envelope as envelope,
-)
-from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
-from .projection.forward_model import forward as forward
-from .projection.operators import ray_operator as ray_operator
+Lengths are in millimetres, lateral points `(x, y)`, volumes `[depth, row, column]`.
+
+The microscope:
+
+    Imager               A microlens array in front of a sensor, and the light: the one geometry of the package
+    MicrolensArray       Plano-convex microlenses on one plate, the plano side toward the object
+    Sensor               A camera sensor of square pixels, in the plane `z = -v` behind the lenses
+    Grid                 Voxels of the object space; centred on the axis, unless it has another origin
+    Design               A microscope, with the tables and keys of its file
+    read_design          The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`
+    write_design         Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal
+    geomscope            The paper's microscope (Table 1), with a random layout of our own of the same statistics
+    random_layout        A random layout with a wanted pitch and no hole between the lenses
+    datasheet            The metrics of a design as numbers for a JSON file, with units in the names
+
+From a capture to a volume:
+
+    read_capture         A capture `(row, column)` in the file's own type: uint8, uint16 or float32
+    reconstruct          The volume that an image shows
+    BackProjection       `backproject`, the paper's reconstruction: one step, no PSF
+    ListRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection: no PSF, and as local
+    RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
+    FISTA                FISTA: least squares with sparsity, not negative, for any operator
+    ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator
+    show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
+    write_volume         Writes a volume, never rescaled or clipped, whole or not at all
+    read_volume          A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths
+
+Without the background:
+
+    suppress             What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero
+    find_points          Finds the points that a capture shows: those that nearly all of their lenses see
+    find_clusters        Points by the paper's particle clustering, from the volume alone
+    write_points         Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal
+    read_points          Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`
+
+From a scene to a capture:
+
+    simulate             The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s
+    Camera               What turns electrons into counts
+    expose               The counts of one exposure
+    rasterize            The volume that a scene makes on a grid: emitters are shared out linearly along x, y, z
+    write_capture        Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all
+
+The operators themselves, differentiable:
+
+    backproject          Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction")
+    backproject_adjoint  The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from
+    forward              The image of a volume: Eq. (2), summed lens by lens and without its zones
+    forward_operator     The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
+    solve                Explain an image: all steps of a solver, or as many as its tolerance asks for
+
+Better designs, and their molds:
+
+    optimize             Search for a design that does what a study wants
+    read_study           The study in a TOML file
+    make_mold            Writes the mold of a design, or the array, to print; and a picture and a report beside it
+
+How good it is:
+
+    quality              PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best
+    localization         Match found points with true ones, each at most once, and score them
+
+Around all:
+
+    Progress             Bars that show how far long work is, on standard error where that is a terminal
+    InputError           Wrong input from a user, explained in one line
+
+"""
+
+import lazy_loader
+
+# What each name is, `__init__.pyi` says, to type checkers too. A name is imported when it is asked for.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -168,7 +168,7 @@ class MicrolensArray(eqx.Module):
 
 
 class Imager(eqx.Module):
-    """A microlens array in front of a sensor, and the light that it images: the one geometry of the package.
+    """A microlens array in front of a sensor, and the light: the one geometry of the package.
 
     Parameters
     ----------

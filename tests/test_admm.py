@@ -8,10 +8,12 @@ import pytest
 from jax.test_util import check_grads
 from skimage.restoration import denoise_tv_chambolle
 
-from gs_jax.solvers.admm import admm, admm_convolution
+from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.convolution import Convolution
-from gs_jax.solvers.fista import fista
-from gs_jax.solvers.total_variation import differences, differences_adjoint, shrink, total_variation
+from gs_jax.solvers.convolution_admm import ConvolutionADMM
+from gs_jax.solvers.fista import FISTA
+from gs_jax.solvers.iteration import solve
+from gs_jax.solvers.variation import differences, differences_adjoint, shrink, total_variation
 
 
 def system(depths=1):
@@ -22,14 +24,21 @@ def system(depths=1):
     return convolution, convolution(scene) + noise
 
 
+def weights(convolution, image, **absolute):
+    """Of a solver, whose unit is the largest voxel of the adjoint's scene."""
+    unit = convolution.operator.T.mv(image).max()
+    return {name: weight / unit for name, weight in absolute.items()}
+
+
 def objective(convolution, image, x, *, tv, l1, isotropic=False):
     residual = convolution(x) - image
     variation = total_variation(differences(x, wrap=True), isotropic=isotropic)
     return jnp.vdot(residual, residual) / 2 + tv * variation + l1 * jnp.sum(x)
 
 
-def numpy_admm(psf, image, steps, tv, l1, rho=1.0):
-    """DiffuserCam's ADMM for one depth, written out: complex FFTs, three splits, three multipliers."""
+def numpy_admm(psf, image, steps, tv, l1, penalties=(1.0, 1.0, 1.0)):
+    """DiffuserCam's ADMM for one depth, written out: complex FFTs, three splits, multipliers and penalties."""
+    r, s, t = penalties
     shape = [n + k - 1 for n, k in zip(image.shape, psf.shape, strict=True)]
     corner = [(n - m) // 2 for n, m in zip(shape, image.shape, strict=True)]
     place = slice(corner[0], corner[0] + image.shape[0]), slice(corner[1], corner[1] + image.shape[1])
@@ -42,17 +51,18 @@ def numpy_admm(psf, image, steps, tv, l1, rho=1.0):
     step_adjoint = lambda u: np.roll(u[0], 1, 0) - u[0] + np.roll(u[1], 1, 1) - u[1]
     point = np.zeros(shape)
     point[0, 0] = 1
-    inverse = 1 / (np.abs(kernel) ** 2 + np.fft.fft2(step_adjoint(step(point))).real + 1)
+    inverse = 1 / (r * np.abs(kernel) ** 2 + s * np.fft.fft2(step_adjoint(step(point))).real + t)
     seen, data = np.zeros(shape), np.zeros(shape)
     seen[place], data[place] = 1, image
     x = v = w = a = c = np.zeros(shape)
     u = b = np.zeros((2, *shape))
     for _ in range(steps):
-        v = (data + rho * (forward(x) + a)) / (seen + rho)
-        u = np.sign(d := step(x) + b) * np.maximum(np.abs(d) - tv / rho, 0)
-        w = np.maximum(x + c - l1 / rho, 0)
+        v = (data + r * (forward(x) + a)) / (seen + r)
+        u = np.sign(d := step(x) + b) * np.maximum(np.abs(d) - tv / s, 0)
+        w = np.maximum(x + c - l1 / t, 0)
         a, b, c = a + forward(x) - v, b + step(x) - u, c + x - w
-        x = np.fft.ifft2(inverse * np.fft.fft2(adjoint(v - a) + step_adjoint(u - b) + w - c)).real
+        target = r * adjoint(v - a) + s * step_adjoint(u - b) + t * (w - c)
+        x = np.fft.ifft2(inverse * np.fft.fft2(target)).real
     w = np.maximum(x, 0)
     residual = forward(w)[place] - image
     return w, (residual**2).sum() / 2 + tv * np.abs(step(w)).sum() + l1 * w.sum()
@@ -87,7 +97,8 @@ def test_the_cost_is_that_of_a_plain_numpy_version():
     convolution, image = system()
     psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
     x, expected = numpy_admm(np.asarray(psf[0]), np.asarray(image), 4000, 0.05, 0.1)
-    found = jax.jit(lambda b: admm_convolution(convolution, b, steps=4000, tv=0.05, l1=0.1))(image)
+    solver = ConvolutionADMM(4000, **weights(convolution, image, tv=0.05, sparsity=0.1))
+    found = jax.jit(lambda b: solve(convolution, b, solver))(image)
     np.testing.assert_allclose(objective(convolution, image, found.x, tv=0.05, l1=0.1), expected, rtol=1e-8)
     np.testing.assert_allclose(found.costs[-1], expected, rtol=1e-8)
     # The scenes differ in size by a margin that reaches no pixel and stays dark.
@@ -98,10 +109,11 @@ def test_the_cost_is_that_of_a_plain_numpy_version():
 def test_ffts_conjugate_gradients_and_fista_meet(depths):
     """Sparsity alone, which all three can."""
     convolution, image = system(depths)
-    solve = lambda solver, A, steps: jax.jit(lambda b: solver(A, b, steps=steps, l1=0.2))(image).x
-    by_fft = solve(admm_convolution, convolution, 3000)
-    by_cg = solve(admm, convolution.operator, 500)
-    by_fista = solve(fista, convolution.operator, 1000)
+    sparse = weights(convolution, image, sparsity=0.2)
+    run = lambda A, solver: jax.jit(lambda b: solve(A, b, solver))(image).x
+    by_fft = run(convolution, ConvolutionADMM(3000, **sparse))
+    by_cg = run(convolution.operator, ADMM(500, **sparse))
+    by_fista = run(convolution.operator, FISTA(1000, **sparse))
     costs = [objective(convolution, image, x, tv=0.0, l1=0.2) for x in (by_fft, by_cg, by_fista)]
     np.testing.assert_allclose(costs, costs[-1], rtol=1e-8)
 
@@ -109,8 +121,8 @@ def test_ffts_conjugate_gradients_and_fista_meet(depths):
 @cache
 def minimum(depths, isotropic):
     convolution, image = system(depths)
-    run = lambda b: admm_convolution(convolution, b, steps=4000, tv=0.05, l1=0.02, isotropic=isotropic)
-    return jax.jit(run)(image)
+    solver = ConvolutionADMM(4000, isotropic=isotropic, **weights(convolution, image, tv=0.05, sparsity=0.02))
+    return jax.jit(lambda b: solve(convolution, b, solver))(image)
 
 
 @pytest.mark.parametrize("isotropic", [False, True])
@@ -131,7 +143,8 @@ def test_isotropic_total_variation_denoises_as_scikit_image_does():
     """The identity as operator; Chambolle's dual method, without wrapping, is what scikit-image has."""
     image = 3 + jnp.zeros((16, 14)).at[4:9, 5:11].set(2.0) + 0.3 * jax.random.normal(jax.random.key(2), (16, 14))
     A = lx.IdentityLinearOperator(jax.ShapeDtypeStruct(image.shape, image.dtype))
-    found = jax.jit(lambda b: admm(A, b, steps=600, tv=0.4, isotropic=True))(image)
+    solver = ADMM(600, sparsity=0.0, tv=0.4 / image.max(), isotropic=True)
+    found = jax.jit(lambda b: solve(A, b, solver))(image)
     expected = denoise_tv_chambolle(np.asarray(image), weight=0.4, eps=1e-12, max_num_iter=20000)
     # Both converge sublinearly; Chambolle's is at about 1e-4 after so many.
     np.testing.assert_allclose(found.x, expected, atol=2e-3)
@@ -139,9 +152,8 @@ def test_isotropic_total_variation_denoises_as_scikit_image_does():
 
 def test_the_penalty_finds_its_way_and_the_residuals_stop_it():
     convolution, image = system()
-    run = jax.jit(
-        lambda b, s: admm_convolution(convolution, s * b, steps=3000, tolerance=1e-5, tv=0.05 * s, l1=0.1 * s)
-    )
+    solver = ConvolutionADMM(3000, tolerance=1e-5, **weights(convolution, image, tv=0.05, sparsity=0.1))
+    run = jax.jit(lambda b, s: solve(convolution, s * b, solver))
     for scale in (1e-3, 1e3):
         found = run(image, scale)
         assert found.converged and found.steps < 2000
@@ -156,17 +168,35 @@ def test_gradients():
 
     def moment(psf, image, tv):
         system = Convolution.of(psf, image.shape)
-        return jnp.vdot(weight, admm_convolution(system, image, steps=4, tv=tv, isotropic=True).x)
+        return jnp.vdot(weight, solve(system, image, ConvolutionADMM(4, tv=tv, isotropic=True)).x)
 
     # Away from the kinks of soft thresholding at this generic point.
-    check_grads(jax.jit(moment), (psf, image, jnp.array(0.05)), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
+    tv = jnp.asarray(weights(convolution, image, tv=0.05)["tv"])
+    check_grads(jax.jit(moment), (psf, image, tv), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("isotropic", [False, True])
 def test_a_dark_image_gives_zeros(isotropic):
     convolution, image = system(2)
-    run = lambda b: admm_convolution(convolution, b, steps=5, tv=0.1, isotropic=isotropic)
+    run = lambda b: solve(convolution, b, ConvolutionADMM(5, tv=0.1, isotropic=isotropic))
     found = jax.jit(run)(0 * image)
     assert not np.any(found.x) and not np.any(found.costs)
     gradient = jax.jit(jax.grad(lambda b: run(b).x.sum()))(0 * image)
     assert np.all(np.isfinite(gradient))
+
+
+def test_low_frequencies_do_not_outweigh_what_is_known_of_the_scene():
+    """A diffuser's lowest are many times as strong as the rest: one penalty for all brings in the scene slowly.
+
+    LenslessPiCam's constant penalties, too, are beaten by far after so few steps.
+    """
+    psf = jax.random.uniform(jax.random.key(0), (1, 32, 30))
+    psf = psf / jnp.linalg.norm(psf)
+    convolution = Convolution.of(psf, (32, 30))
+    image = convolution(jnp.zeros(convolution.scene_shape).at[0, 20:40, 18:40].set(1.0))
+    image = image / jnp.linalg.norm(image)
+    solver = ConvolutionADMM(20, **weights(convolution, image, tv=1e-4, sparsity=0.0))
+    x = jax.jit(lambda b: solve(convolution, b, solver))(image).x
+    cost = objective(convolution, image, x, tv=1e-4, l1=0.0)
+    for penalties in ((1.0, 1.0, 1.0), (1e-6, 1e-5, 4e-5)):
+        assert 4 * cost < numpy_admm(np.asarray(psf[0]), np.asarray(image), 20, 1e-4, 0.0, penalties)[1]

@@ -88,7 +88,7 @@ def test_adjoint_matches_the_transpose_of_a_plain_jax_version():
             rays = imager.project(jnp.stack([x, y, z])[None])[:, 0]
             distance2 = jnp.sum((imager.centers - jnp.stack([x, y])) ** 2, axis=1)
             u, v = imager.sensor.to_pixels(rays).T
-            weight = gs_jax.envelope(distance2, imager.reduced_depth(z), imager.field_radius)
+            weight = gs_jax.geometry.envelope(distance2, imager.reduced_depth(z), imager.field_radius)
             inside = (u >= 0) & (u <= image.shape[0] - 1) & (v >= 0) & (v <= image.shape[1] - 1)
             values = jax.scipy.ndimage.map_coordinates(image, [u, v], order=1)
             return jnp.sum(jnp.where(inside, weight * values, 0))

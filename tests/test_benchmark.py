@@ -2,17 +2,13 @@ import csv
 import json
 import math
 
-import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.base.progress import Progress
 from gs_jax.benchmark import compare, report
 from gs_jax.benchmark.compare import METHODS, obstacle, run, slopes
 from gs_jax.benchmark.scenes import Case, bench, peaks, scores, spots
-from gs_jax.reconstruction.methods import forward_operator, reconstruct
 
 from .helpers import scene
 
@@ -37,7 +33,7 @@ def found():
         patch.setattr(compare, "ProcessPoolExecutor", Here)
         patch.setattr(compare, "_REPEATS", 2)
         names = ("backproject", "backproject + clusters", "richardson-lucy", "richardson-lucy, dense")
-        return run((16,), methods=names, seeds=(0,), progress=Progress())
+        return run((16,), methods=names, seeds=(0,))
 
 
 def test_records_and_files(found, tmp_path):
@@ -98,19 +94,6 @@ def test_what_is_too_large_or_too_slow_is_left_out_in_words():
     assert obstacle("backproject", 100, last, 60.0) == "would take 100 s an image, allowed: 60 s"
     assert obstacle("backproject", 100, last, 200.0) is None
     assert set(METHODS) > {"backproject", "list-rl", "admm, dense"}
-
-
-def test_every_method_reconstructs_and_a_wrong_one_is_named():
-    imager, grid = scene(voxels=(9, 8), pitch=0.1, depths=(18.0, 20.0))
-    psf = jnp.zeros((2, 3, 3)).at[:, 1, 1].set(1.0)
-    truth = jnp.zeros((2, 9, 8)).at[1, 4, 3].set(1.0)
-    A = forward_operator(imager, grid, psf)
-    assert isinstance(A, lx.AbstractLinearOperator)
-    for method in ("backproject", "list-rl", "richardson-lucy", "fista", "admm"):
-        volume = reconstruct(A.mv(truth), imager, grid, psf, method=method, steps=10)
-        assert int(volume.argmax()) == int(truth.argmax()), method
-    with pytest.raises(ValueError, match="one of backproject, list-rl, .*, got 'magic'"):
-        reconstruct(A.mv(truth), imager, grid, psf, method="magic")
 
 
 def test_command(found, tmp_path, monkeypatch):

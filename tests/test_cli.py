@@ -89,7 +89,7 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
         "--voxel-um",
         "20",
         "--suppress",
-        "cluster",
+        "points",
         "-o",
         "v.tif",
         "--points",
@@ -277,7 +277,7 @@ def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gs_jax.cli.reconstruct.reconstruct_stack", interrupt)
+    monkeypatch.setattr("gs_jax.cli.reconstruct.volume_of", interrupt)
     status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
     assert (status, err.strip()) == (1, "gs-jax: interrupted")
     assert not (folder / "v.tif").exists()

@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.stats import binom
 
-from gs_jax import envelope
+from gs_jax.geometry import envelope
 from gs_jax.suppression.consistency import (
     Readings,
     agreed_level,

@@ -5,7 +5,8 @@ import pytest
 from jax.test_util import check_grads
 from scipy import integrate
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, chief_ray, envelope
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
+from gs_jax.geometry import chief_ray, envelope
 
 from .helpers import scene
 

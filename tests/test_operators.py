@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 
-from gs_jax import backproject, backproject_adjoint, ray_operator
+from gs_jax import backproject, backproject_adjoint, forward_operator
 
 from .helpers import scene
 
@@ -12,7 +12,7 @@ def test_transpose_is_backprojection():
     imager, grid = scene()
     image = jax.random.normal(jax.random.key(0), imager.sensor.shape)
     volume = jax.random.normal(jax.random.key(1), (3, *grid.shape))
-    operator = ray_operator(imager, grid)
+    operator = forward_operator(imager, grid)
     np.testing.assert_array_equal(operator.mv(volume), backproject_adjoint(volume, imager, grid))
     np.testing.assert_array_equal(operator.T.mv(image), backproject(image, imager, grid))
     np.testing.assert_array_equal(operator.T.T.mv(volume), operator.mv(volume))
@@ -25,12 +25,12 @@ def test_it_composes_and_solves():
 
     @jax.jit
     def solve(image, imager):
-        operator = ray_operator(imager, grid)
+        operator = forward_operator(imager, grid)
         damping = lx.IdentityLinearOperator(operator.in_structure())
         normal = lx.TaggedLinearOperator(operator.T @ operator + 0.1 * damping, lx.positive_semidefinite_tag)
         return lx.linear_solve(normal, operator.T.mv(image), lx.CG(rtol=1e-12, atol=1e-12)).value
 
-    columns = jax.vmap(lambda e: ray_operator(imager, grid).mv(e.reshape(1, 5, 4)).ravel())(jnp.eye(20))
+    columns = jax.vmap(lambda e: forward_operator(imager, grid).mv(e.reshape(1, 5, 4)).ravel())(jnp.eye(20))
     expected = np.linalg.solve(columns @ columns.T + 0.1 * np.eye(20), columns @ image.ravel())
     np.testing.assert_allclose(solve(image, imager).ravel(), expected, rtol=1e-8)
 

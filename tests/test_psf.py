@@ -5,7 +5,8 @@ import pytest
 from jax.test_util import check_grads
 from scipy.special import j0, j1
 
-from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
+from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax.geometry import chief_ray
 from gs_jax.optics.psf import diffraction_psf, gaussian_psf, geometric_psf, strehl, window_fraction
 from gs_jax.optics.unit import best_focus, unit_rays, wavefront_rms
 

@@ -1,6 +1,6 @@
 """The solvers, on every kind of operator."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +11,18 @@ from jax.test_util import check_grads
 from scipy.optimize import nnls
 from skimage.restoration import richardson_lucy as of_skimage
 
-from gs_jax import Imager, MicrolensArray, backproject, forward, ray_operator
-from gs_jax.solvers.admm import admm
+from gs_jax import Imager, MicrolensArray, forward, forward_operator
+from gs_jax.base.errors import InputError
+from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.convolution import Convolution
-from gs_jax.solvers.fista import fista, gradient_descent, largest_eigenvalue
-from gs_jax.solvers.richardson_lucy import list_richardson_lucy, richardson_lucy
+from gs_jax.solvers.fista import FISTA, largest_eigenvalue
+from gs_jax.solvers.iteration import least_weight_of_darkness, solve
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 from .helpers import scene
 
-SOLVERS = {"R-L": richardson_lucy, "FISTA": fista, "gradient descent": gradient_descent, "ADMM": admm}
+# Nothing but the squares, where there is a choice.
+SOLVERS = {"R-L": RichardsonLucy, "FISTA": partial(FISTA, sparsity=0.0), "ADMM": partial(ADMM, sparsity=0.0)}
 
 
 def small():
@@ -44,7 +47,7 @@ def convolution():
 
 
 OPERATORS = {
-    "ray": lambda: ray_operator(*small()),
+    "ray": lambda: forward_operator(*small()),
     "blurred": lambda: blurred(*small()),
     "dense": dense,
     "convolution": convolution,
@@ -70,7 +73,7 @@ def made(operator):
 
 @cache
 def compiled(solver, operator):
-    return jax.jit(lambda image: SOLVERS[solver](made(operator), image, steps=150))
+    return jax.jit(lambda image: solve(made(operator), image, SOLVERS[solver](steps=150)))
 
 
 @pytest.mark.parametrize("operator", EVERY)
@@ -97,21 +100,22 @@ def test_a_dark_image_gives_zeros(solver, operator):
 def test_what_no_pixel_sees_stays_dark(solver):
     """An operator of zeros: nothing is known, and nothing is NaN."""
     A = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
-    found = jax.jit(lambda image: SOLVERS[solver](A, image, steps=5))(jnp.ones(30))
+    found = jax.jit(lambda image: solve(A, image, SOLVERS[solver](steps=5)))(jnp.ones(30))
     assert not np.any(found.x)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_images_may_be_integers(solver):
     image = jnp.arange(30, dtype=jnp.uint16)
-    run = jax.jit(lambda image: SOLVERS[solver](dense(), image, steps=5).x)
+    run = jax.jit(lambda image: solve(dense(), image, SOLVERS[solver](steps=5)).x)
     np.testing.assert_array_equal(run(image), run(image.astype(float)))
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_dark_image_ends_it_in_float32(solver):
     A = lx.MatrixLinearOperator(dense().matrix.astype(jnp.float32))
-    found = jax.jit(lambda image: SOLVERS[solver](A, image, steps=20, tolerance=1e-3))(jnp.zeros(30, jnp.float32))
+    options = SOLVERS[solver](steps=20, tolerance=1e-3)
+    found = jax.jit(lambda image: solve(A, image, options))(jnp.zeros(30, jnp.float32))
     assert found.converged and found.x.dtype == jnp.float32 and not np.any(found.x)
     assert np.isnan(found.costs[found.steps :]).all() and not np.isnan(found.costs[: found.steps]).any()
 
@@ -121,7 +125,7 @@ def by_geometry():
     imager, grid = scene(voxels=(4, 3), pitch=0.2, depths=(18.0, 20.0))
 
     def operator(centers, v):
-        return ray_operator(Imager(MicrolensArray(centers), imager.sensor, v, imager.field_radius), grid)
+        return forward_operator(Imager(MicrolensArray(centers), imager.sensor, v, imager.field_radius), grid)
 
     return operator, (imager.array.centers, imager.sensor_distance)
 
@@ -139,12 +143,12 @@ def test_gradients_by_image_and_operator(solver, kind):
     A = operator(*parameters)
     row, column = jnp.meshgrid(*(jnp.arange(n, dtype=float) for n in (*A.out_structure().shape, 1)[:2]), indexing="ij")
     image = (2 + jnp.sin(row / 10) + jnp.cos(column / 12 + row / 15)).reshape(A.out_structure().shape)
-    options = {"cg_steps": 3} if solver == "ADMM" else {}
+    options = SOLVERS[solver](steps=3, **({"cg_steps": 3} if solver == "ADMM" else {}))
     weight = jax.random.normal(jax.random.key(5), A.in_structure().shape)
 
     @jax.jit
     def moment(image, *parameters):
-        return jnp.vdot(weight, SOLVERS[solver](operator(*parameters), image, steps=3, **options).x)
+        return jnp.vdot(weight, solve(operator(*parameters), image, options).x)
 
     # Steps of 1e-6 mm stay within a pixel at this generic point; rounding of 1e-13 then costs 1e-6.
     check_grads(moment, (image, *parameters), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
@@ -156,7 +160,7 @@ def test_gradients_stay_finite_in_the_dark(solver, kind):
     operator, parameters = PARAMETRIC[kind]()
 
     def total(image, parameters):
-        return jnp.sum(SOLVERS[solver](operator(*parameters), image, steps=2).x)
+        return jnp.sum(solve(operator(*parameters), image, SOLVERS[solver](steps=2)).x)
 
     dark = jnp.zeros(operator(*parameters).out_structure().shape)
     value, gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(dark, parameters)
@@ -164,40 +168,71 @@ def test_gradients_stay_finite_in_the_dark(solver, kind):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_progress_and_an_early_end(solver):
+def test_an_early_end_and_the_same_step_by_step(solver):
     A = dense()
-    told = []
-    run = lambda image: SOLVERS[solver](A, image, steps=400, tolerance=0.02, callback=lambda *now: told.append(now))
-    found = jax.block_until_ready(jax.jit(run)(A.mv(light(A))))
-    jax.effects_barrier()
+    image, options = A.mv(light(A)), SOLVERS[solver](steps=400, tolerance=0.02)
+    found = jax.jit(lambda image: solve(A, image, options))(image)
     assert found.converged and 1 < found.steps < 400
-    assert sorted(int(number) for number, _ in told) == list(range(1, int(found.steps) + 1))
-    costs = [float(cost) for _, cost in sorted(told, key=lambda now: int(now[0]))]
-    np.testing.assert_array_equal(costs, found.costs[: found.steps])
+    step = jax.jit(lambda state: options.step(A, image, state))
+    state, costs, residuals = options.init(A, image), [], []
+    for _ in range(int(found.steps)):
+        state, cost, residual = step(state)
+        costs.append(cost)
+        residuals.append(residual)
+    assert min(residuals[:-1]) >= 0.02 > residuals[-1]
+    # Compiled apart, the same sums are rounded otherwise.
+    np.testing.assert_allclose(costs, found.costs[: found.steps], rtol=1e-9)
+    np.testing.assert_allclose(options.estimate(state), found.x, atol=1e-9)
 
 
-@pytest.mark.parametrize("solver", ["FISTA", "gradient descent", "ADMM"])
+@pytest.mark.parametrize("solver", ["FISTA", "ADMM"])
 def test_least_squares_without_negative_values_is_scipys(solver):
     """More equations than unknowns and noise: one solution, on the boundary."""
     A = dense()
     image = jax.random.normal(jax.random.key(2), (30,)) + 1
     expected = nnls(np.asarray(A.as_matrix()), np.asarray(image))[0]
     assert 0 < np.count_nonzero(expected) < 12
-    found = jax.jit(lambda b: SOLVERS[solver](A, b, steps=3000))(image)
+    found = jax.jit(lambda b: solve(A, b, SOLVERS[solver](steps=3000)))(image)
     np.testing.assert_allclose(found.x, expected, atol=1e-8)  # they converge linearly, to the last digits
 
 
 def test_the_convex_solvers_meet_with_sparsity():
     A = dense()
     image = A.mv(light(A)) + 0.1 * jax.random.normal(jax.random.key(4), A.out_structure().shape)
+    weight = 0.02 * A.T.mv(image).max()
 
-    def final(solver, steps):
-        x = jax.jit(lambda b: solver(A, b, steps=steps, l1=0.3))(image).x
+    def final(solver):
+        x = jax.jit(lambda b: solve(A, b, solver))(image).x
         residual = A.mv(x) - image
-        return float(jnp.vdot(residual, residual) / 2 + 0.3 * jnp.sum(x))
+        return float(jnp.vdot(residual, residual) / 2 + weight * jnp.sum(x))
 
-    costs = [final(fista, 1000), final(gradient_descent, 6000), final(admm, 1000)]
+    costs = [final(solver(steps=1000, sparsity=0.02)) for solver in (FISTA, ADMM)]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-10)
+
+
+@pytest.mark.parametrize("solver", [FISTA, ADMM])
+def test_the_unit_of_sparsity_leaves_nothing_but_darkness(solver):
+    """A weight of 1 is the least that does, at which the solvers would be slow."""
+    A = dense()
+    image = A.mv(light(A))
+    run = jax.jit(lambda b, sparsity: solve(A, b, solver(steps=2000, sparsity=sparsity)).x)
+    np.testing.assert_allclose(run(image, 1.01), 0, atol=1e-9)
+    assert run(image, 0.99).max() > 1e-3
+    # Of a negative image there is nothing to be seen, and no negative weight.
+    assert least_weight_of_darkness(-image) == 0 and not np.any(run(-image, 0.5))
+
+
+def test_a_weight_that_changes_compiles_nothing(caplog):
+    """Weights are leaves of a solver, not part of its code."""
+    run = jax.jit(lambda image, solver: solve(dense(), image, solver).x)
+    image = jnp.ones(30)
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        first = run(image, FISTA(steps=3, sparsity=0.5))
+        assert [r for r in caplog.records if "Compiling" in r.getMessage()]
+        caplog.clear()
+        second = run(image, FISTA(steps=3, sparsity=0.01))
+        assert not [r for r in caplog.records if "Compiling" in r.getMessage()]
+    assert np.any(np.asarray(first) != np.asarray(second))
 
 
 def test_richardson_lucy_is_scikit_images():
@@ -212,28 +247,15 @@ def test_richardson_lucy_is_scikit_images():
     image = np.maximum(np.asarray(system(embedded)), 0)
     image[image < 1e-12] = 0  # an FFT's rounding
     expected = of_skimage(image, psf, num_iter=25, clip=False)
-    found = jax.jit(lambda b: richardson_lucy(system.operator, b, steps=25))(jnp.asarray(image))
+    found = jax.jit(lambda b: solve(system.operator, b, RichardsonLucy(steps=25)))(jnp.asarray(image))
     # The same iteration in exact arithmetic; 25 divisions amplify the rounding of the FFTs.
     np.testing.assert_allclose(found.x[0][system.place], expected, atol=1e-8)
 
 
-def test_list_richardson_lucy_multiplies_by_mean_ratios():
-    imager, grid = small()
-    image = 1 + jax.random.uniform(jax.random.key(0), imager.sensor.shape)
-    A = ray_operator(imager, grid)
-    x = jnp.where(A.T.mv(jnp.ones_like(image)) > 0, 1.0, 0)
-    for _ in range(3):
-        expected = A.mv(x)
-        ratio = jnp.where(expected > 0, image / jnp.where(expected > 0, expected, 1), 0)
-        x = x * backproject(ratio, imager, grid, normalize=True)
-    found = jax.jit(lambda image: list_richardson_lucy(image, imager, grid, steps=3))(image)
-    np.testing.assert_allclose(found.x, x, rtol=1e-10)  # from another uniform start: its scale does not matter
-
-
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
-    A = ray_operator(*small())
+    A = forward_operator(*small())
     truth = light(A)
-    jitted = cache(lambda **options: jax.jit(lambda b: richardson_lucy(A, b, steps=40, **options)))
+    jitted = cache(lambda **options: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=40, **options))))
     run = lambda image, **options: jitted(**options)(image)
     image = A.mv(truth) + 0.5
     plain, known = run(image), run(image, background=0.5)
@@ -249,7 +271,7 @@ def test_richardson_lucy_with_background_acceleration_and_total_variation():
 def test_richardson_lucy_climbs_and_keeps_the_light():
     A = dense()
     image = A.mv(light(A)) * jax.random.uniform(jax.random.key(6), (30,), minval=0.8, maxval=1.2)
-    found = jax.jit(lambda b: richardson_lucy(A, b, steps=50))(image)
+    found = jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=50)))(image)
     assert np.all(np.diff(found.costs) <= 1e-12)
     # After each step the expected image holds as much light as the image (Lucy 1974).
     np.testing.assert_allclose(A.mv(found.x).sum(), image.sum(), rtol=1e-12)
@@ -264,10 +286,11 @@ def test_largest_eigenvalue():
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_wrong_arguments_are_named(solver):
-    A = dense()
-    with pytest.raises(ValueError, match=r"output shape \(30,\), got \(4,\)"):
-        SOLVERS[solver](A, jnp.zeros(4), steps=1)
-    with pytest.raises(ValueError, match="`steps` must be 1 or more, got 0"):
-        SOLVERS[solver](A, jnp.zeros(30), steps=0)
-    with pytest.raises(ValueError, match="`tolerance` must be 0 or more, got -1"):
-        SOLVERS[solver](A, jnp.zeros(30), steps=1, tolerance=-1.0)
+    with pytest.raises(InputError, match=r"image: found \(4,\), allowed: the operator's output shape, \(30,\)"):
+        solve(dense(), jnp.zeros(4), SOLVERS[solver](steps=1))
+    with pytest.raises(InputError, match="steps: found 0, allowed: 1 or more"):
+        SOLVERS[solver](steps=0)
+    with pytest.raises(InputError, match="tolerance: found -1.0, allowed: 0 or more"):
+        SOLVERS[solver](tolerance=-1.0)
+    with pytest.raises(InputError, match="sparsity: found nan, allowed: 0 or more"):
+        ADMM(sparsity=float("nan"))

@@ -5,7 +5,8 @@ import pytest
 from jax.test_util import check_grads
 from scipy.optimize import minimize_scalar
 
-from gs_jax import Imager, MicrolensArray, Sensor, chief_ray
+from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax.geometry import chief_ray
 from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
 
 WAVELENGTH = 520e-6

@@ -8,27 +8,35 @@ from rich.progress import BarColumn, Progress as Bars, TextColumn, TimeElapsedCo
 
 
 class Progress:
-    """A context in which long work shows how far it is, on standard error."""
+    """Bars that show how far long work is, on standard error where that is a terminal.
 
-    def __init__(self):
+    A context; with `shown=False` it shows nothing.
+    """
+
+    def __init__(self, *, shown: bool = True):
         console = Console(stderr=True)
         columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-        self._bars = Bars(*columns, console=console, disable=not console.is_terminal)
+        self._bars = Bars(*columns, console=console) if shown and console.is_terminal else None
 
     def __enter__(self) -> "Progress":
-        self._bars.start()
+        if self._bars:
+            self._bars.start()
         return self
 
     def __exit__(self, *_) -> None:
-        self._bars.stop()
+        if self._bars:
+            self._bars.stop()
 
     def track(self, items: Iterable, description: str) -> Iterable:
         """The items, one by one, with a bar."""
-        return self._bars.track(items, description=description)
+        return self._bars.track(items, description=description) if self._bars else items
 
     @contextmanager
     def step(self, description: str) -> Iterator[None]:
         """Work of unknown length."""
+        if not self._bars:
+            yield
+            return
         task = self._bars.add_task(description, total=None)
         yield
         self._bars.update(task, total=1, completed=1)
@@ -36,5 +44,12 @@ class Progress:
     @contextmanager
     def counter(self, description: str, total: int) -> Iterator[Callable[[], None]]:
         """Work of `total` parts; what it yields is called after each."""
-        task = self._bars.add_task(description, total=total)
-        yield lambda: self._bars.advance(task)
+        if not self._bars:
+            yield lambda: None
+            return
+        bars, task = self._bars, self._bars.add_task(description, total=total)
+        yield lambda: bars.advance(task)
+
+
+# What functions show that are given no progress.
+SILENT = Progress(shown=False)

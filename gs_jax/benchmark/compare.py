@@ -21,8 +21,13 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.info import available_memory
-from ..base.progress import Progress
-from ..reconstruction.methods import SOLVERS, forward_operator, reconstruct
+from ..base.progress import SILENT, Progress
+from ..projection.operators import forward_operator
+from ..reconstruction.methods import METHODS as RECONSTRUCTIONS
+from ..reconstruction.pipeline import reconstruct
+from ..solvers.admm import ADMM
+from ..solvers.iteration import solve
+from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.clustering import find_clusters
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
@@ -46,17 +51,12 @@ class Method(NamedTuple):
     dense: bool = False
 
 
-def _compiled(method: str):
-    def make(bench: Bench):
-        arguments = bench.imager, bench.grid, jnp.asarray(bench.psf)
-        image = jax.ShapeDtypeStruct(bench.imager.sensor.shape, jnp.float32)
-        call = reconstruct.lower(image, *arguments, method=method, steps=STEPS).compile()
-        return lambda image: call(image, *arguments)
-
-    return make
+def _reconstructed(name: str):
+    method = RECONSTRUCTIONS[name](STEPS)
+    return lambda bench: lambda image: reconstruct(image, bench.imager, bench.grid, method, psf=bench.psf)
 
 
-def _dense(solver: str):
+def _dense(solver: RichardsonLucy | ADMM):
     """The same solver with the system matrix in memory; making it is counted with compilation."""
 
     def make(bench: Bench):
@@ -71,12 +71,12 @@ def _dense(solver: str):
         matrix = jnp.asarray(matrix)
         voxels = jax.ShapeDtypeStruct((size,), jnp.float32)
 
-        def solve(matrix, image):
+        def explain(matrix, image):
             # On processors XLA is many times slower with `matrix.T @ x`, which is what `MatrixLinearOperator` takes.
             operator = lx.FunctionLinearOperator(lambda x: x @ matrix, voxels)
-            return SOLVERS[solver](operator, image, steps=STEPS).x
+            return solve(operator, image, solver).x
 
-        call = jax.jit(solve).lower(matrix, jax.ShapeDtypeStruct((pixels,), jnp.float32)).compile()
+        call = jax.jit(explain).lower(matrix, jax.ShapeDtypeStruct((pixels,), jnp.float32)).compile()
         return lambda image: call(matrix, image.ravel()).reshape(shape)
 
     return make
@@ -84,38 +84,38 @@ def _dense(solver: str):
 
 def _located(bench: Bench):
     def run(image):
-        points = find_points(image, bench.imager, bench.grid, progress=Progress())
+        points = find_points(image, bench.imager, bench.grid)
         return spots(points, bench.grid, bench.width)
 
     return run
 
 
 def _clustered(bench: Bench):
-    first = _compiled("backproject")(bench)
+    first = _reconstructed("backproject")(bench)
 
     def run(image):
-        points = find_clusters(np.asarray(first(image)), bench.grid)
+        points = find_clusters(first(image), bench.grid)
         return spots(points, bench.grid, bench.width)
 
     return run
 
 
 def _network(bench: Bench):
-    first, network = _compiled("backproject")(bench), pretrained()
-    return lambda image: suppress(np.asarray(first(image)), network)
+    first, network = _reconstructed("backproject")(bench), pretrained()
+    return lambda image: suppress(first(image), network)
 
 
 METHODS = {
-    "backproject": Method(_compiled("backproject")),
+    "backproject": Method(_reconstructed("backproject")),
     "backproject + points": Method(_located),
     "backproject + clusters": Method(_clustered),
     "backproject + unet": Method(_network),
-    "list-rl": Method(_compiled("list-rl")),
-    "richardson-lucy": Method(_compiled("richardson-lucy")),
-    "fista": Method(_compiled("fista")),
-    "admm": Method(_compiled("admm")),
-    "richardson-lucy, dense": Method(_dense("richardson-lucy"), 1.0, True),
-    "admm, dense": Method(_dense("admm"), 1.0, True),
+    "list-rl": Method(_reconstructed("list-rl")),
+    "richardson-lucy": Method(_reconstructed("richardson-lucy")),
+    "fista": Method(_reconstructed("fista")),
+    "admm": Method(_reconstructed("admm")),
+    "richardson-lucy, dense": Method(_dense(RichardsonLucy(STEPS)), 1.0, True),
+    "admm, dense": Method(_dense(ADMM(STEPS)), 1.0, True),
 }
 
 
@@ -161,7 +161,7 @@ def run(
     methods: Sequence[str] = tuple(METHODS),
     seeds: Sequence[int] = (0, 1, 2),
     limit: float = LIMIT,
-    progress: Progress,
+    progress: Progress | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The records of all methods and sizes, and what was left out: `method`, `pairs`, `reason`.
 
@@ -176,11 +176,12 @@ def run(
     limit
         A method is not run at a size where an image would take longer, by its time at the last, seconds.
     """
+    progress = progress or SILENT
     records, left_out = [], []
     cases = {}
     for side in progress.track(sides, "Images"):
         at = bench(side)
-        cases[side] = [case(at, seed, Progress()) for seed in (seeds if side**4 < 1e10 else seeds[:1])]
+        cases[side] = [case(at, seed) for seed in (seeds if side**4 < 1e10 else seeds[:1])]
         dark = [scores(np.zeros_like(c.truth), c, at) for c in cases[side]]
         nothing = {"method": "zeros", "pairs": float(side) ** 4} | dict.fromkeys(COSTS, 0.0)
         records += [nothing | found | {"seed": seed} for found, seed in zip(dark, seeds, strict=False)]

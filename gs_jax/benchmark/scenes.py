@@ -61,7 +61,7 @@ def bench(side: int) -> Bench:
     return Bench(in_float32(imager), in_float32(grid), np.asarray(psf, np.float32)[None], width)
 
 
-def case(bench: Bench, seed: int, progress: Progress) -> Case:
+def case(bench: Bench, seed: int, progress: Progress | None = None) -> Case:
     """Particles at random, as wide as the microscope resolves, and their image with noise."""
     _, grid, _, width = bench
     # In JAX's own precision, as the PSFs are computed.

@@ -8,15 +8,17 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import read_design
+from ..geometry import Grid
 from ..io.captures import read_capture
 from ..io.disk import check_output
 from ..io.points import write_points
 from ..io.volumes import VOLUME_SUFFIXES, write_volume
 from ..reconstruction.methods import METHODS
-from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack, voxel_grid
+from ..reconstruction.pipeline import reconstruct as volume_of, voxel_grid
 from ..simulation.phantoms import rasterize
+from ..suppression.clustering import find_clusters
 from ..suppression.locate import find_points
-from ..suppression.unet import pretrained, suppress as without_background
+from ..suppression.unet import read_weights, suppress as without_background
 from .options import UM, Depths, depth_range
 
 
@@ -25,15 +27,16 @@ from .options import UM, Depths, depth_range
 @click.argument("design", type=Path)
 @click.option("--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included.")
 @click.option("--voxel-um", type=UM, help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth]")
-@click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
+@click.option("--method", type=click.Choice(list(METHODS)), default="backproject", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 100_000), default=20, show_default=True, help="Of the other methods.")
 @click.option(
     "--suppress",
-    type=click.Choice(["none", "cluster", "unet"]),
+    type=click.Choice(["none", "points", "clusters", "unet"]),
     default="none",
     show_default=True,
-    help="Background suppression: cluster for sparse points, unet for anything.",
+    help="Background suppression: points that their lenses agree on, the paper's clusters, or a network for anything.",
 )
+@click.option("--weights", type=Path, help="WEIGHTS.npz of `gs-jax train`, for --suppress unet.  [default: ours]")
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
 def command(
@@ -44,6 +47,7 @@ def command(
     method: str,
     steps: int,
     suppress: str,
+    weights: Path | None,
     output: Path,
     points: Path | None,
 ):
@@ -56,23 +60,28 @@ def command(
         check_output(points, [".csv"])
     if suppress != "none" and method != "backproject":
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
+    if weights and suppress != "unet":
+        raise InputError(f"--weights: found --suppress {suppress}, allowed: --suppress unet, which they are for.")
+    network = read_weights(weights) if weights else None
     microscope = read_design(design)
     imager = microscope.imager()
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000)
     image = read_capture(capture, imager.sensor.shape)
     found = np.zeros((0, 4))
     with Progress() as progress:
-        if points or suppress == "cluster":
+        if suppress == "points" or (points and suppress != "clusters"):
             found = find_points(image, imager, grid, progress=progress)
-        if suppress == "cluster":
-            volume = np.asarray(rasterize(found, grid), np.float32)
-        elif method == "backproject":
-            volume = reconstruct_stack(image, imager, grid, progress)
+        if suppress == "points":
+            volume = _volume_of_points(found, grid)
         else:
-            volume = reconstruct_iteratively(image, imager, grid, method=method, steps=steps, progress=progress)
+            volume = volume_of(image, imager, grid, METHODS[method](steps), progress=progress)
+        if suppress == "clusters":
+            with progress.step("Clustering"):
+                found = find_clusters(volume, grid)
+                volume = _volume_of_points(found, grid)
         if suppress == "unet":
             with progress.step("Suppressing the background"):
-                volume = without_background(volume, pretrained())
+                volume = without_background(volume, network)
         with progress.step("Writing"):
             write_volume(output, volume, grid)
             if points:
@@ -80,5 +89,9 @@ def command(
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
-    if points or suppress == "cluster":
+    if points or suppress in ("points", "clusters"):
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
+
+
+def _volume_of_points(points: np.ndarray, grid: Grid) -> np.ndarray:
+    return np.asarray(rasterize(points, grid), np.float32)

@@ -1,5 +1,6 @@
 """The demonstration: a microscope is judged, improved and used, and its mold is made."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +10,7 @@ import jax
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from ..base.progress import Progress
+from ..base.progress import SILENT, Progress
 from ..codesign.outcome import as_records, write_outcome
 from ..codesign.search import optimize
 from ..designs.builtin import geomscope
@@ -24,10 +25,11 @@ from ..io.points import write_points
 from ..io.volumes import write_volume
 from ..metrics import localization, quality
 from ..mold.make import make_mold
-from ..reconstruction.pipeline import reconstruct_iteratively, reconstruct_stack
+from ..reconstruction.pipeline import reconstruct
 from ..simulation.camera import Camera, expose
 from ..simulation.phantoms import random_points, rasterize
 from ..simulation.scene import simulate_points, simulate_volume
+from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
 from .report import Views, points_picture, report_text, views_picture
@@ -85,7 +87,7 @@ steps = 300
 """
 
 
-def run(folder: Path, progress: Progress) -> Path:
+def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Path:
     """Run the pipeline and write a folder: designs, captures, volume, points, mold, pictures, report.
 
     Returns
@@ -98,7 +100,7 @@ def run(folder: Path, progress: Progress) -> Path:
     InputError
         If the folder cannot be made or written to.
     """
-    make_folder(folder)
+    folder, progress = make_folder(folder), progress or SILENT
     seconds: dict[str, float] = {}
     with progress.step("Laying out the lenses"), _timed(seconds, "design and metrics"):
         design = geomscope()
@@ -140,14 +142,12 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
         light = simulate_volume(scene, imager, scene_grid, progress=progress)
         image = _exposed(light, folder / "words.tif", seed=0)
     with _timed(seconds, "back-projection, compiled first"):
-        plain = reconstruct_stack(image, imager, grid, progress)
+        plain = reconstruct(image, imager, grid, progress=progress)
     with progress.step("Suppressing the background"), _timed(seconds, "U-Net"):
         clean = suppress(plain, pretrained())
         write_volume(folder / "words.ome.tif", clean, grid)
     with _timed(seconds, "Richardson-Lucy"):
-        iterated = reconstruct_iteratively(
-            image, imager, coarse, method="richardson-lucy", steps=_STEPS, progress=progress
-        )
+        iterated = reconstruct(image, imager, coarse, RichardsonLucy(_STEPS), progress=progress)
     # A voxel's blur, so that a shift by part of a voxel is not counted as an error.
     truth = gaussian_filter(np.asarray(rasterize(emitters, coarse)), (0, 1, 1))
     volumes = {

@@ -57,7 +57,7 @@ def read_capture(path: str | os.PathLike[str], shape: tuple[int, int] | None = N
 
 
 def write_capture(path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"]) -> None:
-    """Writes a capture as it is, by its suffix an uncompressed TIFF, a PNG or an .npy; whole or not at all.
+    """Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all.
 
     Parameters
     ----------

@@ -7,7 +7,6 @@ their convex hull: of all triangulations the one closest to the sphere. Host cod
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import manifold3d
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, KDTree
 
-from ..base.progress import Progress
+from ..base.progress import SILENT, Progress
 from ..geometry import MicrolensArray
 from ..layouts.cells import cross
 from .outlines import Plan, draw_plan
@@ -103,7 +102,7 @@ def facet_surface(array: MicrolensArray, chord: float, progress: Progress | None
     inside = _hexagonal(radius, float(array.aperture_diameter) / 2, chord)
     points, facets, owners, first = [plan.points], [], [], len(plan.points)
     lenses = list(zip(centers, plan.outlines, strict=True))
-    for i, (center, outline) in enumerate(_tracked(lenses, progress)):
+    for i, (center, outline) in enumerate((progress or SILENT).track(lenses, "Tessellating")):
         ring = plan.points[outline.cap] - center
         added, cap = _facet_cap(ring, inside, radius, chord)
         index = np.concatenate([outline.cap, np.arange(first, first + len(added))])
@@ -130,10 +129,6 @@ def estimated_facets(array: MicrolensArray, chord: float) -> float:
     discs = len(array.centers) * math.pi / 4 * float(array.aperture_diameter) ** 2
     facet = math.sqrt(3) / 4 * 6 * float(array.radius_of_curvature) * chord
     return 1.2 * min(math.prod(array.size), discs) / facet
-
-
-def _tracked(lenses: list, progress: Progress | None) -> Iterable:
-    return progress.track(lenses, "Tessellating") if progress else lenses
 
 
 def _heights(array, plan: Plan, points, facets, lens, radius):

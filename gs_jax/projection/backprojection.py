@@ -73,7 +73,7 @@ def backproject(
 def backproject_adjoint(
     volume: Num[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
 ) -> Float[Array, "row column"]:
-    """The exact adjoint of `backproject`: each voxel adds its value to the pixels that it is read from.
+    """The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from.
 
     Its linear version is the image of a volume by pinholes: Eq. (2) with a point for PSF_o.
     Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths.

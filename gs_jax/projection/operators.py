@@ -1,22 +1,26 @@
 """The imaging system as a linear operator, volume to image."""
 
-import equinox as eqx
 import jax
 import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float
 
 from ..geometry import Grid, Imager
-from .backprojection import backproject_adjoint
+from .forward_model import forward
 
 
-def ray_operator(imager: Imager, grid: Grid, *, method: str = "linear") -> lx.AbstractLinearOperator:
-    """The ray-optics forward model; its transpose `.T` is `backproject`, exactly.
+def forward_operator(
+    imager: Imager, grid: Grid, psf: Float[Array | np.ndarray, "plane tall wide"] | None = None
+) -> lx.AbstractLinearOperator:
+    """The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint.
 
-    Build it inside the jitted function that uses it: as an argument, each new operator would recompile.
+    Without a PSF the adjoint is `backproject`. Build it inside the jitted function that uses it: as an argument, each
+    new operator would recompile.
 
     Parameters
     ----------
-    imager, grid, method
-        As for `backproject`.
+    imager, grid, psf
+        As for `forward`.
 
     Returns
     -------
@@ -24,4 +28,4 @@ def ray_operator(imager: Imager, grid: Grid, *, method: str = "linear") -> lx.Ab
         From `grid.volume_shape` to `sensor.shape`, both of the imager's type. Matrix-free.
     """
     volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
-    return lx.FunctionLinearOperator(eqx.Partial(backproject_adjoint, imager=imager, grid=grid, method=method), volume)
+    return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, psf), volume)

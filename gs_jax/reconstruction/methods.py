@@ -1,85 +1,67 @@
-"""Every way from an image to a volume, by name and with one signature."""
+"""Every way from an image to a volume, as an object that holds its options, and by name."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
-import jax
-import jax.numpy as jnp
-import lineax as lx
-import numpy as np
-from jaxtyping import Array, Float, Num
+import equinox as eqx
 
-from ..geometry import Grid, Imager
-from ..projection.backprojection import backproject
-from ..projection.forward_model import forward
-from ..solvers.admm import admm
-from ..solvers.fista import fista
-from ..solvers.iteration import Callback, Solution, as_image
-from ..solvers.richardson_lucy import list_richardson_lucy, richardson_lucy
-
-# Weight of the sum of voxels, in parts of the least weight that would leave nothing but darkness.
-_SPARSITY = 0.01
-
-Solver = Callable[..., Solution]
+from ..base.errors import InputError
+from ..solvers.admm import ADMM
+from ..solvers.fista import FISTA
+from ..solvers.iteration import Solver, check_options
+from ..solvers.richardson_lucy import RichardsonLucy
 
 
-def forward_operator(
-    imager: Imager, grid: Grid, psf: Float[Array | np.ndarray, "plane tall wide"]
-) -> lx.AbstractLinearOperator:
-    """`forward` with its PSF as a `lineax` operator, volume to image; build it inside the jitted function."""
-    volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
-    return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, psf), volume)
-
-
-def _sparse(solver, A, image, **options):
-    image = as_image(A, image)
-    weight = _SPARSITY * jnp.max(A.T.mv(image))
-    return solver(A, image, l1=jnp.maximum(weight, 0), **options)
-
-
-SOLVERS: dict[str, Solver] = {
-    "richardson-lucy": richardson_lucy,
-    "admm": partial(_sparse, admm),
-    "fista": partial(_sparse, fista),
-}
-METHODS = ("backproject", "list-rl", *SOLVERS)
-
-
-@partial(jax.jit, static_argnames=("method", "steps", "tolerance", "callback"))
-def reconstruct(
-    image: Num[Array | np.ndarray, "row column"],
-    imager: Imager,
-    grid: Grid,
-    psf: Float[Array | np.ndarray, "plane tall wide"],
-    *,
-    method: str,
-    steps: int = 50,
-    tolerance: float = 0.0,
-    callback: Callback | None = None,
-) -> Float[Array, "depth y x"]:
-    """A volume by one of `METHODS`.
+class BackProjection(eqx.Module):
+    """`backproject`, the paper's reconstruction: one step, no PSF.
 
     Parameters
     ----------
-    image, imager, grid, psf
-        As for `forward`; `backproject` and `list-rl` make no use of the PSF.
-    method
-        One of `METHODS`.
-    steps, tolerance, callback
-        As for `iterate`; `backproject` takes none.
+    interpolation
+        Between pixels, `"linear"` or `"nearest"` (the paper's).
+    normalize
+        Divide by the summed weights, so that a uniform image gives a uniform volume.
 
     Raises
     ------
-    ValueError
-        If there is no such method, or a shape is wrong.
+    InputError
+        If there is no such interpolation.
     """
-    options: dict[str, Any] = dict(steps=steps, tolerance=tolerance, callback=callback)
-    image = jnp.asarray(image)
-    if method == "backproject":
-        return backproject(image, imager, grid)
-    if method == "list-rl":
-        return list_richardson_lucy(image, imager, grid, **options).x
-    if method not in SOLVERS:
-        raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
-    return SOLVERS[method](forward_operator(imager, grid, psf), image, **options).x
+
+    interpolation: str = eqx.field(static=True, default="linear")
+    normalize: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if self.interpolation not in ("linear", "nearest"):
+            raise InputError(f"interpolation: found {self.interpolation!r}, allowed: linear, nearest.")
+
+
+class ListRichardsonLucy(eqx.Module):
+    """Richardson-Lucy on the pixel-voxel lists of back-projection: no PSF, and as local.
+
+    Each voxel is multiplied by the mean ratio, weighted by the envelope, over the pixels that back-projection would
+    read: it is `RichardsonLucy` with the ray operator, whose `A'(ratio) / A'1` is
+    `backproject(ratio, ..., normalize=True)`. Parameters and errors as there.
+    """
+
+    steps: int = eqx.field(static=True, default=20)
+    tolerance: float = eqx.field(static=True, default=0.0)
+    accelerate: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check_options(self)
+
+    @property
+    def solver(self) -> RichardsonLucy:
+        return RichardsonLucy(self.steps, self.tolerance, accelerate=self.accelerate)
+
+
+Method = BackProjection | ListRichardsonLucy | Solver
+
+# By the name that the command line and the benchmark know it by: from the number of steps to the method.
+METHODS: dict[str, Callable[[int], Method]] = {
+    "backproject": lambda steps: BackProjection(),
+    "list-rl": ListRichardsonLucy,
+    "richardson-lucy": RichardsonLucy,
+    "fista": FISTA,
+    "admm": ADMM,
+}

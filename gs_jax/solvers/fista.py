@@ -1,9 +1,11 @@
-"""Projected gradient descent and FISTA: least squares with sparsity, not negative, for any operator.
+"""FISTA: least squares with sparsity, not negative, for any operator.
 
-Both minimise `|A x - image|^2 / 2 + l1 |x|_1` over `x >= 0`. FISTA: Beck and Teboulle, SIAM J. Imaging Sci. 2, 183
-(2009).
+It minimises `|A x - image|^2 / 2 + l1 sum(x)` over `x >= 0` (Beck and Teboulle, SIAM J. Imaging Sci. 2, 183, 2009).
 """
 
+from typing import NamedTuple
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -11,86 +13,76 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..base.safe import divide
-from ..layouts.cells import Real
-from .iteration import Callback, Solution, as_image, iterate, norm
+from ..base.safe import Real, divide
+from .iteration import as_image, check_options, least_weight_of_darkness, norm
 
 # Steps of the power method, and what it may fall short by: for operators without negative entries the largest
 # eigenvalue stands alone, and this many steps find it to about a percent.
 _POWER_STEPS, _MARGIN = 20, 1.05
 
 
-def fista(
-    A: lx.AbstractLinearOperator,
-    image: Num[Array | np.ndarray, "..."],
-    *,
-    steps: int,
-    tolerance: float = 0.0,
-    l1: Real | Float[Array, ""] = 0.0,
-    callback: Callback | None = None,
-) -> Solution:
-    """FISTA, restarted whenever the momentum points uphill (O'Donoghue and Candes, Found. Comput. Math. 15, 715, 2015).
+class State(NamedTuple):
+    """Of `FISTA`: the estimate, the point ahead of it, the momentum's `t`; the step length and the weight `l1`."""
+
+    x: Array
+    point: Array
+    t: Array
+    rate: Array
+    weight: Array
+
+
+class FISTA(eqx.Module):
+    """FISTA: least squares with sparsity, not negative, for any operator.
+
+    It restarts whenever the momentum points uphill (O'Donoghue and Candes, Found. Comput. Math. 15, 715, 2015). A dark
+    image gives zeros.
 
     Parameters
     ----------
-    A
-        From a volume to an image.
-    image
-        To be explained.
-    steps, tolerance, callback
-        As for `iterate`; the residual is the relative change of `x`.
-    l1
-        Weight of the sum of `x`.
-
-    Returns
-    -------
-    Solution
-        A dark image gives zeros. `tolerance=0` is differentiable with respect to the image and whatever `A` holds.
+    steps, tolerance
+        As for `Solver`; the residual is the relative change of `x`.
+    sparsity
+        Weight of the sum of `x`, in parts of `max(A' image)`: the least that leaves nothing but darkness.
 
     Raises
     ------
-    ValueError
-        If the image is not of the operator's output shape, or a number is out of range.
+    InputError
+        If an option is negative, or a number of steps 0.
     """
-    return _descend(A, image, l1, True, steps=steps, tolerance=tolerance, callback=callback)
 
+    steps: int = eqx.field(static=True, default=20)
+    tolerance: float = eqx.field(static=True, default=0.0)
+    sparsity: Real | Float[Array, ""] = 0.01
 
-def gradient_descent(
-    A: lx.AbstractLinearOperator,
-    image: Num[Array | np.ndarray, "..."],
-    *,
-    steps: int,
-    tolerance: float = 0.0,
-    l1: Real | Float[Array, ""] = 0.0,
-    callback: Callback | None = None,
-) -> Solution:
-    """Projected gradient descent with the constant step 1/L; parameters and errors as for `fista`."""
-    return _descend(A, image, l1, False, steps=steps, tolerance=tolerance, callback=callback)
+    def __check_init__(self):
+        check_options(self)
 
+    def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
+        image = as_image(A, image)
+        back = A.T.mv(image)
+        weight = jnp.asarray(self.sparsity, image.dtype) * least_weight_of_darkness(back)
+        one, zeros = jnp.ones((), back.dtype), jnp.zeros_like(back)
+        return State(zeros, zeros, one, divide(one, _MARGIN * largest_eigenvalue(A)), weight)
 
-def _descend(A, image, l1, momentum, **options):
-    image = as_image(A, image)
-    l1 = jnp.asarray(l1, image.dtype)
-    rate = divide(jnp.ones((), image.dtype), _MARGIN * largest_eigenvalue(A))
-
-    def step(state):
-        x, point, t = state
-        residual = A.mv(point) - image
-        cost = jnp.vdot(residual, residual) / 2 + l1 * jnp.sum(jnp.abs(point))
-        new = jnp.maximum(point - rate * (A.T.mv(residual) + l1), 0)
-        change = divide(norm(new - x), norm(new))
-        if not momentum:
-            return (new, new, t), cost, change
+    def step(
+        self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
+    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        x, point, t, rate, weight = state
+        residual = A.mv(point) - as_image(A, image)
+        cost = jnp.vdot(residual, residual) / 2 + weight * jnp.sum(jnp.abs(point))
+        new = jnp.maximum(point - rate * (A.T.mv(residual) + weight), 0)
         uphill = jnp.vdot(point - new, new - x) > 0
         t_old = jnp.where(uphill, 1.0, t).astype(t.dtype)
         t_new = (1 + jnp.sqrt(1 + 4 * t_old**2)) / 2
-        weight = jnp.where(uphill, 0, (t_old - 1) / t_new)
-        return (new, new + weight * (new - x), t_new), cost, change
+        momentum = jnp.where(uphill, 0, (t_old - 1) / t_new)
+        return (
+            State(new, new + momentum * (new - x), t_new, rate, weight),
+            cost,
+            divide(norm(new - x), norm(new)),
+        )
 
-    structure = A.in_structure()
-    zeros = jnp.zeros(structure.shape, structure.dtype)
-    (x, *_), *history = iterate(step, (zeros, zeros, jnp.ones((), zeros.dtype)), **options)
-    return Solution(x, *history)
+    def estimate(self, state: State) -> Float[Array, "..."]:
+        return state.x
 
 
 def largest_eigenvalue(A: lx.AbstractLinearOperator, steps: int = _POWER_STEPS) -> Float[Array, ""]:

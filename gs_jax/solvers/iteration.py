@@ -1,11 +1,11 @@
-"""What every iterative solver shares: its result, its stopping rule, its history and its progress.
+"""What every iterative solver shares: how it is called, its result, its stopping rule and its history.
 
-A solver is a function `step(state) -> (state, cost, residual)`. Without a tolerance all steps are run in a
-`lax.scan`, through which `jax.grad` goes; with one, a `lax.while_loop` ends early.
+A solver is an object that holds its options and knows three things: where to start, a step, and what to take for the
+estimate. What stays the same from step to step is computed once, in the state. `solve` runs all steps, in one compiled
+loop; whoever wants to see or end each step calls them one by one.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -15,10 +15,38 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 
+from ..base.errors import InputError
 from ..base.safe import safe_sqrt
+from .convolution import Convolution
 
-# Called on the host after each step, with its number (from 1) and its cost.
-Callback = Callable[[Any, Any], None]
+System = lx.AbstractLinearOperator | Convolution
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """What a solver must have, besides being an `eqx.Module`."""
+
+    @property
+    def steps(self) -> int:
+        """The most to take."""
+        ...
+
+    @property
+    def tolerance(self) -> float:
+        """The residual below which it ends; 0 runs all steps, and can be differentiated in reverse."""
+        ...
+
+    def init(self, A: Any, image: Any, /) -> Any:
+        """The state before the first step: a pytree of arrays."""
+        ...
+
+    def step(self, A: Any, image: Any, state: Any, /) -> tuple[Any, Array, Array]:
+        """The next state, the cost of the point that the step started from, and a residual without unit."""
+        ...
+
+    def estimate(self, state: Any) -> Array:
+        """The volume that a state stands for."""
+        ...
 
 
 class Solution(eqx.Module):
@@ -33,7 +61,7 @@ class Solution(eqx.Module):
     steps
         How many were taken.
     converged
-        Whether the tolerance was met; if not, the steps ran out.
+        Whether the residual fell below the tolerance; if not, the steps ran out.
     """
 
     x: Float[Array, "*shape"]
@@ -42,75 +70,69 @@ class Solution(eqx.Module):
     converged: Bool[Array, ""]
 
 
-def iterate(
-    step: Callable[[PyTree], tuple[PyTree, Array, Array]],
-    state: PyTree,
-    *,
-    steps: int,
-    tolerance: float = 0.0,
-    callback: Callback | None = None,
-) -> tuple[PyTree, Float[Array, " step"], Int[Array, ""], Bool[Array, ""]]:
-    """Run a solver; it may be called inside `jit`.
+def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
+    """Explain an image: all steps of a solver, or as many as its tolerance asks for.
+
+    It may be called inside `jit`; build `A` there too, as an operator that comes as an argument recompiles. Without a
+    tolerance the solution is differentiable with respect to the image, what `A` holds and the solver's weights.
 
     Parameters
     ----------
-    step
-        `step(state)` returns the next state, the cost, and a residual without unit.
-    state
-        A pytree of arrays.
-    steps
-        The most to take.
-    tolerance
-        The residual at which to stop. 0 runs all steps, and can be differentiated in reverse.
-    callback
-        Called on the host with the number of each step and its cost.
-
-    Returns
-    -------
-    tuple
-        The last state, and `costs`, `steps` and `converged` as in `Solution`.
+    A
+        From a volume to an image; for `ConvolutionADMM`, a `Convolution`.
+    image
+        To be explained.
+    solver
+        `RichardsonLucy(...)`, `FISTA(...)`, `ADMM(...)`, or another `Solver`.
 
     Raises
     ------
-    ValueError
-        If `steps` is less than 1, or `tolerance` is negative.
+    InputError
+        If the image is not of the operator's output shape.
     """
-    if steps < 1:
-        raise ValueError(f"`steps` must be 1 or more, got {steps}.")
-    if not tolerance >= 0:
-        raise ValueError(f"`tolerance` must be 0 or more, got {tolerance}.")
-
-    def counted(state, number):
-        state, cost, residual = step(state)
-        if callback is not None:
-            jax.debug.callback(callback, number + 1, cost)
-        return state, cost, residual
-
-    if not tolerance:
-        state, costs = lax.scan(lambda s, n: counted(s, n)[:2], state, jnp.arange(steps))
-        return state, costs, jnp.array(steps), jnp.array(False)
+    state = solver.init(A, image)
+    if not solver.tolerance:
+        state, costs = lax.scan(lambda s, _: solver.step(A, image, s)[:2], state, length=solver.steps)
+        return Solution(solver.estimate(state), costs, jnp.array(solver.steps), jnp.array(False))
 
     def going(carry):
         _, _, number, residual = carry
-        return (number < steps) & (residual > tolerance)
+        return (number < solver.steps) & (residual >= solver.tolerance)
 
     def advance(carry):
         state, costs, number, _ = carry
-        state, cost, residual = counted(state, number)
+        state, cost, residual = solver.step(A, image, state)
         return state, costs.at[number].set(cost), number + 1, residual
 
-    _, cost, residual = jax.eval_shape(step, state)
-    start = state, jnp.full(steps, jnp.nan, cost.dtype), jnp.array(0), jnp.array(jnp.inf, residual.dtype)
+    _, cost, residual = jax.eval_shape(lambda s: solver.step(A, image, s), state)
+    start = state, jnp.full(solver.steps, jnp.nan, cost.dtype), jnp.array(0), jnp.array(jnp.inf, residual.dtype)
     state, costs, number, residual = lax.while_loop(going, advance, start)
-    return state, costs, number, residual <= tolerance
+    return Solution(solver.estimate(state), costs, number, residual < solver.tolerance)
+
+
+def check_options(solver: Any) -> None:
+    """Raises an `InputError` if an option that the solver has is below the least that it may be."""
+    for name, least in {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0}.items():
+        found = getattr(solver, name, least)
+        if isinstance(found, int | float) and not found >= least:
+            raise InputError(f"{name}: found {found}, allowed: {least} or more.")
 
 
 def as_image(A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-    """`image` in the operator's type; raises a `ValueError` that names the shapes if it is not of its output's."""
+    """`image` in the operator's type; raises an `InputError` that names the shapes if it is not of its output's."""
     expected = A.out_structure()
     if image.shape != expected.shape:
-        raise ValueError(f"`image` must be of the operator's output shape {expected.shape}, got {image.shape}.")
+        raise InputError(f"image: found {image.shape}, allowed: the operator's output shape, {expected.shape}.")
     return jnp.asarray(image, expected.dtype)
+
+
+def least_weight_of_darkness(back: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """The unit of weights, `max(A' image)` of `back = A' image`, or 0 if that is negative.
+
+    With this weight of the sum of `x`, or a larger one, the least cost is that of `x = 0`: the slope of
+    `|A x - image|^2 / 2 + weight sum(x)` there is `weight - A' image`, which is nowhere negative.
+    """
+    return jnp.maximum(jnp.max(back), 0)
 
 
 def norm(x: PyTree) -> Float[Array, ""]:

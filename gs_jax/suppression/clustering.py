@@ -23,12 +23,13 @@ def find_clusters(
     thresholds: Sequence[Real] = (0.05, 0.1, 0.15, 0.2),
     noise_floor: Real = 5.0,
 ) -> Float64[np.ndarray, "point 4"]:
-    """The paper's particle clustering ("Background suppression through a particle clustering algorithm").
+    """Points by the paper's particle clustering, from the volume alone.
 
-    What exceeds the first threshold falls into connected groups. Each is divided by its own maximum and cut at the next
-    threshold, which divides some into smaller ones, and so on. The brightest voxel of every group of any threshold is a
-    point. Voxels are connected by a face, an edge or a corner (26 neighbours). The thresholds are those of the authors'
-    published code, as parts of a group's maximum; where that code breaks a tie at random, we take the first voxel.
+    "Background suppression through a particle clustering algorithm": what exceeds the first threshold falls into
+    connected groups. Each is divided by its own maximum and cut at the next threshold, which divides some into smaller
+    ones, and so on. The brightest voxel of every group of any threshold is a point. Voxels are connected by a face, an
+    edge or a corner (26 neighbours). The thresholds are those of the authors' published code, as parts of a group's
+    maximum; where that code breaks a tie at random, we take the first voxel.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Shaped
 from scipy.spatial import KDTree
 
-from ..base.progress import Progress
+from ..base.progress import SILENT, Progress
 from ..geometry import Grid, Imager
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
@@ -59,7 +59,7 @@ _SEARCHES = 2
 
 
 def find_points(
-    image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, *, progress: Progress
+    image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, *, progress: Progress | None = None
 ) -> Points:
     """Finds the points that a capture shows: those that nearly all of their lenses see.
 
@@ -97,6 +97,7 @@ def find_points(
     ValueError
         If the image is not `sensor.shape`.
     """
+    progress = progress or SILENT
     if image.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
     seen, voxels = signal(image), _voxels(imager, grid)

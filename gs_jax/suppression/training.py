@@ -1,7 +1,7 @@
 """Training of the networks of `unet`: the paper's recipe and ours, with checkpoints from which it goes on exactly."""
 
+import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -106,13 +106,13 @@ def _step(optimizer, steps: int, network: Any, memory: optax.OptState, batch: Ba
     return optax.apply_updates(network, updates), memory, value
 
 
-def write_checkpoint(path: Path, state: State) -> None:
+def write_checkpoint(path: str | os.PathLike[str], state: State) -> None:
     """Writes a state, exactly, whole or not at all."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         eqx.tree_serialise_leaves(file, state)
 
 
-def read_checkpoint(path: Path, recipe: Recipe, *, steps: int, seed: int) -> State:
+def read_checkpoint(path: str | os.PathLike[str], recipe: Recipe, *, steps: int, seed: int) -> State:
     """The state in a file of `write_checkpoint`, of the same recipe, number of steps and seed.
 
     Raises

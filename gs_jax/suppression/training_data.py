@@ -4,6 +4,7 @@ Everything is a function of a seed and a number: the same arguments give the sam
 """
 
 import math
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 from ..base.precision import in_float32
-from ..base.progress import Progress
+from ..base.progress import SILENT, Progress
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..io.disk import atomic_write, decoding, make_folder
 from ..layouts.patterns import random_layout
@@ -115,7 +116,7 @@ def simulated_stack(seed: int, number: int) -> Stack:
     return Stack((volume / unit).astype(np.float16), (max(slope, 0.0) / unit * truth).astype(np.float16))
 
 
-def stacks(folder: Path, count: int, seed: int, progress: Progress) -> list[Stack]:
+def stacks(folder: str | os.PathLike[str], count: int, seed: int, progress: Progress | None = None) -> list[Stack]:
     """The first `count` simulated stacks of a seed, from `folder`, or made and kept there.
 
     Raises
@@ -123,8 +124,11 @@ def stacks(folder: Path, count: int, seed: int, progress: Progress) -> list[Stac
     InputError
         If the folder cannot be made, or a file in it is no stack.
     """
-    make_folder(folder)
-    return [_kept(folder / f"{seed}-{i}.npz", seed, i) for i in progress.track(range(count), "Simulating captures")]
+    folder = make_folder(folder)
+    return [
+        _kept(folder / f"{seed}-{i}.npz", seed, i)
+        for i in (progress or SILENT).track(range(count), "Simulating captures")
+    ]
 
 
 def _kept(path: Path, seed: int, number: int) -> Stack:

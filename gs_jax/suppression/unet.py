@@ -6,6 +6,7 @@ and a volume comes out, of the same voxels: nothing is downsampled.
 """
 
 import json
+import os
 import zipfile
 from importlib import resources
 from itertools import product
@@ -137,7 +138,7 @@ def suppress(
     Parameters
     ----------
     volume
-        Of any size, finite; back-projected.
+        Of any size, finite; a volume as `reconstruct` makes it by back-projection.
     network
         From `pretrained`, `read_weights` or training; by default ours, which comes with the package.
 
@@ -195,7 +196,7 @@ def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
     return np.minimum(index, 2 * size - 1 - index)
 
 
-def write_weights(path: str | Path, network: UNet) -> None:
+def write_weights(path: str | os.PathLike[str], network: UNet) -> None:
     """Writes a network as `.npz`: its weights as float16, and what it is as JSON. Whole or not at all.
 
     Raises
@@ -209,7 +210,7 @@ def write_weights(path: str | Path, network: UNet) -> None:
         np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
 
 
-def read_weights(path: str | Path) -> UNet:
+def read_weights(path: str | os.PathLike[str]) -> UNet:
     """The network in a file of `write_weights`, in float32. Nothing in the file is ever executed.
 
     Raises

@@ -1,0 +1,33 @@
+from ._version import __version__ as __version__
+from .base.errors import InputError as InputError
+from .base.progress import Progress as Progress
+from .codesign.search import optimize as optimize
+from .codesign.study import read_study as read_study
+from .designs.builtin import geomscope as geomscope
+from .designs.design import Design as Design, read_design as read_design, write_design as write_design
+from .designs.sheet import datasheet as datasheet
+from .geometry import Grid as Grid, Imager as Imager, MicrolensArray as MicrolensArray, Sensor as Sensor
+from .io.captures import read_capture as read_capture, write_capture as write_capture
+from .io.points import read_points as read_points, write_points as write_points
+from .io.volumes import read_volume as read_volume, write_volume as write_volume
+from .layouts.patterns import random_layout as random_layout
+from .metrics import localization as localization, quality as quality
+from .mold.make import make_mold as make_mold
+from .pictures import show as show
+from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
+from .projection.forward_model import forward as forward
+from .projection.operators import forward_operator as forward_operator
+from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
+from .reconstruction.pipeline import reconstruct as reconstruct
+from .simulation.camera import Camera as Camera, expose as expose
+from .simulation.phantoms import rasterize as rasterize
+from .simulation.scene import simulate as simulate
+from .solvers.admm import ADMM as ADMM
+from .solvers.fista import FISTA as FISTA
+from .solvers.iteration import solve as solve
+from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
+from .suppression.clustering import find_clusters as find_clusters
+from .suppression.locate import find_points as find_points
+from .suppression.unet import suppress as suppress
+
+__all__: list[str]

@@ -1,0 +1,88 @@
+"""What `import gs_jax` offers: the names, their first lines, and the script that a newcomer writes first."""
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import gs_jax as gs
+from gs_jax.simulation.phantoms import random_points
+
+ROOT = Path(__file__).parents[1]
+# A middle piece of the built-in microscope, so that the test takes seconds: 54 lenses, 800^2 pixels of 9 um.
+SMALL = {"[5120, 5120]": "[800, 800]", "pixel_pitch_um = 4.5": "pixel_pitch_um = 9.0"}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a design and a capture of five points and nothing else."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "design").mkdir()
+    text = (ROOT / "design" / "geomscope.toml").read_text()
+    for old, new in SMALL.items():
+        text = text.replace(old, new)
+    pairs = re.findall(r"\[(-?[\d.]+), (-?[\d.]+)\],?\n", text[text.index("centers_mm") :])
+    inner = [pair for pair in pairs if max(abs(float(x)) for x in pair) < 4.4]
+    start, end = text.index("centers_mm"), text.index("[imaging]")
+    text = text[:start] + f"centers_mm = [{', '.join(f'[{x}, {y}]' for x, y in inner)}]\n" + text[end:]
+    (tmp_path / "design" / "geomscope.toml").write_text(text)
+    scope = gs.read_design("design/geomscope.toml").imager()
+    points = random_points(5, (3.0, 3.0), (18.5, 21.5), seed=3)
+    image = gs.simulate(points, scope, psf="geometric")
+    gs.write_capture("capture.tif", np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=2e4)))
+    return points
+
+
+def test_the_first_script(folder):
+    scope = gs.read_design("design/geomscope.toml").imager()
+    image = gs.read_capture("capture.tif", scope.sensor.shape)
+    grid = gs.Grid.over(scope.sensor, depths=np.arange(18, 22.1, 0.25), pitch=0.04)
+    volume = gs.reconstruct(image, scope, grid)
+    clean, points = gs.suppress(volume), gs.find_points(image, scope, grid)
+    figure = gs.show(clean, grid, points=points)
+
+    assert volume.shape == clean.shape == grid.volume_shape
+    assert gs.localization(points, folder).f1 == 1
+    figure.savefig("figure.png", dpi=40)
+    coarse = grid.at([18.5, 20.0, 21.5])
+    assert gs.reconstruct(image, scope, coarse, method=gs.RichardsonLucy(steps=2)).shape == coarse.volume_shape
+
+
+def test_files_take_strings_and_paths(folder, tmp_path):
+    assert gs.read_design(tmp_path / "design" / "geomscope.toml") == gs.read_design("design/geomscope.toml")
+    for path in ("points.csv", tmp_path / "points.csv"):
+        gs.write_points(path, folder)
+        np.testing.assert_array_equal(gs.read_points(path), folder)
+
+
+def test_help_lists_every_name_with_its_first_line():
+    """The package's docstring is its table of contents; what it says of a name is what the name says of itself."""
+    listed = dict(re.findall(r"^    (\w+) {2,}(.+)$", gs.__doc__ or "", re.MULTILINE))
+    assert sorted(listed) == sorted(name for name in gs.__all__ if not name.startswith("_"))
+    assert 30 <= len(listed) <= 45
+    for name, line in listed.items():
+        assert line == (inspect.getdoc(getattr(gs, name)) or "").split("\n")[0].rstrip("."), name
+
+
+def test_every_public_function_documents_its_arguments_or_needs_no_words():
+    for name in gs.__all__:
+        value = getattr(gs, name)
+        if inspect.isfunction(value) and len(inspect.signature(value).parameters) > 2:
+            assert "Parameters\n" in (inspect.getdoc(value) or ""), name
+
+
+def test_importing_the_package_is_quick_work():
+    """Names are loaded when they are asked for: the package alone imports neither JAX nor NumPy."""
+    code = "import sys, gs_jax; print({'jax', 'numpy', 'matplotlib'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_a_design_says_what_it_is_in_a_few_lines():
+    lines = repr(gs.read_design(ROOT / "design" / "geomscope.toml")).splitlines()
+    assert len(lines) == 4 and "geomscope" in lines[0] and "200 lenses" in lines[1] and "520 nm" in lines[3]

@@ -1,0 +1,149 @@
+"""From an image to a volume, by every method."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gs_jax import Imager, MicrolensArray, Sensor, backproject, forward_operator
+from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
+from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
+from gs_jax.reconstruction.pipeline import reconstruct
+from gs_jax.solvers.fista import FISTA
+from gs_jax.solvers.iteration import solve
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
+
+from .helpers import scene
+
+
+@cache
+def small():
+    """An imager, a grid, a PSF, and the image of one bright voxel."""
+    imager, grid = scene(voxels=(9, 8), pitch=0.1, depths=(18.0, 20.0))
+    psf = jnp.zeros((2, 3, 3)).at[:, 1, 1].set(1.0)
+    truth = jnp.zeros(grid.volume_shape).at[1, 4, 3].set(1.0)
+    return imager, grid, psf, truth, forward_operator(imager, grid, psf).mv(truth)
+
+
+class Log(Progress):
+    """What is shown, as a list; the work is interrupted after so many parts."""
+
+    def __init__(self, most=1000):
+        super().__init__(shown=False)
+        self.parts, self.most = [], most
+
+    def counter(self, description, total):
+        log = self
+
+        class Counter:
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_): ...
+            def __call__(self):
+                log.parts.append((description, total))
+                if len(log.parts) == log.most:
+                    raise KeyboardInterrupt
+
+        return Counter()
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
+    """The second call compiles nothing, with another image and for another number of steps, too."""
+    imager, grid, psf, truth, image = small()
+    first = reconstruct(image, imager, grid, METHODS[name](10), psf=psf)
+    assert first.dtype == np.float32 and first.shape == grid.volume_shape
+    assert int(first.argmax()) == int(truth.argmax())
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        jax.jit(lambda x: x + 1)(image)
+        assert [r for r in caplog.records if "Compiling" in r.getMessage()]  # as JAX words it
+        caplog.clear()
+        second = reconstruct(2 * np.asarray(image), imager, grid, METHODS[name](11), psf=psf)
+    assert not [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
+    assert not np.array_equal(first, second)
+
+
+def test_it_is_what_the_solver_finds_in_one_loop():
+    imager, grid, psf, _, image = small()
+    for solver in (FISTA(steps=7), RichardsonLucy(steps=7, accelerate=True)):
+        expected = jax.jit(lambda b, s=solver: solve(forward_operator(imager, grid, psf), b, s).x)(image)
+        np.testing.assert_allclose(reconstruct(image, imager, grid, solver, psf=psf), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_each_step_is_shown_and_can_be_the_last():
+    imager, grid, psf, _, image = small()
+    log = Log()
+    reconstruct(image, imager, grid, RichardsonLucy(steps=10), psf=psf, progress=log)
+    assert log.parts == 10 * [("Iterating", 10)]
+    early = Log()
+    reconstruct(image, imager, grid, RichardsonLucy(steps=10, tolerance=0.3), psf=psf, progress=early)
+    assert 1 <= len(early.parts) < 9
+    interrupted = Log(most=3)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(image, imager, grid, RichardsonLucy(steps=10), psf=psf, progress=interrupted)
+    assert len(interrupted.parts) == 3
+
+
+def test_the_cameras_offset_is_taken_off_once():
+    imager, grid, psf, _, image = small()
+    counts = np.round(1000 * np.asarray(image) / float(image.max()))
+    plain = reconstruct(counts, imager, grid, FISTA(steps=5), psf=psf)
+    offset = reconstruct((counts + 100).astype(np.uint16), imager, grid, FISTA(steps=5), psf=psf)
+    np.testing.assert_allclose(offset, plain, rtol=1e-6)
+    # Read noise about zero is no offset: its darkest percent is negative.
+    noisy = counts + np.random.default_rng(0).normal(0, 3, counts.shape)
+    A = forward_operator(imager, grid, psf)
+    expected = jax.jit(lambda b: solve(A, b, FISTA(steps=5)).x)(noisy)
+    np.testing.assert_allclose(
+        reconstruct(noisy, imager, grid, FISTA(steps=5), psf=psf), expected, rtol=1e-5, atol=1e-5
+    )
+
+
+def test_list_richardson_lucy_multiplies_by_mean_ratios():
+    imager, grid = scene(voxels=(8, 7), pitch=0.1, depths=(18.0, 20.0))
+    # Its darkest percent is no light, so nothing is taken off.
+    image = 1 + jax.random.uniform(jax.random.key(0), imager.sensor.shape)
+    image = image.at[:3].set(0.0)
+    A = forward_operator(imager, grid)
+    x = jnp.where(A.T.mv(jnp.ones_like(image)) > 0, 1.0, 0)
+    for _ in range(3):
+        expected = A.mv(x)
+        ratio = jnp.where(expected > 0, image / jnp.where(expected > 0, expected, 1), 0)
+        x = x * backproject(ratio, imager, grid, normalize=True)
+    found = reconstruct(image, imager, grid, ListRichardsonLucy(steps=3))
+    # From another uniform start, whose scale does not matter; the volume is float32.
+    np.testing.assert_allclose(found, x, rtol=1e-6)
+
+
+def test_back_projection_has_its_options_and_all_its_planes():
+    imager, grid, *_, image = small()
+    many = grid.at(np.linspace(17, 22, 19))  # more than are done at a time
+    for options in ({}, {"normalize": True}, {"interpolation": "nearest"}):
+        method = options.get("interpolation", "linear")
+        expected = backproject(image, imager, many, method=method, normalize="normalize" in options)
+        np.testing.assert_allclose(reconstruct(image, imager, many, BackProjection(**options)), expected, rtol=1e-6)
+
+
+def test_the_psf_is_that_of_the_rays_unless_one_is_given():
+    """A point in focus and one far out of it: the blur is known, so both come back sharp."""
+    lens = MicrolensArray(np.array([[0.0, 0.0], [1.0, 0.1], [0.1, -1.0], [-0.9, 0.8]]), aperture_diameter=0.8)
+    imager = Imager(lens, Sensor((80, 76), 0.04), 4.4, 3.0)
+    _, grid = scene(voxels=(11, 9), pitch=0.1, depths=(20.0,))
+    volume = reconstruct(np.ones((80, 76)), imager, grid, RichardsonLucy(steps=2))
+    assert volume.shape == (1, 11, 9) and np.isfinite(volume).all()
+
+
+def test_wrong_arguments_are_named():
+    imager, grid, *_, image = small()
+    with pytest.raises(InputError, match="method: found 'fista', allowed: an object such as"):
+        reconstruct(image, imager, grid, "fista")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"image: found the shape \(5, 5\), allowed: the sensor's shape \(96, 80\)"):
+        reconstruct(np.ones((5, 5)), imager, grid)
+    with pytest.raises(InputError, match="interpolation: found 'cubic', allowed: linear, nearest"):
+        BackProjection(interpolation="cubic")
+    with pytest.raises(InputError, match="steps: found 0, allowed: 1 or more"):
+        ListRichardsonLucy(steps=0)
