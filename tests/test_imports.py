@@ -9,10 +9,28 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "gs_jax").rglob("*.py"))
 # Whatever stands here imports from what stands before it.
-ORDER: list[str] = (
-    "_version base geometry metrics pictures projection optics layouts io simulation designs solvers suppression "
-    "reconstruction codesign mold benchmark demo cli __main__"
-).split()
+ORDER = [
+    "_version",
+    "base",
+    "geometry",
+    "metrics",
+    "pictures",
+    "projection",
+    "optics",
+    "layouts",
+    "io",
+    "simulation",
+    "designs",
+    "solvers",
+    "suppression",
+    "reconstruction",
+    "codesign",
+    "mold",
+    "benchmark",
+    "demo",
+    "cli",
+    "__main__",
+]
 
 
 def imported(path: Path, root: Path = ROOT) -> Iterator[list[str]]:
