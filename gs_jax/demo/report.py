@@ -1,11 +1,13 @@
 """The pictures and the text of the demonstration."""
 
+from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ..designs.design import Design
+from ..geometry import Sensor
 from ..layouts.cells import nearest_neighbour_distances
 from ..metrics import Localization, Quality
 
@@ -23,15 +25,16 @@ def views_picture(views: Views, design: Design) -> Figure:
     count = len(views.depths)
     figure = Figure(figsize=(3.1 * (count + 1) + 0.8, 2.9 * len(views.volumes)), dpi=110, layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.25, count))
-    _captures(halves[0].subplots(2, 1), views.image, design)
-    size = [n * design.sensor.pixel_pitch_um / 2000 for n in design.sensor.shape]
-    sensor = (-size[1], size[1], size[0], -size[0])
+    sensor = design.imager().sensor
+    _captures(halves[0].subplots(2, 1), views.image, sensor)
     axes = halves[1].subplots(len(views.volumes), count, sharex=True, sharey=True, squeeze=False)
     for row, (name, volume) in zip(axes, views.volumes.items(), strict=True):
         for axis, depth, plane in zip(row, views.depths, volume, strict=True):
             # Back-projection has a pedestal, which is not an object.
             low = np.percentile(plane, 50)
-            axis.imshow(plane, cmap="magma", extent=sensor, vmin=low, vmax=max(np.percentile(plane, 99.9), low + 1e-9))
+            axis.imshow(
+                plane, cmap="magma", extent=sensor.extent, vmin=low, vmax=max(np.percentile(plane, 99.9), low + 1e-9)
+            )
             axis.set_title(f"{name}, {depth:g} mm", fontsize=9)
         row[0].set_ylabel("y, mm")
     for axis in axes[-1]:
@@ -39,17 +42,13 @@ def views_picture(views: Views, design: Design) -> Figure:
     return figure
 
 
-def _captures(axes, image: np.ndarray, design: Design) -> None:
-    pitch = design.sensor.pixel_pitch_um / 1000
-    half = [n * pitch / 2 for n in image.shape]
+def _captures(axes, image: np.ndarray, sensor: Sensor) -> None:
     step = max(1, image.shape[0] // 1024)
-    whole = image[::step, ::step]
     zoom = image[tuple(slice(n // 2 - 400, n // 2 + 400) for n in image.shape)]
-    for axis, part, (y, x), title in (
-        (axes[0], whole, half, "capture"),
-        (axes[1], zoom, 2 * [400 * pitch], "its middle"),
-    ):
-        axis.imshow(part, cmap="gray", extent=(-x, x, y, -y), vmax=np.percentile(part, 99.8))
+    middle = Sensor(zoom.shape, sensor.pixel_pitch)
+    shown = ((image[::step, ::step], sensor, "capture"), (zoom, middle, "its middle"))
+    for axis, (part, seen, title) in zip(axes, shown, strict=True):
+        axis.imshow(part, cmap="gray", extent=seen.extent, vmax=np.percentile(part, 99.8))
         axis.set(title=title, xlabel="x, mm", ylabel="y, mm")
 
 
@@ -84,74 +83,26 @@ def report_text(
     marks = {True: "yes", False: "NO", None: ""}
     span = lambda ends: " to ".join(dict.fromkeys("inf" if x is None else f"{x:.3g}" for x in ends))
     aim = lambda t: f"{t['kind'].replace('_', ' ')} {t['target']:g} {t['unit']}".rstrip()
-    wanted = "\n".join(
-        f"| {t['meaning']} | {aim(t)} | {span(t['before'])} | {span(t['after'])} | {marks[t['met_after']]} |"
-        for t in targets
+    rows = lambda cells: "\n".join(f"| {' | '.join(row)} |" for row in cells)
+    return template("report.md").format(
+        lenses=len(distances),
+        pitch=distances.mean(),
+        pitch_sd=distances.std(),
+        points=points,
+        lateral_um=1000 * points.lateral_rmse,
+        axial_um=1000 * points.axial_rmse,
+        part=part,
+        megabytes=part["file_bytes"] / 1e6,
+        said="\n".join(f"- {sentence}" for sentence in sentences),
+        checks="\n".join(f"- {check['text']}" for check in part["checks"]),
+        wanted=rows(
+            [t["meaning"], aim(t), span(t["before"]), span(t["after"]), marks[t["met_after"]]] for t in targets
+        ),
+        volumes=rows([name, f"{q.psnr_db:.1f}", f"{q.ssim:.3f}", f"{q.mse:.3g}"] for name, q in scores.items()),
+        times=rows([what, f"{time:.1f}"] for what, time in seconds.items()),
     )
-    volumes = "\n".join(f"| {name} | {q.psnr_db:.1f} | {q.ssim:.3f} | {q.mse:.3g} |" for name, q in scores.items())
-    checks = "\n".join(f"- {check['text']}" for check in part["checks"])
-    times = "\n".join(f"| {what} | {time:.1f} |" for what, time in seconds.items())
-    said = "\n".join(f"- {sentence}" for sentence in sentences)
-    return f"""# gs-jax demo
 
-## 1. The design
 
-A lensless microscope of {len(distances)} random microlenses, pitch {distances.mean():.2f} mm, SD
-{distances.std():.2f} mm: `design.toml`. All its numbers are in `metrics.json`. What they say:
-
-{said}
-
-## 2. A better prescription
-
-From the paper's Table 1 as printed (`printed.toml`, out of focus), the study `study.toml` looks for a design that meets
-the paper's targets by the paper's formulas: `optimized.toml` (numbers in `.json`, layout and history in `.png`).
-
-| what | wanted | before | after | met |
-|---|---|---|---|---|
-{wanted}
-
-![Layout, cost and terms](optimized.png)
-
-The formulas count neither aberrations nor light. The rest of this demonstration uses `design.toml`.
-
-## 3. Three words at three depths
-
-One capture (`words.tif`) of words at 18, 20 and 22 mm, simulated with diffraction and noise on a finer grid than the
-voxels, reconstructed in three ways. `words.ome.tif` is the stack after background suppression, to scale in Fiji and
-napari.
-
-![Capture, truth and reconstructions](words.png)
-
-| seven planes, 17 to 23 mm | PSNR, dB | SSIM | MSE |
-|---|---:|---:|---:|
-{volumes}
-
-Each volume is first multiplied by the number that fits it best. In a scene that is mostly dark an empty volume scores
-well; compare with the first row.
-
-## 4. Points
-
-`points.tif` shows points at random between 18 and 22 mm (`points-truth.csv`). Found
-(`points-found.csv`): precision {points.precision:.3f}, recall {points.recall:.3f}, F1 {points.f1:.3f}; RMS error
-{1000 * points.lateral_rmse:.1f} um laterally, {1000 * points.axial_rmse:.0f} um axially.
-
-![True and found points](points.png)
-
-## 5. The mold
-
-`mold.stl`: {part["facets"]:,} facets, {part["file_bytes"] / 1e6:.1f} MB, in mm; its numbers are in `mold.json`.
-
-![The mold](mold.png)
-
-{checks}
-
-## Time
-
-| step | seconds |
-|---|---:|
-{times}
-
-The captures come from the package's own optics (exact rays and diffraction of a lens on its axis, the same for all
-lenses and fields): a demonstration, not a proof of quality. What was measured on captures of an independent ray tracer
-is in the documentation of the experiments.
-"""
+def template(name: str) -> str:
+    """The text of a file that lies beside this one."""
+    return (resources.files("gs_jax") / "demo" / name).read_text("utf-8")

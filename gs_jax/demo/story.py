@@ -32,7 +32,7 @@ from ..simulation.scene import simulate_points, simulate_volume
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
-from .report import Views, points_picture, report_text, views_picture
+from .report import Views, points_picture, report_text, template, views_picture
 from .scene import WORDS, words
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
@@ -42,49 +42,6 @@ _POINTS = 60
 _PEAK_ELECTRONS = 10_000
 # Richardson-Lucy has every second plane and few steps: each costs a hundred back-projections.
 _COARSE, _STEPS = slice(None, None, 2), 8
-_STUDY = """# The paper's targets (Table 1), by the paper's own formulas, over 18 to 23 mm.
-name = "optimized"
-depths_mm = [18.0, 23.0]
-confusion_um = 36.0
-
-[free]
-sensor_distance_mm = [2.0, 6.0]
-radius_of_curvature_mm = [1.0, 3.0]
-aperture_diameter_mm = [0.3, 2.0]
-pitch_mm = [1.0, 1.5]
-
-[[terms]]
-name = "lateral_resolution_um"
-at_most = 40.0
-
-[[terms]]
-name = "axial_resolution_um"
-at_most = 300.0
-
-[[terms]]
-name = "depth_of_field_mm"
-at_least = 5.0
-
-[[terms]]
-name = "focus_offset"
-at_most = 0.5
-
-[[terms]]
-name = "occupancy"
-at_most = 0.5
-
-[[terms]]
-name = "lenses_per_point"
-at_least = 12.0
-
-[[terms]]
-name = "thickness_mm"
-at_most = 7.0
-
-[[stages]]
-solver = "levenberg-marquardt"
-steps = 300
-"""
 
 
 def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Path:
@@ -122,7 +79,7 @@ def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Pat
 
 def _optimise(folder: Path, progress: Progress) -> list[dict]:
     """From the design as the paper prints it, out of focus, to one that meets the paper's targets."""
-    write_text(folder / "study.toml", _STUDY, [".toml"])
+    write_text(folder / "study.toml", template("study.toml"), [".toml"])
     printed = geomscope(sensor_distance_mm=4.0)
     write_design(folder / "printed.toml", printed)
     outcome = optimize(printed, folder / "study.toml", progress=progress)
