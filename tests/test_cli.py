@@ -8,6 +8,7 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
+from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.io.points import read_points
 from gs_jax.io.volumes import read_volume, write_volume
@@ -76,6 +77,22 @@ def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
     assert (status, err) == (0, "") and out.startswith("v.tif: 5 x 39 x 33 voxels")
     volume, _ = read_volume(folder / "v.tif")
     assert np.isfinite(volume).all() and volume.min() >= 0
+
+
+def test_the_papers_clusters(folder, monkeypatch, capsys):
+    """The brightest voxels of connected groups, here of one point seen by four lenses; in the volume and as a table."""
+    image = np.full((96, 80), 16, np.uint16)
+    scope = read_design(folder / "design.toml").imager()
+    for row, column in np.asarray(scope.sensor.to_pixels(scope.project(np.array([[0.0, 0.0, 20.0]]))))[:, 0]:
+        image[round(row) - 1 : round(row) + 2, round(column) - 1 : round(column) + 2] = 1000
+    tifffile.imwrite(folder / "capture.tif", image)
+    options = ("--voxel-um", "50", "--suppress", "clusters", "-o", "v.tif", "--points", "p.csv")
+    status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, *options)
+    found = read_points(folder / "p.csv")
+    assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
+    assert np.abs(found[0, :2]).max() < 0.1 and abs(found[0, 2] - 20) <= 1
+    volume, _ = read_volume(folder / "v.tif")
+    assert volume.sum() == pytest.approx(found[:, 3].sum(), rel=1e-5)
 
 
 def test_points_of_a_capture(folder, monkeypatch, capsys):
@@ -209,6 +226,10 @@ WRONG_ARGUMENTS = [
                        "18:inf:1", "18:22:1e-9", "18:22:1:1", "18,22,1")
     ),
     ((*RECONSTRUCT, "-o", "v.tif", "--method", "admm", "--suppress", "unet"), "--suppress unet: found --method admm"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "cluster"), "'cluster' is not one of 'none', 'points', 'clusters'"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--weights", "w.npz"), "--weights: found --suppress none, allowed: --suppress unet"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "missing.npz"), "missing.npz"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "design.toml"), "design.toml: not a whole"),
     ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "p.txt: found the suffix"),
     (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
     (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),

@@ -8,11 +8,18 @@ from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
+from gs_jax.cli.reconstruct import command as reconstruct_command
 from gs_jax.cli.train import command
+from gs_jax.designs.design import read_design
+from gs_jax.io.captures import write_capture
+from gs_jax.io.volumes import read_volume
+from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.suppression import training_data
 from gs_jax.suppression.training import Recipe, read_checkpoint, start, train, write_checkpoint
 from gs_jax.suppression.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks
-from gs_jax.suppression.unet import UNet, read_weights
+from gs_jax.suppression.unet import UNet, read_weights, suppress
+
+from .test_cli import DESIGN
 
 
 def toy(offsets=(0,), batch=lambda rng: paper_batch(rng, 16)) -> Recipe:
@@ -189,6 +196,23 @@ def test_the_command_writes_weights_losses_and_a_checkpoint(toy_command, tmp_pat
     assert {each.name for each in tmp_path.iterdir()} == {"w.npz", "w.json", "w.checkpoint"}
     history = (tmp_path / "w.json").read_text()
     assert history.count(".") >= 5
+
+
+def test_what_was_trained_reconstructs(toy_command, tmp_path, monkeypatch):
+    """From `train` to the volume: `--weights` is the network of that file and no other."""
+    assert toy_command("--steps", 3, "-o", tmp_path / "w.npz").exit_code == 0
+    (tmp_path / "design.toml").write_text(DESIGN)
+    capture = np.random.default_rng(0).integers(0, 99, (96, 80)).astype(np.uint16)
+    write_capture(tmp_path / "capture.tif", capture)
+    monkeypatch.chdir(tmp_path)
+    options = ("--depths", "18:22:1", "--voxel-um", "50", "--suppress", "unet", "--weights", "w.npz", "-o", "v.tif")
+    result = CliRunner().invoke(reconstruct_command, ["capture.tif", "design.toml", *options])
+    assert result.exit_code == 0, result.output
+    volume, grid = read_volume("v.tif")
+    plain = reconstruct(capture, read_design("design.toml").imager(), grid)
+    expected = suppress(plain, read_weights("w.npz"))
+    np.testing.assert_allclose(volume, expected, rtol=1e-5, atol=1e-5 * expected.max())
+    assert not np.allclose(volume, suppress(plain))
 
 
 def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, monkeypatch):
