@@ -1,5 +1,14 @@
-import jax
-from hypothesis import settings
+import os
+from pathlib import Path
+
+# A test computes little and compiles much: what is less optimised is ready after two thirds of the time, and what was
+# compiled is kept for the other processes and the next run. JAX reads both when it is imported.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+
+import jax  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 # Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
 jax.config.update("jax_enable_x64", True)
