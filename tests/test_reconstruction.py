@@ -3,18 +3,21 @@
 import inspect
 from contextlib import contextmanager
 from functools import cache
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import backproject, forward_operator
+from gs_jax import Grid, backproject, forward_operator
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
+from gs_jax.benchmark.compare import obstacle
 from gs_jax.optics.window import psf_of_depth
 from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
-from gs_jax.reconstruction.pipeline import reconstruct
+from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
+from gs_jax.simulation.scene import simulate_volume
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.iteration import solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
@@ -146,3 +149,15 @@ def test_wrong_arguments_are_named():
         BackProjection(interpolation="cubic")
     with pytest.raises(InputError, match="steps: found 0, allowed: 1 or more"):
         ListRichardsonLucy(steps=0)
+
+
+def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
+    """Of a large machine whose memory others have taken, little is left for a volume or a divided plane."""
+    taken = SimpleNamespace(total=2**50, available=2**20)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: taken)
+    imager, grid, *_ = small()
+    with pytest.raises(InputError, match="GiB of the memory that is free"):
+        voxel_grid(imager, [18.0, 20.0], 0.001)
+    with pytest.raises(InputError, match="GiB that are free"):
+        simulate_volume(np.ones((1, 900, 900), np.float32), imager, Grid([20.0], (900, 900), 0.001))
+    assert obstacle("admm, dense", 30, None, 1e9) is not None

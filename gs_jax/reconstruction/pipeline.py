@@ -51,7 +51,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
         shape = " x ".join(map(str, (len(depths), *grid.shape)))
         raise InputError(
             f"--voxel-um, --depths: found {pitch * 1000:g} um and {len(depths)} depths, a volume of {shape} voxels or "
-            f"{size / 2**30:.3g} GiB, allowed: {memory / 2.5 / 2**30:.3g} GiB on this machine."
+            f"{size / 2**30:.3g} GiB, allowed: {memory / 2.5 / 2**30:.3g} GiB of the memory that is free."
         )
     return grid
 
