@@ -47,9 +47,8 @@ def _single(data: Path, scene: str, imager: Imager, voxel_mm: float, progress: P
     ((x, y, z, _),) = points_of(data, scene)
     grid = Grid.over(imager.sensor, depths=z + np.arange(-0.5, 0.51, 0.05), pitch=voxel_mm)
     volume = reconstruct(read_capture(data / f"P1_{scene}.tif", imager.sensor.shape), imager, grid, progress=progress)
-    d, r, c = np.unravel_index(int(volume.argmax()), volume.shape)
-    lateral = np.hypot(float(grid.x[c]) - x, float(grid.y[r]) - y)
-    return {"lateral_error_um": 1000 * lateral, "axial_error_um": 1000 * (float(grid.depths[d]) - z)}
+    dx, dy, dz = grid.to_mm(np.array(np.unravel_index(int(volume.argmax()), volume.shape))) - (x, y, z)
+    return {"lateral_error_um": 1000 * np.hypot(dx, dy), "axial_error_um": 1000 * dz}
 
 
 def _many(data: Path, imager: Imager, voxel_mm: float, step_mm: float, progress: Progress) -> tuple[dict, np.ndarray]:

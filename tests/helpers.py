@@ -59,7 +59,7 @@ def aperture_edge(array, angles):
 def backproject_loop(image, imager, grid, method="linear"):
     """The paper's sum as it is told: for each voxel, for each lens, find the pixel. Returns it and the weights' sum."""
     image = np.asarray(image, np.float64)
-    volume, weights = np.zeros((grid.depths.size, *grid.shape)), np.zeros((grid.depths.size, *grid.shape))
+    volume, weights = np.zeros(grid.volume_shape), np.zeros(grid.volume_shape)
     cos, sin = np.cos(float(imager.rotation)), np.sin(float(imager.rotation))
     centers = np.asarray(imager.array.centers, np.float64) @ np.array([[cos, sin], [-sin, cos]])
     centers = centers + np.asarray(imager.shift, np.float64)

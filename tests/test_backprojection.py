@@ -23,7 +23,7 @@ def image_of(sensor, dtype=jnp.float64, key=0):
 
 
 def volume_of(grid, dtype=jnp.float64, key=1):
-    return jax.random.uniform(jax.random.key(key), (grid.depths.size, *grid.shape), dtype)
+    return jax.random.uniform(jax.random.key(key), grid.volume_shape, dtype)
 
 
 @pytest.mark.parametrize("method", ["linear", "nearest"])
@@ -177,7 +177,7 @@ def test_many_depths_go_in_groups():
     """37 depths are three groups of 13, of which two are padding."""
     imager, grid = scene(voxels=(7, 6), pitch=0.15, depths=np.linspace(18, 24, 37))
     image, volume = image_of(imager.sensor), volume_of(grid)
-    one = Grid(grid.depths[30:31], grid.shape, grid.pitch)
+    one = grid.at(grid.depths[30:31])
     np.testing.assert_allclose(backproject(image, imager, grid)[30], backproject(image, imager, one)[0], rtol=1e-13)
     adjoint = backproject_adjoint(volume, imager, grid)
     np.testing.assert_allclose(jnp.vdot(backproject(image, imager, grid), volume), jnp.vdot(image, adjoint), rtol=1e-12)

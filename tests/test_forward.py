@@ -26,7 +26,7 @@ def with_sensor(imager, shape):
 
 
 def volume_of(grid, dtype=jnp.float64):
-    return jax.random.uniform(jax.random.key(2), (grid.depths.size, *grid.shape), dtype)
+    return jax.random.uniform(jax.random.key(2), grid.volume_shape, dtype)
 
 
 def test_without_a_psf_it_is_the_adjoint_of_back_projection():
@@ -69,7 +69,7 @@ def test_light_of_chief_rays_beside_the_sensor():
 
 def test_voxels_may_be_integers():
     imager, grid = scene()
-    volume = jax.random.randint(jax.random.key(2), (grid.depths.size, *grid.shape), 0, 9)
+    volume = jax.random.randint(jax.random.key(2), grid.volume_shape, 0, 9)
     for kernels in (None, psfs(3)):
         expected = forward(volume.astype(float), imager, grid, kernels)
         np.testing.assert_array_equal(forward(volume, imager, grid, kernels), expected)

@@ -192,7 +192,7 @@ def test_depths_may_be_one_or_in_any_order():
     truth = many()
     capture = capture_of(truth)
     _, grid = small()
-    np.testing.assert_array_equal(find(capture), find(capture, Grid(grid.depths[::-1], grid.shape, grid.pitch)))
+    np.testing.assert_array_equal(find(capture), find(capture, grid.at(grid.depths[::-1])))
     plane = np.array([[0.5, 0.5, 20.0, 1.0], [-0.5, 0.0, 20.0, 1.0]])
     assert localization(find(capture_of(plane), Grid([20.0], grid.shape, grid.pitch)), plane).f1 == 1
 

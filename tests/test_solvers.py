@@ -37,7 +37,7 @@ def dense():
 def blurred(imager, grid, dtype=jnp.float64):
     """The forward model with a PSF, which is not the adjoint of back-projection."""
     psf = jnp.broadcast_to(jnp.outer(w := jnp.array([0.25, 0.5, 0.25], dtype), w), (grid.depths.size, 3, 3))
-    structure = jax.ShapeDtypeStruct((grid.depths.size, *grid.shape), dtype)
+    structure = jax.ShapeDtypeStruct(grid.volume_shape, dtype)
     return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, psf), structure)
 
 

@@ -85,7 +85,7 @@ def reconstruct(
     Returns
     -------
     Array
-        `(len(depths), *grid.shape)`. A voxel that sums up less weight than half a lens on its axis is dimmed in
+        `grid.volume_shape`. A voxel that sums up less weight than half a lens on its axis is dimmed in
         proportion, so that the edge of the field is neither divided by nothing nor abrupt.
     """
     seen = jnp.ones(image.shape, image.dtype) if lit is None else lit.astype(image.dtype)
