@@ -44,7 +44,6 @@ class Log(Progress):
     """What is shown, as a list; the work is interrupted after so many parts."""
 
     def __init__(self, most=1000):
-        super().__init__(shown=False)
         self.parts, self.most = [], most
 
     @contextmanager

@@ -10,16 +10,15 @@ from rich.progress import BarColumn, Progress as Bars, TextColumn, TimeElapsedCo
 class Progress:
     """Bars that show how far long work is, on standard error where that is a terminal.
 
-    A context; with `shown=False` it shows nothing.
+    They are shown within `with Progress() as progress:`; one that is not entered shows nothing.
     """
 
-    def __init__(self, *, shown: bool = True):
-        console = Console(stderr=True)
-        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-        self._bars = Bars(*columns, console=console) if shown and console.is_terminal else None
+    _bars: Bars | None = None
 
     def __enter__(self) -> "Progress":
-        if self._bars:
+        console = Console(stderr=True)
+        if console.is_terminal:
+            self._bars = Bars(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console)
             self._bars.start()
         return self
 
@@ -34,22 +33,15 @@ class Progress:
     @contextmanager
     def step(self, description: str) -> Iterator[None]:
         """Work of unknown length."""
-        if not self._bars:
+        with self.counter(description, None) as done:
             yield
-            return
-        task = self._bars.add_task(description, total=None)
-        yield
-        self._bars.update(task, total=1, completed=1)
+            done()
 
     @contextmanager
-    def counter(self, description: str, total: int) -> Iterator[Callable[[], None]]:
+    def counter(self, description: str, total: int | None) -> Iterator[Callable[[], None]]:
         """Work of `total` parts; what it yields is called after each."""
-        if not self._bars:
+        if not (bars := self._bars):
             yield lambda: None
             return
-        bars, task = self._bars, self._bars.add_task(description, total=total)
-        yield lambda: bars.advance(task)
-
-
-# What functions show that are given no progress.
-SILENT = Progress(shown=False)
+        task = bars.add_task(description, total=total)
+        yield lambda: bars.update(task, total=total or 1, advance=1)

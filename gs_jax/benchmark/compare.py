@@ -21,7 +21,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.info import available_memory
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..projection.operators import forward_operator
 from ..reconstruction.methods import METHODS as RECONSTRUCTIONS
 from ..reconstruction.pipeline import reconstruct
@@ -176,7 +176,7 @@ def run(
     limit
         A method is not run at a size where an image would take longer, by its time at the last, seconds.
     """
-    progress = progress or SILENT
+    progress = progress or Progress()
     records, left_out = [], []
     cases = {}
     for side in progress.track(sides, "Images"):

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from ..base.errors import InputError
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..designs.design import Design
 from .checkpoint import Log
 from .objectives import unit_of
@@ -76,7 +76,7 @@ def trade_off(design: Design | PathLike, study: Study | PathLike, *, progress: P
         If a file cannot be read, the study does not fit the design or moves no limit.
     """
     with opened(design, study) as (parent, question):
-        return _trade_off(sweep_of(parent, question), progress or SILENT)
+        return _trade_off(sweep_of(parent, question), progress or Progress())
 
 
 class Sweep(NamedTuple):

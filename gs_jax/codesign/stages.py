@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.errors import InputError
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..designs.design import Design
 from .checkpoint import Log, restored
 from .parameters import Bounds, Box, Parent, Values, candidate, parent_of, start_values
@@ -190,7 +190,7 @@ def run_stages(
     InputError
         If no start of a stage comes to a finite cost.
     """
-    progress = progress or SILENT
+    progress = progress or Progress()
     for stage in stages:
         wanted = terms_of(stage.table, terms)
         given = targets_of(wanted), values

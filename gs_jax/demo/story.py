@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..codesign.outcome import as_records, write_outcome
 from ..codesign.search import optimize
 from ..designs.builtin import geomscope
@@ -57,7 +57,7 @@ def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Pat
     InputError
         If the folder cannot be made or written to.
     """
-    folder, progress = make_folder(folder), progress or SILENT
+    folder, progress = make_folder(folder), progress or Progress()
     seconds: dict[str, float] = {}
     with progress.step("Laying out the lenses"), _timed(seconds, "design and metrics"):
         design = geomscope()

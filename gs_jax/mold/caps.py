@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, KDTree
 
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import MicrolensArray
 from ..layouts.cells import cross
 from .outlines import Plan, draw_plan
@@ -102,7 +102,7 @@ def facet_surface(array: MicrolensArray, chord: float, progress: Progress | None
     inside = _hexagonal(radius, float(array.aperture_diameter) / 2, chord)
     points, facets, owners, first = [plan.points], [], [], len(plan.points)
     lenses = list(zip(centers, plan.outlines, strict=True))
-    for i, (center, outline) in enumerate((progress or SILENT).track(lenses, "Tessellating")):
+    for i, (center, outline) in enumerate((progress or Progress()).track(lenses, "Tessellating")):
         ring = plan.points[outline.cap] - center
         added, cap = _facet_cap(ring, inside, radius, chord)
         index = np.concatenate([outline.cap, np.arange(first, first + len(added))])

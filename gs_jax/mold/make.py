@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..designs.design import Design, read_design
 from ..io.disk import atomic_write, check_output, write_json, write_text
 from ..io.figures import write_figure
@@ -76,7 +76,7 @@ def make_mold(
     RuntimeError
         If the solid, or what was read back, is not the design: a fault of the program.
     """
-    progress = progress or SILENT
+    progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)
     picture, record, text = (check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt"))
     source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)

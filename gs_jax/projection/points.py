@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import Imager, chief_ray, envelope, field_limit
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
@@ -90,7 +90,7 @@ def forward_points(
     tiles = jnp.zeros((rows * columns, side, side), kernels.dtype, device=kernels.device)
     lenses, limit = KDTree(np.asarray(imager.centers)), field_limit(imager.field_radius)
     starts = range(0, len(points), _POINTS)
-    for start in (progress or SILENT).track(starts, "Imaging points"):
+    for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
         pairs = KDTree(some[:, :2]).sparse_distance_matrix(lenses, limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):

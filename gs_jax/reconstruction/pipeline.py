@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Float32, Num
 
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import Grid, Imager
 from ..optics.window import psf_of_depth
 from ..projection.backprojection import backproject
@@ -92,7 +92,7 @@ def reconstruct(
     --------
     >>> volume = reconstruct(image, imager, grid, RichardsonLucy(steps=20))
     """
-    progress = progress or SILENT
+    progress = progress or Progress()
     if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
         raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
     if image.shape != imager.sensor.shape:
@@ -110,11 +110,13 @@ def reconstruct(
 
 
 def _back_projected(image, imager, grid, method, progress):
+    options = {"method": method.interpolation, "normalize": method.normalize}
+    if grid.depths.size <= _PLANES:
+        return np.asarray(backproject(image, imager, grid, **options), np.float32)
     image, depths = jnp.asarray(image), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
     for first in progress.track(range(0, depths.size, _PLANES), "Back-projecting"):
         some = slice(first, first + _PLANES)
-        options = {"method": method.interpolation, "normalize": method.normalize}
         volume[some] = backproject(image, imager, grid.at(depths[some]), **options)
     return volume
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import Grid, Imager, Sensor
 from ..io.points import read_points
 from ..io.volumes import read_volume
@@ -114,7 +114,7 @@ def simulate_volume(
     if np.min(volume) < 0:
         raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
     kernel = psf_of_depth(imager, np.asarray(grid.depths), kind)
-    image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or SILENT
+    image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or Progress()
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
             continue
@@ -142,7 +142,7 @@ def simulate_points(
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
     # Each point between two depths of its slab, the last of which is the first of the next slab.
     between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))
-    slabs, image, progress = between // _SLAB, 0, progress or SILENT
+    slabs, image, progress = between // _SLAB, 0, progress or Progress()
     for slab in np.unique(slabs):
         some = depths[slab * _SLAB :][: _SLAB + 1]
         fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Shaped
 from scipy.spatial import KDTree
 
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import Grid, Imager
 from ..optics.aperture import clear_diameter
 from ..optics.psf import geometric_psf
@@ -97,7 +97,7 @@ def find_points(
     ValueError
         If the image is not `sensor.shape`.
     """
-    progress = progress or SILENT
+    progress = progress or Progress()
     if image.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
     seen, voxels = signal(image), _voxels(imager, grid)

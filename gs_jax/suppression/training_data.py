@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 from ..base.precision import in_float32
-from ..base.progress import SILENT, Progress
+from ..base.progress import Progress
 from ..geometry import Grid, Imager, MicrolensArray, Sensor
 from ..io.disk import atomic_write, decoding, make_folder
 from ..layouts.patterns import random_layout
@@ -127,7 +127,7 @@ def stacks(folder: str | os.PathLike[str], count: int, seed: int, progress: Prog
     folder = make_folder(folder)
     return [
         _kept(folder / f"{seed}-{i}.npz", seed, i)
-        for i in (progress or SILENT).track(range(count), "Simulating captures")
+        for i in (progress or Progress()).track(range(count), "Simulating captures")
     ]
 
 
