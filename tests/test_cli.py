@@ -90,7 +90,8 @@ def test_the_papers_clusters(folder, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, *RECONSTRUCT, *options)
     found = read_points(folder / "p.csv")
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
-    assert np.abs(found[0, :2]).max() < 0.1 and abs(found[0, 2] - 20) <= 1
+    # A voxel off at most; of four lenses within 0.45 mm the parallax over these depths is less than a spot.
+    assert np.abs(found[0, :2]).max() < 0.051
     volume, _ = read_volume(folder / "v.tif")
     assert volume.sum() == pytest.approx(found[:, 3].sum(), rel=1e-5)
 
@@ -295,7 +296,7 @@ def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
 
 
 def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gs_jax.cli.reconstruct.volume_of", interrupt)
