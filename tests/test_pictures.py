@@ -1,5 +1,7 @@
 """What `show` draws: every voxel that is brightest along a line of sight, where it is in mm."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,8 @@ def test_a_bright_voxel_is_where_its_millimetres_are(depths):
     figure = show(volume, grid, points=np.array([[x, y, z, 1.0]]))
     views = {(0, 1): figure.axes[0], (2, 1): figure.axes[1], (0, 2): figure.axes[2]}
     for (across, along), axes in views.items():
-        mesh, circles = axes.collections
+        drawn: Any = axes.collections  # a mesh and circles
+        mesh, circles = drawn
         corners = mesh.get_coordinates()
         row, column = np.argwhere(mesh.get_array() == 1)[0]
         low, high = np.sort(corners[[row, row + 1], [column, column + 1]], axis=0)
