@@ -179,12 +179,12 @@ class Imager(eqx.Module):
     field_radius
         `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
         of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
-    wavelength
-        Of the light, mm: 520e-6 for 520 nm.
     rotation
         Of the array about the sensor's centre, radians, from +x toward +y.
     shift
         `(x, y)` of the array after the rotation, mm.
+    wavelength
+        Of the light, mm: 520e-6 for 520 nm.
 
     Raises
     ------
@@ -196,9 +196,9 @@ class Imager(eqx.Module):
     sensor: Sensor
     sensor_distance: Float[Array, ""] = eqx.field(converter=as_float)
     field_radius: float = eqx.field(static=True, converter=float)
-    wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
     rotation: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
+    wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
 
     def __check_init__(self):
         if not self.field_radius > 0:

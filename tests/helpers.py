@@ -7,7 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor
+from gs_jax import (
+    Camera,
+    Design,
+    Grid,
+    Imager,
+    MicrolensArray,
+    Sensor,
+    expose,
+    read_design,
+    simulate,
+    write_capture,
+    write_design,
+)
+from gs_jax.simulation.phantoms import random_points
 
 # Cropped captures that ship with the tests.
 CAPTURES = Path(__file__).parent / "data"
@@ -85,3 +98,19 @@ def backproject_loop(image, imager, grid, method="linear"):
             volume[d, r, c] += weight * (np.array([1 - a, a]) @ square @ np.array([1 - b, b]))
             weights[d, r, c] += weight
     return volume, weights
+
+
+def design_and_capture(folder: Path) -> np.ndarray:
+    """A middle piece of the built-in microscope in `design/geomscope.toml`, and its `capture.tif` of five points.
+
+    54 lenses and 800^2 pixels of 9 um, so that what is written for the whole takes seconds.
+    """
+    data = read_design(Path(__file__).parents[1] / "design" / "geomscope.toml").model_dump()
+    data["sensor"] = {"shape": (800, 800), "pixel_pitch_um": 9.0}
+    data["array"]["centers_mm"] = [center for center in data["array"]["centers_mm"] if max(map(abs, center)) < 4.4]
+    (folder / "design").mkdir()
+    write_design(folder / "design" / "geomscope.toml", design := Design.model_validate(data))
+    points = random_points(5, (3.0, 3.0), (18.5, 21.5), seed=3)
+    image = simulate(points, design.imager(), psf="geometric")
+    write_capture(folder / "capture.tif", np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=2e4)))
+    return points

@@ -173,7 +173,7 @@ def test_gradients_by_everything_that_is_continuous():
             size=(2.0, 2.0),
         )
         m = Microscope(
-            Imager(moved, imager.sensor, v, 1.0, um * 1e-3),
+            Imager(moved, imager.sensor, v, 1.0, wavelength=um * 1e-3),
             depths,
             clear_diameter=clear_diameter(moved),
             field_radius=field_radius,

@@ -6,36 +6,21 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
 import gs_jax as gs
-from gs_jax.simulation.phantoms import random_points
+
+from .helpers import design_and_capture
 
 ROOT = Path(__file__).parents[1]
-# A middle piece of the built-in microscope, so that the test takes seconds: 54 lenses, 800^2 pixels of 9 um.
-SMALL = {"[5120, 5120]": "[800, 800]", "pixel_pitch_um = 4.5": "pixel_pitch_um = 9.0"}
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a design and a capture of five points and nothing else."""
+    """A folder with a small design and a capture of five points: returns the points."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "design").mkdir()
-    text = (ROOT / "design" / "geomscope.toml").read_text()
-    for old, new in SMALL.items():
-        text = text.replace(old, new)
-    pairs = re.findall(r"\[(-?[\d.]+), (-?[\d.]+)\],?\n", text[text.index("centers_mm") :])
-    inner = [pair for pair in pairs if max(abs(float(x)) for x in pair) < 4.4]
-    start, end = text.index("centers_mm"), text.index("[imaging]")
-    text = text[:start] + f"centers_mm = [{', '.join(f'[{x}, {y}]' for x, y in inner)}]\n" + text[end:]
-    (tmp_path / "design" / "geomscope.toml").write_text(text)
-    scope = gs.read_design("design/geomscope.toml").imager()
-    points = random_points(5, (3.0, 3.0), (18.5, 21.5), seed=3)
-    image = gs.simulate(points, scope, psf="geometric")
-    gs.write_capture("capture.tif", np.asarray(gs.expose(image, gs.Camera(), jax.random.key(0), peak_electrons=2e4)))
-    return points
+    return design_and_capture(tmp_path)
 
 
 def test_the_first_script(folder):

@@ -112,8 +112,14 @@ def test_map_is_separable():
         (lambda: Sensor((1, 64), 0.0045), "2 or more"),
         (lambda: Sensor((64, 64), 0.0), "`pixel_pitch` must be positive, got 0.0"),
         (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, -1.0), "`field_radius`"),
-        (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, 520.0), "520 nm are 520e-6 mm"),
-        (lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, 0.52), "`wavelength`.*got 0.52"),
+        (
+            lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, wavelength=520.0),
+            "520 nm are 520e-6 mm",
+        ),
+        (
+            lambda: Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), 5.8, 1.0, wavelength=0.52),
+            "`wavelength`.*got 0.52",
+        ),
         (lambda: Grid([20.0], (0, 3), 0.1), "two positive numbers of voxels"),
         (lambda: Grid([20.0], (3, 3), 0.0), "`pitch` must be positive"),
         (lambda: Grid(np.zeros(0), (3, 3), 0.1), "a depth at least"),

@@ -51,8 +51,10 @@ def bench(side: int) -> Bench:
     centers = np.asarray(lens.centers)
     centers = centers[(np.abs(centers) < plate).all(axis=1)]
     pitch = WIDTH / side
-    whole = (lens.sensor_distance, lens.field_radius, lens.wavelength)
-    imager = Imager(MicrolensArray(centers), Sensor((side, side), pitch), *whole)
+    sensor = Sensor((side, side), pitch)
+    imager = Imager(
+        MicrolensArray(centers), sensor, lens.sensor_distance, lens.field_radius, wavelength=lens.wavelength
+    )
     grid = Grid([DEPTH], (side, side), pitch)
     # The rays' blur is 0.1 mm and more: in pixels, and a pixel for what is beside it.
     size = 2 * math.ceil(0.1 / pitch) + 3
