@@ -1,4 +1,4 @@
-"""Fig. 4A: points in 3-D, plain back-projection against particle clustering.
+"""Fig. 4A: points in 3-D, plain back-projection, particle clustering and `find_points`.
 
 120 points at 18 to 22 mm are reconstructed and shown at three depths: the plain stack, the stack of the points that
 `find_points` makes of it, and the truth. The table puts methods side by side: nothing at all, the peaks above a

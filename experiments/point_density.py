@@ -1,4 +1,4 @@
-"""How many points a capture may show: the F1 score of particle clustering against their density.
+"""How many points a capture may show: the F1 score of `find_points` against their density.
 
 Points at random over 20 x 20 mm and 18 to 22 mm, of intensities 0.5 to 1.5, are imaged with the diffraction PSF by
 `simulate_points`, which places them finer than any voxel, and exposed with shot and read noise. Each capture goes to
