@@ -39,8 +39,6 @@ def show(
     volume = np.asarray(volume)
     if volume.shape != grid.volume_shape:
         raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")
-    low, high = np.percentile(volume, _DARKEST), np.percentile(volume, _BRIGHTEST)
-    style = {"cmap": "magma", "vmin": low, "vmax": max(high, low + 1e-12)}
     # As high as the plane is, so that it fills its place and the views beside it are in line with it.
     figure = Figure(figsize=(8.2, 2.4 + 5.4 * grid.shape[0] / grid.shape[1]), layout="constrained")
     axes = figure.subplots(2, 2, width_ratios=(4, 1), height_ratios=(4 * grid.shape[0] / grid.shape[1], 1))
@@ -50,13 +48,13 @@ def show(
     left, right, bottom, top = grid.extent
     x, y = np.linspace(left, right, grid.shape[1] + 1), np.linspace(top, bottom, grid.shape[0] + 1)
     z = _edges(np.asarray(grid.depths, float), grid.pitch)
-    image = plane.pcolormesh(x, y, volume.max(0), **style, rasterized=True)
-    beside.pcolormesh(z, y, volume.max(2).T, **style, rasterized=True)
-    below.pcolormesh(x, z, volume.max(1), **style, rasterized=True)
+    image = _draw(plane, x, y, volume.max(0))
+    _draw(beside, z, y, volume.max(2).T)
+    _draw(below, x, z, volume.max(1))
     plane.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(left, right), ylim=(bottom, top))
     beside.set(xlabel="z, mm", ylim=(bottom, top), xlim=(z[0], z[-1]))
     below.set(xlabel="x, mm", ylabel="z, mm", xlim=(left, right), ylim=(z[0], z[-1]))
-    figure.colorbar(image, ax=axes[1, 1], label="intensity", fraction=0.6, location="left")
+    figure.colorbar(image, ax=axes[1, 1], label="from above", fraction=0.6, location="left")
     plane.set_title(" x ".join(map(str, volume.shape)) + " voxels (z, y, x), maxima")
     if points is not None and len(points):
         px, py, pz = np.asarray(points)[:, :3].T
@@ -65,6 +63,12 @@ def show(
             axis.scatter(a, b, s=30, facecolors="none", edgecolors=colours)
         plane.set_title(f"{plane.get_title()}, {len(points)} points")
     return figure
+
+
+def _draw(axes, across, along, maxima):
+    """Each view to its own brightness: the more voxels a line of sight has, the brighter are their maxima."""
+    low, high = np.percentile(maxima, (_DARKEST, _BRIGHTEST))
+    return axes.pcolormesh(across, along, maxima, cmap="magma", vmin=low, vmax=max(high, low + 1e-12), rasterized=True)
 
 
 def _edges(depths, pitch):
