@@ -27,7 +27,8 @@ def backproject(
 ) -> Float[Array, "depth y x"]:
     """Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction").
 
-    Differentiable once, in both modes, with respect to the image, the imager and the grid's depths.
+    Differentiable once, in both modes, with respect to the image, the imager and the grid's depths and
+    origin.
 
     Parameters
     ----------
@@ -76,7 +77,8 @@ def backproject_adjoint(
     """The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from.
 
     Its linear version is the image of a volume by pinholes: Eq. (2) with a point for PSF_o.
-    Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths.
+    Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths and
+    origin.
 
     Parameters
     ----------

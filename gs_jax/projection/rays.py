@@ -61,8 +61,8 @@ def trace(imager: Imager, grid: Grid, *, nearest: bool, dtype) -> Rays:
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
         distance2 = jnp.where(on_sensor, (offset**2)[:, None, :], _OUTSIDE)
-        origin = jax.lax.stop_gradient(coordinate[..., 0])
-        return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), origin)
+        first_coordinate = jax.lax.stop_gradient(coordinate[..., 0])
+        return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
     return Rays(
         y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0]),
