@@ -70,9 +70,14 @@ def envelope(distance_squared, reduced_depth, field_radius):
         `sqrt(A_e / pi)`, mm.
     """
     cos_squared = reduced_depth**2 / (reduced_depth**2 + distance_squared)
+    return cos_squared**2 * falloff(distance_squared, field_radius)
+
+
+def falloff(distance_squared, field_radius):
+    """From 1 to 0 across the field radius, where it is 1/2; 0 from `field_limit` on."""
     outer = field_limit(field_radius) ** 2
     t = jnp.clip((outer - distance_squared) / (2 * FALLOFF * field_radius**2), 0, 1)
-    return cos_squared**2 * t * t * (3 - 2 * t)
+    return t * t * (3 - 2 * t)
 
 
 def field_limit(field_radius):

@@ -23,7 +23,7 @@ from .unit import Point, pupil_disc, pupil_radius, unit_rays
 
 _RAYS = 2**15
 # Turn of Vogel's spiral, which spreads any number of points evenly over a disc.
-_GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
+GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 Scalar = Float[ArrayLike, ""]
 
@@ -115,7 +115,7 @@ def geometric_psf(
     """
     _check(size)
     order = np.arange(_RAYS) + 0.5
-    spiral = np.sqrt(order / _RAYS) * np.stack([np.cos(_GOLDEN_ANGLE * order), np.sin(_GOLDEN_ANGLE * order)])
+    spiral = np.sqrt(order / _RAYS) * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)])
     radius = pupil_radius(imager, radius)
     points = radius * jnp.asarray(spiral.T, radius.dtype)
     rays = unit_rays(imager, depth, points, field)

@@ -223,15 +223,15 @@ def _thick_ray(imager: Imager, depth: Array, point: Array, field: Array) -> Unit
     sag = r2 / (radius + depth_of_center)
 
     # Slope in front q = (point - field) / (depth + air), with the glass as so much air.
-    air, air_chief = _as_air(n, t - sag, depth, point - field), _as_air(n, t, depth, -field)
+    air, air_chief = as_air(n, t - sag, depth, point - field), as_air(n, t, depth, -field)
     h, h_chief = depth + air, depth + air_chief
     q, q_chief = (point - field) / h, -field / h_chief
     change = point / h + field * (air - air_chief) / (h * h_chief)
-    glass, glass_chief = _slope_in_glass(n, q), _slope_in_glass(n, q_chief)
+    glass, glass_chief = slope_in_glass(n, q), slope_in_glass(n, q_chief)
     s_chief, s_glass, s_glass_chief = _secant(q_chief), _secant(glass), _secant(glass_chief)
     squares = jnp.sum(change * (q + q_chief))
     path = depth * squares / (_secant(q) + s_chief)
-    # Snell's law for the square of the slope in glass; see `_slope_in_glass`.
+    # Snell's law for the square of the slope in glass; see `slope_in_glass`.
     flat, flat_chief = n**2 + (n**2 - 1) * jnp.sum(q**2), n**2 + (n**2 - 1) * jnp.sum(q_chief**2)
     glass_squares = n**2 * squares / (flat * flat_chief)
     path = path + n * (t * glass_squares / (s_glass + s_glass_chief) - sag * s_glass)
@@ -251,7 +251,7 @@ def _thick_ray(imager: Imager, depth: Array, point: Array, field: Array) -> Unit
     return UnitRay(landing, tangent, path, valid)
 
 
-def _as_air(n: Array, thickness: Array, depth: Array, across: Array) -> Array:
+def as_air(n: Array, thickness: Array, depth: Array, across: Array) -> Array:
     """The layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
     square = jnp.sum(across**2)
     g = thickness / n
@@ -264,7 +264,7 @@ def _as_air(n: Array, thickness: Array, depth: Array, across: Array) -> Array:
     return g
 
 
-def _slope_in_glass(n: Array, slope: Array) -> Array:
+def slope_in_glass(n: Array, slope: Array) -> Array:
     """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
     return slope / jnp.sqrt(n**2 + (n**2 - 1) * jnp.sum(slope**2))
 

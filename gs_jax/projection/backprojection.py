@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Num
 
 from ..geometry import Grid, Imager
 from .bilinear import Shapes, image_to_volume, volume_to_image
-from .rays import Rays, trace
+from .rays import Envelope, Rays, trace
 
 # Depths that are handled at once. More would be no faster, and patches would grow with the volume.
 _DEPTHS = 16
@@ -132,4 +132,4 @@ def _prepare(imager: Imager, grid: Grid, method: str, dtype) -> tuple[Shapes, Ra
     if method not in ("linear", "nearest"):
         raise ValueError(f'`method` must be "linear" or "nearest", got {method!r}.')
     rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype)
-    return Shapes(imager.sensor.shape, grid.volume_shape, imager.field_radius), rays
+    return Shapes(imager.sensor.shape, grid.volume_shape, Envelope(imager.field_radius)), rays

@@ -4,7 +4,7 @@ Back-projection, its adjoint and its gradient are derivatives of one bilinear fo
 
     B(volume, image, rays) = sum_j sum_q C_j(q) volume(q) image(p_j(q)),
 
-the sum over lenses j and voxels q of the envelope C, times the voxel, times the image at the chief ray's pixel:
+the sum over lenses j and voxels q of the lenses' weight, times the voxel, times the image at the chief ray's pixel:
 back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image), and the gradient with respect
 to the geometry is dB/d(rays), which JAX carries on to lens positions, distances and depths. Each is written out
 because the transpose that JAX would derive of a gather is a scatter, twenty times slower on a processor.
@@ -23,13 +23,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..geometry import envelope, field_limit
 from .primitive import linear_call
-from .rays import Axis, Rays
+from .rays import Axis, Envelope, Rays, RingLight
 
 # Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache, and the number of
 # squares, not their size, follows the magnification, which may be traced.
 _BLOCK = 160
+
+
+Weight = Envelope | RingLight
 
 
 class Shapes(NamedTuple):
@@ -37,7 +39,7 @@ class Shapes(NamedTuple):
 
     image: tuple[int, int]
     volume: tuple[int, int, int]
-    field_radius: float
+    weight: Weight
 
 
 def image_to_volume(shapes: Shapes, rays: Rays, image):
@@ -57,7 +59,7 @@ def _gather(shapes: Shapes, rays: Rays, image):
         y, x, y_pair, x_pair = lens
 
         def patch():
-            weight = _weights(shapes, y, x, rays.reduced_depth)
+            weight = _weights(shapes, y, x, rays.parameters)
             return (
                 weight if image is None else weight * _interpolate(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
             )
@@ -65,7 +67,7 @@ def _gather(shapes: Shapes, rays: Rays, image):
         new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
         return lax.dynamic_update_slice(volume, new, _corner(y, x)), None
 
-    volume = jnp.zeros(shapes.volume, rays.reduced_depth.dtype)
+    volume = jnp.zeros(shapes.volume, rays.parameters.dtype)
     return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
 
 
@@ -76,7 +78,7 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
 
     def add_lens(image, lens):
         y, x = lens
-        weighted = lambda: _weights(shapes, y, x, rays.reduced_depth) * _patch(volume, y, x)
+        weighted = lambda: _weights(shapes, y, x, rays.parameters) * _patch(volume, y, x)
         patch = _if_seen(shapes, y, x, weighted)
         columns_of, rows_of = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
 
@@ -103,24 +105,22 @@ def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:
         y, x, y_pair, x_pair = lens
         patch = _patch(volume, y, x)
         distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
-        weight, envelope_vjp = jax.vjp(
-            lambda d2, z: envelope(d2, z, shapes.field_radius), distance2, rays.reduced_depth[:, None, None]
-        )
+        weight, weight_vjp = jax.vjp(shapes.weight, distance2, rays.parameters[:, None, None])
         if image is None:
             sample, along_y, along_x = jnp.ones_like(patch), jnp.zeros_like(patch), jnp.zeros_like(patch)
         else:
             corners = _if_seen(shapes, y, x, lambda: _corners(image, y_pair, x_pair))
             sample, along_y, along_x = _interpolate(corners, y_pair, x_pair)
-        distance2_bar, depth_bar = envelope_vjp(patch * sample)
+        distance2_bar, parameters_bar = weight_vjp(patch * sample)
         by_y, by_x = patch * weight * along_y, patch * weight * along_x
         bars = by_y.sum(2), distance2_bar.sum(2), by_x.sum(1), distance2_bar.sum(1)
-        return total + depth_bar[:, 0, 0], bars
+        return total + parameters_bar[:, 0, 0], bars
 
-    total = jnp.zeros_like(rays.reduced_depth)
-    depth_bar, bars = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
+    total = jnp.zeros_like(rays.parameters)
+    parameters_bar, bars = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
     constant = jax.tree.map(jnp.zeros_like, rays)
-    continuous = lambda r: (r.y.fraction, r.y.distance2, r.x.fraction, r.x.distance2, r.reduced_depth)
-    return eqx.tree_at(continuous, constant, (*bars, depth_bar))
+    continuous = lambda r: (r.y.fraction, r.y.distance2, r.x.fraction, r.x.distance2, r.parameters)
+    return eqx.tree_at(continuous, constant, (*bars, parameters_bar))
 
 
 def _rays_bar_by_volume(shapes: Shapes, rays: Rays, volume, image) -> Rays:
@@ -151,14 +151,14 @@ def _corner(y: Axis, x: Axis):
     return jnp.zeros_like(y.start), y.start, x.start
 
 
-def _weights(shapes: Shapes, y: Axis, x: Axis, reduced_depth) -> Float[Array, "depth y x"]:
+def _weights(shapes: Shapes, y: Axis, x: Axis, parameters) -> Float[Array, "depth y x"]:
     distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
-    return envelope(distance2, reduced_depth[:, None, None], shapes.field_radius)
+    return shapes.weight(distance2, parameters[:, None, None])
 
 
 def _if_seen(shapes: Shapes, y: Axis, x: Axis, compute):
     """`compute()`, or zeros if the lens sees no voxel on the sensor."""
-    seen = y.distance2.min() + x.distance2.min() < field_limit(shapes.field_radius) ** 2
+    seen = y.distance2.min() + x.distance2.min() < shapes.weight.limit**2
     zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(compute))
     return lax.cond(seen, compute, lambda: zeros)
 

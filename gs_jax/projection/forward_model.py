@@ -1,17 +1,18 @@
 """The forward model, Eq. (2): what the sensor sees of a volume or of points."""
 
-from functools import partial
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
-from scipy.fft import next_fast_len
 
-from ..geometry import Grid, Imager, Sensor
+from ..geometry import Grid, Imager
+from ..optics.full import FullOptics
 from .backprojection import as_volume, backproject_adjoint
+from .convolve import add_spectrum, image_of, padded_shape, with_margin
+from .full_image import full_image
+
+Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | None
 
 
 @jax.jit
@@ -19,7 +20,7 @@ def forward(
     volume: Num[Array | np.ndarray, "depth y x"],
     imager: Imager,
     grid: Grid,
-    psf: Float[Array | np.ndarray, "plane tall wide"] | None = None,
+    optics: Optics = None,
 ) -> Float[Array, "row column"]:
     """The image of a volume: Eq. (2), summed lens by lens and without its zones.
 
@@ -53,28 +54,24 @@ def forward(
         If the volume is not of the grid's shape, or there is not one PSF of odd size for each depth.
     """
     volume = as_volume(volume, imager)
-    if psf is None:
+    if optics is None:
         return backproject_adjoint(volume, imager, grid)
+    if isinstance(optics, FullOptics):
+        return full_image(volume, imager, grid, optics)
+    psf = optics
     size = psf.shape[-1]
     if psf.shape != (grid.depths.size, size, size) or size % 2 == 0:
         raise ValueError(f"`psf` must be ({grid.depths.size}, size, size) with an odd size, got {psf.shape}.")
-    # Sharp images up to half a PSF beyond the sensor, whose light spreads onto it; a line more each way, as rays that
-    # land there share their light with the next. What a transform without these lines wraps round falls on its first
-    # `size - 1`, which are beyond the sensor.
-    rows, columns = imager.sensor.shape
-    wide = Sensor((rows + size + 1, columns + size + 1), imager.sensor.pixel_pitch)
-    imager = eqx.tree_at(lambda i: i.sensor, imager, wide)
-    padded = [int(next_fast_len(n + size - 1, real=True) or 0) for n in (rows, columns)]
-    transform = partial(jnp.fft.rfft2, s=padded)
+    wide, padded = with_margin(imager, size), padded_shape(imager.sensor, size)
 
     # Not kept for the gradient: a spectrum for each depth is more than the volume.
     @jax.checkpoint
     def add_depth(spectrum, plane):
         depth, voxels, kernel = plane
-        sharp = backproject_adjoint(voxels[None], imager, grid.at(depth))[1:-1, 1:-1]
-        return spectrum + transform(sharp) * transform(kernel), None
+        sharp = backproject_adjoint(voxels[None], wide, grid.at(depth))
+        return add_spectrum(spectrum, sharp, kernel, padded), None
 
     dark = jnp.zeros((padded[0], padded[1] // 2 + 1), volume.dtype)
     planes = grid.depths, volume, jnp.asarray(psf, volume.dtype)
     spectrum = lax.scan(add_depth, lax.complex(dark, dark), planes)[0]
-    return jnp.fft.irfft2(spectrum, s=padded)[size - 1 : size - 1 + rows, size - 1 : size - 1 + columns]
+    return image_of(spectrum, imager.sensor, size - 1, padded)

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..geometry import Grid, Imager, chief_ray, field_limit
+from ..geometry import Grid, Imager, chief_ray, envelope, field_limit
+from ..optics.cores import ring_light
 
 # Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
 # where the envelope and all its derivatives vanish.
@@ -36,18 +37,56 @@ class Rays(NamedTuple):
     y: Axis
     x: Axis
     spacing: Float[Array, " depth"]  # of neighbouring voxels on the sensor, pixels
-    reduced_depth: Float[Array, " depth"]
+    parameters: Float[Array, "depth parameter"]  # of the lenses' weight at each depth
 
 
-def trace(imager: Imager, grid: Grid, *, nearest: bool, dtype) -> Rays:
+class Envelope(NamedTuple):
+    """What a lens gives to a point's image: the envelope C. Its parameter is the reduced depth."""
+
+    field_radius: float
+
+    @property
+    def limit(self) -> float:
+        """Lateral distance from a lens's axis from which on the weight is zero, mm."""
+        return field_limit(self.field_radius)
+
+    def __call__(self, distance2, parameters):
+        return envelope(distance2, parameters[..., 0], self.field_radius)
+
+
+class RingLight(NamedTuple):
+    """What the core of a spot holds of a point's light, in a ring of the field; see `gs_jax.optics.cores`."""
+
+    inner: float
+    outer: float
+
+    @property
+    def limit(self) -> float:
+        return field_limit(self.outer)
+
+    def __call__(self, distance2, parameters):
+        return ring_light(distance2, parameters, self.inner, self.outer)
+
+
+def trace(
+    imager: Imager,
+    grid: Grid,
+    *,
+    nearest: bool,
+    dtype,
+    limit: float | None = None,
+    parameters: Float[Array, "depth parameter"] | None = None,
+) -> Rays:
     """The rays of every voxel through every lens that sees it, in a cache-friendly order of lenses.
 
     With `nearest` they are moved to the nearest pixel centre, as in the paper. `dtype` is the type of the
-    tables; the coordinates are computed in the geometry's own.
+    tables; the coordinates are computed in the geometry's own. A lens sees what is nearer to its axis than `limit`, mm;
+    that and the `parameters` of its weight are by default those of the envelope.
     """
-    reduced_depth = imager.reduced_depth(grid.depths)
+    if parameters is None:
+        parameters = imager.reduced_depth(grid.depths)[:, None]
     magnification = imager.magnification(grid.depths)
-    limit = field_limit(imager.field_radius)
+    limit = limit or field_limit(imager.field_radius)
     x, y = imager.centers[_snake(imager.centers)].T
 
     def axis(center, origin, voxels, pixels):
@@ -68,7 +107,7 @@ def trace(imager: Imager, grid: Grid, *, nearest: bool, dtype) -> Rays:
         y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0]),
         x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1]),
         spacing=jax.lax.stop_gradient(magnification * (grid.pitch / imager.sensor.pixel_pitch)),
-        reduced_depth=reduced_depth.astype(dtype),
+        parameters=parameters.astype(dtype),
     )
 
 

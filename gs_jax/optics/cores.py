@@ -1,0 +1,174 @@
+"""The bright cores of a lens's spots: where they land, how bright they are, and what they look like.
+
+With the lens's full aperture a spot is a core, a few pixels wide, in a halo that holds more than half of its light. The
+core is not on the chief ray: spherical aberration and coma move it by up to a percent of its distance from the lens's
+axis. Over a ring of the field that is all but a change of the magnification, which leaves the map separable in x and y.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Float64
+from scipy.optimize import minimize_scalar
+
+from ..geometry import Imager, falloff
+from .light import SpotRays, Zones, spot_rays, zones
+from .psf import GOLDEN_ANGLE
+from .theory import airy_deviation
+
+# Ends of the rings in field radii. Farther out cores are as wide as the halo's pixels.
+RINGS = (1.0, 1.33, 1.67, 2.0, 2.5)
+# Degree of the light's polynomial in the squared field, and its number of coefficients.
+_DEGREE = 6
+# Points of the field in a field radius, and rays of each.
+_FIELDS, _RAYS = 16, 8192
+# A core is looked for this far from the chief ray's magnification, relative to that.
+_FARTHEST, _STEPS = 0.03, 61
+# Radial bins in a pixel, and samples of a kernel when it is drawn.
+_BINS, _SAMPLES = 4, 2**17
+
+
+class Cores(NamedTuple):
+    """The cores of all rings at one depth.
+
+    `stretch`: magnification over the chief ray's, one a ring. `light`: coefficients of `ring_light`. `profile`: light
+    in radial bins of a quarter pixel, with the sum 1.
+    """
+
+    stretch: Float64[np.ndarray, " ring"]
+    light: Float64[np.ndarray, "ring coefficient"]
+    profile: Float64[np.ndarray, "ring bin"]
+
+
+def ring_share(distance_squared, inner: float, outer: float):
+    """1 within a ring of the field, 0 beyond it, with the envelope's smooth falloff at both ends; all rings add up."""
+    share = falloff(distance_squared, outer)
+    return share - falloff(distance_squared, inner) if inner else share
+
+
+def ring_light(distance_squared, coefficients, inner: float, outer: float):
+    """Light of a ring's cores at a squared field, mm^2: a polynomial, within the ring.
+
+    `coefficients` `(..., coefficient)` broadcast, but for the last axis, against `distance_squared`.
+    """
+    # Beyond the ring, where it does not count, a polynomial would overflow.
+    t = jnp.minimum(distance_squared / outer**2, 2)
+    value = coefficients[..., -1]
+    for power in range(coefficients.shape[-1] - 2, -1, -1):
+        value = value * t + coefficients[..., power]
+    return value * ring_share(distance_squared, inner, outer)
+
+
+def ring_edges(field_radius: float) -> list[tuple[float, float]]:
+    """Inner and outer end of each ring, mm."""
+    return [(field_radius * a, field_radius * b) for a, b in zip((0.0, *RINGS), RINGS, strict=False)]
+
+
+def core_table(imager: Imager, depth: float, zones: Zones, reach: float) -> Cores:
+    """The cores at one depth, by exact rays of a mean lens.
+
+    A ring has one kernel: the mean of its spots up to `reach` (mm) about the magnification at which that mean is the
+    sharpest. Each spot counts with as much of it as explains the spot best, by least squares.
+    """
+    pitch = imager.sensor.pixel_pitch
+    rings = ring_edges(imager.field_radius)
+    fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
+    rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
+    chief = float(imager.magnification(depth))
+    edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
+    parts = [_ring_cores(rays, fields, chief, pitch, edges, *ring) for ring in rings]
+    return Cores(*map(np.stack, zip(*parts, strict=True)))
+
+
+def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
+    """Magnification of the bright core, by exact rays within the field radius; a constant to derivatives.
+
+    The chief ray's is `M_z = v/z'` (Eq. 3); the authors' lenses have 0.4 % less to 0.8 % more, by depth.
+    """
+    aperture, fields = zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
+    found = []
+    for depth in np.asarray(depths, np.float64):
+        rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
+        chief = float(imager.magnification(depth))
+        found.append(chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch))
+    return np.array(found)
+
+
+def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float[Array, " depth"]:
+    """Where cores seem to lie by their chief rays: the depths at which `M_z` is the core's magnification, mm.
+
+    Whoever follows chief rays at the apparent depth of a plane (back-projection, say) meets the cores of that plane.
+    The authors' lenses, focused on 20 mm, show 18 mm 0.16 mm too near, and 22 mm 0.09 mm too far.
+    """
+    found = float(imager.sensor_distance) / core_magnification(imager, depths) - float(imager.reduced_depth(0.0))
+    return jnp.asarray(found, imager.sensor_distance.dtype)
+
+
+def diffracted(imager: Imager, rays: SpotRays) -> SpotRays:
+    """Rays moved at random, but always the same, by as much as the aperture diffracts: a Gaussian as wide as Airy's."""
+    width = float(airy_deviation(imager.wavelength, imager.sensor_distance, imager.array.aperture_diameter))
+    moves = np.random.default_rng(0).normal(0, width, rays.landing.shape[1:])
+    return rays._replace(landing=rays.landing + moves)
+
+
+def _ring_cores(rays, fields, chief, pitch, edges, inner, outer):
+    share = np.asarray(ring_share(jnp.asarray(fields**2), inner, outer), np.float64)
+    used = share > 1e-6
+    mine = SpotRays(*(part[used] for part in rays))
+    # Lenses are spread evenly: there are as many more at a field as its circle is longer.
+    weight = share[used] * np.maximum(fields[used], fields[1] / 8)
+    stretch = _sharpest(mine, fields[used], weight, chief, pitch)
+    radius = _from_map(mine, fields[used], chief * stretch)
+    profile = np.histogram(radius, edges, weights=mine.light * weight[:, None])[0]
+    profile = profile / profile.sum()
+    density = profile / np.diff(edges**2)
+    bins = np.minimum((radius / edges[1]).astype(int), density.size)
+    amount = (mine.light * np.append(density, 0)[bins]).sum(1) / (profile * density).sum()
+    powers = (fields[used] / outer)[:, None] ** (2 * np.arange(_DEGREE + 1))
+    root = np.sqrt(weight)
+    # Ridge: a ring that begins far out leaves the low powers undetermined.
+    system = np.concatenate([powers * root[:, None], 1e-4 * root.max() * np.eye(_DEGREE + 1)])
+    light = np.linalg.lstsq(system, np.append(amount * root, np.zeros(_DEGREE + 1)))[0]
+    return stretch, light, profile
+
+
+def _from_map(rays: SpotRays, fields, magnification) -> np.ndarray:
+    """Distances of the rays from where a magnification puts the spot."""
+    return np.hypot(rays.landing[..., 0] + magnification * fields[:, None], rays.landing[..., 1])
+
+
+def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> float:
+    """The magnification, over the chief ray's, that gives the weighted mean of the spots the largest sum of squares."""
+    light, half = rays.light * weight[:, None], pitch / 2
+
+    def squares(stretch):
+        ring = (_from_map(rays, fields, chief * stretch) / half).astype(int).ravel()
+        total = np.bincount(ring, light.ravel())
+        return -(total**2 / (2 * np.arange(total.size) + 1)).sum()
+
+    tried = np.linspace(1 - _FARTHEST, 1 + _FARTHEST, _STEPS)
+    best = int(np.argmin([squares(stretch) for stretch in tried]))
+    around = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
+    return float(minimize_scalar(squares, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
+
+
+def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float = 1) -> Float64[np.ndarray, "row column"]:
+    """A kernel from its radial light, on pixels (or their `parts` each way), odd `size` in all; its sum is 1.
+
+    Light is put down point by point, so that none is lost between the pixels; turned and mirrored, it is symmetric.
+    """
+    column, row = np.floor(parts * spread(profile, _SAMPLES) + size / 2).astype(int).T
+    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+    light = np.bincount((row * size + column)[inside], minlength=size * size).reshape(size, size) / _SAMPLES
+    light = light + light[::-1] + light[:, ::-1] + light[::-1, ::-1]
+    return (light + light.T) / 8
+
+
+def spread(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
+    """Points `(x, y)` in pixels that are as dense as a core is bright, along Vogel's spiral."""
+    order = np.arange(count) + 0.5
+    edges = np.arange(profile.size + 1) / _BINS
+    radius = np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2))
+    return radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)

@@ -1,0 +1,125 @@
+"""All of a spot's light that is not its core, out to where light ends: tables in polar coordinates about the lens.
+
+A round lens turns with the point that it images: at a field `(rho, phi)` its spot is the one at `(rho, 0)`, turned by
+`phi`. So in polar coordinates about the lens's axis, on both sides, the image is a convolution over the angle: each
+angular harmonic of the object becomes the same harmonic of the image by a small matrix over the radii, without a limit
+on the rank. A lens's own clear area counts to first order.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from ..geometry import Imager
+from .cores import Cores, diffracted, ring_edges, ring_light, spread
+from .light import Zones, spot_rays
+
+# Widest field, in reduced depths of the nearest plane: beyond, a lens passes on a third of its light and less.
+_WIDEST = 0.9
+# Radii of the object's nodes grow linearly up to about this part of the widest field, then exponentially.
+_LINEAR = 0.45
+# Nodes in the linear part. The nodes' distance at the sensor is the halo's pixel.
+_NODES = 44
+# How far beyond the widest field's chief ray light is followed on the sensor, in the image of the widest field.
+_BEYOND = 0.35
+# Of each field; samples of a core.
+_RAYS, _CORE_SAMPLES = 16384, 2048
+
+
+class HaloGrid(NamedTuple):
+    """Polar nodes about a lens's axis, on the object's side and on the sensor's.
+
+    `step`: distance of the inner nodes in the object, mm; `pixel`: of those on the sensor. `bend`: radius at which
+    they begin to spread, in steps. `angles`, `fields`, `radii`: numbers of nodes, around and outward on either side.
+    """
+
+    step: float
+    pixel: float
+    bend: float
+    angles: int
+    fields: int
+    radii: int
+
+    def nodes(self, count: int) -> Float64[np.ndarray, " node"]:
+        """Radii of the nodes, in steps: as far apart as they are around, where they spread."""
+        return self.bend * np.sinh(np.arange(count) / self.bend)
+
+    def areas(self, count: int) -> Float64[np.ndarray, " node"]:
+        """Area of a node's cell, in squared steps."""
+        edges = self.bend * np.sinh((np.arange(count + 1) - 0.5) / self.bend)
+        edges[0] = 0
+        return np.pi * np.diff(edges**2) / self.angles
+
+
+def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float) -> HaloGrid:
+    """Nodes for a range of depths.
+
+    Parameters
+    ----------
+    imager
+        Its sensor and magnification decide.
+    depths
+        Of the object, mm.
+    most
+        The largest field that occurs, mm: no point is farther from a lens.
+    """
+    near = float(imager.reduced_depth(depths.min()))
+    widest = min(_WIDEST * near, most)
+    middle = float(imager.magnification((depths.min() + depths.max()) / 2))
+    linear = _LINEAR * _WIDEST * near
+    # A whole number of pixels.
+    pixels = max(round(middle * linear / _NODES / imager.sensor.pixel_pitch), 1)
+    pixel = pixels * imager.sensor.pixel_pitch
+    step = pixel / middle
+    bend = linear / step
+    count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
+    largest = float(imager.magnification(depths.min())) / middle
+    radii = count((1 + _BEYOND) * largest * widest / step)
+    return HaloGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
+
+
+def halo_table(
+    imager: Imager, depth: float, zones: Zones, grid: HaloGrid, cores: Cores
+) -> Float32[np.ndarray, "kind harmonic radius field"]:
+    """From each object harmonic over the fields to the image's over the radii, at one depth.
+
+    The first kind is that of a mean lens, less its cores; the second is what it changes by with the clear area, 1/mm^2.
+    An object in the direction `phi` is imaged in the opposite one, from which the image's angle counts.
+    """
+    fields = grid.step * grid.nodes(grid.fields)
+    rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
+    chief = float(imager.magnification(depth))
+    table = np.zeros((2, grid.fields, grid.radii * grid.angles))
+    share = lambda landing, light: np.stack([_shared(grid, *one) for one in zip(landing, light, strict=True)])
+    table[0] = share(rays.landing, rays.light)
+    if zones.by_area.any():
+        table[1] = share(rays.landing, rays.light_by_area)
+    for (inner, outer), stretch, light, profile in zip(ring_edges(imager.field_radius), *cores, strict=True):
+        # The share of a core's light that a lens has at each field.
+        amount = np.asarray(ring_light(fields**2, light, inner, outer), np.float64)
+        core = imager.sensor.pixel_pitch * spread(profile, _CORE_SAMPLES)
+        for field in np.flatnonzero(amount):
+            landing = core - [chief * stretch * fields[field], 0]
+            table[0, field] -= _shared(grid, landing, np.full(len(core), amount[field] / len(core)))
+    around = table.reshape(2, grid.fields, grid.radii, grid.angles)
+    # Spots are symmetric about the field's direction: their spectra are real.
+    return np.fft.rfft(around).real.transpose(0, 3, 2, 1).astype(np.float32)
+
+
+def _shared(grid: HaloGrid, landing, light):
+    """Light of rays, shared by the four nodes around each; linear in the node's number."""
+    x, y = -landing.T
+    place = grid.bend * np.arcsinh(np.hypot(x, y) / grid.pixel / grid.bend)
+    angle = np.arctan2(y, x) * (grid.angles / (2 * np.pi)) % grid.angles
+    radius, around = place.astype(int), angle.astype(int)
+    out, on = place - radius, angle - around
+    total = np.zeros(grid.radii * grid.angles)
+    inside = radius < grid.radii - 1
+    radius = np.where(inside, radius, 0)
+    for step, part in ((0, 1 - out), (1, out)):
+        for turn, share in ((0, 1 - on), (1, on)):
+            node = (radius + step) * grid.angles + (around + turn) % grid.angles
+            total += np.bincount(node, np.where(inside, light * part * share, 0), total.size)
+    return total

@@ -1,0 +1,273 @@
+"""The image of a volume with all of its light: the spots' cores at full resolution, and their halo on coarse pixels."""
+
+import dataclasses
+import math
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..geometry import Grid, Imager, Sensor
+from ..optics.cores import ring_edges
+from ..optics.full import FullOptics
+from ..optics.halo import HaloGrid
+from ..optics.light import clear_area
+from .bilinear import Shapes, volume_to_image
+from .convolve import add_halved, add_symmetric_spectrum, image_of, padded_shape, with_margin
+from .primitive import linear_call
+from .rays import RingLight, trace
+
+# Lenses whose halos are computed at once, which bounds the memory.
+_LENSES = 64
+# The halo passes several linear interpolations, which blur it by about this variance, in squared pixels. Wiener's
+# filter undoes that, as far as the blur leaves more than this share of a frequency's power.
+_BLUR, _NOISE = 0.5, 0.02
+# Pixels of the halo around the sensor, for that filter and for the interpolation.
+_MARGIN = 12
+
+
+def full_image(
+    volume: Float[Array, "depth y x"], imager: Imager, grid: Grid, optics: FullOptics
+) -> Float[Array, "row column"]:
+    """`gs_jax.forward` with `FullOptics`."""
+    return _cores_image(volume, imager, grid, optics) + _halo_image(volume, imager, grid, optics)
+
+
+def _cores_image(volume, imager, grid, optics):
+    """The inner ring on the sensor's pixels, the others on pixels twice as large: their cores are wider."""
+    sensor, rings = imager.sensor, ring_edges(imager.field_radius)
+    size = optics.kernels.shape[-1]
+    # Even: a pixel that is twice as large is two pixels.
+    padded = padded_shape(sensor, size + 1)
+    halved = Sensor([-(-n // 2) for n in sensor.shape], 2 * sensor.pixel_pitch)
+    # A large pixel more than half an odd sensor has moves the middle.
+    moved = [(2 * large - n) * sensor.pixel_pitch / 2 for n, large in zip(sensor.shape, halved.shape, strict=True)][::-1]
+    rough = eqx.tree_at(lambda i: (i.sensor, i.shift), imager, (halved, imager.shift - jnp.asarray(moved)))
+    wide, wide_rough = with_margin(imager, size), with_margin(rough, optics.rough.shape[-1])
+    dtype = volume.dtype
+
+    def sharp(imager, plane, number):
+        depth, voxels, stretch, light, _, _ = plane
+        # Chief rays of this apparent depth land where the cores of the true one do.
+        magnification = imager.magnification(depth) * stretch[number]
+        at = grid.at(imager.sensor_distance / magnification - imager.reduced_depth(0.0))
+        weight = RingLight(*rings[number])
+        rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
+        return volume_to_image(Shapes(imager.sensor.shape, at.volume_shape, weight), rays, voxels[None])
+
+    # Not kept for the gradient: spectra for each depth are more than the volume.
+    @jax.checkpoint
+    def add_depth(spectra, plane):
+        fine, coarse = spectra
+        *_, kernels, rough = plane
+        fine = add_symmetric_spectrum(fine, sharp(wide, plane, 0), kernels[0], padded)
+        for number in range(1, len(rings)):
+            coarse = add_symmetric_spectrum(coarse, sharp(wide_rough, plane, number), rough[number - 1], half)
+        return (fine, coarse), None
+
+    half = padded[0] // 2, padded[1] // 2
+    dark = [jnp.zeros((rows, columns // 2 + 1), dtype) for rows, columns in (padded, half)]
+    tables = (part.astype(dtype) for part in (optics.stretch, optics.light, optics.kernels, optics.rough))
+    start = tuple(lax.complex(part, part) for part in dark)
+    fine, coarse = lax.scan(add_depth, start, (grid.depths, volume, *tables))[0]
+    first = size // 2 - 2 * (optics.rough.shape[-1] // 2)
+    return image_of(add_halved(fine, coarse, padded, first), sensor, size // 2, padded)
+
+
+def _halo_image(volume, imager, grid, optics):
+    dtype = volume.dtype
+    halo, v = optics.grid, imager.sensor_distance / optics.sensor_distance
+    # The spots' pattern grows with the sensor's distance, and the pixels of the halo with it.
+    pixel = halo.pixel * v
+    nodes = _on_nodes(volume, grid, halo)
+    splat, spread = _splat_table(halo), _spread_table(halo)
+    inner, outer = splat.patch, spread.patch
+    coarse = [math.ceil(n * imager.sensor.pixel_pitch / halo.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
+    nodes = jnp.pad(nodes, [(0, 0), (inner + 1, inner + 1), (inner + 1, inner + 1)])
+    table = optics.table.astype(dtype)
+
+    def add_lenses(image, lenses):
+        centers, excess = lenses
+
+        def add_depth(spots, plane):
+            nodes, table = plane
+            objects = _windows(nodes, *_place(centers, grid.origin, halo.step, nodes.shape, inner), inner)
+            polar = _apply(splat, objects.reshape(len(centers), -1).T)
+            spectrum = jnp.fft.rfft(polar.reshape(halo.fields, halo.angles, -1), axis=1)
+            turned = lax.complex(*(_mixed(table, part, excess) for part in (spectrum.real, spectrum.imag)))
+            return spots + turned, None
+
+        empty = jnp.zeros((halo.radii, halo.angles // 2 + 1, len(centers)), dtype)
+        spots = lax.scan(jax.checkpoint(add_depth), lax.complex(empty, empty), (nodes, table))[0]
+        # The image lies opposite to the object: half a turn.
+        half_turn = jnp.where(jnp.arange(halo.angles // 2 + 1) % 2, -1, 1).astype(dtype)
+        polar = jnp.fft.irfft(spots * half_turn[None, :, None], halo.angles, axis=1).reshape(-1, len(centers))
+        spots = _apply(spread, polar).T.reshape(-1, outer, outer)
+        where = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
+        return _add_windows(image, spots, *where), None
+
+    # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.
+    image = jnp.zeros([n + 2 * outer + 2 for n in coarse], dtype)
+    image = lax.scan(jax.checkpoint(add_lenses), image, _in_groups(imager, optics, dtype))[0]
+    image = image[outer + 1 : -outer - 1, outer + 1 : -outer - 1]
+    rows, columns = (
+        _finer(fine, rough, imager.sensor.pixel_pitch / pixel, dtype)
+        for fine, rough in zip(imager.sensor.shape, coarse, strict=True)
+    )
+    return (rows @ image @ columns.T) * (imager.sensor.pixel_pitch / pixel) ** 2
+
+
+def _mixed(table, spectrum, excess):
+    """Harmonics `(field, harmonic, lens)` of the object to those of the image `(radius, harmonic, lens)`."""
+    product = lambda table, part: jnp.einsum("mrf,fml->rml", table, part)
+    return product(table[0], spectrum) + product(table[1], spectrum * excess[None, None])
+
+
+def _in_groups(imager, optics, dtype):
+    """Centres and excess areas of the lenses, `_LENSES` at a time; the last are filled up with lenses far away."""
+    centers, excess = imager.centers.astype(dtype), (clear_area(imager.array) - optics.area).astype(dtype)
+    count = len(excess)
+    groups = -(-count // _LENSES)
+    size = -(-count // groups)
+    missing = groups * size - count
+    centers = jnp.pad(centers, [(0, missing), (0, 0)], constant_values=1e6)
+    return centers.reshape(groups, size, 2), jnp.pad(excess, (0, missing)).reshape(groups, size)
+
+
+def _on_nodes(volume, grid, halo):
+    """The volume's light on the halo's coarse nodes, which are centred as the grid is: linear shares."""
+
+    def shares(voxels):
+        count = math.ceil(voxels * grid.pitch / halo.step / 2) * 2 + 1
+        place = (np.arange(voxels) - (voxels - 1) / 2) * grid.pitch / halo.step + (count - 1) / 2
+        return jnp.asarray(np.maximum(1 - np.abs(np.arange(count)[:, None] - place), 0), volume.dtype)
+
+    rows, columns = map(shares, grid.shape)
+    return jnp.einsum("ay,dyx,bx->dab", rows, volume, columns)
+
+
+def _place(centers, origin, step, shape, window):
+    """First `(row, column)` of the window about each lens on nodes with this step, and the fractions that are left."""
+    middle = (jnp.asarray(shape, centers.dtype) - 1) / 2
+    place = ((centers - origin[None]) / step)[:, ::-1] + middle[None]
+    whole = jnp.floor(lax.stop_gradient(place))
+    return whole.astype(jnp.int32) - window // 2, place - whole
+
+
+_WINDOWS = dict(update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1))
+
+
+def _windows(nodes, start, fraction, size):
+    """Square windows of the nodes, whose middles are the lenses: `(lens, size, size)`; zero where they end."""
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
+    wide = (size + 1, size + 1)
+    taken = lax.gather(nodes, start, dimensions, wide, mode="fill", fill_value=0)
+    down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    taken = (1 - down) * taken[:, :-1] + down * taken[:, 1:]
+    return (1 - right) * taken[..., :-1] + right * taken[..., 1:]
+
+
+def _add_windows(image, spots, start, fraction):
+    """The adjoint of `_windows`, added to an image."""
+    down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    spots = jnp.pad((1 - down) * spots, [(0, 0), (0, 1), (0, 0)]) + jnp.pad(down * spots, [(0, 0), (1, 0), (0, 0)])
+    spots = jnp.pad((1 - right) * spots, [(0, 0), (0, 0), (0, 1)]) + jnp.pad(right * spots, [(0, 0), (0, 0), (1, 0)])
+    return lax.scatter_add(image, start, spots, lax.ScatterDimensionNumbers(**_WINDOWS), mode="drop")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Table:
+    """A sparse matrix and its transpose, each as the entries of every row; `patch`: side of the square of pixels."""
+
+    patch: int
+    entries: tuple[np.ndarray, np.ndarray]
+    transposed: tuple[np.ndarray, np.ndarray]
+
+
+def _apply(table: _Table, columns: Float[Array, "row many"]) -> Float[Array, "new many"]:
+    """A table times many columns. Both directions gather whole rows: the scatter of a transpose is slower by far."""
+    return linear_call(_gathered, _gathered_back, None, table, (), columns)
+
+
+def _gathered(table, _, columns):
+    return _rows(*table.entries, columns)
+
+
+def _gathered_back(table, _, columns):
+    return _rows(*table.transposed, columns)
+
+
+def _rows(index, weight, columns):
+    total = 0
+    for at, share in zip(index.T, weight.T, strict=True):
+        total = total + jnp.asarray(share, columns.dtype)[:, None] * columns[at]
+    return total
+
+
+@cache
+def _splat_table(halo: HaloGrid) -> _Table:
+    """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
+    reach = math.ceil(halo.nodes(halo.fields)[-2])
+    node, index, share = _polar(halo, halo.fields, reach)
+    return _table(2 * reach + 1, node, index, share, halo.fields * halo.angles, to_polar=True)
+
+
+@cache
+def _spread_table(halo: HaloGrid) -> _Table:
+    """From polar nodes to the pixels about a lens: the density of light, interpolated."""
+    reach = math.ceil(halo.nodes(halo.radii)[-2])
+    node, index, share = _polar(halo, halo.radii, reach)
+    share = share / np.repeat(halo.areas(halo.radii), halo.angles)[index]
+    return _table(2 * reach + 1, node, index, share, halo.radii * halo.angles, to_polar=False)
+
+
+def _polar(halo: HaloGrid, count: int, reach: int):
+    """Entries (square node, polar node, share) of the bilinear interpolation between polar nodes."""
+    side = np.arange(-reach, reach + 1)
+    y, x = (part.ravel() for part in np.meshgrid(side, side, indexing="ij"))
+    place = halo.bend * np.arcsinh(np.hypot(x, y) / halo.bend)
+    node = np.flatnonzero(place < count - 1)
+    place, angle = place[node], (np.arctan2(y, x)[node] / (2 * np.pi) * halo.angles) % halo.angles
+    radius, around = place.astype(int), angle.astype(int)
+    out, on = place - radius, angle - around
+    parts = []
+    for step, part in ((0, 1 - out), (1, out)):
+        for turn, share in ((0, 1 - on), (1, on)):
+            parts.append((node, (radius + step) * halo.angles + (around + turn) % halo.angles, part * share))
+    return (np.concatenate(part) for part in zip(*parts, strict=True))
+
+
+def _table(patch, square, polar, share, polars, *, to_polar):
+    by_polar, by_square = _by_row(polar, square, share, polars), _by_row(square, polar, share, patch**2)
+    return _Table(patch, by_polar, by_square) if to_polar else _Table(patch, by_square, by_polar)
+
+
+def _by_row(row, column, share, rows):
+    """Entries of each row, `(rows, most)`: columns and shares, filled up with zeros."""
+    order = np.argsort(row, kind="stable")
+    row, column, share = row[order], column[order], share[order]
+    number = np.arange(row.size) - np.searchsorted(row, row)
+    index, weight = np.zeros((rows, number.max() + 1), np.int32), np.zeros((rows, number.max() + 1))
+    index[row, number], weight[row, number] = column, share
+    return index, weight
+
+
+def _finer(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fine coarse"]:
+    """Along one axis, from the halo's pixels, sharpened, to the sensor's: Keys' cubic interpolation."""
+    place = (jnp.arange(fine, dtype=dtype) - (fine - 1) / 2) * ratio + (coarse - 1) / 2
+    x = jnp.abs(place[:, None] - jnp.arange(coarse, dtype=dtype)[None])
+    near, far = (1.5 * x - 2.5) * x**2 + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
+    cubic = jnp.where(x <= 1, near, jnp.where(x < 2, far, 0))
+    return cubic @ jnp.asarray(_sharpening(coarse), dtype)
+
+
+@cache
+def _sharpening(count: int) -> Float[np.ndarray, "pixel pixel"]:
+    """Wiener's filter against a Gaussian blur, as a matrix."""
+    blur = np.exp(-2 * np.pi**2 * _BLUR * np.fft.fftfreq(2 * count) ** 2)
+    kernel = np.fft.ifft(blur * (1 + _NOISE) / (blur**2 + _NOISE)).real
+    return kernel[np.arange(count)[:, None] - np.arange(count)]
