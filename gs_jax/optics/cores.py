@@ -6,6 +6,7 @@ axis. Over a ring of the field that is all but a change of the magnification, wh
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 from scipy.optimize import minimize_scalar
 
+from ..base.progress import Progress
 from ..geometry import Imager, falloff
 from .light import SpotRays, Zones, spot_rays, zones
 from .psf import GOLDEN_ANGLE
@@ -26,6 +28,8 @@ _DEGREE = 6
 _FIELDS, _RAYS = 16, 8192
 # A core is looked for this far from the chief ray's magnification, relative to that.
 _FARTHEST, _STEPS = 0.03, 61
+# One in so many rays is enough for the first search.
+_SPARSE = 8
 # Radial bins in a pixel, and samples of a kernel when it is drawn.
 _BINS, _SAMPLES = 4, 2**17
 
@@ -61,25 +65,39 @@ def ring_light(distance_squared, coefficients, inner: float, outer: float):
     return value * ring_share(distance_squared, inner, outer)
 
 
-def ring_edges(field_radius: float) -> list[tuple[float, float]]:
-    """Inner and outer end of each ring, mm."""
-    return [(field_radius * a, field_radius * b) for a, b in zip((0.0, *RINGS), RINGS, strict=False)]
+def ring_edges(imager: Imager, ends: Sequence[float] = RINGS) -> list[tuple[float, float]]:
+    """Inner and outer end of each ring, mm, from their ends in field radii."""
+    radius = imager.field_radius
+    return [(radius * a, radius * b) for a, b in zip((0.0, *ends), ends, strict=False)]
 
 
-def core_table(imager: Imager, depth: float, zones: Zones, reach: float) -> Cores:
+def core_table(imager: Imager, depth: float, zones: Zones, reach: float, ends: Sequence[float] = RINGS) -> Cores:
     """The cores at one depth, by exact rays of a mean lens.
 
     A ring has one kernel: the mean of its spots up to `reach` (mm) about the magnification at which that mean is the
     sharpest. Each spot counts with as much of it as explains the spot best, by least squares.
     """
     pitch = imager.sensor.pixel_pitch
-    rings = ring_edges(imager.field_radius)
+    rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
     chief = float(imager.magnification(depth))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
     parts = [_ring_cores(rays, fields, chief, pitch, edges, *ring) for ring in rings]
     return Cores(*map(np.stack, zip(*parts, strict=True)))
+
+
+def core_tables(
+    imager: Imager,
+    depths: Float64[np.ndarray, " depth"],
+    reach: float,
+    ends: Sequence[float] = RINGS,
+    progress: Progress | None = None,
+) -> Cores:
+    """The cores at some depths: `core_table` of each, with the depths first."""
+    aperture = zones(imager.array)
+    tracked = (progress or Progress()).track(depths, "Tracing cores")
+    return Cores(*map(np.stack, zip(*(core_table(imager, z, aperture, reach, ends) for z in tracked), strict=True)))
 
 
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
@@ -141,15 +159,16 @@ def _from_map(rays: SpotRays, fields, magnification) -> np.ndarray:
 
 def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> float:
     """The magnification, over the chief ray's, that gives the weighted mean of the spots the largest sum of squares."""
-    light, half = rays.light * weight[:, None], pitch / 2
+    rays = rays._replace(light=rays.light * weight[:, None])
 
-    def squares(stretch):
-        ring = (_from_map(rays, fields, chief * stretch) / half).astype(int).ravel()
-        total = np.bincount(ring, light.ravel())
+    def squares(stretch, rays=rays):
+        ring = (2 / pitch * _from_map(rays, fields, chief * stretch)).astype(int).ravel()
+        total = np.bincount(ring, rays.light.ravel())
         return -(total**2 / (2 * np.arange(total.size) + 1)).sum()
 
     tried = np.linspace(1 - _FARTHEST, 1 + _FARTHEST, _STEPS)
-    best = int(np.argmin([squares(stretch) for stretch in tried]))
+    some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
+    best = int(np.argmin([squares(stretch, some) for stretch in tried]))
     around = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
     return float(minimize_scalar(squares, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
 

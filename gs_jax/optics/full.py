@@ -10,56 +10,75 @@ from jaxtyping import Array, Float, Float64
 
 from ..base.progress import Progress
 from ..geometry import Imager
-from .cores import core_table, drawn
+from .cores import RINGS, Cores, core_table, drawn
 from .halo import HaloGrid, halo_grid, halo_table
 from .light import zones
 
 # Reach of a core's kernel, in the halo's pixels: what is wider is smooth enough for them.
-_REACH = 5
+CORE_REACH = 5
+
+
+class Halo(eqx.Module):
+    """All light but the cores', at some depths; made by `halo_and_cores`.
+
+    Parameters
+    ----------
+    table
+        Of `gs_jax.optics.halo.halo_table`, one a depth.
+    area
+        Mean clear area of the lenses, mm^2.
+    sensor_distance
+        Of the tables, mm.
+    grid
+        The nodes.
+    """
+
+    table: Float[Array, "depth kind harmonic radius field"]
+    area: Float[Array, ""]
+    sensor_distance: Float[Array, ""]
+    grid: HaloGrid = eqx.field(static=True)
+
+    @property
+    def reach(self) -> float:
+        """Of a core's kernel, mm."""
+        return CORE_REACH * self.grid.pixel
 
 
 class FullOptics(eqx.Module):
     """Where all of a point's light goes, at some depths; made by `full_optics`.
 
     A lens's spot has a core, sharp, where the field is not too wide, and a halo, which is everything else. Cores
-    are splatted at full resolution, ring by ring, and each ring has one kernel. The halo is computed on coarse pixels.
+    are splatted ring by ring, and each ring has one kernel. The halo is computed on coarse pixels.
 
     Parameters
     ----------
     stretch
-        `(depth, ring)`: magnification of the cores, over the chief ray's.
+        Magnification of the cores, over the chief ray's.
     light
-        `(depth, ring, coefficient)` of `gs_jax.optics.cores.ring_light`.
-    kernels
-        `(depth, ring, size, size)` on the sensor's pixels, each with the sum 1.
-    table
-        `(depth, kind, harmonic, radius, field)` of `gs_jax.optics.halo.halo_table`.
-    area
-        Mean clear area of the lenses, mm^2.
-    sensor_distance
-        Of the tables, mm.
-    grid
-        Of the halo.
+        Coefficients of `gs_jax.optics.cores.ring_light`.
+    kernel
+        Of the inner ring, on the sensor's pixels, with the sum 1.
+    wide_kernels
+        Of the outer rings, on pixels twice as large.
+    halo
+        The rest.
     """
 
     stretch: Float[Array, "depth ring"]
     light: Float[Array, "depth ring coefficient"]
-    kernels: Float[Array, "depth 1 size size"]
-    rough: Float[Array, "depth outer small small"]
-    table: Float[Array, "depth kind harmonic radius field"]
-    area: Float[Array, ""]
-    sensor_distance: Float[Array, ""]
-    grid: HaloGrid = eqx.field(static=True)
+    kernel: Float[Array, "depth size size"]
+    wide_kernels: Float[Array, "depth outer small small"]
+    halo: Halo
 
 
 def full_optics(
     imager: Imager,
-    depths: Sequence[float] | Float64[np.ndarray, " depth"],
+    depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
     *,
     extent: float | None = None,
     progress: Progress | None = None,
 ) -> FullOptics:
-    """The tables of a microscope at some depths, by exact rays; a third of a second each.
+    """The tables of a microscope at some depths, by exact rays; half a second each.
 
     They are constants to JAX: derivatives of an image by the lens centres and the sensor's distance move the spots and
     leave their shapes. Whoever changes the lens makes new tables.
@@ -67,7 +86,7 @@ def full_optics(
     Parameters
     ----------
     imager
-        Its lens, pitch and sensor count; where it is rotated or shifted to does not.
+        Its lens, the layout of its lenses and its sensor count; how it is turned or shifted does not.
     depths
         Of the planes, mm, in their order.
     extent
@@ -79,19 +98,39 @@ def full_optics(
     --------
     >>> image = forward(volume, imager, grid, full_optics(imager, grid.depths))
     """
-    depths = np.asarray(depths, np.float64)
+    halo, cores = halo_and_cores(imager, np.asarray(depths, np.float64), extent=extent, progress=progress)
+    size = kernel_size(imager, halo)
+    kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
+    outer = cores.profile[:, 1:]
+    wide = np.stack([[drawn(profile, size // 4 * 2 + 1, 0.5) for profile in rings] for rings in outer])
+    tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.stretch, cores.light, kernel, wide))
+    return FullOptics(*tables, halo)
+
+
+def halo_and_cores(
+    imager: Imager,
+    depths: Float64[np.ndarray, " depth"],
+    *,
+    ends: Sequence[float] = RINGS,
+    extent: float | None = None,
+    progress: Progress | None = None,
+) -> tuple[Halo, Cores]:
+    """The halo that is left by the cores of rings with these ends, in field radii; and these cores, depths first."""
     aperture = zones(imager.array)
     extent = extent or max(imager.sensor.shape) * imager.sensor.pixel_pitch
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
     grid = halo_grid(imager, depths, math.sqrt(2) * farthest)
-    reach = _REACH * grid.pixel
-    size = 2 * round(reach / imager.sensor.pixel_pitch) + 1
-    parts = []
+    parts, tables = [], []
     for depth in (progress or Progress()).track(depths, "Tracing spots"):
-        core = core_table(imager, depth, aperture, reach)
-        kernels = drawn(core.profile[0], size)[None]
-        rough = np.stack([drawn(profile, size // 4 * 2 + 1, 0.5) for profile in core.profile[1:]])
-        parts.append((core.stretch, core.light, kernels, rough, halo_table(imager, depth, aperture, grid, core)))
+        parts.append(core_table(imager, depth, aperture, CORE_REACH * grid.pixel, ends))
+        tables.append(halo_table(imager, depth, aperture, grid, parts[-1], ends))
     dtype = imager.sensor_distance.dtype
-    tables = (jnp.asarray(np.stack(part), dtype) for part in zip(*parts, strict=True))
-    return FullOptics(*tables, jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid)
+    halo = Halo(
+        jnp.asarray(np.stack(tables), dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid
+    )
+    return halo, Cores(*map(np.stack, zip(*parts, strict=True)))
+
+
+def kernel_size(imager: Imager, halo: Halo) -> int:
+    """Pixels along a side of a core's kernel, odd."""
+    return 2 * round(halo.reach / imager.sensor.pixel_pitch) + 1

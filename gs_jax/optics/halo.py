@@ -7,13 +7,14 @@ on the rank. A lens's own clear area counts to first order.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from ..geometry import Imager
-from .cores import Cores, diffracted, ring_edges, ring_light, spread
+from .cores import RINGS, Cores, diffracted, ring_edges, ring_light, spread
 from .light import Zones, spot_rays
 
 # Widest field, in reduced depths of the nearest plane: beyond, a lens passes on a third of its light and less.
@@ -81,7 +82,7 @@ def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float
 
 
 def halo_table(
-    imager: Imager, depth: float, zones: Zones, grid: HaloGrid, cores: Cores
+    imager: Imager, depth: float, zones: Zones, grid: HaloGrid, cores: Cores, ends: Sequence[float] = RINGS
 ) -> Float32[np.ndarray, "kind harmonic radius field"]:
     """From each object harmonic over the fields to the image's over the radii, at one depth.
 
@@ -96,7 +97,7 @@ def halo_table(
     table[0] = share(rays.landing, rays.light)
     if zones.by_area.any():
         table[1] = share(rays.landing, rays.light_by_area)
-    for (inner, outer), stretch, light, profile in zip(ring_edges(imager.field_radius), *cores, strict=True):
+    for (inner, outer), stretch, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
         # The share of a core's light that a lens has at each field.
         amount = np.asarray(ring_light(fields**2, light, inner, outer), np.float64)
         core = imager.sensor.pixel_pitch * spread(profile, _CORE_SAMPLES)

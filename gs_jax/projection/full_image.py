@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..geometry import Grid, Imager, Sensor
 from ..optics.cores import ring_edges
-from ..optics.full import FullOptics
+from ..optics.full import FullOptics, Halo
 from ..optics.halo import HaloGrid
 from ..optics.light import clear_area
 from .bilinear import Shapes, volume_to_image
@@ -25,7 +25,7 @@ from .rays import RingLight, trace
 _LENSES = 64
 # The halo passes several linear interpolations, which blur it by about this variance, in squared pixels. Wiener's
 # filter undoes that, as far as the blur leaves more than this share of a frequency's power.
-_BLUR, _NOISE = 0.5, 0.02
+_BLUR, _NOISE = 0.7, 0.02
 # Pixels of the halo around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
 
@@ -34,20 +34,27 @@ def full_image(
     volume: Float[Array, "depth y x"], imager: Imager, grid: Grid, optics: FullOptics
 ) -> Float[Array, "row column"]:
     """`gs_jax.forward` with `FullOptics`."""
-    return _cores_image(volume, imager, grid, optics) + _halo_image(volume, imager, grid, optics)
+    nodes = _on_nodes(volume, grid, optics.halo.grid)
+    return _cores_image(volume, imager, grid, optics) + halo_image(nodes, imager, optics.halo, grid.origin)
+
+
+def halved(imager: Imager) -> Imager:
+    """The imager with pixels twice as large: the first covers the first two each way, the last of an odd number one."""
+    sensor = imager.sensor
+    large = Sensor([-(-n // 2) for n in sensor.shape], 2 * sensor.pixel_pitch)
+    # A pixel too many moves the middle.
+    moved = [(2 * a - n) * sensor.pixel_pitch / 2 for n, a in zip(sensor.shape, large.shape, strict=True)][::-1]
+    moved = jnp.asarray(moved, imager.shift.dtype)
+    return eqx.tree_at(lambda i: (i.sensor, i.shift), imager, (large, imager.shift - moved))
 
 
 def _cores_image(volume, imager, grid, optics):
     """The inner ring on the sensor's pixels, the others on pixels twice as large: their cores are wider."""
-    sensor, rings = imager.sensor, ring_edges(imager.field_radius)
-    size = optics.kernels.shape[-1]
+    sensor, rings = imager.sensor, ring_edges(imager)
+    size = optics.kernel.shape[-1]
     # Even: a pixel that is twice as large is two pixels.
     padded = padded_shape(sensor, size + 1)
-    halved = Sensor([-(-n // 2) for n in sensor.shape], 2 * sensor.pixel_pitch)
-    # A large pixel more than half an odd sensor has moves the middle.
-    moved = [(2 * large - n) * sensor.pixel_pitch / 2 for n, large in zip(sensor.shape, halved.shape, strict=True)][::-1]
-    rough = eqx.tree_at(lambda i: (i.sensor, i.shift), imager, (halved, imager.shift - jnp.asarray(moved)))
-    wide, wide_rough = with_margin(imager, size), with_margin(rough, optics.rough.shape[-1])
+    wide, wide_halved = with_margin(imager, size), with_margin(halved(imager), optics.wide_kernels.shape[-1])
     dtype = volume.dtype
 
     def sharp(imager, plane, number):
@@ -63,27 +70,29 @@ def _cores_image(volume, imager, grid, optics):
     @jax.checkpoint
     def add_depth(spectra, plane):
         fine, coarse = spectra
-        *_, kernels, rough = plane
-        fine = add_symmetric_spectrum(fine, sharp(wide, plane, 0), kernels[0], padded)
+        *_, kernel, wide_kernels = plane
+        fine = add_symmetric_spectrum(fine, sharp(wide, plane, 0), kernel, padded)
         for number in range(1, len(rings)):
-            coarse = add_symmetric_spectrum(coarse, sharp(wide_rough, plane, number), rough[number - 1], half)
+            coarse = add_symmetric_spectrum(coarse, sharp(wide_halved, plane, number), wide_kernels[number - 1], half)
         return (fine, coarse), None
 
     half = padded[0] // 2, padded[1] // 2
     dark = [jnp.zeros((rows, columns // 2 + 1), dtype) for rows, columns in (padded, half)]
-    tables = (part.astype(dtype) for part in (optics.stretch, optics.light, optics.kernels, optics.rough))
+    tables = (part.astype(dtype) for part in (optics.stretch, optics.light, optics.kernel, optics.wide_kernels))
     start = tuple(lax.complex(part, part) for part in dark)
     fine, coarse = lax.scan(add_depth, start, (grid.depths, volume, *tables))[0]
-    first = size // 2 - 2 * (optics.rough.shape[-1] // 2)
+    first = size // 2 - 2 * (optics.wide_kernels.shape[-1] // 2)
     return image_of(add_halved(fine, coarse, padded, first), sensor, size // 2, padded)
 
 
-def _halo_image(volume, imager, grid, optics):
-    dtype = volume.dtype
+def halo_image(
+    nodes: Float[Array, "depth y x"], imager: Imager, optics: Halo, origin: Float[Array, "2"]
+) -> Float[Array, "row column"]:
+    """The halo of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm."""
+    dtype = nodes.dtype
     halo, v = optics.grid, imager.sensor_distance / optics.sensor_distance
     # The spots' pattern grows with the sensor's distance, and the pixels of the halo with it.
     pixel = halo.pixel * v
-    nodes = _on_nodes(volume, grid, halo)
     splat, spread = _splat_table(halo), _spread_table(halo)
     inner, outer = splat.patch, spread.patch
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / halo.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
@@ -95,7 +104,7 @@ def _halo_image(volume, imager, grid, optics):
 
         def add_depth(spots, plane):
             nodes, table = plane
-            objects = _windows(nodes, *_place(centers, grid.origin, halo.step, nodes.shape, inner), inner)
+            objects = _windows(nodes, *_place(centers, origin, halo.step, nodes.shape, inner), inner)
             polar = _apply(splat, objects.reshape(len(centers), -1).T)
             spectrum = jnp.fft.rfft(polar.reshape(halo.fields, halo.angles, -1), axis=1)
             turned = lax.complex(*(_mixed(table, part, excess) for part in (spectrum.real, spectrum.imag)))

@@ -1,5 +1,6 @@
 """The image of points that lie anywhere: one stamp of PSF_o for each lens that sees a point, a spot. Host code."""
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -12,7 +13,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
 from ..base.progress import Progress
-from ..geometry import Imager, chief_ray, envelope, field_limit
+from ..geometry import Imager, chief_ray
+from ..optics.cores import core_tables, drawn, ring_edges
+from ..optics.full import halo_and_cores, kernel_size
+from .full_image import halo_image
+from .rays import Envelope, RingLight
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
 STEPS = 5
@@ -20,20 +25,38 @@ STEPS = 5
 _POINTS, _SPOTS = 2048, 32768
 # The image is added up in square tiles of so many pixels, which stay in the processor's cache.
 _TILE = 512
+# Distances of depths for all of the light, mm: of the cores, which change by less than a pixel's width, and the halo.
+_CORE_STEP, _HALO_STEP = 0.1, 0.5
+# Ends of the rings that have a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
+_RINGS = tuple(np.arange(1, 21) / 8)
+
+
+class Cores(NamedTuple):
+    """Which cores stamps are of: those of a ring of the field, at each depth of the stamps.
+
+    `ring`: inner and outer end, mm. `stretch` and `light` are of `gs_jax.optics.cores.Cores`.
+    """
+
+    ring: tuple[float, float]
+    stretch: Float[np.ndarray, " depth"]
+    light: Float[np.ndarray, "depth coefficient"]
 
 
 class Stamps(NamedTuple):
-    """PSF_o at some depths, moved by every fifth of a pixel.
+    """PSF_o at some depths, or the cores of a ring, moved by every fifth of a pixel.
 
-    `kernels[d, i, j]` is on the sensor's pixels, and its chief ray lands `(i - 2, j - 2)` fifths of a pixel (row,
-    column) from the middle of the central one.
+    `kernels[d, i, j]` is on the sensor's pixels, and its chief ray (or core) lands `(i - 2, j - 2)` fifths of a pixel
+    (row, column) from the middle of the central one.
     """
 
     depths: Float[np.ndarray, " depth"]
     kernels: Float[np.ndarray, "depth 5 5 size size"]
+    cores: Cores | None = None
 
 
-def stamps(depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"]) -> Stamps:
+def stamps(
+    depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"], cores: Cores | None = None
+) -> Stamps:
     """Stamps from PSFs on pixels a fifth as large, `(depth, 5 size, 5 size)` with an odd size.
 
     Raises
@@ -52,7 +75,7 @@ def stamps(depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth f
     for axis in (1, 2):
         wide = sliding_window_view(wide, STEPS, axis).sum(-1)
     pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
-    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)))
+    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)), cores)
 
 
 def forward_points(
@@ -66,11 +89,12 @@ def forward_points(
     Parameters
     ----------
     points
-        `(x, y, z, intensity)`, mm. Each lens's image of a point adds `intensity` times the envelope C.
+        `(x, y, z, intensity)`, mm. Each lens's image of a point adds `intensity` times the envelope C, or the light of
+        the core.
     imager
         What sees them.
     stamps
-        PSF_o. A point beyond its depths takes the nearest.
+        PSF_o, or cores. A point beyond its depths takes the nearest.
     progress
         Shows how many points are done.
 
@@ -88,16 +112,18 @@ def forward_points(
     rows, columns = _tiles(imager.sensor.shape, size)
     side = _TILE + size - 1
     tiles = jnp.zeros((rows * columns, side, side), kernels.dtype, device=kernels.device)
-    lenses, limit = KDTree(np.asarray(imager.centers)), field_limit(imager.field_radius)
+    lenses, weight = KDTree(np.asarray(imager.centers)), _weight(imager, stamps)
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
-        pairs = KDTree(some[:, :2]).sparse_distance_matrix(lenses, limit, output_type="ndarray")
+        pairs = KDTree(some[:, :2]).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
             spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
             count = min(_SPOTS, len(pairs) - first)
-            tiles = _add_spots(tiles, count, some[spots["i"]], spots["j"], imager, depths, kernels)
+            rays = _rays(some[:, 2], imager, stamps)
+            seen = (some[spots["i"]], spots["j"], *(part[spots["i"]] for part in rays))
+            tiles = _add_spots(tiles, count, *seen, imager, depths, kernels, weight)
     image = np.zeros((rows * _TILE + size - 1, columns * _TILE + size - 1), stamps.kernels.dtype)
     for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
         image[row * _TILE :, column * _TILE :][:side, :side] += tile
@@ -110,27 +136,43 @@ def _tiles(shape: tuple[int, int], size: int) -> tuple[int, int]:
     return rows, columns
 
 
-@partial(jax.jit, donate_argnums=0)
+def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
+    return RingLight(*stamps.cores.ring) if stamps.cores else Envelope(imager.field_radius)
+
+
+def _rays(depth, imager, stamps):
+    """Magnification and parameters of the weight, for each point."""
+    magnification = np.asarray(imager.magnification(depth), np.float64)
+    if stamps.cores is None:
+        return magnification, np.asarray(imager.reduced_depth(depth), np.float64)[:, None]
+    between = lambda part: np.interp(depth, stamps.depths, part)
+    light = np.stack([between(part) for part in stamps.cores.light.T], -1)
+    return magnification * between(stamps.cores.stretch), light
+
+
+@partial(jax.jit, donate_argnums=0, static_argnames="weight")
 def _add_spots(
     tiles: Float[Array, "tile side side"],
     count: Int[ArrayLike, ""],
     points: Float[Array | np.ndarray, "spot 4"],
     lenses: Int[Array | np.ndarray, " spot"],
+    magnification: Float[Array | np.ndarray, " spot"],
+    parameters: Float[Array | np.ndarray, "spot parameter"],
     imager: Imager,
     depths: Float[Array, " depth"],
     kernels: Float[Array, "depth 5 5 size size"],
+    weight: Envelope | RingLight,
 ) -> Float[Array, "tile side side"]:
     """Adds the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
     size, dtype = kernels.shape[-1], imager.sensor_distance.dtype
-    points = jnp.asarray(points, dtype)
+    points, magnification, parameters = (jnp.asarray(part, dtype) for part in (points, magnification, parameters))
     center, point, depth = imager.centers[lenses], points[:, :2], points[:, 2]
-    weight = envelope(jnp.sum((center - point) ** 2, -1), imager.reduced_depth(depth), imager.field_radius)
-    weight = (points[:, 3] * weight).astype(kernels.dtype)
+    light = (points[:, 3] * weight(jnp.sum((center - point) ** 2, -1), parameters)).astype(kernels.dtype)
     between = jnp.interp(depth, depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
     near = between.astype(int)
     far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
 
-    place = imager.sensor.to_pixels(chief_ray(center, point, imager.magnification(depth)[:, None]))
+    place = imager.sensor.to_pixels(chief_ray(center, point, magnification[:, None]))
     fifths = jnp.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
     (i, j), corner = (fifths % STEPS).T, fifths // STEPS + size // 2
     last = jnp.array(imager.sensor.shape) + size - 2
@@ -145,6 +187,60 @@ def _add_spots(
         stamp = (1 - part[n]) * kernels[near[n], i[n], j[n]] + part[n] * kernels[far[n], i[n], j[n]]
         at = tile[n], row[n], column[n]
         patch = lax.dynamic_slice(tiles, at, (1, size, size))
-        return lax.dynamic_update_slice(tiles, patch + weight[n] * stamp[None], at)
+        return lax.dynamic_update_slice(tiles, patch + light[n] * stamp[None], at)
 
     return lax.fori_loop(0, jnp.sum(lit), add, tiles)
+
+
+def full_image_of_points(
+    points: Float[np.ndarray, "point 4"], imager: Imager, progress: Progress | None = None
+) -> Float[np.ndarray, "row column"]:
+    """The image of points with all of their light: what `forward` does with `FullOptics`, without a grid.
+
+    Cores are stamps, interpolated between depths that are 0.1 mm apart, at fifths of a pixel, or of two where they are
+    wider (`gs_jax.projection.full_image`); the halo is interpolated between depths that are 0.5 mm apart.
+
+    Parameters
+    ----------
+    points
+        `(x, y, z, intensity)`, mm: the intensity is all that a point sends out, in every direction.
+    imager
+        What sees them.
+    progress
+        Shows how far it is.
+    """
+    progress = progress or Progress()
+    near, far = points[:, 2].min(), points[:, 2].max()
+    extent = 2 * float(np.abs(points[:, :2]).max())
+    coarse = np.linspace(near, far, math.ceil((far - near) / _HALO_STEP) + 1)
+    halo, _ = halo_and_cores(imager, coarse, ends=_RINGS, extent=extent, progress=progress)
+    nodes = jnp.asarray(_on_nodes(points, coarse, halo.grid), imager.sensor_distance.dtype)
+    image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
+    depths = np.unique(points[:, 2])
+    if depths.size > (count := math.ceil((far - near) / _CORE_STEP) + 1):
+        depths = np.linspace(near, far, count)
+    tables = core_tables(imager, depths, halo.reach, _RINGS, progress)
+    size = kernel_size(imager, halo)
+    for ring, *parts, profiles in zip(ring_edges(imager, _RINGS), *(np.moveaxis(t, 1, 0) for t in tables), strict=True):
+        fine = np.stack([drawn(profile, STEPS * size, STEPS) for profile in profiles])
+        spots = stamps(depths, fine.astype(np.float32), Cores(ring, *parts))
+        image += forward_points(points, imager, spots, progress)
+    return np.maximum(image, 0)
+
+
+def _on_nodes(points, depths, halo):
+    """Light of points, shared linearly by the halo's coarse nodes and depths: `(depth, y, x)`."""
+    count = 2 * math.ceil(np.abs(points[:, :2]).max() / halo.step + 1) + 1
+    place = np.column_stack(
+        [
+            np.interp(points[:, 2], depths, np.arange(len(depths))),
+            points[:, 1] / halo.step + count // 2,
+            points[:, 0] / halo.step + count // 2,
+        ]
+    )
+    whole = np.floor(place).astype(int)
+    nodes = np.zeros((len(depths) + 1, count, count))
+    for corner in np.ndindex(2, 2, 2):
+        share = np.prod(np.where(corner, place - whole, 1 - (place - whole)), -1)
+        np.add.at(nodes, tuple((whole + corner).T), points[:, 3] * share)
+    return nodes[:-1]
