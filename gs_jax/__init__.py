@@ -50,6 +50,7 @@ The operators themselves, differentiable:
     backproject_adjoint  The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from
     forward              The image of a volume: Eq. (2), summed lens by lens and without its zones
     forward_operator     The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
+    optics_of            What `forward` takes to image planes at some depths, as true as is wanted
     solve                Explain an image: all steps of a solver, or as many as its tolerance asks for
 
 Better designs, and their molds:

@@ -16,6 +16,7 @@ from .mold.make import make_mold as make_mold
 from .pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward
+from .projection.levels import optics_of as optics_of
 from .projection.operators import forward_operator as forward_operator
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct

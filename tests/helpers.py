@@ -111,6 +111,6 @@ def design_and_capture(folder: Path) -> np.ndarray:
     (folder / "design").mkdir()
     write_design(folder / "design" / "geomscope.toml", design := Design.model_validate(data))
     points = random_points(5, (3.0, 3.0), (18.5, 21.5), seed=3)
-    image = simulate(points, design.imager(), psf="geometric")
+    image = simulate(points, design.imager(), optics="near", psf="geometric")
     write_capture(folder / "capture.tif", np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=2e4)))
     return points

@@ -61,47 +61,47 @@ def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
     """The second call compiles nothing, with another image and for another number of steps, too."""
     imager, grid, psf, truth, image = small()
     image = np.asarray(image)
-    first = reconstruct(image, imager, grid, METHODS[name](10), psf=psf)
+    first = reconstruct(image, imager, grid, METHODS[name](10), optics=psf)
     assert first.dtype == np.float32 and first.shape == grid.volume_shape
     assert int(first.argmax()) == int(truth.argmax())
     with jax.log_compiles(), caplog.at_level("WARNING"):
         jax.jit(lambda x: x + 1)(image)
         assert [r for r in caplog.records if "Compiling" in r.getMessage()]  # as JAX words it
         caplog.clear()
-        second = reconstruct(2 * image, imager, grid, METHODS[name](11), psf=psf)
+        second = reconstruct(2 * image, imager, grid, METHODS[name](11), optics=psf)
     assert not [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
     assert not np.array_equal(first, second)
 
 
 def test_it_is_what_the_solver_finds_in_one_loop():
     imager, grid, psf, _, image = small()
-    found = reconstruct(image, imager, grid, FISTA(steps=7), psf=psf)
+    found = reconstruct(image, imager, grid, FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(found, in_one_loop()(image), rtol=1e-6, atol=1e-9)
 
 
 def test_each_step_is_shown_and_can_be_the_last():
     imager, grid, psf, _, image = small()
     log = Log()
-    reconstruct(image, imager, grid, RichardsonLucy(steps=10), psf=psf, progress=log)
+    reconstruct(image, imager, grid, RichardsonLucy(steps=10), optics=psf, progress=log)
     assert log.parts == 10 * [("Iterating", 10)]
     early = Log()
-    reconstruct(image, imager, grid, RichardsonLucy(steps=10, tolerance=0.3), psf=psf, progress=early)
+    reconstruct(image, imager, grid, RichardsonLucy(steps=10, tolerance=0.3), optics=psf, progress=early)
     assert 1 <= len(early.parts) < 9
     interrupted = Log(most=3)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(image, imager, grid, RichardsonLucy(steps=10), psf=psf, progress=interrupted)
+        reconstruct(image, imager, grid, RichardsonLucy(steps=10), optics=psf, progress=interrupted)
     assert len(interrupted.parts) == 3
 
 
 def test_the_cameras_offset_is_taken_off_once():
     imager, grid, psf, _, image = small()
     counts = np.round(1000 * np.asarray(image) / float(image.max()))
-    plain = reconstruct(counts, imager, grid, FISTA(steps=7), psf=psf)
-    offset = reconstruct((counts + 100).astype(np.uint16), imager, grid, FISTA(steps=7), psf=psf)
+    plain = reconstruct(counts, imager, grid, FISTA(steps=7), optics=psf)
+    offset = reconstruct((counts + 100).astype(np.uint16), imager, grid, FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(offset, plain, rtol=1e-6)
     # Read noise about zero is no offset: its darkest percent is negative.
     noisy = counts + np.random.default_rng(0).normal(0, 3, counts.shape)
-    found = reconstruct(noisy, imager, grid, FISTA(steps=7), psf=psf)
+    found = reconstruct(noisy, imager, grid, FISTA(steps=7), optics=psf)
     np.testing.assert_allclose(found, in_one_loop()(noisy), rtol=1e-6, atol=1e-6)
 
 

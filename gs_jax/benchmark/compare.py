@@ -23,7 +23,7 @@ from ..base.errors import InputError
 from ..base.info import available_memory
 from ..base.progress import Progress
 from ..projection.operators import forward_operator
-from ..reconstruction.methods import METHODS as RECONSTRUCTIONS
+from ..reconstruction.methods import METHODS as RECONSTRUCTIONS, ListRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
 from ..solvers.admm import ADMM
 from ..solvers.iteration import solve
@@ -53,7 +53,9 @@ class Method(NamedTuple):
 
 def _reconstructed(name: str):
     method = RECONSTRUCTIONS[name](STEPS)
-    return lambda bench: lambda image: reconstruct(image, bench.imager, bench.grid, method, psf=bench.psf)
+    # Pixel-voxel lists have no PSF.
+    of = lambda bench: None if isinstance(method, ListRichardsonLucy) else bench.psf
+    return lambda bench: lambda image: reconstruct(image, bench.imager, bench.grid, method, optics=of(bench))
 
 
 def _dense(solver: RichardsonLucy | ADMM):

@@ -1,5 +1,6 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points."""
 
+import dataclasses
 from pathlib import Path
 
 import click
@@ -13,22 +14,36 @@ from ..io.captures import read_capture
 from ..io.disk import check_output
 from ..io.points import write_points
 from ..io.volumes import VOLUME_SUFFIXES, write_volume
+from ..projection.levels import LEVELS
 from ..reconstruction.methods import METHODS
-from ..reconstruction.pipeline import reconstruct as volume_of, voxel_grid
+from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
 from ..simulation.phantoms import rasterize
 from ..suppression.clustering import find_clusters
 from ..suppression.locate import find_points
 from ..suppression.unet import read_weights, suppress as without_background
-from .options import UM, Depths, depth_range
+from .options import UM, Depths, Number, depth_range
 
 
 @click.command("reconstruct")
 @click.argument("capture", type=Path)
 @click.argument("design", type=Path)
 @click.option("--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included.")
-@click.option("--voxel-um", type=UM, help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth]")
+@click.option(
+    "--voxel-um",
+    type=UM,
+    help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
+)
 @click.option("--method", type=click.Choice(list(METHODS)), default="backproject", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 100_000), default=20, show_default=True, help="Of the other methods.")
+@click.option(
+    "--optics",
+    type=click.Choice(LEVELS),
+    default="full",
+    show_default=True,
+    help="What the method knows of the light: all, one PSF for all lenses near a point, or chief rays alone.",
+)
+@click.option("--tv", type=Number(least=0, most=10, unit=""), help="Weight of total variation (richardson-lucy, admm).")
+@click.option("--sparsity", type=Number(least=0, most=1, unit=""), help="Weight of the sum of voxels (fista, admm).")
 @click.option(
     "--suppress",
     type=click.Choice(["none", "points", "clusters", "unet"]),
@@ -46,6 +61,9 @@ def command(
     voxel_um: float | None,
     method: str,
     steps: int,
+    optics: str,
+    tv: float | None,
+    sparsity: float | None,
     suppress: str,
     weights: Path | None,
     output: Path,
@@ -62,10 +80,12 @@ def command(
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
     if weights and suppress != "unet":
         raise InputError(f"--weights: found --suppress {suppress}, allowed: --suppress unet, which they are for.")
+    inversion = _with(METHODS[method](steps), method, tv=tv, sparsity=sparsity)
     network = read_weights(weights) if weights else None
     microscope = read_design(design)
     imager = microscope.imager()
-    grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000)
+    pixels = 1 if method == "backproject" else COARSE
+    grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
     image = read_capture(capture, imager.sensor.shape)
     found = np.zeros((0, 4))
     with Progress() as progress:
@@ -74,7 +94,7 @@ def command(
         if suppress == "points":
             volume = _volume_of_points(found, grid)
         else:
-            volume = volume_of(image, imager, grid, METHODS[method](steps), progress=progress)
+            volume = volume_of(image, imager, grid, inversion, optics=optics, progress=progress)
         if suppress == "clusters":
             with progress.step("Clustering"):
                 found = find_clusters(volume, grid)
@@ -91,6 +111,16 @@ def command(
     click.echo(f"{output}: {size}, {depth_range(depths)}")
     if points or suppress in ("points", "clusters"):
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
+
+
+def _with(method, name: str, **options):
+    """The method with the options that were given, if it has them."""
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        if not hasattr(method, option):
+            has = [other for other, make in METHODS.items() if hasattr(make(1), option)]
+            raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
+    return dataclasses.replace(method, **given)
 
 
 def _volume_of_points(points: np.ndarray, grid: Grid) -> np.ndarray:

@@ -13,19 +13,35 @@ from ..io.captures import CAPTURE_SUFFIXES, write_capture
 from ..io.disk import check_output
 from ..optics.window import PSFS
 from ..simulation.camera import Camera, expose
-from ..simulation.scene import read_scene, simulate
+from ..simulation.scene import OPTICS, read_scene, simulate
 from .options import Number
 
 
 @click.command("simulate")
 @click.argument("scene", type=Path)
 @click.argument("design", type=Path)
-@click.option("--psf", type=click.Choice(list(PSFS)), default="diffraction", show_default=True)
+@click.option(
+    "--optics",
+    type=click.Choice(OPTICS),
+    default="full",
+    show_default=True,
+    help="All of the light, where it lands; or Eq. (2), with one PSF for all lenses near a point.",
+)
+@click.option("--psf", type=click.Choice(list(PSFS)), help="Of --optics near.  [default: diffraction]")
 @click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
 @click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
-def command(scene: Path, design: Path, psf: str, peak_electrons: float, noise: bool, seed: int, output: Path):
+def command(
+    scene: Path,
+    design: Path,
+    optics: str,
+    psf: str | None,
+    peak_electrons: float,
+    noise: bool,
+    seed: int,
+    output: Path,
+):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
     SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
@@ -36,11 +52,13 @@ def command(scene: Path, design: Path, psf: str, peak_electrons: float, noise: b
         raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
     if scene.suffix.lower() == ".toml":
         raise InputError(f"{scene}: found a design in the place of SCENE, allowed: SCENE first, then DESIGN.")
+    if psf and optics == "full":
+        raise InputError(f"--psf {psf}: found --optics full, allowed: --optics near, which has one PSF for all lenses.")
     microscope = read_design(design)
     with Progress() as progress:
         light, grid = read_scene(scene)
         with errors_name_file(scene):
-            image = simulate(light, microscope.imager(), grid, psf=psf, progress=progress)
+            image = simulate(light, microscope.imager(), grid, optics=optics, psf=psf, progress=progress)
         if noise:
             with progress.step("Exposing"):
                 image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))

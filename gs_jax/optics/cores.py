@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
-from scipy.optimize import minimize_scalar
+from scipy.interpolate import CubicSpline
+from scipy.optimize import fminbound
 
 from ..base.progress import Progress
 from ..geometry import Imager, falloff
@@ -28,6 +29,8 @@ _DEGREE = 6
 _FIELDS, _RAYS = 16, 8192
 # A core is looked for this far from the chief ray's magnification, relative to that.
 _FARTHEST, _STEPS = 0.03, 61
+# Depths that are traced for the cores' magnification; others are interpolated.
+_MOST = 9
 # One in so many rays is enough for the first search.
 _SPARSE = 8
 # Radial bins in a pixel, and samples of a kernel when it is drawn.
@@ -105,9 +108,15 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
 
     The chief ray's is `M_z = v/z'` (Eq. 3); the authors' lenses have 0.4 % less to 0.8 % more, by depth.
     """
+    depths = np.asarray(depths, np.float64)
+    if depths.size > _MOST:
+        # A smooth function of the depth.
+        some = np.linspace(depths.min(), depths.max(), _MOST)
+        stretch = CubicSpline(some, core_magnification(imager, some) * np.asarray(imager.reduced_depth(some)))
+        return stretch(depths) / np.asarray(imager.reduced_depth(depths), np.float64)
     aperture, fields = zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
     found = []
-    for depth in np.asarray(depths, np.float64):
+    for depth in depths:
         rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
         chief = float(imager.magnification(depth))
         found.append(chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch))
@@ -122,6 +131,18 @@ def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float
     """
     found = float(imager.sensor_distance) / core_magnification(imager, depths) - float(imager.reduced_depth(0.0))
     return jnp.asarray(found, imager.sensor_distance.dtype)
+
+
+def core_shares(
+    imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"], side: float
+) -> Float64[np.ndarray, "depth field"]:
+    """Share of a point's light that a mean lens brings into a square of this side (mm) about its spot's core."""
+    aperture, shares = zones(imager.array), []
+    for depth, magnification in zip(depths, core_magnification(imager, depths), strict=True):
+        rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
+        away = np.abs(rays.landing + np.stack([magnification * fields, 0 * fields], -1)[:, None])
+        shares.append(np.where((away < side / 2).all(-1), rays.light, 0).sum(1))
+    return np.array(shares)
 
 
 def diffracted(imager: Imager, rays: SpotRays) -> SpotRays:
@@ -170,7 +191,7 @@ def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> flo
     some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
     best = int(np.argmin([squares(stretch, some) for stretch in tried]))
     around = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
-    return float(minimize_scalar(squares, bounds=around, method="bounded", options={"xatol": 1e-5}).x)
+    return float(fminbound(squares, *around, xtol=1e-5))
 
 
 def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float = 1) -> Float64[np.ndarray, "row column"]:

@@ -76,6 +76,7 @@ def full_optics(
     depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
     *,
     extent: float | None = None,
+    nodes_for: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> FullOptics:
     """The tables of a microscope at some depths, by exact rays; half a second each.
@@ -91,6 +92,9 @@ def full_optics(
         Of the planes, mm, in their order.
     extent
         Size of the object, mm: no light is followed that comes from farther off. By default the sensor's.
+    nodes_for
+        Nearest and farthest depth that share the halo's nodes, so that what is compiled for one serves all; by default
+        those of `depths`.
     progress
         Shows how many depths are done.
 
@@ -98,13 +102,15 @@ def full_optics(
     --------
     >>> image = forward(volume, imager, grid, full_optics(imager, grid.depths))
     """
-    halo, cores = halo_and_cores(imager, np.asarray(depths, np.float64), extent=extent, progress=progress)
+    depths = np.asarray(depths, np.float64)
+    halo, cores = halo_and_cores(imager, depths, extent=extent, nodes_for=nodes_for, progress=progress)
     size = kernel_size(imager, halo)
     kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
     outer = cores.profile[:, 1:]
     wide = np.stack([[drawn(profile, size // 4 * 2 + 1, 0.5) for profile in rings] for rings in outer])
     tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.stretch, cores.light, kernel, wide))
-    return FullOptics(*tables, halo)
+    stretch, light, kernel, wide = tables
+    return FullOptics(stretch, light, kernel, wide, halo)
 
 
 def halo_and_cores(
@@ -113,21 +119,20 @@ def halo_and_cores(
     *,
     ends: Sequence[float] = RINGS,
     extent: float | None = None,
+    nodes_for: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> tuple[Halo, Cores]:
     """The halo that is left by the cores of rings with these ends, in field radii; and these cores, depths first."""
     aperture = zones(imager.array)
     extent = extent or max(imager.sensor.shape) * imager.sensor.pixel_pitch
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
-    grid = halo_grid(imager, depths, math.sqrt(2) * farthest)
+    grid = halo_grid(imager, np.asarray(nodes_for or depths), math.sqrt(2) * farthest)
     parts, tables = [], []
     for depth in (progress or Progress()).track(depths, "Tracing spots"):
         parts.append(core_table(imager, depth, aperture, CORE_REACH * grid.pixel, ends))
         tables.append(halo_table(imager, depth, aperture, grid, parts[-1], ends))
     dtype = imager.sensor_distance.dtype
-    halo = Halo(
-        jnp.asarray(np.stack(tables), dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid
-    )
+    halo = Halo(jnp.asarray(np.stack(tables), dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid)
     return halo, Cores(*map(np.stack, zip(*parts, strict=True)))
 
 

@@ -73,7 +73,9 @@ def zones(array: MicrolensArray) -> Zones:
     return Zones(radius, shares.mean(0), slope, float(areas.mean()))
 
 
-def spot_rays(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], zones: Zones, count: int) -> SpotRays:
+def spot_rays(
+    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], zones: Zones, count: int
+) -> SpotRays:
     """Rays of a point at each field, `count` of them evenly over the lens's disc."""
     order = np.arange(count) + 0.5
     radius = zones.radius[-1] * _RADII / (_RADII - 0.5) * np.sqrt(order / count)

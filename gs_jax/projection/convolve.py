@@ -53,7 +53,9 @@ def add_symmetric_spectrum(
     rows, columns = padded
     half = kernel.shape[0] // 2
     quarter = kernel[half:, half:]
-    of_kernel = _cosines(rows, rows, half, kernel.dtype) @ quarter @ _cosines(columns // 2 + 1, columns, half, kernel.dtype).T
+    of_kernel = (
+        _cosines(rows, rows, half, kernel.dtype) @ quarter @ _cosines(columns // 2 + 1, columns, half, kernel.dtype).T
+    )
     return spectrum + jnp.fft.rfft2(sharp[1:-1, 1:-1], padded) * of_kernel
 
 

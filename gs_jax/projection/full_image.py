@@ -104,7 +104,8 @@ def halo_image(
 
         def add_depth(spots, plane):
             nodes, table = plane
-            objects = _windows(nodes, *_place(centers, origin, halo.step, nodes.shape, inner), inner)
+            start, fraction = _place(centers, origin, halo.step, nodes.shape, inner)
+            objects = _windows(nodes, start, fraction, inner)
             polar = _apply(splat, objects.reshape(len(centers), -1).T)
             spectrum = jnp.fft.rfft(polar.reshape(halo.fields, halo.angles, -1), axis=1)
             turned = lax.complex(*(_mixed(table, part, excess) for part in (spectrum.real, spectrum.imag)))
@@ -116,8 +117,8 @@ def halo_image(
         half_turn = jnp.where(jnp.arange(halo.angles // 2 + 1) % 2, -1, 1).astype(dtype)
         polar = jnp.fft.irfft(spots * half_turn[None, :, None], halo.angles, axis=1).reshape(-1, len(centers))
         spots = _apply(spread, polar).T.reshape(-1, outer, outer)
-        where = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
-        return _add_windows(image, spots, *where), None
+        start, fraction = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
+        return _add_windows(image, spots, start, fraction), None
 
     # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.
     image = jnp.zeros([n + 2 * outer + 2 for n in coarse], dtype)
@@ -167,9 +168,6 @@ def _place(centers, origin, step, shape, window):
     return whole.astype(jnp.int32) - window // 2, place - whole
 
 
-_WINDOWS = dict(update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1))
-
-
 def _windows(nodes, start, fraction, size):
     """Square windows of the nodes, whose middles are the lenses: `(lens, size, size)`; zero where they end."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
@@ -185,7 +183,10 @@ def _add_windows(image, spots, start, fraction):
     down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
     spots = jnp.pad((1 - down) * spots, [(0, 0), (0, 1), (0, 0)]) + jnp.pad(down * spots, [(0, 0), (1, 0), (0, 0)])
     spots = jnp.pad((1 - right) * spots, [(0, 0), (0, 0), (0, 1)]) + jnp.pad(right * spots, [(0, 0), (0, 0), (1, 0)])
-    return lax.scatter_add(image, start, spots, lax.ScatterDimensionNumbers(**_WINDOWS), mode="drop")
+    dimensions = lax.ScatterDimensionNumbers(
+        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
+    )
+    return lax.scatter_add(image, start, spots, dimensions, mode="drop")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -213,7 +214,7 @@ def _gathered_back(table, _, columns):
 def _rows(index, weight, columns):
     total = 0
     for at, share in zip(index.T, weight.T, strict=True):
-        total = total + jnp.asarray(share, columns.dtype)[:, None] * columns[at]
+        total = total + jnp.asarray(share, columns.dtype)[:, None] * columns.at[at].get(mode="promise_in_bounds")
     return total
 
 

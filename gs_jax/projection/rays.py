@@ -86,12 +86,12 @@ def trace(
     if parameters is None:
         parameters = imager.reduced_depth(grid.depths)[:, None]
     magnification = imager.magnification(grid.depths)
-    limit = limit or field_limit(imager.field_radius)
+    reach = field_limit(imager.field_radius) if limit is None else limit
     x, y = imager.centers[_snake(imager.centers)].T
 
     def axis(center, origin, voxels, pixels):
-        size = min(voxels, int(2 * limit / grid.pitch) + 1)
-        first = jnp.ceil((center - origin - limit) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
+        size = min(voxels, int(2 * reach / grid.pitch) + 1)
+        first = jnp.ceil((center - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
         index = (start[:, None] + jnp.arange(size, dtype=jnp.int32)[None, :]).astype(center.dtype) - (voxels - 1) / 2
         pixel, fraction, offset = _project(

@@ -1,30 +1,43 @@
 """From a capture to a volume, whatever the method."""
 
 import dataclasses
+import math
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Float32, Num
 
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
-from ..geometry import Grid, Imager
-from ..optics.window import psf_of_depth
+from ..geometry import Grid, Imager, Sensor
+from ..optics.cores import apparent_depths
+from ..optics.full import FullOptics
 from ..projection.backprojection import backproject
-from ..projection.operators import forward_operator
+from ..projection.forward_model import Optics
+from ..projection.levels import LEVELS, optics_of
+from ..projection.operators import Unmatched, forward_operator
 from ..solvers.iteration import Solver
+from ..solvers.richardson_lucy import RichardsonLucy
+from ..suppression.consistency import local_levels
 from .methods import BackProjection, ListRichardsonLucy, Method
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARKEST = 1
+# Half a wave of background is this many of the halo's pixels at least: as wide as the halo of a spot.
+_SLOW = 6.5
+# Of the default voxel of an iterative method, which is as wide as so many pixels.
+COARSE = 4
+_ROUNDING = 0.02
 
 
-def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) -> Grid:
+def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:
     """The voxels to reconstruct: the field of view, as large as the sensor.
 
     Parameters
@@ -34,7 +47,9 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
     depths
         In mm.
     pitch
-        Of the voxels laterally, mm. By default a pixel as seen at the middle depth, rounded to 0.1 um, and no less.
+        Of the voxels laterally, mm. By default `pixels` as seen at the middle depth, rounded to 0.1 um, and no less.
+    pixels
+        Of the default.
 
     Raises
     ------
@@ -43,7 +58,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None) 
     """
     if pitch is None:
         middle = float(imager.magnification(np.median(depths)))
-        pitch = max(round(imager.sensor.pixel_pitch / middle, 4), 1e-4)
+        pitch = max(round(pixels * imager.sensor.pixel_pitch / middle, 4), 1e-4)
     grid = Grid.over(imager.sensor, depths=jnp.array(depths), pitch=pitch)
     size = 4 * len(depths) * grid.shape[0] * grid.shape[1]
     # The volume, the copy that is being computed, and room for the image.
@@ -62,7 +77,7 @@ def reconstruct(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    psf: Float[Array | np.ndarray, "plane tall wide"] | None = None,
+    optics: Optics | str = "full",
     progress: Progress | None = None,
 ) -> Float32[np.ndarray, "depth y x"]:
     """The volume that an image shows.
@@ -71,22 +86,28 @@ def reconstruct(
     camera's offset: the image's darkest percent, or nothing if that is negative, as it was taken off already. They run
     step by step, and can be interrupted after each; the second call with the same shapes compiles nothing.
 
+    With optics by name, iterative methods sum as many pixels as the voxels are wide. Light that the optics does not
+    hold is background, and is fitted by no voxel. With "full" that varies slowly: FISTA and ADMM leave the image's
+    longest waves out of account. With "near" and "pinhole" it is most of the light: what is everywhere within squares
+    of 32 pixels.
+
     Parameters
     ----------
     image, imager, grid
         As for `backproject`.
     method
         `BackProjection()`, `ListRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`.
-    psf
-        Of the solvers, as for `forward`; by default that of the rays, without diffraction.
+    optics
+        As for `forward`, or its name for `optics_of`. By name, "full" or "near", back-projection reads the bright cores
+        of the spots; otherwise it follows the chief rays, as the paper does.
     progress
         Shows how far it is; by default nothing does.
 
     Raises
     ------
     InputError
-        If `method` is no method, the image is not `sensor.shape`, or a depth of the grid is blurred over more than 128
-        pixels.
+        If `method` is no method, the image is not `sensor.shape`, there is no such optics, or a depth of the grid is
+        blurred over more than 128 pixels ("near").
 
     Examples
     --------
@@ -95,18 +116,89 @@ def reconstruct(
     progress = progress or Progress()
     if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
         raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
+    if isinstance(optics, str) and optics not in LEVELS:
+        raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
     if image.shape != imager.sensor.shape:
         raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
+    on_cores = isinstance(optics, str) and optics != "pinhole"
+    seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
     if isinstance(method, BackProjection):
-        return _back_projected(image, imager, grid, method, progress)
+        return _back_projected(image, imager, seen, method, progress)
     light = np.asarray(image, imager.sensor_distance.dtype)
     light = light - max(float(np.percentile(light, _DARKEST)), 0.0)
+    background, slow = 0.0, 0
+    if isinstance(optics, str):
+        light, imager = _binned(light, imager, grid)
+        if optics != "full":
+            background = np.maximum(local_levels(light)[0], 0)
+        optics = optics_of(imager, grid.depths, optics, progress=progress)
+        if isinstance(optics, FullOptics):
+            width = max(imager.sensor.shape) * imager.sensor.pixel_pitch
+            slow = round(width / (_SLOW * optics.halo.grid.pixel))
+    if isinstance(optics, np.ndarray):
+        optics = jnp.asarray(optics)
     if isinstance(method, ListRichardsonLucy):
-        return _iterated(method.solver, progress, light, imager, grid, None)
-    if psf is None:
-        kernel = psf_of_depth(imager, np.asarray(grid.depths), "geometric")
-        psf = jnp.stack([kernel(z) for z in progress.track(np.asarray(grid.depths), "Point spread functions")])
-    return _iterated(method, progress, light, imager, grid, jnp.asarray(psf))
+        return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen))
+    if isinstance(method, RichardsonLucy):
+        if isinstance(background, np.ndarray):
+            method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
+        return _iterated(method, progress, light, System(imager, grid, optics))
+    system = System(imager, grid, optics, slow=slow)
+    return _iterated(method, progress, np.asarray(system.fast(light - background), light.dtype), system)
+
+
+class System(eqx.Module):
+    """What a solver inverts: the microscope, and how.
+
+    Parameters
+    ----------
+    imager, grid, optics
+        As for `forward`.
+    seen
+        If given, back-projection from these voxels stands for the adjoint.
+    slow
+        So many of the image's longest cosine waves each way are left out of account.
+    """
+
+    imager: Imager
+    grid: Grid
+    optics: Optics
+    seen: Grid | None = None
+    slow: int = eqx.field(static=True, default=0)
+
+    @property
+    def operator(self) -> lx.AbstractLinearOperator | Unmatched:
+        A = forward_operator(self.imager, self.grid, self.optics)
+        if self.seen is not None:
+            return Unmatched(A, forward_operator(self.imager, self.seen).T)
+        return lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
+
+    def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+        """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""
+        image = jnp.asarray(image)
+        if not self.slow:
+            return image
+        rows, columns = (_waves(n, self.slow, image.dtype) for n in image.shape)
+        return image - rows @ (rows.T @ image @ columns) @ columns.T
+
+
+def _waves(size, count, dtype):
+    """The longest waves of the discrete cosine transform, orthonormal: `(size, count)`."""
+    waves = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
+    return jnp.asarray(waves / np.linalg.norm(waves, axis=0), dtype)
+
+
+def _binned(light, imager, grid):
+    """Pixels summed to squares that are at most as wide as a voxel's image, and divide the sensor."""
+    sensor = imager.sensor
+    wanted = float(imager.magnification(grid.depths).mean()) * grid.pitch / sensor.pixel_pitch
+    common = math.gcd(*sensor.shape)
+    # Two pixels each way must be left.
+    fits = lambda n: common % n == 0 and n <= wanted + _ROUNDING and min(sensor.shape) >= 2 * n
+    side = max((n for n in range(1, math.ceil(wanted) + 1) if fits(n)), default=1)
+    rows, columns = (n // side for n in sensor.shape)
+    light = light.reshape(rows, side, columns, side).sum((1, 3))
+    return light, eqx.tree_at(lambda i: i.sensor, imager, Sensor((rows, columns), side * sensor.pixel_pitch))
 
 
 def _back_projected(image, imager, grid, method, progress):
@@ -121,13 +213,13 @@ def _back_projected(image, imager, grid, method, progress):
     return volume
 
 
-def _iterated(solver, progress, light, *system):
+def _iterated(solver, progress, light, system):
     # How many steps and until when is decided here: other numbers need no other code.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
-    state = _start(compiled, light, *system)
+    state = _start(compiled, light, system)
     with progress.counter("Iterating", solver.steps) as advance:
         for _ in range(solver.steps):
-            state, residual = _step(state, compiled, light, *system)
+            state, residual = _step(state, compiled, light, system)
             # To read the number waits for the step: what is shown has been done, and Ctrl-C ends it here.
             if float(residual) < solver.tolerance:
                 break
@@ -136,11 +228,11 @@ def _iterated(solver, progress, light, *system):
 
 
 @jax.jit
-def _start(solver, light, *system):
-    return solver.init(forward_operator(*system), light)
+def _start(solver, light, system):
+    return solver.init(system.operator, light)
 
 
 @partial(jax.jit, donate_argnums=0)
-def _step(state, solver, light, *system):
-    state, _, residual = solver.step(forward_operator(*system), light, state)
+def _step(state, solver, light, system):
+    state, _, residual = solver.step(system.operator, light, state)
     return state, residual

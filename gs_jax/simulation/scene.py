@@ -15,10 +15,13 @@ from ..base.progress import Progress
 from ..geometry import Grid, Imager, Sensor
 from ..io.points import read_points
 from ..io.volumes import read_volume
+from ..optics.full import full_optics
 from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
-from ..projection.points import STEPS, forward_points, stamps
+from ..projection.points import STEPS, forward_points, full_image_of_points, stamps
 
+# Names of the models of the light.
+OPTICS = ("full", "near")
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
 # As many of these depths at a time, which bounds the memory.
@@ -43,7 +46,8 @@ def simulate(
     imager: Imager,
     grid: Grid | None = None,
     *,
-    psf: str = "diffraction",
+    optics: str = "full",
+    psf: str | None = None,
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s.
@@ -57,22 +61,32 @@ def simulate(
         What sees it.
     grid
         Of a volume.
+    optics
+        "full": all light of every lens, where it lands, by exact rays; intensities are what is sent out in all
+        directions. "near": Eq. (2), one PSF for all lenses within the field radius; intensities are what a lens on the
+        axis gets.
     psf
-        Of a lens: "diffraction", "geometric" (rays alone) or "gaussian"; the quicker ones last.
+        Of a lens, for "near": "diffraction" (the default), "geometric" (rays alone) or "gaussian"; the quicker ones
+        last.
     progress
         Shows how far it is.
 
     Raises
     ------
     InputError
-        If there is no such PSF, a voxel is negative, the work would not fit into the memory, or a depth is blurred over
-        more than 128 pixels each way.
+        If there is no such optics or PSF, a voxel is negative, the work would not fit into the memory, or a depth is
+        blurred over more than 128 pixels each way ("near").
     """
-    if psf not in PSFS:
+    if optics not in OPTICS:
+        raise InputError(f"`optics`: found {short_repr(optics)}, allowed: {', '.join(OPTICS)}.")
+    if psf and optics == "full":
+        raise InputError(f'`psf`: found {short_repr(psf)} with optics "full", allowed: with "near", which has one PSF.')
+    if psf not in (None, *PSFS):
         raise InputError(f"`psf`: found {short_repr(psf)}, allowed: {', '.join(PSFS)}.")
+    kind = None if optics == "full" else psf or "diffraction"
     if grid is None:
-        return simulate_points(np.asarray(scene, np.float64), imager, kind=psf, progress=progress)
-    return simulate_volume(scene, imager, grid, kind=psf, progress=progress)
+        return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
+    return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
 
 
 def simulate_volume(
@@ -80,7 +94,7 @@ def simulate_volume(
     imager: Imager,
     grid: Grid,
     *,
-    kind: str = "diffraction",
+    kind: str | None = "diffraction",
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of a volume whose voxels are evenly lit boxes, one plane after the other.
@@ -95,7 +109,7 @@ def simulate_volume(
     imager, grid
         As for `forward`.
     kind
-        Of the PSF: a key of `gs_jax.optics.window.PSFS`.
+        Of the PSF: a key of `gs_jax.optics.window.PSFS`; None for all of the light.
 
     Raises
     ------
@@ -113,27 +127,39 @@ def simulate_volume(
         )
     if np.min(volume) < 0:
         raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
-    kernel = psf_of_depth(imager, np.asarray(grid.depths), kind)
+    of_depth = _optics_of_depth(imager, grid, kind)
     image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or Progress()
     for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
         if not plane.any():
             continue
         fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
         one = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
-        image += forward(fine[None], imager, one, kernel(depth)[None])
+        image += forward(fine[None], imager, one, of_depth(depth))
     return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
+
+
+def _optics_of_depth(imager, grid, kind):
+    depths = np.asarray(grid.depths)
+    if kind is None:
+        extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
+        range_ = float(depths.min()), float(depths.max())
+        return lambda depth: full_optics(imager, [depth], extent=extent, nodes_for=range_)
+    kernel = psf_of_depth(imager, depths, kind)
+    return lambda depth: kernel(depth)[None]
 
 
 def simulate_points(
     points: Float[np.ndarray, "point 4"],
     imager: Imager,
     *,
-    kind: str = "diffraction",
+    kind: str | None = "diffraction",
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate_volume`."""
     if not len(points):
         return np.zeros(imager.sensor.shape, np.float32)
+    if kind is None:
+        return full_image_of_points(points, imager, progress)
     near, far = points[:, 2].min(), points[:, 2].max()
     depths = np.unique(points[:, 2])
     if depths.size > (count := math.ceil((far - near) / _STEP) + 1):

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 from scipy.stats import binom
 
-from ..geometry import Imager, chief_ray, envelope
+from ..geometry import Imager, chief_ray
 
 # Of the Gaussian that evens out where in a pixel a spot is, pixels: most that keeps spots 2.5 pixels apart apart.
 _SMOOTHING = 0.7
@@ -72,7 +72,7 @@ class Readings(NamedTuple):
     pixels: Float64[np.ndarray, "point lens 2"]
     light: Float64[np.ndarray, "point lens"]
     noise: Float64[np.ndarray, "point lens"]
-    weight: Float64[np.ndarray, "point lens"]
+    field: Float64[np.ndarray, "point lens"]
     seen: Bool[np.ndarray, "point lens"]
 
 
@@ -82,8 +82,8 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     Returns
     -------
     Readings
-        `pixels` are fractional `(row, column)`, `weight` is the envelope; lenses that image a point beyond the sensor
-        do not see it.
+        `pixels` are fractional `(row, column)`, `field` is the distance from the lens's axis, mm; lenses that
+        image a point beyond the sensor do not see it.
     """
     centers = np.asarray(imager.centers, np.float64)
     tree = KDTree(centers)
@@ -98,14 +98,12 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     pixels = np.asarray(imager.sensor.to_pixels(landing), np.float64)
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
-    reduced_depth = np.asarray(imager.reduced_depth(depth), np.float64)[:, None]
-    weight = np.asarray(envelope(distance**2, reduced_depth, imager.field_radius), np.float64)
     read = lambda part, order: map_coordinates(part, pixels.reshape(-1, 2).T, np.float64, order=order, mode="nearest")
     light, noise = (
         np.where(seen, read(part, order).reshape(seen.shape), 0)
         for part, order in ((signal.light, 1), (signal.noise, 0))
     )
-    return Readings(pixels, light, noise, np.where(seen, weight, 0), seen)
+    return Readings(pixels, light, noise, distance, seen)
 
 
 def select_readings(readings: Readings, which) -> Readings:

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Shaped
+from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from ..base.progress import Progress
 from ..geometry import Grid, Imager
-from ..optics.aperture import clear_diameter
-from ..optics.psf import geometric_psf
+from ..optics.cores import apparent_depths, core_shares
 from ..projection.backprojection import backproject
 from .consistency import (
     REACH,
@@ -51,9 +51,11 @@ _REFINEMENTS = 7
 _COARSE = 2
 # Planes that are searched at once.
 _PLANES = 16
-# Half the sides, in pixels, of the square in which the light of a spot is summed and of the one that holds all of it;
-# depths at which the ratio is computed.
-_APERTURE, _WINDOW, _DEPTHS = 3, 128, 5
+# Half the side, in pixels, of the square in which the light of a spot is summed; depths and fields at which the share
+# of the light in it is computed.
+_APERTURE, _DEPTHS, _FIELDS = 3, 5, 17
+# Depths whose cores are traced, and how far they go beyond the grid, in depths.
+_TRACED, _BEYOND = 9, 0.05
 # Searches: the second, without the light that the first explains, finds what is close to brighter points.
 _SEARCHES = 2
 
@@ -72,8 +74,8 @@ def find_points(
        before. The light of these is subtracted from the readings, with the spot's shape as this image shows it.
     4. All is repeated once on what the image holds beside the points, for those in the shadow of brighter ones.
 
-    No threshold depends on the scene, and nothing is random. Chief rays are as the imager says; where aberrations bend
-    them, depths are off by what its calibration leaves (0.1 to 0.2 mm for the paper's lenses at 2 mm from the focus).
+    No threshold depends on the scene, and nothing is random. Points are looked for where the bright cores of the spots
+    land, by exact rays (`gs_jax.optics.cores.apparent_depths`).
 
     Parameters
     ----------
@@ -89,8 +91,8 @@ def find_points(
     Returns
     -------
     ndarray
-        `(point, 4)`, brightest first. The intensity is that of `forward_points` in the image's unit: the light of one
-        lens's spot, over the envelope.
+        `(point, 4)`, brightest first. The intensity is all that the point sends out, in every direction, in the image's
+        unit: the light in the middle of its spots over the share that exact rays bring there.
 
     Raises
     ------
@@ -100,7 +102,10 @@ def find_points(
     progress = progress or Progress()
     if image.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
-    seen, voxels = signal(image), _voxels(imager, grid)
+    depths = _around(grid)
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64)
+    searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
+    seen, voxels = signal(image), _voxels(imager, searched)
     rest, candidates = seen, np.zeros((0, 3))
     points, spots, own = _consistent(candidates, seen, imager, voxels)
     for _ in range(_SEARCHES):
@@ -112,9 +117,18 @@ def find_points(
             new = _refined(new[lit], voxels, rest, imager)
             points, spots, own = _consistent(np.concatenate([points, new]), seen, imager, voxels)
             rest = seen._replace(light=without_spots(seen.light, spots, own))
+    # Until here, depths were those of chief rays.
+    points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
     found = np.column_stack([points, _intensity(points, spots, own, seen, imager)])
     found = found[_inside(found, grid, float(voxels.depths[1] - voxels.depths[0]) / _COARSE)]
     return found[np.argsort(-found[:, 3], kind="stable")]
+
+
+def _around(grid: Grid) -> Float64[np.ndarray, " depth"]:
+    """Depths that hold the grid's, and more on both sides."""
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    beyond = max(_BEYOND * far, (far - near) / 4)
+    return np.linspace(near - min(beyond, near / 2), far + beyond, _TRACED)
 
 
 def _voxels(imager: Imager, grid: Grid) -> Grid:
@@ -242,28 +256,29 @@ def _consistent(
 def _intensity(
     points: Places, seen: Readings, own: np.ndarray, signal: Signal, imager: Imager
 ) -> Float64[np.ndarray, " point"]:
-    """Light of the spots over the envelope, the median of the lenses.
+    """What the points send out, the median of the lenses.
 
-    Summed in a square about each spot; of it the part that is the point's own at the chief ray; over the part of all
-    its light that falls into the square, by counted rays.
+    Summed in a square about each spot; of it the part that is the point's own in the middle; over the share of the
+    point's light that falls into the square.
     """
     side = np.arange(-_APERTURE, _APERTURE + 1)
     middle = np.floor(seen.pixels + 0.5).astype(int)
     row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
     total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
-    use = seen.seen & (seen.light > 0)
-    ratio = np.where(use, total * own / np.where(use, seen.light * seen.weight, 1), 0)
-    medians = [np.median(some[which]) if which.any() else 0.0 for some, which in zip(ratio, use, strict=True)]
-    return np.array(medians) / _enclosed(points[:, 2], imager)
+    expected = _expected(points, seen, imager)
+    use = seen.seen & (seen.light > 0) & (expected > 0)
+    ratio = np.where(use, total * own / np.where(use, seen.light * expected, 1), 0)
+    return np.array([np.median(some[which]) if which.any() else 0.0 for some, which in zip(ratio, use, strict=True)])
 
 
-def _enclosed(depth: np.ndarray, imager: Imager) -> np.ndarray:
-    """The part of a spot's light that falls into the square."""
-    if not depth.size:
-        return np.ones(0)
-    some = np.linspace(depth.min(), depth.max(), _DEPTHS if np.ptp(depth) > 0 else 1)
-    square = slice(_WINDOW - _APERTURE, _WINDOW + _APERTURE + 1)
-    radius = clear_diameter(imager.array) / 2
-    spot = lambda z: np.asarray(geometric_psf(imager, z, size=2 * _WINDOW + 1, radius=radius))
-    parts = np.array([spot(z)[square, square].sum() for z in some])
-    return np.interp(depth, some, np.where(parts > 0, parts, 1))
+def _expected(points: Places, seen: Readings, imager: Imager) -> Float64[np.ndarray, "point lens"]:
+    """The share of a point's light that falls into the square about the core of each lens's spot, by exact rays."""
+    if not len(points):
+        return np.zeros_like(seen.light)
+    depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
+    fields = np.linspace(0, imager.field_radius, _FIELDS)
+    side = (2 * _APERTURE + 1) * imager.sensor.pixel_pitch
+    shares = core_shares(imager, depths, fields, side)
+    place = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
+    at = np.stack(np.broadcast_arrays(place, seen.field / fields[1]))
+    return map_coordinates(shares, at.reshape(2, -1), order=1, mode="nearest").reshape(seen.field.shape)
