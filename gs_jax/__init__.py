@@ -20,7 +20,7 @@ From a capture to a volume:
     read_capture         A capture `(row, column)` in the file's own type: uint8, uint16 or float32
     reconstruct          The volume that an image shows
     BackProjection       `backproject`, the paper's reconstruction: one step, no PSF
-    ListRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection: no PSF, and as local
+    ListRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
     FISTA                FISTA: least squares with sparsity, not negative, for any operator
     ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator

@@ -38,7 +38,7 @@ def small() -> tuple[Imager, Grid]:
 @cache
 def rendered(points: tuple) -> np.ndarray:
     imager, _ = small()
-    return simulate_points(np.array(points), imager, kind="geometric", progress=Progress())
+    return simulate_points(np.array(points), imager, kind=None, progress=Progress())
 
 
 def image_of(points) -> np.ndarray:
@@ -154,7 +154,7 @@ def test_what_only_half_of_the_lenses_see_is_a_ghost():
     image = np.zeros(imager.sensor.shape, np.float32)
     for point, mask in zip(points, left, strict=True):
         half = eqx.tree_at(lambda i: i.array.centers, imager, imager.array.centers[mask])
-        image += simulate_points(point[None], half, kind="geometric", progress=Progress())
+        image += simulate_points(point[None], half, kind=None, progress=Progress())
     capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=3000))
     assert len(find(capture)) == 0
     volume = backproject(capture.astype(np.float32), imager, grid)

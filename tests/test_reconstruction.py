@@ -116,7 +116,7 @@ def test_list_richardson_lucy_multiplies_by_mean_ratios():
         expected = A.mv(x)
         ratio = jnp.where(expected > 0, image / jnp.where(expected > 0, expected, 1), 0)
         x = x * backproject(ratio, imager, grid, normalize=True)
-    found = reconstruct(image, imager, grid, ListRichardsonLucy(steps=3))
+    found = reconstruct(image, imager, grid, ListRichardsonLucy(steps=3), optics=None)
     # From another uniform start, whose scale does not matter; the volume is float32.
     np.testing.assert_allclose(found, x, rtol=1e-6)
 
@@ -126,7 +126,7 @@ def test_back_projection_has_its_options_and_all_its_planes():
     many = grid.at(np.linspace(17, 22, 19))  # more than are done at a time
     for interpolation, normalize in (("linear", False), ("nearest", True)):
         expected = backproject(image, imager, many, method=interpolation, normalize=normalize)
-        found = reconstruct(image, imager, many, BackProjection(interpolation, normalize))
+        found = reconstruct(image, imager, many, BackProjection(interpolation, normalize), optics=None)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -28,7 +28,7 @@ from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
 from ..simulation.camera import Camera, expose
 from ..simulation.phantoms import random_points, rasterize
-from ..simulation.scene import simulate_points, simulate_volume
+from ..simulation.scene import simulate
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
@@ -96,7 +96,7 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
     grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)
     coarse = grid.at(grid.depths[_COARSE])
     with _timed(seconds, "simulating words"):
-        light = simulate_volume(scene, imager, scene_grid, progress=progress)
+        light = simulate(scene, imager, scene_grid, progress=progress)
         image = _exposed(light, folder / "words.tif", seed=0)
     with _timed(seconds, "back-projection, compiled first"):
         plain = reconstruct(image, imager, grid, progress=progress)
@@ -104,7 +104,7 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
         clean = suppress(plain, pretrained())
         write_volume(folder / "words.ome.tif", clean, grid)
     with _timed(seconds, "Richardson-Lucy"):
-        iterated = reconstruct(image, imager, coarse, RichardsonLucy(_STEPS), progress=progress)
+        iterated = reconstruct(image, imager, coarse, RichardsonLucy(_STEPS, accelerate=True), progress=progress)
     # A voxel's blur, so that a shift by part of a voxel is not counted as an error.
     truth = gaussian_filter(np.asarray(rasterize(emitters, coarse)), (0, 1, 1))
     volumes = {
@@ -124,7 +124,7 @@ def _points(folder: Path, design: Design, seconds: dict, progress: Progress):
     imager = design.imager()
     truth = random_points(_POINTS, (20.0, 20.0), (18.0, 22.0), seed=1)
     with _timed(seconds, "simulating points"):
-        light = simulate_points(truth, imager, progress=progress)
+        light = simulate(truth, imager, progress=progress)
         image = _exposed(light, folder / "points.tif", seed=1)
     with _timed(seconds, "finding points"):
         grid = Grid.over(imager.sensor, depths=_DEPTHS, pitch=_VOXEL_MM)

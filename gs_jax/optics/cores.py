@@ -22,13 +22,13 @@ from .psf import GOLDEN_ANGLE
 from .theory import airy_deviation
 
 # Ends of the rings in field radii. Farther out cores are as wide as the halo's pixels.
-RINGS = (1.0, 1.33, 1.67, 2.0, 2.5)
+RINGS = (1.0, 1.33, 1.67, 2.0, 2.5, 3.0)
 # Degree of the light's polynomial in the squared field, and its number of coefficients.
 _DEGREE = 6
 # Points of the field in a field radius, and rays of each.
 _FIELDS, _RAYS = 16, 8192
 # A core is looked for this far from the chief ray's magnification, relative to that.
-_FARTHEST, _STEPS = 0.03, 61
+_FARTHEST, _STEPS = 0.08, 161
 # Depths that are traced for the cores' magnification; others are interpolated.
 _MOST = 9
 # One in so many rays is enough for the first search.
@@ -84,7 +84,7 @@ def core_table(imager: Imager, depth: float, zones: Zones, reach: float, ends: S
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
-    chief = float(imager.magnification(depth))
+    chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
     parts = [_ring_cores(rays, fields, chief, pitch, edges, *ring) for ring in rings]
     return Cores(*map(np.stack, zip(*parts, strict=True)))
@@ -112,13 +112,13 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
     if depths.size > _MOST:
         # A smooth function of the depth.
         some = np.linspace(depths.min(), depths.max(), _MOST)
-        stretch = CubicSpline(some, core_magnification(imager, some) * np.asarray(imager.reduced_depth(some)))
-        return stretch(depths) / np.asarray(imager.reduced_depth(depths), np.float64)
+        beyond = float(imager.reduced_depth(0.0))
+        return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
     aperture, fields = zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
     found = []
     for depth in depths:
         rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
-        chief = float(imager.magnification(depth))
+        chief = float(imager.magnification(float(depth)))
         found.append(chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch))
     return np.array(found)
 
@@ -191,10 +191,10 @@ def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> flo
     some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
     best = int(np.argmin([squares(stretch, some) for stretch in tried]))
     around = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
-    return float(fminbound(squares, *around, xtol=1e-5))
+    return float(np.ravel(fminbound(squares, *around, xtol=1e-5))[0])
 
 
-def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float = 1) -> Float64[np.ndarray, "row column"]:
+def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1) -> Float64[np.ndarray, "row column"]:
     """A kernel from its radial light, on pixels (or their `parts` each way), odd `size` in all; its sum is 1.
 
     Light is put down point by point, so that none is lost between the pixels; turned and mirrored, it is symmetric.

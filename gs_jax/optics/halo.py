@@ -66,9 +66,9 @@ def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float
     most
         The largest field that occurs, mm: no point is farther from a lens.
     """
-    near = float(imager.reduced_depth(depths.min()))
+    near = float(imager.reduced_depth(float(depths.min())))
     widest = min(_WIDEST * near, most)
-    middle = float(imager.magnification((depths.min() + depths.max()) / 2))
+    middle = float(imager.magnification(float(depths.min() + depths.max()) / 2))
     linear = _LINEAR * _WIDEST * near
     # A whole number of pixels.
     pixels = max(round(middle * linear / _NODES / imager.sensor.pixel_pitch), 1)
@@ -76,7 +76,7 @@ def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float
     step = pixel / middle
     bend = linear / step
     count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
-    largest = float(imager.magnification(depths.min())) / middle
+    largest = float(imager.magnification(float(depths.min()))) / middle
     radii = count((1 + _BEYOND) * largest * widest / step)
     return HaloGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
 
@@ -91,7 +91,7 @@ def halo_table(
     """
     fields = grid.step * grid.nodes(grid.fields)
     rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
-    chief = float(imager.magnification(depth))
+    chief = float(imager.magnification(float(depth)))
     table = np.zeros((2, grid.fields, grid.radii * grid.angles))
     share = lambda landing, light: np.stack([_shared(grid, *one) for one in zip(landing, light, strict=True)])
     table[0] = share(rays.landing, rays.light)

@@ -80,7 +80,7 @@ def spot_rays(
     order = np.arange(count) + 0.5
     radius = zones.radius[-1] * _RADII / (_RADII - 0.5) * np.sqrt(order / count)
     points = radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)
-    landing, light = (np.asarray(part, np.float64) for part in _traced(imager, depth, points, fields))
+    landing, light = (np.asarray(part, np.float64) for part in _traced(imager, float(depth), points, fields))
     light = light * np.pi * radius[-1] ** 2 * (count / (count - 0.5)) / count
     share, slope = (np.interp(radius, zones.radius, part) for part in (zones.open, zones.by_area))
     return SpotRays(landing, light * share, light * slope)

@@ -3,10 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Complex, Float
 from scipy.fft import next_fast_len
 
 from ..geometry import Imager, Sensor
+from ..optics.exit_pupil import phasor
 
 
 def with_margin(imager: Imager, size: int) -> Imager:
@@ -56,7 +58,8 @@ def add_symmetric_spectrum(
     of_kernel = (
         _cosines(rows, rows, half, kernel.dtype) @ quarter @ _cosines(columns // 2 + 1, columns, half, kernel.dtype).T
     )
-    return spectrum + jnp.fft.rfft2(sharp[1:-1, 1:-1], padded) * of_kernel
+    image = jnp.fft.rfft2(sharp[1:-1, 1:-1], padded)
+    return spectrum + lax.complex(image.real * of_kernel, image.imag * of_kernel)
 
 
 def _cosines(frequencies, size, half, dtype):
@@ -81,11 +84,11 @@ def add_halved(
     Its large pixel 0 covers the pixels `first` and `first + 1` of the other.
     """
     rows, columns = (n // 2 for n in padded)
-    low = rows // 2
+    low, dtype = rows // 2, spectrum.real.dtype
     # Left out are the highest frequencies of an even number of pixels, which have no sign.
     kept = (columns - 1) // 2 + 1
     across, down = jnp.arange(kept), jnp.concatenate([jnp.arange(low), jnp.arange(low - rows, 0)])
-    turn = lambda frequency, size: jnp.exp(-2j * np.pi * (first + 0.5) * (frequency / size)).astype(spectrum.dtype)
+    turn = lambda frequency, size: phasor(1, (-2 * np.pi * (first + 0.5) / size) * frequency.astype(dtype))
     moved = coarse[:, :kept] * turn(down, padded[0])[:, None] * turn(across, padded[1])[None]
     spectrum = spectrum.at[:low, :kept].add(moved[:low])
     return spectrum.at[padded[0] - (rows - low) + 1 :, :kept].add(moved[low + 1 :])

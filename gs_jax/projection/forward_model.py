@@ -10,7 +10,7 @@ from ..geometry import Grid, Imager
 from ..optics.full import FullOptics
 from .backprojection import as_volume, backproject_adjoint
 from .convolve import add_spectrum, image_of, padded_shape, with_margin
-from .full_image import full_image
+from .full import full_image
 
 Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | None
 

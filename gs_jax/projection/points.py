@@ -16,7 +16,7 @@ from ..base.progress import Progress
 from ..geometry import Imager, chief_ray
 from ..optics.cores import core_tables, drawn, ring_edges
 from ..optics.full import halo_and_cores, kernel_size
-from .full_image import halo_image
+from .full import halo_image
 from .rays import Envelope, RingLight
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
@@ -28,7 +28,7 @@ _TILE = 512
 # Distances of depths for all of the light, mm: of the cores, which change by less than a pixel's width, and the halo.
 _CORE_STEP, _HALO_STEP = 0.1, 0.5
 # Ends of the rings that have a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
-_RINGS = tuple(np.arange(1, 21) / 8)
+_RINGS = tuple(np.arange(1, 29) / 8)
 
 
 class Cores(NamedTuple):
@@ -142,9 +142,10 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
 
 def _rays(depth, imager, stamps):
     """Magnification and parameters of the weight, for each point."""
-    magnification = np.asarray(imager.magnification(depth), np.float64)
+    reduced = depth + float(imager.reduced_depth(0.0))
+    magnification = float(imager.sensor_distance) / reduced
     if stamps.cores is None:
-        return magnification, np.asarray(imager.reduced_depth(depth), np.float64)[:, None]
+        return magnification, reduced[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
     light = np.stack([between(part) for part in stamps.cores.light.T], -1)
     return magnification * between(stamps.cores.stretch), light
@@ -198,7 +199,7 @@ def full_image_of_points(
     """The image of points with all of their light: what `forward` does with `FullOptics`, without a grid.
 
     Cores are stamps, interpolated between depths that are 0.1 mm apart, at fifths of a pixel, or of two where they are
-    wider (`gs_jax.projection.full_image`); the halo is interpolated between depths that are 0.5 mm apart.
+    wider (`gs_jax.projection.full`); the halo is interpolated between depths that are 0.5 mm apart.
 
     Parameters
     ----------
@@ -225,7 +226,9 @@ def full_image_of_points(
         fine = np.stack([drawn(profile, STEPS * size, STEPS) for profile in profiles])
         spots = stamps(depths, fine.astype(np.float32), Cores(ring, *parts))
         image += forward_points(points, imager, spots, progress)
-    return np.maximum(image, 0)
+    # The halo's ripple goes below zero in places. Without it there would be more light than there is.
+    clipped = np.maximum(image, 0)
+    return clipped * (image.sum() / clipped.sum())
 
 
 def _on_nodes(points, depths, halo):

@@ -20,9 +20,9 @@ from ..optics.full import FullOptics
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS, optics_of
-from ..projection.operators import Unmatched, forward_operator
+from ..projection.operators import forward_operator
 from ..solvers.iteration import Solver
-from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.richardson_lucy import RichardsonLucy, Unmatched
 from ..suppression.consistency import local_levels
 from .methods import BackProjection, ListRichardsonLucy, Method
 

@@ -118,7 +118,7 @@ def check_options(solver: Any) -> None:
             raise InputError(f"{name}: found {found}, allowed: {least} or more.")
 
 
-def as_image(A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
+def as_image(A: Any, image: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
     """`image` in the operator's type; raises an `InputError` that names the shapes if it is not of its output's."""
     expected = A.out_structure()
     if image.shape != expected.shape:

@@ -23,6 +23,30 @@ _LEAST_DENOMINATOR = 0.1
 _ROUNDING = 100
 
 
+class Unmatched(eqx.Module):
+    """An operator with another one in the place of its transpose: `A.mv` is `forward`'s, `A.T.mv` is `back`'s.
+
+    Enough of an operator for Richardson-Lucy, which comes to its end in fewer steps if what goes back is sharper than
+    the adjoint (Zeng and Gullberg, IEEE Trans. Med. Imaging 19, 548, 2000).
+    """
+
+    forward: lx.AbstractLinearOperator
+    back: lx.AbstractLinearOperator
+
+    @property
+    def T(self) -> "Unmatched":
+        return Unmatched(self.back, self.forward)
+
+    def mv(self, vector):
+        return self.forward.mv(vector)
+
+    def in_structure(self):
+        return self.forward.in_structure()
+
+    def out_structure(self):
+        return self.forward.out_structure()
+
+
 class State(NamedTuple):
     """Of `RichardsonLucy`: the estimate, `A'1`, and where it accelerates the last estimate, product and gain."""
 
@@ -66,7 +90,7 @@ class RichardsonLucy(eqx.Module):
     def __check_init__(self):
         check_options(self)
 
-    def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
+    def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
         sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
         # The scale of the start does not matter without a background; this one has the image's light.
@@ -76,7 +100,7 @@ class RichardsonLucy(eqx.Module):
         return State(x, sensitivity, momentum)
 
     def step(
-        self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
+        self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
         x, sensitivity, momentum = state

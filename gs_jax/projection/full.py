@@ -26,6 +26,8 @@ _LENSES = 64
 # The halo passes several linear interpolations, which blur it by about this variance, in squared pixels. Wiener's
 # filter undoes that, as far as the blur leaves more than this share of a frequency's power.
 _BLUR, _NOISE = 0.7, 0.02
+# Rings of polar nodes, from the axis on, that are closer to each other than pixels are.
+_INNER = 4
 # Pixels of the halo around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
 
@@ -114,8 +116,8 @@ def halo_image(
         empty = jnp.zeros((halo.radii, halo.angles // 2 + 1, len(centers)), dtype)
         spots = lax.scan(jax.checkpoint(add_depth), lax.complex(empty, empty), (nodes, table))[0]
         # The image lies opposite to the object: half a turn.
-        half_turn = jnp.where(jnp.arange(halo.angles // 2 + 1) % 2, -1, 1).astype(dtype)
-        polar = jnp.fft.irfft(spots * half_turn[None, :, None], halo.angles, axis=1).reshape(-1, len(centers))
+        half_turn = (jnp.arange(halo.angles // 2 + 1) % 2 == 1)[None, :, None]
+        polar = jnp.fft.irfft(jnp.where(half_turn, -spots, spots), halo.angles, axis=1).reshape(-1, len(centers))
         spots = _apply(spread, polar).T.reshape(-1, outer, outer)
         start, fraction = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
         return _add_windows(image, spots, start, fraction), None
@@ -204,11 +206,13 @@ def _apply(table: _Table, columns: Float[Array, "row many"]) -> Float[Array, "ne
 
 
 def _gathered(table, _, columns):
-    return _rows(*table.entries, columns)
+    index, weight = table.entries
+    return _rows(index, weight, columns)
 
 
 def _gathered_back(table, _, columns):
-    return _rows(*table.transposed, columns)
+    index, weight = table.transposed
+    return _rows(index, weight, columns)
 
 
 def _rows(index, weight, columns):
@@ -228,11 +232,35 @@ def _splat_table(halo: HaloGrid) -> _Table:
 
 @cache
 def _spread_table(halo: HaloGrid) -> _Table:
-    """From polar nodes to the pixels about a lens: the density of light, interpolated."""
+    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that none is lost.
+
+    About the axis the nodes are closer than the pixels, and are shared by the four around them instead.
+    """
     reach = math.ceil(halo.nodes(halo.radii)[-2])
-    node, index, share = _polar(halo, halo.radii, reach)
-    share = share / np.repeat(halo.areas(halo.radii), halo.angles)[index]
-    return _table(2 * reach + 1, node, index, share, halo.radii * halo.angles, to_polar=False)
+    pixel, node, share = _polar(halo, halo.radii, reach)
+    outer = (node >= _INNER * halo.angles) & (share > 0)
+    pixel, node, share = pixel[outer], node[outer], share[outer]
+    total = np.bincount(node, share, halo.radii * halo.angles)
+    # The last rings are cut by the window's edge, and have no more light than that.
+    whole = node < (halo.radii - 3) * halo.angles
+    share = share / np.where(whole, total[node], np.repeat(halo.areas(halo.radii), halo.angles)[node])
+    near_pixel, near_node, near_share = _near_axis(halo, reach)
+    entries = ((pixel, near_pixel), (node, near_node), (share, near_share))
+    return _table(2 * reach + 1, *map(np.concatenate, entries), halo.radii * halo.angles, to_polar=False)
+
+
+def _near_axis(halo: HaloGrid, reach: int):
+    """Entries (square node, polar node, share) of the inner polar nodes, each shared by the four pixels around it."""
+    node = np.arange(_INNER * halo.angles)
+    radius, angle = halo.nodes(_INNER)[node // halo.angles], 2 * np.pi * (node % halo.angles) / halo.angles
+    place = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1) + reach
+    whole = np.floor(place).astype(int)
+    parts = []
+    for corner in np.ndindex(2, 2):
+        row, column = (whole + corner).T
+        share = np.where(corner, place - whole, 1 - (place - whole)).prod(-1)
+        parts.append((row * (2 * reach + 1) + column, node, share))
+    return (np.concatenate(part) for part in zip(*parts, strict=True))
 
 
 def _polar(halo: HaloGrid, count: int, reach: int):

@@ -1,0 +1,212 @@
+"""All of the light: where it goes, in tables; and the image of a volume and of points."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, forward, forward_operator, optics_of, reconstruct
+from gs_jax.geometry import falloff
+from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring_edges, ring_share, spread
+from gs_jax.optics.full import full_optics
+from gs_jax.optics.light import clear_area, spot_rays, transmitted, zones
+from gs_jax.optics.unit import unit_rays
+from gs_jax.projection.points import full_image_of_points
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
+from gs_jax.suppression.locate import find_points
+
+DEPTHS = (18.0, 21.0)
+
+
+def imager(dtype=float, *, pixels=(96, 81), pitch=0.06, lenses=9) -> Imager:
+    """Lenses on a slightly disordered square, in front of a small sensor with large pixels."""
+    side = round(math.sqrt(lenses))
+    place = (np.stack(np.mgrid[:side, :side], -1).reshape(-1, 2) - (side - 1) / 2) * 1.3
+    centers = place + np.random.default_rng(0).uniform(-0.2, 0.2, place.shape)
+    made = Imager(MicrolensArray(centers), Sensor(pixels, pitch), 5.75, 1.5, rotation=0.1, shift=(0.05, -0.03))
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), made)
+
+
+def grid(dtype=float, shape=(13, 12)) -> Grid:
+    made = Grid(DEPTHS, shape, 0.4, (0.2, -0.1))
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), made)
+
+
+def volume(shape, dtype=float) -> jax.Array:
+    return jax.random.uniform(jax.random.key(0), shape, dtype)
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-11), (jnp.float32, 1e-5)])
+@pytest.mark.parametrize("pixels", [(96, 81), (80, 80)])
+def test_the_adjoint_is_exact(dtype, rtol, pixels):
+    scope, voxels = imager(dtype, pixels=pixels), grid(dtype)
+    A = forward_operator(scope, voxels, full_optics(scope, voxels.depths))
+    x = volume(voxels.volume_shape, dtype)
+    y = jax.random.uniform(jax.random.key(1), pixels, dtype)
+    one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
+    np.testing.assert_allclose(one, other, rtol=rtol)
+    assert A.mv(x).dtype == dtype and one > 0
+
+
+def test_gradients_by_volume_centers_and_distance():
+    scope, voxels = imager(), grid(shape=(6, 5))
+    optics = full_optics(scope, voxels.depths)
+    weights = jax.random.normal(jax.random.key(2), scope.sensor.shape)
+    x = volume(voxels.volume_shape)
+
+    def of(x, centers, distance):
+        moved = eqx.tree_at(lambda i: (i.array.centers, i.sensor_distance), scope, (centers, distance))
+        return jnp.vdot(weights, forward(x, moved, voxels, optics))
+
+    # Interpolations have kinks: steps that are small beside a pixel.
+    check_grads(jax.jit(of), (x, scope.array.centers, scope.sensor_distance), 1, modes=["rev"], eps=1e-7, rtol=1e-3)
+
+
+def test_darkness_is_dark_and_has_finite_gradients():
+    scope, voxels = imager(), grid()
+    optics = full_optics(scope, voxels.depths)
+    dark = jnp.zeros(voxels.volume_shape)
+    np.testing.assert_array_equal(forward(dark, scope, voxels, optics), 0)
+    gradient = jax.grad(lambda i: jnp.sum(forward(dark, i, voxels, optics) ** 2))(scope)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def traced_light(scope: Imager, point) -> float:
+    """What of a point's light reaches the sensor, by rays through each lens's own aperture."""
+    centers, radius = np.asarray(scope.centers), float(scope.array.aperture_diameter) / 2
+    side = (np.arange(101) - 50) / 50 * radius
+    pupil = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    total = 0.0
+    for center in centers:
+        offsets = np.delete(centers, (centers == center).all(1), 0) - center
+        beyond = (pupil @ offsets.T > (offsets**2).sum(1) / 2).any(1) | (np.hypot(*pupil.T) > radius)
+        field = point[:2] - center
+        rays = unit_rays(scope, point[2], pupil, field)
+        light = np.where(rays.valid & ~beyond, transmitted(scope, point[2], pupil, field), 0)
+        pixels = np.asarray(scope.sensor.to_pixels(np.asarray(rays.landing) + center))
+        seen = ((pixels > -0.5) & (pixels < np.array(scope.sensor.shape) - 0.5)).all(1)
+        total += light[seen].sum() * (side[1] - side[0]) ** 2
+    return total
+
+
+@pytest.mark.parametrize("point", [(0.2, -0.1, 18.0), (2.0, 1.0, 21.0)])
+def test_it_holds_the_light_that_rays_bring(point):
+    scope = imager(pitch=0.1)
+    found = full_image_of_points(np.array([[*point, 2.0]]), scope)
+    np.testing.assert_allclose(found.sum(), 2 * traced_light(scope, point), rtol=0.03)
+    one = Grid([point[2]], (1, 1), 0.1, point[:2])
+    image = forward(jnp.full((1, 1, 1), 2.0), scope, one, full_optics(scope, one.depths))
+    np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.03)
+
+
+def test_points_are_voxels_that_lie_anywhere():
+    scope = imager(pixels=(200, 200), pitch=0.03)
+    point = np.array([[0.2, -0.1, 20.0, 1.0]])
+    one = Grid([20.0], (1, 1), 0.1, point[0, :2])
+    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, full_optics(scope, one.depths)))
+    found = full_image_of_points(point, scope)
+    binned = lambda image: image.reshape(50, 4, 50, 4).sum((1, 3))
+    assert np.corrcoef(binned(found).ravel(), binned(image).ravel())[0, 1] > 0.98
+
+
+def test_what_leaves_a_lens_is_what_its_solid_angle_holds():
+    """Far away and without reflection, the clear disc over the sphere; a little less with Fresnel's few percent."""
+    ideal = imager()
+    thin = eqx.tree_at(lambda i: i.array.thin_lens_focal_length, ideal, jnp.asarray(4.65), is_leaf=lambda x: x is None)
+    lone = [dataclasses.replace(i, array=dataclasses.replace(i.array, centers=np.zeros((1, 2)))) for i in (thin, ideal)]
+    for scope, least in zip(lone, (0.999, 0.9), strict=True):
+        rays = spot_rays(scope, 200.0, np.zeros(1), zones(scope.array), 4096)
+        part = rays.light.sum() / (np.pi / (4 * np.pi * float(scope.reduced_depth(200.0)) ** 2))
+        assert least < part < 1.001
+    # Normal incidence: each face passes 4 n / (n + 1)^2.
+    (light,) = (
+        transmitted(lone[1], 200.0, np.zeros((1, 2)), np.zeros(2)) * 4 * np.pi * lone[1].reduced_depth(200.0) ** 2
+    )
+    np.testing.assert_allclose(light, (4 * 1.43 / 2.43**2) ** 2, rtol=1e-6)
+
+
+def test_zones_are_the_lenses_apertures():
+    array = imager(lenses=25).array
+    found = zones(array)
+    areas = np.asarray(clear_area(array))
+    step = found.radius[1] - found.radius[0]
+    np.testing.assert_allclose(found.area, areas.mean())
+    np.testing.assert_allclose((2 * np.pi * found.radius * found.open).sum() * step, areas.mean(), rtol=2e-3)
+    # By regression, what a larger area adds is that area.
+    np.testing.assert_allclose((2 * np.pi * found.radius * found.by_area).sum() * step, 1, rtol=0.02)
+    alone = zones(MicrolensArray([[0.0, 0.0]]))
+    assert (alone.open == 1).all() and (alone.by_area == 0).all()
+
+
+def test_rings_add_up_to_the_falloff():
+    scope = imager()
+    rings = ring_edges(scope)
+    distance2 = jnp.linspace(0, 20, 200)
+    total = sum(ring_share(distance2, *ring) for ring in rings)
+    np.testing.assert_allclose(total, falloff(distance2, rings[-1][1]), atol=1e-12)
+
+
+def test_a_kernel_keeps_its_light_and_is_symmetric():
+    profile = np.exp(-np.arange(40) / 8)
+    profile /= profile.sum()
+    for size, parts in ((23, 1), (111, 5), (13, 0.5)):
+        kernel = drawn(profile, size, parts)
+        np.testing.assert_allclose(kernel.sum(), 1, rtol=1e-3)
+        for same in (kernel[::-1], kernel[:, ::-1], kernel.T):
+            np.testing.assert_allclose(kernel, same, atol=1e-15)
+    radius = np.hypot(*spread(profile, 20_000).T)
+    assert abs(np.mean(radius < 2) - profile[:8].sum()) < 0.01
+
+
+def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():
+    scope = imager(pitch=0.01)
+    thin = eqx.tree_at(lambda i: i.array.thin_lens_focal_length, scope, jnp.asarray(4.6), is_leaf=lambda x: x is None)
+    # Out of focus the spot is an even disc, whose middle is found to a tenth of a pixel.
+    depths = np.array([18.0, 20.0, 24.0])
+    np.testing.assert_allclose(core_magnification(thin, depths), thin.magnification(depths), rtol=4e-3)
+    np.testing.assert_allclose(apparent_depths(thin, depths), depths, atol=0.06)
+    many = np.linspace(18, 22, 30)
+    few = apparent_depths(scope, many[::29])
+    np.testing.assert_allclose(apparent_depths(scope, many)[::29], few, atol=1e-6)
+
+
+def test_levels_have_names():
+    scope, voxels = imager(), grid()
+    assert optics_of(scope, DEPTHS, "pinhole") is None
+    near = optics_of(scope, DEPTHS, "near")
+    assert isinstance(near, jax.Array) and near.shape[0] == 2
+    image = forward(volume(voxels.volume_shape), scope, voxels, optics_of(scope, DEPTHS))
+    assert image.shape == scope.sensor.shape
+    with pytest.raises(InputError, match="optics: found 'exact', allowed: full, near, pinhole"):
+        optics_of(scope, DEPTHS, "exact")
+
+
+@pytest.mark.parametrize("level", ["full", "near", "pinhole"])
+def test_every_level_reconstructs(level):
+    """A bright voxel is the brightest, whatever the method knows of the light."""
+    scope = imager(jnp.float32, pixels=(160, 160), pitch=0.03)
+    voxels = Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
+    voxels = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), voxels)
+    truth = np.zeros(voxels.volume_shape, np.float32)
+    truth[1, 8, 13] = 1
+    place = voxels.to_mm(np.array([[1, 8, 13]]))
+    image = full_image_of_points(np.column_stack([place, [1e6]]), scope)
+    found = reconstruct(image, scope, voxels, RichardsonLucy(steps=10), optics=level)
+    at = np.unravel_index(found.argmax(), found.shape)
+    assert np.abs(np.array(at[1:]) - (8, 13)).max() <= 1 and np.isfinite(found).all()
+
+
+def test_intensities_are_what_points_send_out():
+    scope = imager(pixels=(600, 600), pitch=0.009, lenses=25)
+    truth = np.array([[0.3, 0.2, 19.5, 1.0], [-0.4, -0.5, 20.4, 2.0]])
+    image = full_image_of_points(truth, scope)
+    found = find_points(image, scope, Grid([19.0, 21.0], (61, 61), 0.05))
+    found = found[np.argsort(found[:, 3])]
+    np.testing.assert_allclose(found[:, 3], truth[:, 3], rtol=0.1)
+    # A pixel is 0.43 mm axially here.
+    np.testing.assert_allclose(found[:, 2], truth[:, 2], atol=0.15)
