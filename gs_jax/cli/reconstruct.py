@@ -23,6 +23,8 @@ from ..suppression.locate import find_points
 from ..suppression.unet import read_weights, suppress as without_background
 from .options import UM, Depths, Number, depth_range
 
+WEIGHT = Number(least=0.0, most=10.0, unit="")
+
 
 @click.command("reconstruct")
 @click.argument("capture", type=Path)
@@ -42,8 +44,12 @@ from .options import UM, Depths, Number, depth_range
     show_default=True,
     help="What the method knows of the light: all, one PSF for all lenses near a point, or chief rays alone.",
 )
-@click.option("--tv", type=Number(least=0, most=10, unit=""), help="Weight of total variation (richardson-lucy, admm).")
-@click.option("--sparsity", type=Number(least=0, most=1, unit=""), help="Weight of the sum of voxels (fista, admm).")
+@click.option(
+    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation (richardson-lucy, admm)."
+)
+@click.option(
+    "--sparsity", type=Number(least=0.0, most=1.0, unit=""), help="Weight of the sum of voxels (fista, admm)."
+)
 @click.option(
     "--suppress",
     type=click.Choice(["none", "points", "clusters", "unet"]),

@@ -71,7 +71,7 @@ def ring_light(distance_squared, coefficients, inner: float, outer: float):
 def ring_edges(imager: Imager, ends: Sequence[float] = RINGS) -> list[tuple[float, float]]:
     """Inner and outer end of each ring, mm, from their ends in field radii."""
     radius = imager.field_radius
-    return [(radius * a, radius * b) for a, b in zip((0.0, *ends), ends, strict=False)]
+    return [(radius * float(a), radius * float(b)) for a, b in zip((0.0, *ends), ends, strict=False)]
 
 
 def core_table(imager: Imager, depth: float, zones: Zones, reach: float, ends: Sequence[float] = RINGS) -> Cores:

@@ -80,7 +80,8 @@ def _cores_image(volume, imager, grid, optics):
 
     half = padded[0] // 2, padded[1] // 2
     dark = [jnp.zeros((rows, columns // 2 + 1), dtype) for rows, columns in (padded, half)]
-    tables = (part.astype(dtype) for part in (optics.stretch, optics.light, optics.kernel, optics.wide_kernels))
+    kernels = (part.astype(dtype) for part in (optics.kernel, optics.wide_kernels))
+    tables = optics.stretch, optics.light, *kernels
     start = tuple(lax.complex(part, part) for part in dark)
     fine, coarse = lax.scan(add_depth, start, (grid.depths, volume, *tables))[0]
     first = size // 2 - 2 * (optics.wide_kernels.shape[-1] // 2)
@@ -92,7 +93,7 @@ def halo_image(
 ) -> Float[Array, "row column"]:
     """The halo of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm."""
     dtype = nodes.dtype
-    halo, v = optics.grid, imager.sensor_distance / optics.sensor_distance
+    halo, v = optics.grid, (imager.sensor_distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the pixels of the halo with it.
     pixel = halo.pixel * v
     splat, spread = _splat_table(halo), _spread_table(halo)
@@ -106,7 +107,7 @@ def halo_image(
 
         def add_depth(spots, plane):
             nodes, table = plane
-            start, fraction = _place(centers, origin, halo.step, nodes.shape, inner)
+            start, fraction = _place(centers, origin.astype(dtype), halo.step, nodes.shape, inner)
             objects = _windows(nodes, start, fraction, inner)
             polar = _apply(splat, objects.reshape(len(centers), -1).T)
             spectrum = jnp.fft.rfft(polar.reshape(halo.fields, halo.angles, -1), axis=1)
@@ -141,7 +142,7 @@ def _mixed(table, spectrum, excess):
 
 def _in_groups(imager, optics, dtype):
     """Centres and excess areas of the lenses, `_LENSES` at a time; the last are filled up with lenses far away."""
-    centers, excess = imager.centers.astype(dtype), (clear_area(imager.array) - optics.area).astype(dtype)
+    centers, excess = imager.centers.astype(dtype), clear_area(imager.array).astype(dtype) - optics.area.astype(dtype)
     count = len(excess)
     groups = -(-count // _LENSES)
     size = -(-count // groups)
@@ -245,8 +246,9 @@ def _spread_table(halo: HaloGrid) -> _Table:
     whole = node < (halo.radii - 3) * halo.angles
     share = share / np.where(whole, total[node], np.repeat(halo.areas(halo.radii), halo.angles)[node])
     near_pixel, near_node, near_share = _near_axis(halo, reach)
-    entries = ((pixel, near_pixel), (node, near_node), (share, near_share))
-    return _table(2 * reach + 1, *map(np.concatenate, entries), halo.radii * halo.angles, to_polar=False)
+    pixel, node = np.concatenate([pixel, near_pixel]), np.concatenate([node, near_node])
+    share = np.concatenate([share, near_share])
+    return _table(2 * reach + 1, pixel, node, share, halo.radii * halo.angles, to_polar=False)
 
 
 def _near_axis(halo: HaloGrid, reach: int):
