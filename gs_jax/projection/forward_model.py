@@ -24,11 +24,13 @@ def forward(
 ) -> Float[Array, "row column"]:
     """The image of a volume: Eq. (2), summed lens by lens and without its zones.
 
-    Each voxel is a point at its centre. Every lens images it at the chief ray's pixel (scale `s_z`, magnification
-    `M_z`), weighted by the envelope C, and spread by PSF_o of its depth. The paper takes C from the centre of the
-    voxel's zone instead of from the voxel, which is the only difference. As in Eq. (2) a voxel counts the same at
-    every depth; the aperture's solid angle would add a factor 1/z'^2. Chief rays that miss the sensor by less than half
-    a PSF count with what spreads onto it.
+    Each voxel is a point at its centre. With a PSF every lens images it at the chief ray's pixel (scale `s_z`,
+    magnification `M_z`), weighted by the envelope C, and spread by PSF_o of its depth. The paper takes C from the
+    centre of the voxel's zone instead of from the voxel, which is the only difference. As in Eq. (2) a voxel counts
+    the same at every depth. Chief rays that miss the sensor by less than half a PSF count with what spreads onto it.
+
+    With `FullOptics` each lens's spot is where exact rays put it, at every distance from the lens's axis, and a voxel
+    is the light that it sends out in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
 
     Linear in the volume and in the PSF; differentiable with respect to everything that is continuous.
 
@@ -38,25 +40,31 @@ def forward(
         `grid.volume_shape`; integers count as the imager's type.
     imager, grid
         As for `backproject`.
-    psf
-        PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`: `(len(depths), size, size)`, odd size. By
-        default a point, which makes this the adjoint of `backproject`.
+    optics
+        `gs_jax.optics_of` makes it by name. None: points, which makes this the adjoint of `backproject`. An array:
+        PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size.
+        `FullOptics`: all light, by tables for these depths.
 
     Returns
     -------
     Array
         `sensor.shape`, of the volume's type. With a PSF it is as exact as an FFT of that type, so dark pixels may
-        be about 1e-7 of the brightest below zero in float32.
+        be about 1e-7 of the brightest below zero in float32; with `FullOptics`, a few percent of the light's mean, as
+        the halo ripples.
 
     Raises
     ------
     ValueError
-        If the volume is not of the grid's shape, or there is not one PSF of odd size for each depth.
+        If the volume is not of the grid's shape, or there is not one PSF of odd size, or table, for each depth.
     """
     volume = as_volume(volume, imager)
     if optics is None:
         return backproject_adjoint(volume, imager, grid)
     if isinstance(optics, FullOptics):
+        if len(optics.kernel) != grid.depths.size:
+            raise ValueError(
+                f"`optics` must be of {grid.depths.size} depths, as the grid is, got {len(optics.kernel)}."
+            )
         return full_image(volume, imager, grid, optics)
     psf = optics
     size = psf.shape[-1]
