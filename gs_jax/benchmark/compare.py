@@ -23,9 +23,10 @@ from ..base.errors import InputError
 from ..base.info import available_memory
 from ..base.progress import Progress
 from ..projection.operators import forward_operator
-from ..reconstruction.methods import METHODS as RECONSTRUCTIONS, ListRichardsonLucy
+from ..reconstruction.methods import BackProjection, ListRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
 from ..solvers.admm import ADMM
+from ..solvers.fista import FISTA
 from ..solvers.iteration import solve
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.clustering import find_clusters
@@ -51,8 +52,18 @@ class Method(NamedTuple):
     dense: bool = False
 
 
+# Every step as the paper's comparison has it, without acceleration.
+_PLAIN = {
+    "backproject": BackProjection(),
+    "list-rl": ListRichardsonLucy(STEPS),
+    "richardson-lucy": RichardsonLucy(STEPS),
+    "fista": FISTA(STEPS),
+    "admm": ADMM(STEPS),
+}
+
+
 def _reconstructed(name: str):
-    method = RECONSTRUCTIONS[name](STEPS)
+    method = _PLAIN[name]
     # Pixel-voxel lists have no PSF.
     of = lambda bench: None if isinstance(method, ListRichardsonLucy) else bench.psf
     return lambda bench: lambda image: reconstruct(image, bench.imager, bench.grid, method, optics=of(bench))

@@ -49,13 +49,14 @@ class Cores(NamedTuple):
     profile: Float64[np.ndarray, "ring bin"]
 
 
-def ring_share(distance_squared, inner: float, outer: float):
+def ring_share(distance_squared, inner, outer):
     """1 within a ring of the field, 0 beyond it, with the envelope's smooth falloff at both ends; all rings add up."""
-    share = falloff(distance_squared, outer)
-    return share - falloff(distance_squared, inner) if inner else share
+    # The ends may be traced; a disc has no falloff inside.
+    hole = falloff(distance_squared, jnp.where(inner > 0, inner, 1.0))
+    return falloff(distance_squared, outer) - jnp.where(inner > 0, hole, 0)
 
 
-def ring_light(distance_squared, coefficients, inner: float, outer: float):
+def ring_light(distance_squared, coefficients, inner, outer):
     """Light of a ring's cores at a squared field, mm^2: a polynomial, within the ring.
 
     `coefficients` `(..., coefficient)` broadcast, but for the last axis, against `distance_squared`.

@@ -151,7 +151,7 @@ def _rays(depth, imager, stamps):
     return magnification * between(stamps.cores.stretch), light
 
 
-@partial(jax.jit, donate_argnums=0, static_argnames="weight")
+@partial(jax.jit, donate_argnums=0)
 def _add_spots(
     tiles: Float[Array, "tile side side"],
     count: Int[ArrayLike, ""],
