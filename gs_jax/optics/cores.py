@@ -28,7 +28,7 @@ _DEGREE = 6
 # Points of the field in a field radius, and rays of each.
 _FIELDS, _RAYS = 16, 8192
 # A core is looked for this far from the chief ray's magnification, relative to that.
-_FARTHEST, _STEPS = 0.08, 161
+_FARTHEST, _STEPS = 0.08, 81
 # Depths that are traced for the cores' magnification; others are interpolated.
 _MOST = 9
 # One in so many rays is enough for the first search.
