@@ -2,7 +2,7 @@
 
 120 points at 18 to 22 mm are reconstructed and shown at three depths: the plain stack, the stack of the points that
 `find_points` makes of it, and the truth. The table puts methods side by side: nothing at all, the peaks above a
-threshold (scikit-image), the paper's particle clustering, ours. Images come from our simulation (diffraction, shot and
+threshold (scikit-image), the paper's particle clustering, ours. Images come from our simulation (all light, shot and
 read noise), and, if DATA is given, from an independent ray tracer, with haze and clipped apertures.
 
     python -m experiments.fig4_suppression [DATA] [--out DIR]

@@ -1,7 +1,7 @@
 """Fig. 7: fluorescent beads in a slab, from the capture to points in 3-D.
 
 The paper embeds 5 um beads in a slab about 2.5 mm thick. Ours are balls filled with emitters, brighter and dimmer,
-imaged with the diffraction PSF and exposed with shot and read noise; the reconstruction knows neither. With DATA, the
+imaged with all of their light and exposed with shot and read noise; the reconstruction knows neither. With DATA, the
 120 points of an independent ray tracer go the same way.
 
     python -m experiments.fig7_beads [DATA] [--out DIR]
@@ -53,7 +53,7 @@ def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, 
     emitters = beads(count, SIZE, SLAB, pitch=APART)
     each = emitters.reshape(count, -1, 4)
     each[..., 3] *= np.random.default_rng(0).uniform(0.3, 1.7, (count, 1)) / each[0, :, 3].sum()
-    image = simulate_points(emitters, design.imager(), progress=progress)
+    image = simulate_points(emitters, design.imager(), kind="full", progress=progress)
     capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
     return np.column_stack([each[..., :3].mean(1), each[..., 3].sum(1)]), capture
 

@@ -1,10 +1,10 @@
 """How many points a capture may show: the F1 score of `find_points` against their density.
 
-Points at random over 20 x 20 mm and 18 to 22 mm, of intensities 0.5 to 1.5, are imaged with the diffraction PSF by
+Points at random over 20 x 20 mm and 18 to 22 mm, of intensities 0.5 to 1.5, are imaged with all of their light by
 `simulate_points`, which places them finer than any voxel, and exposed with shot and read noise. Each capture goes to
-`find_points` with the same settings. For comparison: the brightest peaks of the plain back-projection, as many as there
-are points, which a user cannot know. The simulation has no haze and no lens with its own aperture, so it is optimistic;
-the ray-traced captures of `fig4_suppression` have both.
+`find_points` with the same settings. For comparison: the brightest peaks of the back-projection, as many as there are
+points, which a user cannot know. Cores are where `find_points` expects them, so the simulation is a little optimistic;
+the ray-traced captures of `fig4_suppression` are not.
 
     python -m experiments.point_density [DESIGN.toml] [--out DIR]
 """
@@ -52,7 +52,7 @@ def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np
     """Points and a capture of them."""
     truth = random_points(count, SIZE, DEPTHS, seed=seed)
     truth[:, 3] = np.random.default_rng(seed).uniform(0.5, 1.5, count)
-    image = simulate_points(truth, design.imager(), progress=progress)
+    image = simulate_points(truth, design.imager(), kind="full", progress=progress)
     return truth, np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=10_000))
 
 

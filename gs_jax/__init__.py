@@ -48,7 +48,7 @@ The operators themselves, differentiable:
 
     backproject          Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction")
     backproject_adjoint  The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from
-    forward              The image of a volume: Eq. (2), summed lens by lens and without its zones
+    forward              The image of a volume, summed lens by lens: Eq. (2), or with all of the light
     forward_operator     The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
     optics_of            What `forward` takes to image planes at some depths, as true as is wanted
     solve                Explain an image: all steps of a solver, or as many as its tolerance asks for

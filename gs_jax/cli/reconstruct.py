@@ -23,8 +23,6 @@ from ..suppression.locate import find_points
 from ..suppression.unet import read_weights, suppress as without_background
 from .options import UM, Depths, Number, depth_range
 
-WEIGHT = Number(least=0.0, most=10.0, unit="")
-
 
 @click.command("reconstruct")
 @click.argument("capture", type=Path)
@@ -84,6 +82,8 @@ def command(
         check_output(points, [".csv"])
     if suppress != "none" and method != "backproject":
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
+    if suppress == "points" and optics != "full":
+        raise InputError(f"--optics {optics}: found --suppress points, allowed: full, which finds points.")
     if weights and suppress != "unet":
         raise InputError(f"--weights: found --suppress {suppress}, allowed: --suppress unet, which they are for.")
     inversion = _with(METHODS[method](steps), method, tv=tv, sparsity=sparsity)

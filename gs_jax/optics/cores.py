@@ -29,6 +29,8 @@ _DEGREE = 6
 _FIELDS, _RAYS = 16, 8192
 # A core is looked for this far from the chief ray's magnification, relative to that.
 _FARTHEST, _STEPS = 0.08, 81
+# As finely as this: a twentieth of a pixel where cores are farthest from the axis.
+_FINE = 1e-4
 # Depths that are traced for the cores' magnification; others are interpolated.
 _MOST = 9
 # One in so many rays is enough for the first search.
@@ -75,7 +77,7 @@ def ring_edges(imager: Imager, ends: Sequence[float] = RINGS) -> list[tuple[floa
     return [(radius * float(a), radius * float(b)) for a, b in zip((0.0, *ends), ends, strict=False)]
 
 
-def core_table(imager: Imager, depth: float, zones: Zones, reach: float, ends: Sequence[float] = RINGS) -> Cores:
+def core_table(imager: Imager, depth: float, aperture: Zones, reach: float, ends: Sequence[float] = RINGS) -> Cores:
     """The cores at one depth, by exact rays of a mean lens.
 
     A ring has one kernel: the mean of its spots up to `reach` (mm) about the magnification at which that mean is the
@@ -84,7 +86,7 @@ def core_table(imager: Imager, depth: float, zones: Zones, reach: float, ends: S
     pitch = imager.sensor.pixel_pitch
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
-    rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
+    rays = diffracted(imager, spot_rays(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
     parts = [_ring_cores(rays, fields, chief, pitch, edges, *ring) for ring in rings]
@@ -110,7 +112,7 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
     The chief ray's is `M_z = v/z'` (Eq. 3); the authors' lenses have 0.4 % less to 0.8 % more, by depth.
     """
     depths = np.asarray(depths, np.float64)
-    if depths.size > _MOST:
+    if np.unique(depths).size > _MOST:
         # A smooth function of the depth.
         some = np.linspace(depths.min(), depths.max(), _MOST)
         beyond = float(imager.reduced_depth(0.0))
@@ -192,7 +194,7 @@ def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> flo
     some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
     best = int(np.argmin([squares(stretch, some) for stretch in tried]))
     around = tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)]
-    return float(np.ravel(fminbound(squares, *around, xtol=1e-5))[0])
+    return float(np.ravel(fminbound(squares, *around, xtol=_FINE))[0])
 
 
 def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1) -> Float64[np.ndarray, "row column"]:

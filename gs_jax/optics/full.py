@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Float64
 
 from ..base.progress import Progress
 from ..geometry import Imager
-from .cores import RINGS, Cores, core_table, drawn
+from .cores import RINGS, Cores, core_tables, drawn
 from .halo import HaloGrid, halo_grid, halo_table
 from .light import zones
 
@@ -19,7 +19,7 @@ CORE_REACH = 5
 
 
 class Halo(eqx.Module):
-    """All light but the cores', at some depths; made by `halo_and_cores`.
+    """All light but the cores', at some depths; made by `halo_of`.
 
     Parameters
     ----------
@@ -103,7 +103,9 @@ def full_optics(
     >>> image = forward(volume, imager, grid, full_optics(imager, grid.depths))
     """
     depths = np.asarray(depths, np.float64)
-    halo, cores = halo_and_cores(imager, depths, extent=extent, nodes_for=nodes_for, progress=progress)
+    grid, reach = halo_nodes(imager, np.asarray(nodes_for or depths), extent=extent)
+    cores = core_tables(imager, depths, reach, progress=progress)
+    halo = halo_of(imager, depths, grid, cores, progress=progress)
     size = kernel_size(imager, halo)
     kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
     outer = cores.profile[:, 1:]
@@ -113,27 +115,29 @@ def full_optics(
     return FullOptics(stretch, light, kernel, wide, halo)
 
 
-def halo_and_cores(
-    imager: Imager,
-    depths: Float64[np.ndarray, " depth"],
-    *,
-    ends: Sequence[float] = RINGS,
-    extent: float | None = None,
-    nodes_for: tuple[float, float] | None = None,
-    progress: Progress | None = None,
-) -> tuple[Halo, Cores]:
-    """The halo that is left by the cores of rings with these ends, in field radii; and these cores, depths first."""
-    aperture = zones(imager.array)
+def halo_nodes(
+    imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None
+) -> tuple[HaloGrid, float]:
+    """The halo's nodes for a range of depths and an object's extent, mm; and the reach of cores beside it, mm."""
     extent = extent or max(imager.sensor.shape) * imager.sensor.pixel_pitch
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
-    grid = halo_grid(imager, np.asarray(nodes_for or depths), math.sqrt(2) * farthest)
-    parts, tables = [], []
-    for depth in (progress or Progress()).track(depths, "Tracing spots"):
-        parts.append(core_table(imager, depth, aperture, CORE_REACH * grid.pixel, ends))
-        tables.append(halo_table(imager, depth, aperture, grid, parts[-1], ends))
-    dtype = imager.sensor_distance.dtype
-    halo = Halo(jnp.asarray(np.stack(tables), dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid)
-    return halo, Cores(*map(np.stack, zip(*parts, strict=True)))
+    grid = halo_grid(imager, depths, math.sqrt(2) * farthest)
+    return grid, CORE_REACH * grid.pixel
+
+
+def halo_of(
+    imager: Imager,
+    depths: Float64[np.ndarray, " depth"],
+    grid: HaloGrid,
+    cores: Cores,
+    ends: Sequence[float] = RINGS,
+    progress: Progress | None = None,
+) -> Halo:
+    """What the cores leave of the light at each depth, theirs being those of rings with these ends, in field radii."""
+    aperture, dtype = zones(imager.array), imager.sensor_distance.dtype
+    each = zip((progress or Progress()).track(depths, "Tracing halos"), map(Cores, *cores), strict=True)
+    table = np.stack([halo_table(imager, depth, aperture, grid, core, ends) for depth, core in each])
+    return Halo(jnp.asarray(table, dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid)
 
 
 def kernel_size(imager: Imager, halo: Halo) -> int:

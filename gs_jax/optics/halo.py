@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int, Num
 
 from ..geometry import Imager
 from .cores import RINGS, Cores, diffracted, ring_edges, ring_light, spread
@@ -82,7 +82,7 @@ def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float
 
 
 def halo_table(
-    imager: Imager, depth: float, zones: Zones, grid: HaloGrid, cores: Cores, ends: Sequence[float] = RINGS
+    imager: Imager, depth: float, aperture: Zones, grid: HaloGrid, cores: Cores, ends: Sequence[float] = RINGS
 ) -> Float32[np.ndarray, "kind harmonic radius field"]:
     """From each object harmonic over the fields to the image's over the radii, at one depth.
 
@@ -90,12 +90,12 @@ def halo_table(
     An object in the direction `phi` is imaged in the opposite one, from which the image's angle counts.
     """
     fields = grid.step * grid.nodes(grid.fields)
-    rays = diffracted(imager, spot_rays(imager, depth, fields, zones, _RAYS))
+    rays = diffracted(imager, spot_rays(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
     table = np.zeros((2, grid.fields, grid.radii * grid.angles))
     share = lambda landing, light: np.stack([_shared(grid, *one) for one in zip(landing, light, strict=True)])
     table[0] = share(rays.landing, rays.light)
-    if zones.by_area.any():
+    if aperture.by_area.any():
         table[1] = share(rays.landing, rays.light_by_area)
     for (inner, outer), stretch, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
         # The share of a core's light that a lens has at each field.
@@ -109,18 +109,29 @@ def halo_table(
     return np.fft.rfft(around).real.transpose(0, 3, 2, 1).astype(np.float32)
 
 
-def _shared(grid: HaloGrid, landing, light):
-    """Light of rays, shared by the four nodes around each; linear in the node's number."""
-    x, y = -landing.T
-    place = grid.bend * np.arcsinh(np.hypot(x, y) / grid.pixel / grid.bend)
-    angle = np.arctan2(y, x) * (grid.angles / (2 * np.pi)) % grid.angles
-    radius, around = place.astype(int), angle.astype(int)
-    out, on = place - radius, angle - around
-    total = np.zeros(grid.radii * grid.angles)
-    inside = radius < grid.radii - 1
-    radius = np.where(inside, radius, 0)
-    for step, part in ((0, 1 - out), (1, out)):
-        for turn, share in ((0, 1 - on), (1, on)):
-            node = (radius + step) * grid.angles + (around + turn) % grid.angles
-            total += np.bincount(node, np.where(inside, light * part * share, 0), total.size)
-    return total
+def polar_shares(
+    grid: HaloGrid, count: int, x: Num[np.ndarray, " place"], y: Num[np.ndarray, " place"]
+) -> tuple[Int[np.ndarray, " entry"], Int[np.ndarray, " entry"], Float64[np.ndarray, " entry"]]:
+    """How the four nodes around each place share it, bilinearly in the nodes' numbers: (place, node, share).
+
+    Places are in steps; of those beyond the nodes, `count` outward, there are no entries.
+    """
+    outward = grid.bend * np.arcsinh(np.hypot(x, y) / grid.bend)
+    place = np.flatnonzero(outward < count - 1)
+    outward = outward[place]
+    turned = np.arctan2(y, x)[place] * (grid.angles / (2 * np.pi)) % grid.angles
+    radius, around = outward.astype(int), turned.astype(int)
+    parts = []
+    for step, turn in np.ndindex(2, 2):
+        node = (radius + step) * grid.angles + (around + turn) % grid.angles
+        share = np.abs(1 - step - (outward - radius)) * np.abs(1 - turn - (turned - around))
+        parts.append((place, node, share))
+    place, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return place, node, share
+
+
+def _shared(grid, landing, light):
+    """Light of rays on the polar nodes, `(radius angle)`."""
+    x, y = -landing.T / grid.pixel
+    ray, node, share = polar_shares(grid, grid.radii, x, y)
+    return np.bincount(node, light[ray] * share, grid.radii * grid.angles)

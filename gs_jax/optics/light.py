@@ -74,15 +74,15 @@ def zones(array: MicrolensArray) -> Zones:
 
 
 def spot_rays(
-    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], zones: Zones, count: int
+    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: Zones, count: int
 ) -> SpotRays:
     """Rays of a point at each field, `count` of them evenly over the lens's disc."""
-    order = np.arange(count) + 0.5
-    radius = zones.radius[-1] * _RADII / (_RADII - 0.5) * np.sqrt(order / count)
+    order, rim = np.arange(count) + 0.5, float(imager.array.aperture_diameter) / 2
+    radius = rim * np.sqrt(order / count)
     points = radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)
     landing, light = (np.asarray(part, np.float64) for part in _traced(imager, float(depth), points, fields))
-    light = light * np.pi * radius[-1] ** 2 * (count / (count - 0.5)) / count
-    share, slope = (np.interp(radius, zones.radius, part) for part in (zones.open, zones.by_area))
+    light = light * np.pi * rim**2 / count
+    share, slope = (np.interp(radius, aperture.radius, part) for part in (aperture.open, aperture.by_area))
     return SpotRays(landing, light * share, light * slope)
 
 

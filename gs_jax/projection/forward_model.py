@@ -22,12 +22,13 @@ def forward(
     grid: Grid,
     optics: Optics = None,
 ) -> Float[Array, "row column"]:
-    """The image of a volume: Eq. (2), summed lens by lens and without its zones.
+    """The image of a volume, summed lens by lens: Eq. (2), or with all of the light.
 
-    Each voxel is a point at its centre. With a PSF every lens images it at the chief ray's pixel (scale `s_z`,
-    magnification `M_z`), weighted by the envelope C, and spread by PSF_o of its depth. The paper takes C from the
-    centre of the voxel's zone instead of from the voxel, which is the only difference. As in Eq. (2) a voxel counts
-    the same at every depth. Chief rays that miss the sensor by less than half a PSF count with what spreads onto it.
+    Each voxel is a point at its centre. With a PSF this is Eq. (2) without its zones: every lens images a voxel at the
+    chief ray's pixel (scale `s_z`, magnification `M_z`), weighted by the envelope C, and spread by PSF_o of its depth.
+    The paper takes C from the centre of the voxel's zone instead of from the voxel, which is the only difference. As in
+    Eq. (2) a voxel counts the same at every depth. Chief rays that miss the sensor by less than half a PSF count with
+    what spreads onto it.
 
     With `FullOptics` each lens's spot is where exact rays put it, at every distance from the lens's axis, and a voxel
     is the light that it sends out in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.

@@ -1,6 +1,5 @@
 """The image of a volume with all of its light: the spots' cores at full resolution, and their halo on coarse pixels."""
 
-import dataclasses
 import math
 from functools import cache
 
@@ -14,11 +13,10 @@ from jaxtyping import Array, Float
 from ..geometry import Grid, Imager, Sensor
 from ..optics.cores import ring_edges
 from ..optics.full import FullOptics, Halo
-from ..optics.halo import HaloGrid
 from ..optics.light import clear_area
 from .bilinear import Shapes, volume_to_image
 from .convolve import add_halved, add_symmetric_spectrum, image_of, padded_shape, with_margin
-from .primitive import linear_call
+from .polar import apply, splat_table, spread_table
 from .rays import RingLight, trace
 
 # Lenses whose halos are computed at once, which bounds the memory.
@@ -26,8 +24,6 @@ _LENSES = 64
 # The halo passes several linear interpolations, which blur it by about this variance, in squared pixels. Wiener's
 # filter undoes that, as far as the blur leaves more than this share of a frequency's power.
 _BLUR, _NOISE = 0.7, 0.02
-# Rings of polar nodes, from the axis on, that are closer to each other than pixels are.
-_INNER = 4
 # Pixels of the halo around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
 
@@ -96,7 +92,7 @@ def halo_image(
     halo, v = optics.grid, (imager.sensor_distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the pixels of the halo with it.
     pixel = halo.pixel * v
-    splat, spread = _splat_table(halo), _spread_table(halo)
+    splat, spread = splat_table(halo), spread_table(halo)
     inner, outer = splat.patch, spread.patch
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / halo.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
     nodes = jnp.pad(nodes, [(0, 0), (inner + 1, inner + 1), (inner + 1, inner + 1)])
@@ -109,7 +105,7 @@ def halo_image(
             nodes, table = plane
             start, fraction = _place(centers, origin.astype(dtype), halo.step, nodes.shape, inner)
             objects = _windows(nodes, start, fraction, inner)
-            polar = _apply(splat, objects.reshape(len(centers), -1).T)
+            polar = apply(splat, objects.reshape(len(centers), -1).T)
             spectrum = jnp.fft.rfft(polar.reshape(halo.fields, halo.angles, -1), axis=1)
             turned = lax.complex(*(_mixed(table, part, excess) for part in (spectrum.real, spectrum.imag)))
             return spots + turned, None
@@ -119,7 +115,7 @@ def halo_image(
         # The image lies opposite to the object: half a turn.
         half_turn = (jnp.arange(halo.angles // 2 + 1) % 2 == 1)[None, :, None]
         polar = jnp.fft.irfft(jnp.where(half_turn, -spots, spots), halo.angles, axis=1).reshape(-1, len(centers))
-        spots = _apply(spread, polar).T.reshape(-1, outer, outer)
+        spots = apply(spread, polar).T.reshape(-1, outer, outer)
         start, fraction = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
         return _add_windows(image, spots, start, fraction), None
 
@@ -190,110 +186,6 @@ def _add_windows(image, spots, start, fraction):
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
     return lax.scatter_add(image, start, spots, dimensions, mode="drop")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Table:
-    """A sparse matrix and its transpose, each as the entries of every row; `patch`: side of the square of pixels."""
-
-    patch: int
-    entries: tuple[np.ndarray, np.ndarray]
-    transposed: tuple[np.ndarray, np.ndarray]
-
-
-def _apply(table: _Table, columns: Float[Array, "row many"]) -> Float[Array, "new many"]:
-    """A table times many columns. Both directions gather whole rows: the scatter of a transpose is slower by far."""
-    return linear_call(_gathered, _gathered_back, None, table, (), columns)
-
-
-def _gathered(table, _, columns):
-    index, weight = table.entries
-    return _rows(index, weight, columns)
-
-
-def _gathered_back(table, _, columns):
-    index, weight = table.transposed
-    return _rows(index, weight, columns)
-
-
-def _rows(index, weight, columns):
-    total = 0
-    for at, share in zip(index.T, weight.T, strict=True):
-        total = total + jnp.asarray(share, columns.dtype)[:, None] * columns.at[at].get(mode="promise_in_bounds")
-    return total
-
-
-@cache
-def _splat_table(halo: HaloGrid) -> _Table:
-    """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
-    reach = math.ceil(halo.nodes(halo.fields)[-2])
-    node, index, share = _polar(halo, halo.fields, reach)
-    return _table(2 * reach + 1, node, index, share, halo.fields * halo.angles, to_polar=True)
-
-
-@cache
-def _spread_table(halo: HaloGrid) -> _Table:
-    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that none is lost.
-
-    About the axis the nodes are closer than the pixels, and are shared by the four around them instead.
-    """
-    reach = math.ceil(halo.nodes(halo.radii)[-2])
-    pixel, node, share = _polar(halo, halo.radii, reach)
-    outer = (node >= _INNER * halo.angles) & (share > 0)
-    pixel, node, share = pixel[outer], node[outer], share[outer]
-    total = np.bincount(node, share, halo.radii * halo.angles)
-    # The last rings are cut by the window's edge, and have no more light than that.
-    whole = node < (halo.radii - 3) * halo.angles
-    share = share / np.where(whole, total[node], np.repeat(halo.areas(halo.radii), halo.angles)[node])
-    near_pixel, near_node, near_share = _near_axis(halo, reach)
-    pixel, node = np.concatenate([pixel, near_pixel]), np.concatenate([node, near_node])
-    share = np.concatenate([share, near_share])
-    return _table(2 * reach + 1, pixel, node, share, halo.radii * halo.angles, to_polar=False)
-
-
-def _near_axis(halo: HaloGrid, reach: int):
-    """Entries (square node, polar node, share) of the inner polar nodes, each shared by the four pixels around it."""
-    node = np.arange(_INNER * halo.angles)
-    radius, angle = halo.nodes(_INNER)[node // halo.angles], 2 * np.pi * (node % halo.angles) / halo.angles
-    place = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1) + reach
-    whole = np.floor(place).astype(int)
-    parts = []
-    for corner in np.ndindex(2, 2):
-        row, column = (whole + corner).T
-        share = np.where(corner, place - whole, 1 - (place - whole)).prod(-1)
-        parts.append((row * (2 * reach + 1) + column, node, share))
-    return (np.concatenate(part) for part in zip(*parts, strict=True))
-
-
-def _polar(halo: HaloGrid, count: int, reach: int):
-    """Entries (square node, polar node, share) of the bilinear interpolation between polar nodes."""
-    side = np.arange(-reach, reach + 1)
-    y, x = (part.ravel() for part in np.meshgrid(side, side, indexing="ij"))
-    place = halo.bend * np.arcsinh(np.hypot(x, y) / halo.bend)
-    node = np.flatnonzero(place < count - 1)
-    place, angle = place[node], (np.arctan2(y, x)[node] / (2 * np.pi) * halo.angles) % halo.angles
-    radius, around = place.astype(int), angle.astype(int)
-    out, on = place - radius, angle - around
-    parts = []
-    for step, part in ((0, 1 - out), (1, out)):
-        for turn, share in ((0, 1 - on), (1, on)):
-            parts.append((node, (radius + step) * halo.angles + (around + turn) % halo.angles, part * share))
-    return (np.concatenate(part) for part in zip(*parts, strict=True))
-
-
-def _table(patch, square, polar, share, polars, *, to_polar):
-    by_polar, by_square = _by_row(polar, square, share, polars), _by_row(square, polar, share, patch**2)
-    return _Table(patch, by_polar, by_square) if to_polar else _Table(patch, by_square, by_polar)
-
-
-def _by_row(row, column, share, rows):
-    """Entries of each row, `(rows, most)`: columns and shares, filled up with zeros."""
-    order = np.argsort(row, kind="stable")
-    row, column, share = row[order], column[order], share[order]
-    number = np.arange(row.size) - np.searchsorted(row, row)
-    index, weight = np.zeros((rows, number.max() + 1), np.int32), np.zeros((rows, number.max() + 1))
-    index[row, number], weight[row, number] = column, share
-    return index, weight
 
 
 def _finer(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fine coarse"]:

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 
 from ..base.progress import Progress
 from ..geometry import Imager, chief_ray
-from ..optics.cores import core_tables, drawn, ring_edges
-from ..optics.full import halo_and_cores, kernel_size
+from ..optics.cores import Cores, core_tables, drawn, ring_edges
+from ..optics.full import halo_nodes, halo_of, kernel_size
 from .full import halo_image
 from .rays import Envelope, RingLight
 
@@ -25,19 +25,19 @@ STEPS = 5
 _POINTS, _SPOTS = 2048, 32768
 # The image is added up in square tiles of so many pixels, which stay in the processor's cache.
 _TILE = 512
-# Distances of depths for all of the light, mm: of the cores, which change by less than a pixel's width, and the halo.
-_CORE_STEP, _HALO_STEP = 0.1, 0.5
+# Distance of depths for all of the light, mm: of the halo; cores are computed half-way, too.
+_STEP = 0.5
 # Ends of the rings that have a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
 _RINGS = tuple(np.arange(1, 29) / 8)
 
 
-class Cores(NamedTuple):
-    """Which cores stamps are of: those of a ring of the field, at each depth of the stamps.
+class Ring(NamedTuple):
+    """The ring of the field whose cores stamps are of.
 
-    `ring`: inner and outer end, mm. `stretch` and `light` are of `gs_jax.optics.cores.Cores`.
+    `ends`: inner and outer, mm. `stretch`, `light`: of `gs_jax.optics.cores.Cores`, at each depth of the stamps.
     """
 
-    ring: tuple[float, float]
+    ends: tuple[float, float]
     stretch: Float[np.ndarray, " depth"]
     light: Float[np.ndarray, "depth coefficient"]
 
@@ -51,11 +51,11 @@ class Stamps(NamedTuple):
 
     depths: Float[np.ndarray, " depth"]
     kernels: Float[np.ndarray, "depth 5 5 size size"]
-    cores: Cores | None = None
+    ring: Ring | None = None
 
 
 def stamps(
-    depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"], cores: Cores | None = None
+    depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"], ring: Ring | None = None
 ) -> Stamps:
     """Stamps from PSFs on pixels a fifth as large, `(depth, 5 size, 5 size)` with an odd size.
 
@@ -75,7 +75,7 @@ def stamps(
     for axis in (1, 2):
         wide = sliding_window_view(wide, STEPS, axis).sum(-1)
     pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
-    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)), cores)
+    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)), ring)
 
 
 def forward_points(
@@ -137,18 +137,18 @@ def _tiles(shape: tuple[int, int], size: int) -> tuple[int, int]:
 
 
 def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
-    return RingLight(*stamps.cores.ring) if stamps.cores else Envelope(imager.field_radius)
+    return RingLight(*stamps.ring.ends) if stamps.ring else Envelope(imager.field_radius)
 
 
 def _rays(depth, imager, stamps):
     """Magnification and parameters of the weight, for each point."""
     reduced = depth + float(imager.reduced_depth(0.0))
     magnification = float(imager.sensor_distance) / reduced
-    if stamps.cores is None:
+    if stamps.ring is None:
         return magnification, reduced[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
-    light = np.stack([between(part) for part in stamps.cores.light.T], -1)
-    return magnification * between(stamps.cores.stretch), light
+    light = np.stack([between(part) for part in stamps.ring.light.T], -1)
+    return magnification * between(stamps.ring.stretch), light
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -198,8 +198,8 @@ def full_image_of_points(
 ) -> Float[np.ndarray, "row column"]:
     """The image of points with all of their light: what `forward` does with `FullOptics`, without a grid.
 
-    Cores are stamps, interpolated between depths that are 0.1 mm apart, at fifths of a pixel, or of two where they are
-    wider (`gs_jax.projection.full`); the halo is interpolated between depths that are 0.5 mm apart.
+    Cores are stamps in narrow rings of the field, interpolated between depths that are 0.25 mm apart; the halo is
+    interpolated between depths that are 0.5 mm apart. On the ray-traced 120 points nearer depths change nothing.
 
     Parameters
     ----------
@@ -210,28 +210,29 @@ def full_image_of_points(
     progress
         Shows how far it is.
     """
-    progress = progress or Progress()
-    near, far = points[:, 2].min(), points[:, 2].max()
-    extent = 2 * float(np.abs(points[:, :2]).max())
-    coarse = np.linspace(near, far, math.ceil((far - near) / _HALO_STEP) + 1)
-    halo, _ = halo_and_cores(imager, coarse, ends=_RINGS, extent=extent, progress=progress)
-    nodes = jnp.asarray(_on_nodes(points, coarse, halo.grid), imager.sensor_distance.dtype)
-    image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
     depths = np.unique(points[:, 2])
-    if depths.size > (count := math.ceil((far - near) / _CORE_STEP) + 1):
-        depths = np.linspace(near, far, count)
-    tables = core_tables(imager, depths, halo.reach, _RINGS, progress)
+    steps = math.ceil((depths[-1] - depths[0]) / _STEP)
+    few = depths.size <= steps + 1
+    fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
+    every = 1 if few else 2
+    grid, reach = halo_nodes(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
+    tables = core_tables(imager, fine, reach, _RINGS, progress)
+    coarse, cores = fine[::every], Cores(*(part[::every] for part in tables))
+    halo = halo_of(imager, coarse, grid, cores, _RINGS, progress)
+    nodes = jnp.asarray(_shared(points, coarse, grid), imager.sensor_distance.dtype)
+    image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
     size = kernel_size(imager, halo)
-    for ring, *parts, profiles in zip(ring_edges(imager, _RINGS), *(np.moveaxis(t, 1, 0) for t in tables), strict=True):
-        fine = np.stack([drawn(profile, STEPS * size, STEPS) for profile in profiles])
-        spots = stamps(depths, fine.astype(np.float32), Cores(ring, *parts))
+    rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
+    for ends, *parts, profiles in rings:
+        kernels = np.stack([drawn(profile, STEPS * size, STEPS) for profile in profiles])
+        spots = stamps(fine, kernels.astype(np.float32), Ring(ends, *parts))
         image += forward_points(points, imager, spots, progress)
     # The halo's ripple goes below zero in places. Without it there would be more light than there is.
     clipped = np.maximum(image, 0)
-    return clipped * (image.sum() / clipped.sum())
+    return clipped * (image.sum() / max(clipped.sum(), np.finfo(image.dtype).tiny))
 
 
-def _on_nodes(points, depths, halo):
+def _shared(points, depths, halo):
     """Light of points, shared linearly by the halo's coarse nodes and depths: `(depth, y, x)`."""
     count = 2 * math.ceil(np.abs(points[:, :2]).max() / halo.step + 1) + 1
     place = np.column_stack(

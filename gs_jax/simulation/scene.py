@@ -18,10 +18,11 @@ from ..io.volumes import read_volume
 from ..optics.full import full_optics
 from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
+from ..projection.levels import LEVELS
 from ..projection.points import STEPS, forward_points, full_image_of_points, stamps
 
-# Names of the models of the light.
-OPTICS = ("full", "near")
+# Chief rays alone make no image of a point.
+OPTICS = tuple(level for level in LEVELS if level != "pinhole")
 # Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
 _STEP = 0.1
 # As many of these depths at a time, which bounds the memory.
@@ -83,7 +84,7 @@ def simulate(
         raise InputError(f'`psf`: found {short_repr(psf)} with optics "full", allowed: with "near", which has one PSF.')
     if psf not in (None, *PSFS):
         raise InputError(f"`psf`: found {short_repr(psf)}, allowed: {', '.join(PSFS)}.")
-    kind = None if optics == "full" else psf or "diffraction"
+    kind = "full" if optics == "full" else psf or "diffraction"
     if grid is None:
         return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
     return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
@@ -94,7 +95,7 @@ def simulate_volume(
     imager: Imager,
     grid: Grid,
     *,
-    kind: str | None = "diffraction",
+    kind: str = "diffraction",
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of a volume whose voxels are evenly lit boxes, one plane after the other.
@@ -109,7 +110,7 @@ def simulate_volume(
     imager, grid
         As for `forward`.
     kind
-        Of the PSF: a key of `gs_jax.optics.window.PSFS`; None for all of the light.
+        Of the PSF: a key of `gs_jax.optics.window.PSFS`; or "full", all of the light.
 
     Raises
     ------
@@ -140,10 +141,10 @@ def simulate_volume(
 
 def _optics_of_depth(imager, grid, kind):
     depths = np.asarray(grid.depths)
-    if kind is None:
+    if kind == "full":
         extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
-        range_ = float(depths.min()), float(depths.max())
-        return lambda depth: full_optics(imager, [depth], extent=extent, nodes_for=range_)
+        ends = float(depths.min()), float(depths.max())
+        return lambda depth: full_optics(imager, [depth], extent=extent, nodes_for=ends)
     kernel = psf_of_depth(imager, depths, kind)
     return lambda depth: kernel(depth)[None]
 
@@ -152,13 +153,13 @@ def simulate_points(
     points: Float[np.ndarray, "point 4"],
     imager: Imager,
     *,
-    kind: str | None = "diffraction",
+    kind: str = "diffraction",
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
     """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate_volume`."""
     if not len(points):
         return np.zeros(imager.sensor.shape, np.float32)
-    if kind is None:
+    if kind == "full":
         return full_image_of_points(points, imager, progress)
     near, far = points[:, 2].min(), points[:, 2].max()
     depths = np.unique(points[:, 2])
