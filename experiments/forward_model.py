@@ -1,13 +1,14 @@
 """The forward model: what it costs, and how far the paper's zones are from the exact sum.
 
 Cost: `gs_jax.forward` at full scale (5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at
-each depth) and with more or fewer depths, lenses and pixels. Zones: Eq. (2) takes the envelope C from the centre of
+each depth) and with more or fewer depths, lenses and pixels; in focus also with all of the light, and the adjoints of
+both, in turns. Zones: Eq. (2) takes the envelope C from the centre of
 the zone that a voxel lies in, `gs_jax.forward` from the voxel; nothing else differs. The zone of a lens is its
 Voronoi cell, so the departure follows from the envelope alone.
 
     python -m experiments.forward_model [--out DIR]
 
-writes `forward.json` and `forward.png`; about three minutes on two cores.
+writes `forward.json` and `forward.png`; about four minutes on two cores.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,34 +21,57 @@ from scipy.spatial import KDTree
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.common import Report, main, table
-from gs_jax import Imager, forward
+from gs_jax import Imager, forward, forward_operator
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.geometry import envelope
+from gs_jax.optics.full import full_optics
 
 STUDY = {
     "depths": [Job(depths=n) for n in (1, 4, 13, 40)],
     "lenses": [Job(lenses=n) for n in (13, 53, 213, 850)],
     "pixels": [Job(pixels=n) for n in (640, 1280, 2560, 5120)],
 }
+# Where all of the light is compared with one PSF.
+FOCUSED = Job(sensor_distance_mm=5.8)
 PSF_PIXELS = 65
 
 
 def cost(job: Job, rounds: int = 3) -> dict[str, float]:
     """Warm median, compile time and what XLA allocates beside the arguments."""
     s: Inputs = inputs(job)
-    psf = jnp.full((job.depths, PSF_PIXELS, PSF_PIXELS), PSF_PIXELS**-2.0, jnp.float32)
-    arguments = s.volume, s.imager, s.grid, psf
-    compile_s, compiled = timed(lambda: forward.lower(*arguments).compile())
-    call = lambda: jax.block_until_ready(compiled(*arguments))
-    call()
-    memory = compiled.memory_analysis()
-    return {
-        "median_s": float(np.median([timed(call)[0] for _ in range(rounds)])),
-        "compile_s": compile_s,
-        "mib": (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20,
-    }
+    return _in_turns({"near": (forward, (s.volume, s.imager, s.grid, _psf(job)))}, rounds)["near"]
+
+
+def levels(job: Job, rounds: int = 3) -> dict[str, dict[str, float]]:
+    """`cost` with one PSF ("near") and with all of the light ("full"), and of their adjoints."""
+    s: Inputs = inputs(job)
+    adjoint = jax.jit(lambda image, imager, grid, optics: forward_operator(imager, grid, optics).T.mv(image))
+    calls = {}
+    for name, optics in (("near", _psf(job)), ("full", full_optics(s.imager, s.grid.depths))):
+        calls[name] = forward, (s.volume, s.imager, s.grid, optics)
+        calls[f"{name}, adjoint"] = adjoint, (s.image, s.imager, s.grid, optics)
+    return _in_turns(calls, rounds)
+
+
+def _psf(job: Job) -> jax.Array:
+    return jnp.full((job.depths, PSF_PIXELS, PSF_PIXELS), PSF_PIXELS**-2.0, jnp.float32)
+
+
+def _in_turns(calls, rounds):
+    found, ready = {}, {}
+    for name, (function, arguments) in calls.items():
+        compile_s, compiled = timed(lambda f=function, a=arguments: f.lower(*a).compile())
+        ready[name] = lambda c=compiled, a=arguments: jax.block_until_ready(c(*a))
+        ready[name]()
+        memory = compiled.memory_analysis()
+        mib = (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20
+        found[name] = {"median_s": [], "compile_s": compile_s, "mib": mib}
+    for _ in range(rounds):
+        for name, call in ready.items():
+            found[name]["median_s"].append(timed(call)[0])
+    return {name: numbers | {"median_s": float(np.median(numbers["median_s"]))} for name, numbers in found.items()}
 
 
 def zone_departure(imager: Imager, depth: float, size: tuple[float, float], points: int = 20_000) -> dict[str, float]:
@@ -69,7 +93,7 @@ def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return ((a[:, None] - b[None]) ** 2).sum(-1)
 
 
-def run(study: Mapping[str, Sequence[Job]] = STUDY, *, progress: Progress) -> dict:
+def run(study: Mapping[str, Sequence[Job]] = STUDY, focused: Job = FOCUSED, *, progress: Progress) -> dict:
     """Everything that `forward.json` holds; units are in the keys."""
     jobs = dict.fromkeys(job for axis in study.values() for job in axis)
     costs = {job: cost(job) for job in progress.track(list(jobs), "Forward model")}
@@ -77,6 +101,7 @@ def run(study: Mapping[str, Sequence[Job]] = STUDY, *, progress: Progress) -> di
     return {
         "machine": describe(),
         "cost": {axis: [job._asdict() | costs[job] for job in jobs] for axis, jobs in study.items()},
+        "levels": levels(focused),
         "zones": zone_departure(design.imager(), 20.0, design.array.size_mm),
     }
 
@@ -99,6 +124,8 @@ def report(progress: Progress) -> Report:
         table((axis, "time, s", "compile, s", "memory, MiB"), [[str(row[axis]), *numbers(row)] for row in rows])
         for axis, rows in found["cost"].items()
     ]
+    columns = ("model", "time, s", "compile, s", "memory, MiB")
+    shown.append(table(columns, [[name, *numbers(row)] for name, row in found["levels"].items()]))
     return Report({"forward.json": found, "forward.png": picture(found)}, [*shown, str(found["zones"])])
 
 

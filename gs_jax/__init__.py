@@ -23,6 +23,7 @@ From a capture to a volume:
     ListRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
     FISTA                FISTA: least squares with sparsity, not negative, for any operator
+    Unrolled             Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package
     ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
     write_volume         Writes a volume, never rescaled or clipped, whole or not at all
@@ -61,6 +62,7 @@ Better designs, and their molds:
 
 How good it is:
 
+    reproject            Image a volume again, and compare with the capture that it was reconstructed from
     quality              PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best
     localization         Match found points with true ones, each at most once, and score them
 

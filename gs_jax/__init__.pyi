@@ -20,6 +20,7 @@ from .projection.levels import optics_of as optics_of
 from .projection.operators import forward_operator as forward_operator
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
+from .reconstruction.reprojection import reproject as reproject
 from .simulation.camera import Camera as Camera, expose as expose
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.scene import simulate as simulate
@@ -27,6 +28,7 @@ from .solvers.admm import ADMM as ADMM
 from .solvers.fista import FISTA as FISTA
 from .solvers.iteration import solve as solve
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
+from .solvers.unrolled import Unrolled as Unrolled
 from .suppression.clustering import find_clusters as find_clusters
 from .suppression.locate import find_points as find_points
 from .suppression.unet import suppress as suppress

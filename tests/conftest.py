@@ -8,6 +8,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_COMPILATION_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax  # noqa: E402
+import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 # Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
@@ -18,3 +19,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # The same examples each time: a change should fail for what it changed.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_code_is_dropped():
+    """Programs take memory maps, of which Linux gives a process 65,530: too few for those of all tests."""
+    yield
+    jax.clear_caches()

@@ -96,6 +96,7 @@ def traced_light(scope: Imager, point) -> float:
 
 @pytest.mark.parametrize("point", [(0.2, -0.1, 18.0), (2.0, 1.0, 21.0)])
 def test_it_holds_the_light_that_rays_bring(point):
+    """To 5 %: an aperture that neighbours cut counts as round, with the mean lens's openness and its own area."""
     scope = imager(pitch=0.1)
     found = full_image_of_points(np.array([[*point, 2.0]]), scope)
     np.testing.assert_allclose(found.sum(), 2 * traced_light(scope, point), rtol=0.05)

@@ -24,6 +24,7 @@ ORDER = [
     "solvers",
     "suppression",
     "reconstruction",
+    "training",
     "codesign",
     "mold",
     "benchmark",

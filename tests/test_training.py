@@ -7,24 +7,25 @@ import pytest
 from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
-from gs_jax.base.progress import Progress
 from gs_jax.cli.reconstruct import command as reconstruct_command
 from gs_jax.cli.train import command
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import write_capture
 from gs_jax.io.volumes import read_volume
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.suppression import training_data
-from gs_jax.suppression.training import Recipe, read_checkpoint, start, train, write_checkpoint
-from gs_jax.suppression.training_data import PLANES, Stack, paper_batch, patches, simulated_stack, stacks
 from gs_jax.suppression.unet import UNet, read_weights, suppress
+from gs_jax.training import scenes, slices
+from gs_jax.training.examples import Kind
+from gs_jax.training.loop import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.training.recipes import slices_loss
+from gs_jax.training.slices import Stack, paper_batch, patches, simulated_stack, stacks
 
 from .test_cli import DESIGN
 
 
 def toy(offsets=(0,), batch=lambda rng: paper_batch(rng, 16)) -> Recipe:
     network = lambda key: UNet(offsets, (4, 8), standardized=False, key=key)
-    return Recipe(network, lambda steps: optax.rmsprop(optax.cosine_decay_schedule(3e-3, steps)), batch)
+    return Recipe(network, lambda steps: optax.rmsprop(optax.cosine_decay_schedule(3e-3, steps)), batch, slices_loss)
 
 
 def assert_equal(a, b):
@@ -91,21 +92,21 @@ def test_the_papers_slices():
 
 
 def test_nothing_drawn_is_no_division_by_zero(monkeypatch):
-    monkeypatch.setattr(training_data, "_drawn", lambda size, *_: np.zeros((size, size), np.float32))
+    monkeypatch.setattr(slices, "drawn", lambda size, *_: np.zeros((size, size), np.float32))
     batch = paper_batch(np.random.default_rng(0), 16)
     assert np.isfinite(batch.slices).all() and not batch.truth.any()
 
 
-@pytest.mark.parametrize("kind", training_data._DRAW)
+@pytest.mark.parametrize("kind", scenes._DRAW)
 def test_every_kind_of_object_is_drawn(kind):
-    plane = training_data._drawn(120, np.random.default_rng(3), 20, (kind,))
+    plane = scenes.drawn(120, np.random.default_rng(3), 20, (kind,))
     assert plane.shape == (120, 120) and 0 < np.count_nonzero(plane) < plane.size
     assert plane.min() == 0 and plane.max() <= 10
 
 
 def test_an_inclined_page_is_shared_out_to_all_planes():
     page = np.ones((60, 60), np.float32)
-    scene = training_data._inclined(page, np.random.default_rng(0))
+    scene = scenes.on_sheet(page, np.random.default_rng(0))
     np.testing.assert_allclose(scene.sum(0), page, rtol=1e-6)
     assert (scene.sum((1, 2)) > 0).all()
 
@@ -113,7 +114,7 @@ def test_an_inclined_page_is_shared_out_to_all_planes():
 def test_the_truth_lies_where_the_scene_does():
     scene = np.zeros((2, 8, 6), np.float32)
     scene[0, 2:4, 4:6] = 1
-    found = training_data._shared_out(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
+    found = scenes.shared_out(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
     expected = np.zeros((3, 4, 3))
     expected[1:, 1, 2] = 0.75, 0.25
     np.testing.assert_allclose(found, expected, atol=1e-6)
@@ -140,19 +141,15 @@ def test_an_empty_stack_gives_patches():
     assert not patches([dark], (0,), np.random.default_rng(0), size=8, count=2).slices.any()
 
 
-@pytest.fixture
-def tiny(monkeypatch):
-    """Microscopes of few pixels."""
-    monkeypatch.setattr(training_data, "PIXELS", 128)
-    monkeypatch.setattr(training_data, "SIZES", ((0.045, 0.2),))
-    monkeypatch.setattr(training_data, "_REACH", 4)
+# Microscopes of few pixels.
+TINY = (Kind(96, 0.045, 0.2, 5),)
 
 
-def test_a_simulated_stack_shows_its_scene(tiny):
-    one, again, other = simulated_stack(0, 0), simulated_stack(0, 0), simulated_stack(0, 1)
+def test_a_simulated_stack_shows_its_scene():
+    one, again, other = (simulated_stack(0, number, TINY) for number in (0, 0, 1))
     assert_equal(one, again)
     assert not np.array_equal(one.volume, other.volume)
-    assert len(one.volume) == PLANES and one.volume.shape == one.truth.shape
+    assert len(one.volume) == 5 and one.volume.shape == one.truth.shape
     for stack in (one, other):
         volume, truth = (np.asarray(each, np.float64).ravel() for each in stack)
         assert np.isfinite(volume).all() and truth.min() >= 0
@@ -160,19 +157,19 @@ def test_a_simulated_stack_shows_its_scene(tiny):
         assert np.polyfit(truth, volume, 1)[0] == pytest.approx(1, abs=0.01)
 
 
-def test_some_stacks_are_nothing_but_noise(tiny):
-    stack = simulated_stack(0, 15)
+def test_some_stacks_are_nothing_but_noise():
+    stack = simulated_stack(0, 15, TINY)
     assert not stack.truth.any() and np.asarray(stack.volume, np.float32).std() > 0
 
 
-def test_stacks_are_kept(tiny, tmp_path):
+def test_stacks_are_kept(tmp_path):
     folder = tmp_path / "stacks"
-    made = stacks(folder, 2, 5, Progress())
-    for a, b in zip(stacks(folder, 2, 5, Progress()), made, strict=True):
+    made = stacks(folder, 2, 5, kinds=TINY)
+    for a, b in zip(stacks(folder, 2, 5, kinds=TINY), made, strict=True):
         assert_equal(a, b)
     (folder / "5-1.npz").write_bytes(b"garbage")
     with pytest.raises(InputError, match=r"5-1\.npz"):
-        stacks(folder, 2, 5, Progress())
+        stacks(folder, 2, 5, kinds=TINY)
 
 
 @pytest.fixture

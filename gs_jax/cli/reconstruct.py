@@ -17,7 +17,9 @@ from ..io.volumes import VOLUME_SUFFIXES, write_volume
 from ..projection.levels import LEVELS
 from ..reconstruction.methods import METHODS
 from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
+from ..reconstruction.reprojection import reproject
 from ..simulation.phantoms import rasterize
+from ..solvers.unrolled import read_unrolled
 from ..suppression.clustering import find_clusters
 from ..suppression.locate import find_points
 from ..suppression.unet import read_weights, suppress as without_background
@@ -34,7 +36,13 @@ from .options import UM, Depths, Number, depth_range
     help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
 )
 @click.option("--method", type=click.Choice(list(METHODS)), default="backproject", show_default=True)
-@click.option("--steps", type=click.IntRange(1, 100_000), default=20, show_default=True, help="Of the other methods.")
+@click.option(
+    "--steps",
+    type=click.IntRange(1, 100_000),
+    default=20,
+    show_default=True,
+    help="Of list-rl to admm; unrolled has its own.",
+)
 @click.option(
     "--optics",
     type=click.Choice(LEVELS),
@@ -55,7 +63,11 @@ from .options import UM, Depths, Number, depth_range
     show_default=True,
     help="Background suppression: points that their lenses agree on, the paper's clusters, or a network for anything.",
 )
-@click.option("--weights", type=Path, help="WEIGHTS.npz of `gs-jax train`, for --suppress unet.  [default: ours]")
+@click.option(
+    "--weights",
+    type=Path,
+    help="WEIGHTS.npz of `gs-jax train`, for --method unrolled or --suppress unet.  [default: ours]",
+)
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
 def command(
@@ -84,10 +96,12 @@ def command(
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
     if suppress == "points" and optics != "full":
         raise InputError(f"--optics {optics}: found --suppress points, allowed: full, which finds points.")
-    if weights and suppress != "unet":
-        raise InputError(f"--weights: found --suppress {suppress}, allowed: --suppress unet, which they are for.")
-    inversion = _with(METHODS[method](steps), method, tv=tv, sparsity=sparsity)
-    network = read_weights(weights) if weights else None
+    if weights and suppress != "unet" and method != "unrolled":
+        found = f"--method {method} and --suppress {suppress}"
+        raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
+    chosen = read_unrolled(weights) if weights and method == "unrolled" else METHODS[method](steps)
+    inversion = _with(chosen, method, tv=tv, sparsity=sparsity)
+    network = read_weights(weights) if weights and suppress == "unet" else None
     microscope = read_design(design)
     imager = microscope.imager()
     pixels = 1 if method == "backproject" else COARSE
@@ -108,6 +122,9 @@ def command(
         if suppress == "unet":
             with progress.step("Suppressing the background"):
                 volume = without_background(volume, network)
+        check = None
+        if method == "unrolled" or suppress == "unet":
+            check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
         with progress.step("Writing"):
             write_volume(output, volume, grid)
             if points:
@@ -115,6 +132,9 @@ def command(
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
+    if check:
+        found = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
+        click.echo(f"{output}: imaged again it is {found}, {check.regions.max():.0%} where it is farthest")
     if points or suppress in ("points", "clusters"):
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
 

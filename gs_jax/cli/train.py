@@ -9,35 +9,32 @@ import numpy as np
 
 from ..base.progress import Progress
 from ..io.disk import check_input, check_output, write_json
-from ..suppression.training import (
-    multislice_recipe,
-    paper_recipe,
-    read_checkpoint,
-    start,
-    train as run,
-    write_checkpoint,
-)
-from ..suppression.training_data import stacks
-from ..suppression.unet import PRETRAINED, write_weights
+from ..solvers.unrolled import write_unrolled
+from ..suppression.unet import write_weights
+from ..training.loop import read_checkpoint, start, train as run, write_checkpoint
+from ..training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
+from ..training.slices import stacks
 
 # Those of the weights that come with the package.
-STEPS = {"paper": 2000, "multislice": 4000}
+STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
 _EVERY = 50
-_STACKS = 96
+_STACKS, _CASES = 96, 112
 _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
 @click.command("train")
-@click.option("--network", type=click.Choice(PRETRAINED), default="multislice", show_default=True)
+@click.option("--network", type=click.Choice(list(STEPS)), default="multislice", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
 def command(network: str, steps: int | None, seed: int, resume: bool, output: Path):
-    """Train a network for background suppression: the paper's, or ours, which looks at seven slices.
+    """Train networks: for background suppression the paper's, or ours, which looks at seven slices; or for the unrolled
+    inversion.
 
     Beside WEIGHTS.npz it keeps WEIGHTS.checkpoint, which an interrupt leaves there, and WEIGHTS.json, the losses; for
-    ours also the folder WEIGHTS-stacks, the simulated captures that it is trained on (0.4 GB; it may be deleted).
+    seven slices also the folder WEIGHTS-stacks, the simulated captures that they are trained on (0.4 GB; it may be
+    deleted).
     """
     check_output(output, [".npz"])
     steps = steps or STEPS[network]
@@ -45,11 +42,13 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     check_output(history, [".json"])
     if resume:
         check_input(checkpoint)
-    if network == "paper":
-        recipe = paper_recipe()
-    else:
-        with Progress() as progress:
+    with Progress() as progress:
+        if network == "paper":
+            recipe = paper_recipe()
+        elif network == "multislice":
             recipe = multislice_recipe(stacks(output.with_name(f"{output.stem}-stacks"), _STACKS, seed, progress))
+        else:
+            recipe = unrolled_recipe(unrolled_cases(_CASES, seed, progress))
     begin = partial(read_checkpoint, checkpoint) if resume else start
     state = begin(recipe, steps=steps, seed=seed)
     recent = lambda state: float(np.mean(state.losses[max(int(state.step) - _EVERY, 0) : int(state.step)]))
@@ -67,5 +66,8 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
             bar.update(1, f"{recent(state):.4f}")
 
         state = run(recipe, state, each=each)
-    write_weights(output, state.network)
-    click.echo(f"{output}: {network} network, {steps} steps, loss {recent(state):.4f}")
+    if network == "unrolled":
+        write_unrolled(output, finished(state.network))
+    else:
+        write_weights(output, state.network)
+    click.echo(f"{output}: {network}, {steps} steps, loss {recent(state):.4f}")

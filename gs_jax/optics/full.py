@@ -1,9 +1,12 @@
 """All of the light that lenses pass on, as tables: what `gs_jax.forward` needs for the true image of a volume."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
@@ -76,10 +79,10 @@ def full_optics(
     depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
     *,
     extent: float | None = None,
-    nodes_for: tuple[float, float] | None = None,
+    nodes: HaloGrid | None = None,
     progress: Progress | None = None,
 ) -> FullOptics:
-    """The tables of a microscope at some depths, by exact rays; half a second each.
+    """The tables of a microscope at some depths, by exact rays; a second each, and the last ones are kept.
 
     They are constants to JAX: derivatives of an image by the lens centres and the sensor's distance move the spots and
     leave their shapes. Whoever changes the lens makes new tables.
@@ -92,9 +95,9 @@ def full_optics(
         Of the planes, mm, in their order.
     extent
         Size of the object, mm: no light is followed that comes from farther off. By default the sensor's.
-    nodes_for
-        Nearest and farthest depth that share the halo's nodes, so that what is compiled for one serves all; by default
-        those of `depths`.
+    nodes
+        Of the halo, by `halo_nodes`: what is compiled for tables of some nodes serves others of the same. By default
+        those that suit the depths.
     progress
         Shows how many depths are done.
 
@@ -103,8 +106,29 @@ def full_optics(
     >>> image = forward(volume, imager, grid, full_optics(imager, grid.depths))
     """
     depths = np.asarray(depths, np.float64)
-    grid, reach = halo_nodes(imager, np.asarray(nodes_for or depths), extent=extent)
-    cores = core_tables(imager, depths, reach, progress=progress)
+    leaves, structure = jax.tree.flatten(imager)
+    same = structure, *(np.asarray(leaf).tobytes() for leaf in leaves), depths.tobytes(), extent, nodes
+    return _tables(_Wanted(same, imager, depths, extent, nodes, progress))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Wanted:
+    """What tables are asked for; equal if the tables are."""
+
+    same: tuple
+    imager: Imager = dataclasses.field(compare=False)
+    depths: Float64[np.ndarray, " depth"] = dataclasses.field(compare=False)
+    extent: float | None = dataclasses.field(compare=False)
+    nodes: HaloGrid | None = dataclasses.field(compare=False)
+    progress: Progress | None = dataclasses.field(compare=False)
+
+
+# Capture after capture of a microscope has the same tables; these are kept, some 80 MiB each at full scale.
+@lru_cache(maxsize=2)
+def _tables(wanted):
+    imager, depths, progress = wanted.imager, wanted.depths, wanted.progress
+    grid = wanted.nodes or halo_nodes(imager, depths, extent=wanted.extent)
+    cores = core_tables(imager, depths, CORE_REACH * grid.pixel, progress=progress)
     halo = halo_of(imager, depths, grid, cores, progress=progress)
     size = kernel_size(imager, halo)
     kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
@@ -115,14 +139,11 @@ def full_optics(
     return FullOptics(stretch, light, kernel, wide, halo)
 
 
-def halo_nodes(
-    imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None
-) -> tuple[HaloGrid, float]:
-    """The halo's nodes for a range of depths and an object's extent, mm; and the reach of cores beside it, mm."""
+def halo_nodes(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> HaloGrid:
+    """The halo's nodes for a range of depths and an object's extent, mm; by default the sensor's."""
     extent = extent or max(imager.sensor.shape) * imager.sensor.pixel_pitch
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
-    grid = halo_grid(imager, depths, math.sqrt(2) * farthest)
-    return grid, CORE_REACH * grid.pixel
+    return halo_grid(imager, depths, math.sqrt(2) * farthest)
 
 
 def halo_of(

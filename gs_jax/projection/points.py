@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from ..base.progress import Progress
 from ..geometry import Imager, chief_ray
 from ..optics.cores import Cores, core_tables, drawn, ring_edges
-from ..optics.full import halo_nodes, halo_of, kernel_size
+from ..optics.full import CORE_REACH, halo_nodes, halo_of, kernel_size
 from .full import halo_image
 from .rays import Envelope, RingLight
 
@@ -215,8 +215,8 @@ def full_image_of_points(
     few = depths.size <= steps + 1
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2
-    grid, reach = halo_nodes(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    tables = core_tables(imager, fine, reach, _RINGS, progress)
+    grid = halo_nodes(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
+    tables = core_tables(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress)
     coarse, cores = fine[::every], Cores(*(part[::every] for part in tables))
     halo = halo_of(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_shared(points, coarse, grid), imager.sensor_distance.dtype)

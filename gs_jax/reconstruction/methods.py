@@ -11,6 +11,7 @@ from ..solvers.admm import ADMM
 from ..solvers.fista import FISTA
 from ..solvers.iteration import Solver, check_options
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.unrolled import Unrolled
 
 
 class BackProjection(eqx.Module):
@@ -61,11 +62,12 @@ class ListRichardsonLucy(eqx.Module):
 Method = BackProjection | ListRichardsonLucy | Solver
 
 # By the name that the command line and the benchmark know it by: from the number of steps to the method. A step of
-# ADMM holds few conjugate gradients, as each starts from the last.
+# ADMM holds few conjugate gradients, as each starts from the last; unrolled steps are as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
     "list-rl": lambda steps: ListRichardsonLucy(steps, accelerate=True),
     "richardson-lucy": lambda steps: RichardsonLucy(steps, accelerate=True),
     "fista": FISTA,
     "admm": lambda steps: ADMM(steps, cg_steps=3),
+    "unrolled": lambda steps: Unrolled.pretrained(),
 }

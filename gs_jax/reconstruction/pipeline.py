@@ -22,7 +22,9 @@ from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS, optics_of
 from ..projection.operators import forward_operator
 from ..solvers.iteration import Solver
-from ..solvers.richardson_lucy import RichardsonLucy, Unmatched
+from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.unmatched import Unmatched
+from ..solvers.unrolled import Unrolled
 from ..suppression.consistency import local_levels
 from .methods import BackProjection, ListRichardsonLucy, Method
 
@@ -96,7 +98,8 @@ def reconstruct(
     image, imager, grid
         As for `backproject`.
     method
-        `BackProjection()`, `ListRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`.
+        `BackProjection()`, `ListRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
+        `Unrolled.pretrained()`.
     optics
         As for `forward`, or its name for `optics_of`. By name, "full" or "near", back-projection reads the bright cores
         of the spots; otherwise it follows the chief rays, as the paper does.
@@ -113,38 +116,54 @@ def reconstruct(
     --------
     >>> volume = reconstruct(image, imager, grid, RichardsonLucy(steps=20))
     """
-    progress = progress or Progress()
+    progress, by_name = progress or Progress(), isinstance(optics, str)
     if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
         raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
-    if isinstance(optics, str) and optics not in LEVELS:
+    if by_name and optics not in LEVELS:
         raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
     if image.shape != imager.sensor.shape:
         raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
-    on_cores = isinstance(optics, str) and optics != "pinhole"
+    on_cores = by_name and optics != "pinhole"
     seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
     if isinstance(method, BackProjection):
         return _back_projected(image, imager, seen, method, progress)
-    light = np.asarray(image, imager.sensor_distance.dtype)
-    light = light - max(float(np.percentile(light, _DARKEST)), 0.0)
-    background, slow = 0.0, 0
-    if isinstance(optics, str):
-        light, imager = _binned(light, imager, grid)
-        if optics != "full":
-            background = np.maximum(local_levels(light)[0], 0)
-        optics = optics_of(imager, grid.depths, optics, progress=progress)
-        if isinstance(optics, FullOptics):
-            width = max(imager.sensor.shape) * imager.sensor.pixel_pitch
-            slow = round(width / (_SLOW * optics.halo.grid.pixel))
-    if isinstance(optics, np.ndarray):
-        optics = jnp.asarray(optics)
+    light = above_offset(np.asarray(image, imager.sensor_distance.dtype))
+    light, imager, background, optics = explained(light, imager, grid, optics, progress)
     if isinstance(method, ListRichardsonLucy):
         return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen))
     if isinstance(method, RichardsonLucy):
-        if isinstance(background, np.ndarray):
-            method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
+        method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
         return _iterated(method, progress, light, System(imager, grid, optics))
-    system = System(imager, grid, optics, slow=slow)
-    return _iterated(method, progress, np.asarray(system.fast(light - background), light.dtype), system)
+    light = light - background
+    if isinstance(method, Unrolled):
+        return _iterated(method, progress, light, System(imager, grid, optics, seen))
+    system = System(imager, grid, optics, slow=_slow_waves(imager, optics) if by_name else 0)
+    return _iterated(method, progress, np.asarray(system.fast(light), light.dtype), system)
+
+
+def explained(
+    light: Float[np.ndarray, "row column"], imager: Imager, grid: Grid, optics: Optics | str, progress: Progress
+) -> tuple[Float[np.ndarray, "row column"], Imager, Float[np.ndarray, "row column"] | float, Optics]:
+    """What iterative methods are to explain: the light, its microscope, the background in it, and the optics.
+
+    With optics by name, pixels are as wide as voxels, and what optics other than "full" do not hold is background.
+    """
+    if not isinstance(optics, str):
+        return light, imager, 0.0, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics
+    light, imager = _binned(light, imager, grid)
+    background = 0.0 if optics == "full" else np.maximum(local_levels(light)[0], 0)
+    return light, imager, background, optics_of(imager, grid.depths, optics, progress=progress)
+
+
+def _slow_waves(imager, optics):
+    if not isinstance(optics, FullOptics):
+        return 0
+    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.halo.grid.pixel))
+
+
+def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+    """An image less its darkest percent, or as it is if that is negative."""
+    return image - np.asarray(max(float(np.percentile(image, _DARKEST)), 0.0), image.dtype)
 
 
 class System(eqx.Module):

@@ -15,7 +15,7 @@ from ..base.progress import Progress
 from ..geometry import Grid, Imager, Sensor
 from ..io.points import read_points
 from ..io.volumes import read_volume
-from ..optics.full import full_optics
+from ..optics.full import full_optics, halo_nodes
 from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
@@ -143,8 +143,8 @@ def _optics_of_depth(imager, grid, kind):
     depths = np.asarray(grid.depths)
     if kind == "full":
         extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
-        ends = float(depths.min()), float(depths.max())
-        return lambda depth: full_optics(imager, [depth], extent=extent, nodes_for=ends)
+        nodes = halo_nodes(imager, depths, extent=extent)
+        return lambda depth: full_optics(imager, [depth], nodes=nodes)
     kernel = psf_of_depth(imager, depths, kind)
     return lambda depth: kernel(depth)[None]
 

@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 from ..base.errors import InputError
 from ..base.safe import safe_sqrt
 from .convolution import Convolution
+from .unmatched import Unmatched
 
-System = lx.AbstractLinearOperator | Convolution
+System = lx.AbstractLinearOperator | Convolution | Unmatched
 
 
 @runtime_checkable

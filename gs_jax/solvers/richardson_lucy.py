@@ -15,36 +15,13 @@ from jaxtyping import Array, Float, Num
 
 from ..base.safe import Real, divide
 from .iteration import as_image, check_options, norm
+from .unmatched import Unmatched
 from .variation import differences, differences_adjoint, magnitude
 
 # The most that total variation may hold back a voxel in one step: Dey's denominator must stay positive.
 _LEAST_DENOMINATOR = 0.1
 # In units of the type's precision, relative to the largest sensitivity.
 _ROUNDING = 100
-
-
-class Unmatched(eqx.Module):
-    """An operator with another one in the place of its transpose: `A.mv` is `forward`'s, `A.T.mv` is `back`'s.
-
-    Enough of an operator for Richardson-Lucy, which comes to its end in fewer steps if what goes back is sharper than
-    the adjoint (Zeng and Gullberg, IEEE Trans. Med. Imaging 19, 548, 2000).
-    """
-
-    forward: lx.AbstractLinearOperator
-    back: lx.AbstractLinearOperator
-
-    @property
-    def T(self) -> "Unmatched":
-        return Unmatched(self.back, self.forward)
-
-    def mv(self, vector):
-        return self.forward.mv(vector)
-
-    def in_structure(self):
-        return self.forward.in_structure()
-
-    def out_structure(self):
-        return self.forward.out_structure()
 
 
 class State(NamedTuple):
@@ -92,7 +69,7 @@ class RichardsonLucy(eqx.Module):
 
     def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
-        sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
+        sensitivity = without_rounding(A.T.mv(jnp.ones_like(image)))
         # The scale of the start does not matter without a background; this one has the image's light.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
@@ -134,7 +111,7 @@ def _gain(product, last):
     return jnp.clip(divide(jnp.vdot(product, last), jnp.vdot(last, last)), 0, 1)
 
 
-def _without_rounding(sensitivity):
+def without_rounding(sensitivity):
     """What an FFT leaves in voxels that no pixel sees is taken for 0: rounding over rounding would grow without end."""
     least = _ROUNDING * jnp.finfo(sensitivity.dtype).eps * lax.stop_gradient(sensitivity.max())
     return jnp.where(sensitivity > least, sensitivity, 0)

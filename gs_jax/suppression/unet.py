@@ -5,12 +5,8 @@ looks at one slice (the paper's) or at several around it (ours) gives back what 
 and a volume comes out, of the same voxels: nothing is downsampled.
 """
 
-import json
 import os
-import zipfile
-from importlib import resources
 from itertools import product
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -19,11 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ..base.errors import InputError, short_repr
-from ..io.disk import atomic_write, check_input, check_output, decoding
+from ..io import weights
 
 # The networks that come with the package, and what a file of weights may hold at most.
 PRETRAINED = ("paper", "multislice")
-_MOST_BYTES, _MOST_LEVELS, _MOST_WIDTH, _MOST_OFFSET = 2**27, 8, 4096, 64
+_MOST_LEVELS, _MOST_WIDTH, _MOST_OFFSET = 8, 4096, 64
 # The most voxels of a plane that one call of the network answers for, along each axis: about half a GiB.
 _CORE = 1024
 
@@ -197,17 +193,9 @@ def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
 
 
 def write_weights(path: str | os.PathLike[str], network: UNet) -> None:
-    """Writes a network as `.npz`: its weights as float16, and what it is as JSON. Whole or not at all.
-
-    Raises
-    ------
-    InputError
-        As `check_output`.
-    """
+    """Writes a network as `.npz`; see `gs_jax.io.weights`."""
     about = {"offsets": network.offsets, "widths": network.widths, "standardized": network.standardized}
-    arrays = {f"array_{i}": np.asarray(leaf, np.float16) for i, leaf in enumerate(jax.tree.leaves(network))}
-    with atomic_write(check_output(path, [".npz"])) as temporary:
-        np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+    weights.write_weights(path, network, about)
 
 
 def read_weights(path: str | os.PathLike[str]) -> UNet:
@@ -218,7 +206,7 @@ def read_weights(path: str | os.PathLike[str]) -> UNet:
     InputError
         If the file cannot be read, or holds no network, or not the arrays of its network, finite.
     """
-    return _read(check_input(path))
+    return weights.read_weights(path, _skeleton)
 
 
 def pretrained(name: str = "multislice") -> UNet:
@@ -231,25 +219,7 @@ def pretrained(name: str = "multislice") -> UNet:
     """
     if name not in PRETRAINED:
         raise InputError(f"found the network {short_repr(name)}, allowed: {', '.join(PRETRAINED)}.")
-    with resources.as_file(resources.files("gs_jax") / "weights" / f"{name}.npz") as path:
-        return _read(path)
-
-
-def _read(path: Path) -> UNet:
-    with decoding(path, "file of weights (.npz)"):
-        with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > _MOST_BYTES:
-            raise ValueError(f"found {size} bytes, allowed: at most {_MOST_BYTES}")
-        with np.load(path, allow_pickle=False) as archive:
-            about = json.loads(str(archive["about"]))
-            skeleton = _skeleton(**about)
-            leaves, structure = jax.tree.flatten(skeleton)
-            arrays = [archive[f"array_{i}"] for i in range(len(leaves))]
-        for leaf, array in zip(leaves, arrays, strict=True):
-            if array.shape != leaf.shape or array.dtype != np.float16 or not np.isfinite(array).all():
-                raise ValueError(f"found {array.dtype} {array.shape}, allowed: finite float16 {leaf.shape}")
-    return jax.tree.unflatten(structure, [jnp.asarray(array, jnp.float32) for array in arrays])
+    return weights.shipped(name, _skeleton)
 
 
 def _skeleton(offsets: list[int], widths: list[int], standardized: bool) -> UNet:

@@ -1,4 +1,4 @@
-"""Training of the networks of `unet`: the paper's recipe and ours, with checkpoints from which it goes on exactly."""
+"""Training of a network by a recipe, with checkpoints from which it goes on exactly."""
 
 import os
 from collections.abc import Callable
@@ -6,15 +6,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ..base.errors import InputError
 from ..io.disk import atomic_write, check_input, decoding
-from .training_data import Batch, Stack, paper_batch, patches
-from .unet import UNet, multislice_network, paper_network
 
 
 class Recipe(NamedTuple):
@@ -28,24 +25,14 @@ class Recipe(NamedTuple):
         Makes it for a number of steps.
     batch
         Draws one with a generator of random numbers.
+    loss
+        Of a network and a batch.
     """
 
-    network: Callable[[PRNGKeyArray], UNet]
+    network: Callable[[PRNGKeyArray], Any]
     optimizer: Callable[[int], optax.GradientTransformation]
-    batch: Callable[[np.random.Generator], Batch]
-
-
-def paper_recipe() -> Recipe:
-    """The paper's: RMSprop and mean squared error on synthetic polygons. It prints no rate."""
-    return Recipe(paper_network, lambda steps: optax.rmsprop(3e-4), paper_batch)
-
-
-def multislice_recipe(stacks: list[Stack]) -> Recipe:
-    """Ours: Adam, its rate falling as a cosine, and mean squared error on simulated stacks."""
-    rate = lambda steps: optax.warmup_cosine_decay_schedule(0, 1e-3, min(100, steps // 10), steps)
-    optimizer = lambda steps: optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate(steps)))
-    offsets = eqx.filter_eval_shape(multislice_network, jax.random.key(0)).offsets
-    return Recipe(multislice_network, optimizer, lambda rng: patches(stacks, offsets, rng))
+    batch: Callable[[np.random.Generator], Any]
+    loss: Callable[[Any, Any], Float[Array, ""]]
 
 
 class State(eqx.Module):
@@ -61,7 +48,7 @@ class State(eqx.Module):
         Which training it is, and the steps that are done.
     """
 
-    network: UNet
+    network: Any
     optimizer: optax.OptState
     losses: Float32[np.ndarray, " step"]
     seed: np.ndarray
@@ -84,7 +71,7 @@ def train(recipe: Recipe, state: State, *, each: Callable[[State], None] = lambd
     steps = len(state.losses)
     for number in range(int(state.step), steps):
         batch = recipe.batch(np.random.default_rng([int(state.seed), 1, number]))
-        network, memory, value = _step(recipe.optimizer, steps, state.network, state.optimizer, batch)
+        network, memory, value = _step(recipe, steps, state.network, state.optimizer, batch)
         losses = state.losses.copy()
         losses[number] = value
         state = State(network, memory, losses, state.seed, np.array(number + 1))
@@ -92,17 +79,11 @@ def train(recipe: Recipe, state: State, *, each: Callable[[State], None] = lambd
     return state
 
 
-def loss(network: UNet, batch: Batch) -> Float[Array, ""]:
-    """Mean squared error over the voxels of a batch, weighted."""
-    error = jax.vmap(network)(jnp.asarray(batch.slices)) - jnp.asarray(batch.truth)
-    return jnp.mean(jnp.asarray(batch.weight) * jnp.mean(error**2, axis=(1, 2)))
-
-
 @eqx.filter_jit
-def _step(optimizer, steps: int, network: Any, memory: optax.OptState, batch: Batch) -> tuple[Any, optax.OptState, Any]:
-    value, gradient = jax.value_and_grad(loss)(network, batch)
+def _step(recipe: Recipe, steps: int, network: Any, memory: optax.OptState, batch: Any) -> tuple[Any, Any, Any]:
+    value, gradient = jax.value_and_grad(recipe.loss)(network, batch)
     with jax.numpy_dtype_promotion("standard"):  # optax counts steps with integers
-        updates, memory = optimizer(steps).update(gradient, memory, network)
+        updates, memory = recipe.optimizer(steps).update(gradient, memory, network)
     return optax.apply_updates(network, updates), memory, value
 
 

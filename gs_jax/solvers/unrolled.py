@@ -1,0 +1,220 @@
+"""Unrolled inversion: an iterative solver, whose last steps have small networks between them, trained together.
+
+What a capture says of a volume is in the operators of its own microscope, which the networks do not hold: they are the
+same for every layout of lenses. The first steps are those of accelerated list-Richardson-Lucy. In each of the others
+its step is taken to a power that was learned, and a network then weighs each voxel by what it and its neighbours look
+like.
+"""
+
+import os
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
+
+from ..base.errors import InputError
+from ..base.safe import divide, safe_sqrt
+from ..io import weights
+from .iteration import as_image, check_options, norm
+from .richardson_lucy import RichardsonLucy, State as LucyState, divergence
+from .unmatched import Unmatched
+
+# Channels that a network sees: the voxel after the step and before it, the largest and the mean over its column, how
+# far its lenses agree, what the step asked for, and how many lenses see it.
+_SEEN = 7
+# Voxels along a side of each layer's convolution, and how far a network sees laterally.
+_SIDES = (3, 3, 1)
+_MARGIN = sum(side // 2 for side in _SIDES)
+# Light that counts as none, in parts of the image's mean: where lenses are asked whether they agree, and in ratios.
+_DARK, _FAINT = 1e-2, 1e-3
+# What a step may ask for at most, and at least, as the network sees it.
+_MOST = 20.0
+# Rows of voxels at a time, which bounds the memory: what a network sees does not depend on them.
+_ROWS = 128
+_MOST_STEPS, _MOST_WIDTH = 64, 1024
+_LUCY = RichardsonLucy(accelerate=True)
+
+
+class Layer(eqx.Module):
+    """A convolution, one for each step: over rows and columns, with neighbouring planes among the channels seen."""
+
+    weight: Float[Array, "*step side side seen made"]
+    bias: Float[Array, "*step made"]
+
+
+class State(NamedTuple):
+    """Of `Unrolled`: the state of Richardson-Lucy, how far the lenses agree, and the steps that are done."""
+
+    lucy: LucyState
+    agreement: Array
+    number: Int[Array, ""]
+
+
+class Unrolled(eqx.Module):
+    """Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package.
+
+    `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
+    power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
+    accelerated Richardson-Lucy with `A` and `B`. A dark image gives zeros.
+
+    Parameters
+    ----------
+    layers
+        Of the networks.
+    power
+        One for each step with a network.
+    first
+        Steps without.
+    steps, tolerance
+        As for `Solver`; there are `first` steps and as many more as there are networks, or fewer.
+
+    Raises
+    ------
+    InputError
+        If an option is negative, or there are no steps or too many.
+    """
+
+    layers: tuple[Layer, ...]
+    power: Float[Array, " step"]
+    first: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self):
+        check_options(self)
+        # Where modules are made of shapes or of nothing, there is nothing to check.
+        if isinstance(self.power, jax.Array) and self.steps > (most := self.first + self.power.size):
+            raise InputError(
+                f"steps: found {self.steps}, allowed: 1 to {most}, {self.power.size} of them with networks."
+            )
+
+    def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
+        image = jnp.maximum(as_image(A, image), 0)
+        lucy = _LUCY.init(A, image)
+        dark = _DARK * jnp.mean(image)
+        inverse = divide(jnp.ones_like(image), image + dark)
+        # The harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
+        agreement = jnp.maximum(divide(lucy.sensitivity, A.T.mv(inverse)) - dark, 0)
+        return State(lucy, agreement, jnp.zeros((), jnp.int32))
+
+    def step(
+        self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
+    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        image = jnp.maximum(as_image(A, image), 0)
+        plain = lambda lucy: _LUCY.step(A, image, lucy)
+        learned = lambda lucy: self.learned(A, image, state._replace(lucy=lucy))
+        lucy, cost, residual = lax.cond(state.number < self.first, plain, learned, state.lucy)
+        return State(lucy, state.agreement, state.number + 1), cost, residual
+
+    def learned(
+        self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], state: State
+    ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
+        """A step with a network: the new estimate, the cost of the old one, and the relative change."""
+        (x, sensitivity, momentum), number = state.lucy, state.number - self.first
+        expected = jnp.maximum(A.mv(x), 0)
+        ratio = divide(image, expected + _FAINT * jnp.mean(image))
+        asked = jnp.clip(divide(A.T.mv(ratio), sensitivity), 1 / _MOST, _MOST)
+        ahead = x * asked ** self.power[number].astype(x.dtype)
+        unit = _rms(ahead)
+        in_unit = lambda volume, unit: jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
+        column = lambda part: in_unit(jnp.broadcast_to(part(ahead, axis=0, keepdims=True), x.shape), unit)
+        seen = [
+            in_unit(ahead, unit),
+            in_unit(x, unit),
+            column(jnp.max),
+            column(jnp.mean),
+            in_unit(state.agreement, _rms(state.agreement)),
+            jnp.log(asked),
+            divide(sensitivity, jnp.broadcast_to(jnp.max(sensitivity), x.shape)),
+        ]
+        layers = jax.tree.map(lambda part: part[number], self.layers)
+        new = ahead * 2 * jax.nn.sigmoid(_weighed(layers, jnp.stack(seen, -1)))
+        residual = divide(norm(new - x), norm(new))
+        return LucyState(new, sensitivity, momentum), divergence(image, expected), residual
+
+    def estimate(self, state: State) -> Float[Array, "..."]:
+        return state.lucy.x
+
+    @staticmethod
+    def pretrained() -> "Unrolled":
+        """The networks that come with the package; their model card says how they were made."""
+        return weights.shipped("unrolled", _skeleton)
+
+
+def write_unrolled(path: str | os.PathLike[str], networks: Unrolled) -> None:
+    """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
+    about = {"first": networks.first, "networks": networks.power.size, "width": networks.layers[0].bias.shape[-1]}
+    weights.write_weights(path, networks, about)
+
+
+def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:
+    """The networks in a file of `write_unrolled`, in float32. Nothing in the file is ever executed.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or holds no such networks, or not their arrays, finite.
+    """
+    return weights.read_weights(path, _skeleton)
+
+
+def _skeleton(first: int, networks: int, width: int) -> Unrolled:
+    """The shapes of the networks, checked: what a file says decides how much memory is asked for."""
+    whole = lambda n, least, most: type(n) is int and least <= n <= most
+    if not (whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(width, 1, _MOST_WIDTH)):
+        raise ValueError("its number of steps or its width is out of range")
+    return eqx.filter_eval_shape(lambda key: untrained(first, networks, width, key=key), jax.random.key(0))
+
+
+def untrained(first: int = 15, networks: int = 3, width: int = 16, *, key: PRNGKeyArray) -> Unrolled:
+    """Networks before their training: they leave nearly every voxel as it is."""
+    widths = (_SEEN, *(len(_SIDES) - 1) * (width,), 1)
+    layers = []
+    for one, side, seen, made in zip(jax.random.split(key, len(_SIDES)), _SIDES, widths[:-1], widths[1:], strict=True):
+        # He's normal distribution. As many planes are seen as rows.
+        weight = jax.random.normal(one, (networks, side, side, side * seen, made)) * (2 / (side**3 * seen)) ** 0.5
+        layers.append(Layer(weight.astype(jnp.float32), jnp.zeros((networks, made), jnp.float32)))
+    layers[-1] = eqx.tree_at(lambda layer: layer.weight, layers[-1], 0.1 * layers[-1].weight)
+    return Unrolled(tuple(layers), jnp.full(networks, 1.3, jnp.float32), first, first + networks)
+
+
+def _rms(x):
+    return safe_sqrt(jnp.mean(x**2))
+
+
+def _weighed(layers, seen: Float[Array, "depth y x channel"]) -> Float[Array, "depth y x"]:
+    """What the network of one step says of each voxel; beyond the volume it sees zeros."""
+    depths, rows, columns, channels = seen.shape
+    bands = -(-rows // _ROWS)
+    tall = -(-rows // bands)
+    wide = jnp.pad(seen, [(0, 0), (_MARGIN, bands * tall - rows + _MARGIN), (_MARGIN, _MARGIN), (0, 0)])
+    shape = (depths, tall + 2 * _MARGIN, columns + 2 * _MARGIN, channels)
+    network = lambda first: _network(layers, lax.dynamic_slice(wide, (0, first, 0, 0), shape))
+    found = lax.map(network, jnp.arange(bands) * tall)
+    return jnp.moveaxis(found, 0, 1).reshape(depths, bands * tall, columns)[:, :rows]
+
+
+def _network(layers, x):
+    for layer in layers:
+        if layer is not layers[0]:
+            x = jax.nn.relu(x)
+        x = _convolved(x, layer.weight.astype(x.dtype)) + layer.bias.astype(x.dtype)[None, None, None]
+    return x[..., 0]
+
+
+def _convolved(x, weight):
+    """Sums of products of matrices: within loops XLA's convolutions take five times as long on processors."""
+    side, _, seen, made = weight.shape
+    ends = side // 2
+    depths, rows, columns = x.shape[0], x.shape[1] - 2 * ends, x.shape[2] - 2 * ends
+    planes = jnp.pad(x, [(ends, ends), (0, 0), (0, 0), (0, 0)])
+    beside = jnp.concatenate([planes[first : first + depths] for first in range(side)], -1)
+    total = jnp.zeros((depths * rows * columns, made), x.dtype)
+    for row, column in np.ndindex(side, side):
+        total = total + beside[:, row : row + rows, column : column + columns].reshape(-1, seen) @ weight[row, column]
+    return total.reshape(depths, rows, columns, made)

@@ -1,0 +1,128 @@
+"""Unrolled inversion: the networks between the steps, their training, and the check by imaging again."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
+from gs_jax.projection.points import full_image_of_points
+from gs_jax.reconstruction.pipeline import System
+from gs_jax.reconstruction.reprojection import reproject
+from gs_jax.solvers import unrolled
+from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
+from gs_jax.training.examples import SCENES, Kind, example
+from gs_jax.training.loop import start, train
+from gs_jax.training.recipes import Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
+
+KEY = jax.random.key(0)
+TINY = Kind(64, 0.06, 0.25, 3, binning=4)
+
+
+def imager(pixels=(160, 160), pitch=0.03) -> Imager:
+    side = (np.argwhere(np.ones((3, 3))) - 1) * 1.3
+    centers = side + np.random.default_rng(0).uniform(-0.2, 0.2, side.shape)
+    return Imager(MicrolensArray(centers), Sensor(pixels, pitch), 5.75, 1.5)
+
+
+def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
+    """Chief rays through nine lenses, and the exact image of random voxels."""
+    scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
+    system = System(scope, grid, None, grid)
+    truth = jax.random.uniform(KEY, grid.volume_shape)
+    light = system.operator.mv(truth)
+    networks = networks or untrained(1, 2, 4, key=KEY)
+    start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
+    return networks, Case(np.asarray(light), system, np.asarray(truth), start)
+
+
+def test_a_bright_voxel_is_the_brightest():
+    scope, voxels = imager(), Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
+    place = voxels.to_mm(np.array([[1, 8, 13]]))
+    image = full_image_of_points(np.column_stack([place, [1e6]]), scope)
+    found = reconstruct(image, scope, voxels, untrained(key=KEY))
+    assert np.unravel_index(found.argmax(), found.shape) == (1, 8, 13)
+    assert np.isfinite(found).all() and found.min() >= 0
+
+
+def test_darkness_stays_dark_and_has_finite_gradients():
+    networks, case = small()
+    dark = case._replace(light=np.zeros_like(case.light), truth=np.zeros_like(case.truth))
+    assert not solve(case.system.operator, dark.light, networks).x.any()
+    gradient = jax.grad(lambda n: jnp.sum(solve(case.system.operator, dark.light, n).x))(networks)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_gradients_by_the_weights():
+    networks, case = small()
+    networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
+    check_grads(jax.jit(lambda n: unrolled_loss(n, case)), (networks,), 1, modes=["rev"], rtol=2e-3)
+
+
+def test_bands_leave_no_seams(monkeypatch):
+    layers = jax.tree.map(lambda part: part[0], untrained(key=KEY).layers)
+    seen = jax.random.normal(KEY, (3, 23, 17, 7))
+    whole = unrolled._weighed(layers, seen)
+    monkeypatch.setattr(unrolled, "_ROWS", 5)
+    np.testing.assert_allclose(unrolled._weighed(layers, seen), whole, rtol=1e-5, atol=1e-6)
+
+
+def test_no_more_steps_than_networks():
+    networks = untrained(1, 3, key=KEY)
+    assert networks.steps == 4
+    with pytest.raises(InputError, match="steps: found 5, allowed: 1 to 4"):
+        Unrolled(networks.layers, networks.power, 1, 5)
+    with pytest.raises(InputError, match="steps: found 0"):
+        Unrolled(networks.layers, networks.power, 1, 0)
+
+
+def test_weights_come_back(tmp_path):
+    made = untrained(3, 2, 4, key=KEY)
+    write_unrolled(tmp_path / "w.npz", made)
+    found = read_unrolled(tmp_path / "w.npz")
+    assert (found.first, found.steps) == (3, 5)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(made), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+    np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "width": 4}'))
+    for name in ("other", "missing"):
+        with pytest.raises(InputError, match=name):
+            read_unrolled(tmp_path / f"{name}.npz")
+
+
+def test_an_example_is_its_seed_and_number():
+    one, again, other = (example(0, number, TINY) for number in (0, 0, SCENES))
+    np.testing.assert_array_equal(one.image, again.image)
+    np.testing.assert_array_equal(one.truth, again.truth)
+    assert one.image.shape == (64, 64) and one.truth.shape == one.grid.volume_shape
+    assert not np.array_equal(one.imager.array.centers, other.imager.array.centers)
+    empty = example(0, 15, TINY)
+    assert not empty.truth.any() and empty.image.std() > 0
+
+
+@pytest.mark.slow
+def test_training_makes_it_better():
+    cases = unrolled_cases(4, 0, kind=TINY)
+    recipe = unrolled_recipe(cases)
+    state = train(recipe, start(recipe, steps=30, seed=0))
+    mean = lambda networks: np.mean([unrolled_loss(networks, case) for case in cases])
+    assert mean(state.network) < 0.9 * mean(recipe.network(jax.random.key(0)))
+
+
+def test_a_volume_imaged_again():
+    _, case = small()
+    scope, grid, light = case.system.imager, case.system.grid, case.light
+    same = reproject(3 * case.truth, light, scope, grid, optics=None)
+    # The image's darkest percent counts as the camera's offset.
+    assert same.error < 0.05 and same.correlation == pytest.approx(1, abs=1e-6)
+    assert same.regions.shape == (16, 16) and (same.regions >= 0).all()
+    nothing = reproject(0 * case.truth, light, scope, grid, optics=None)
+    assert nothing.error == pytest.approx(1) and nothing.correlation == 0
+    wrong = reproject(case.truth[::-1], light, scope, grid, optics=None)
+    assert same.error < wrong.error < nothing.error
+
+
+def test_the_networks_of_the_package():
+    """They are what the recipe makes."""
+    found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
+    assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == found.first + 3
