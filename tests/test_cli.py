@@ -229,7 +229,14 @@ WRONG_ARGUMENTS = [
     ),
     ((*RECONSTRUCT, "-o", "v.tif", "--method", "admm", "--suppress", "unet"), "--suppress unet: found --method admm"),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "cluster"), "'cluster' is not one of 'none', 'points', 'clusters'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--weights", "w.npz"), "--weights: found --suppress none, allowed: --suppress unet"),
+    (
+        (*RECONSTRUCT, "-o", "v.tif", "--weights", "w.npz"),
+        "--weights: found --method backproject and --suppress none, allowed: --method unrolled or --suppress unet",
+    ),
+    (
+        (*RECONSTRUCT, "-o", "v.tif", "--optics", "near", "--suppress", "points"),
+        "--optics near: found --suppress points, allowed: full",
+    ),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "missing.npz"), "missing.npz"),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "design.toml"), "design.toml: not a whole"),
     ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "p.txt: found the suffix"),

@@ -35,7 +35,7 @@ def random_scene(shape: tuple[int, int], rng: np.random.Generator) -> Float32[np
 
 
 def on_sheet(page: Float32[np.ndarray, "y x"], rng: np.random.Generator) -> Float32[np.ndarray, "plane y x"]:
-    """A page that crosses all planes, straight or curved, in some direction; its parts are in the two nearest."""
+    """A page that crosses the planes, straight or curved, in some direction; its parts are in the two nearest."""
     turn, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1) * (rng.random() < 0.5)
     place = np.linspace(-1, 1, len(page), dtype=np.float32)
     along = (np.cos(turn) * place + np.sin(turn) * place[:, None]) / (abs(np.cos(turn)) + abs(np.sin(turn)))
