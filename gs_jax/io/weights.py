@@ -5,7 +5,6 @@ import os
 import zipfile
 from collections.abc import Callable
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -65,4 +64,4 @@ def read_weights(path: str | os.PathLike[str], skeleton: Callable[..., PyTree]) 
 def shipped(name: str, skeleton: Callable[..., PyTree]) -> PyTree:
     """A network that comes with the package."""
     with resources.as_file(resources.files("gs_jax") / "weights" / f"{name}.npz") as path:
-        return read_weights(Path(path), skeleton)
+        return read_weights(path, skeleton)

@@ -127,8 +127,7 @@ def reconstruct(
     seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
     if isinstance(method, BackProjection):
         return _back_projected(image, imager, seen, method, progress)
-    light = above_offset(np.asarray(image, imager.sensor_distance.dtype))
-    light, imager, background, optics = explained(light, imager, grid, optics, progress)
+    light, imager, background, optics = explainable(image, imager, grid, optics, progress)
     if isinstance(method, ListRichardsonLucy):
         return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen))
     if isinstance(method, RichardsonLucy):
@@ -141,13 +140,14 @@ def reconstruct(
     return _iterated(method, progress, np.asarray(system.fast(light), light.dtype), system)
 
 
-def explained(
-    light: Float[np.ndarray, "row column"], imager: Imager, grid: Grid, optics: Optics | str, progress: Progress
+def explainable(
+    image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, optics: Optics | str, progress: Progress
 ) -> tuple[Float[np.ndarray, "row column"], Imager, Float[np.ndarray, "row column"] | float, Optics]:
-    """What iterative methods are to explain: the light, its microscope, the background in it, and the optics.
+    """What iterative methods are to explain: light above the offset, its microscope, background in it, and the optics.
 
     With optics by name, pixels are as wide as voxels, and what optics other than "full" do not hold is background.
     """
+    light = above_offset(np.asarray(image, imager.sensor_distance.dtype))
     if not isinstance(optics, str):
         return light, imager, 0.0, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics
     light, imager = _binned(light, imager, grid)

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..base.progress import Progress
-from ..base.safe import divide
 from ..geometry import Grid, Imager
 from ..projection.forward_model import Optics, forward
-from .pipeline import above_offset, explained
+from .pipeline import explainable
 
 # Squares along a side of the sensor, unless it has fewer pixels.
 REGIONS = 16
@@ -56,22 +55,20 @@ def reproject(
     image, imager, grid, optics, progress
         As for `reconstruct`.
     """
-    light = above_offset(np.asarray(image, imager.sensor_distance.dtype))
-    light, imager, background, optics = explained(light, imager, grid, optics, progress or Progress())
-    light = jnp.asarray(light - background)
-    return Reprojection(*_compared(jnp.asarray(volume, light.dtype), light, imager, grid, optics))
+    light, imager, background, optics = explainable(image, imager, grid, optics, progress or Progress())
+    model = forward(jnp.asarray(volume, light.dtype), imager, grid, optics)
+    return _compared(np.asarray(model, np.float64), np.asarray(light - background, np.float64))
 
 
-def _compared(volume, light, imager, grid, optics):
-    model = forward(volume, imager, grid, optics)
-    # Scaled by hand: squares of a capture's counts times a volume's leave half of float32's range.
-    model = divide(model, jnp.broadcast_to(jnp.max(jnp.abs(model)), model.shape))
-    left = light - divide(jnp.vdot(model, light), jnp.vdot(model, model)) * model
-    whole = jnp.sqrt(jnp.mean(light**2))
-    centred = [part - jnp.mean(part) for part in (model, light)]
-    correlation = divide(jnp.vdot(*centred), jnp.linalg.norm(centred[0]) * jnp.linalg.norm(centred[1]))
-    error = float(divide(jnp.sqrt(jnp.mean(left**2)), whole))
-    return error, float(correlation), _rms_of_regions(np.asarray(left)) / max(float(whole), 1e-30)
+def _compared(model, light):
+    energy, whole = np.vdot(model, model), np.sqrt(np.mean(light**2))
+    left = light - (np.vdot(model, light) / energy if energy > 0 else 0) * model
+    spread = model.std() * light.std()
+    correlation = np.mean((model - model.mean()) * (light - light.mean())) / spread if spread > 0 else 0.0
+    # A dark capture is explained by anything.
+    regions = _rms_of_regions(left) / (whole if whole > 0 else 1)
+    error = np.sqrt(np.mean(left**2)) / whole if whole > 0 else 0.0
+    return Reprojection(float(error), float(correlation), regions)
 
 
 def _rms_of_regions(image):

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
 from ..base.errors import InputError
-from ..base.safe import divide, safe_sqrt
+from ..base.safe import divide
 from ..io import weights
 from .iteration import as_image, check_options, norm
 from .richardson_lucy import RichardsonLucy, State as LucyState, divergence
@@ -184,7 +184,7 @@ def untrained(first: int = 15, networks: int = 3, width: int = 16, *, key: PRNGK
 
 
 def _rms(x):
-    return safe_sqrt(jnp.mean(x**2))
+    return norm(x) / x.size**0.5
 
 
 def _weighed(layers, seen: Float[Array, "depth y x channel"]) -> Float[Array, "depth y x"]:
