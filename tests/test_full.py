@@ -144,6 +144,15 @@ def test_zones_are_the_lenses_apertures():
     assert (alone.open == 1).all() and (alone.by_area == 0).all()
 
 
+def test_tables_are_kept_for_the_same_microscope():
+    scope = imager(pixels=(24, 24), pitch=0.2)
+    first = full_optics(scope, [20.0])
+    assert full_optics(imager(pixels=(24, 24), pitch=0.2), [20.0]) is first
+    farther = eqx.tree_at(lambda i: i.sensor_distance, scope, scope.sensor_distance + 1e-6)
+    for other in (full_optics(scope, [20.1]), full_optics(farther, [20.0]), full_optics(scope, [20.0], extent=2.0)):
+        assert other is not first
+
+
 def test_rings_add_up_to_the_falloff():
     scope = imager()
     rings = ring_edges(scope)

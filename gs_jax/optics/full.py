@@ -107,8 +107,8 @@ def full_optics(
     """
     depths = np.asarray(depths, np.float64)
     leaves, structure = jax.tree.flatten(imager)
-    same = structure, *(np.asarray(leaf).tobytes() for leaf in leaves), depths.tobytes(), extent, nodes
-    return _tables(_Wanted(same, imager, depths, extent, nodes, progress))
+    same = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
+    return _tables(_Wanted(same, nodes or halo_nodes(imager, depths, extent=extent), imager, depths, progress))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,18 +116,16 @@ class _Wanted:
     """What tables are asked for; equal if the tables are."""
 
     same: tuple
+    grid: HaloGrid
     imager: Imager = dataclasses.field(compare=False)
     depths: Float64[np.ndarray, " depth"] = dataclasses.field(compare=False)
-    extent: float | None = dataclasses.field(compare=False)
-    nodes: HaloGrid | None = dataclasses.field(compare=False)
     progress: Progress | None = dataclasses.field(compare=False)
 
 
 # Capture after capture of a microscope has the same tables; these are kept, some 80 MiB each at full scale.
 @lru_cache(maxsize=2)
 def _tables(wanted):
-    imager, depths, progress = wanted.imager, wanted.depths, wanted.progress
-    grid = wanted.nodes or halo_nodes(imager, depths, extent=wanted.extent)
+    imager, depths, grid, progress = wanted.imager, wanted.depths, wanted.grid, wanted.progress
     cores = core_tables(imager, depths, CORE_REACH * grid.pixel, progress=progress)
     halo = halo_of(imager, depths, grid, cores, progress=progress)
     size = kernel_size(imager, halo)
