@@ -17,7 +17,7 @@ from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.iteration import least_weight_of_darkness, solve
-from gs_jax.solvers.richardson_lucy import RichardsonLucy
+from gs_jax.solvers.richardson_lucy import RichardsonLucy, climbed, of_tents
 
 from .helpers import scene
 
@@ -268,6 +268,26 @@ def test_richardson_lucy_with_background_acceleration_and_total_variation():
     assert variation(smooth) < 0.97 * variation(rough)
 
 
+def test_richardson_lucy_fits_a_slow_background():
+    A = forward_operator(*small())
+    truth = light(A)
+    shape = A.out_structure().shape
+    slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
+    jitted = cache(lambda slow: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, slow=slow))))
+    error = lambda image, slow: float(jnp.linalg.norm(jitted(slow)(image).x - truth) / jnp.linalg.norm(truth))
+    assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
+    assert error(A.mv(truth), 3) < 0.1
+    assert not jitted(3)(jnp.zeros(shape)).x.any()
+
+
+def test_tents_are_climbed_where_there_are_fewer_pixels():
+    image = jnp.ones((3, 40))
+    slow = jnp.ones((8, 8))
+    np.testing.assert_allclose(of_tents(slow, image), 1, rtol=1e-12)
+    found = np.asarray(climbed(slow, 2 * image))
+    assert np.isfinite(found).all() and set(np.round(np.unique(found), 9)) == {0.0, 2.0}
+
+
 def test_richardson_lucy_climbs_and_keeps_the_light():
     A = dense()
     image = A.mv(light(A)) * jax.random.uniform(jax.random.key(6), (30,), minval=0.8, maxval=1.2)
@@ -294,3 +314,7 @@ def test_wrong_arguments_are_named(solver):
         SOLVERS[solver](tolerance=-1.0)
     with pytest.raises(InputError, match="sparsity: found nan, allowed: 0 or more"):
         ADMM(sparsity=float("nan"))
+    with pytest.raises(InputError, match="slow: found 1, allowed: 0, or 2 and more"):
+        RichardsonLucy(slow=1)
+    with pytest.raises(InputError, match="slow: found 2 and an image of 1 dimensions, allowed: of 2"):
+        solve(dense(), jnp.zeros(30), RichardsonLucy(slow=2))

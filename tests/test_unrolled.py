@@ -14,7 +14,7 @@ from gs_jax.solvers import unrolled
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
 from gs_jax.training.examples import SCENES, Kind, example
 from gs_jax.training.loop import start, train
-from gs_jax.training.recipes import Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
+from gs_jax.training.recipes import Case, unrolled_cases, unrolled_loss, unrolled_recipe
 
 KEY = jax.random.key(0)
 TINY = Kind(64, 0.06, 0.25, 3, binning=4)
@@ -32,7 +32,7 @@ def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     system = System(scope, grid, None, grid)
     truth = jax.random.uniform(KEY, grid.volume_shape)
     light = system.operator.mv(truth)
-    networks = networks or untrained(1, 2, 4, key=KEY)
+    networks = networks or untrained(1, 2, 1, 4, key=KEY)
     start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
     return networks, Case(np.asarray(light), system, np.asarray(truth), start)
 
@@ -69,22 +69,22 @@ def test_bands_leave_no_seams(monkeypatch):
 
 
 def test_no_more_steps_than_networks():
-    networks = untrained(1, 3, key=KEY)
-    assert networks.steps == 4
-    with pytest.raises(InputError, match="steps: found 5, allowed: 1 to 4"):
-        Unrolled(networks.layers, networks.power, 1, 5)
+    networks = untrained(1, 3, 2, key=KEY)
+    assert networks.steps == 6
+    with pytest.raises(InputError, match="steps: found 7, allowed: 1 to 6"):
+        Unrolled(networks.layers, networks.power, 1, 2, 7)
     with pytest.raises(InputError, match="steps: found 0"):
-        Unrolled(networks.layers, networks.power, 1, 0)
+        Unrolled(networks.layers, networks.power, 1, 2, 0)
 
 
 def test_weights_come_back(tmp_path):
-    made = untrained(3, 2, 4, key=KEY)
+    made = untrained(3, 2, 1, 4, key=KEY)
     write_unrolled(tmp_path / "w.npz", made)
     found = read_unrolled(tmp_path / "w.npz")
-    assert (found.first, found.steps) == (3, 5)
+    assert (found.first, found.last, found.steps) == (3, 1, 6)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(made), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
-    np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "width": 4}'))
+    np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "last": 1, "width": 4}'))
     for name in ("other", "missing"):
         with pytest.raises(InputError, match=name):
             read_unrolled(tmp_path / f"{name}.npz")
@@ -124,5 +124,5 @@ def test_a_volume_imaged_again():
 
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
-    found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
-    assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == found.first + 3
+    found, made = Unrolled.pretrained(), untrained(key=KEY)
+    assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 30

@@ -57,6 +57,9 @@ from .options import UM, Depths, Number, depth_range
     "--sparsity", type=Number(least=0.0, most=1.0, unit=""), help="Weight of the sum of voxels (fista, admm)."
 )
 @click.option(
+    "--stop-at-noise", is_flag=True, help="End before the last step where all but noise is explained (list-rl to admm)."
+)
+@click.option(
     "--suppress",
     type=click.Choice(["none", "points", "clusters", "unet"]),
     default="none",
@@ -80,6 +83,7 @@ def command(
     optics: str,
     tv: float | None,
     sparsity: float | None,
+    stop_at_noise: bool,
     suppress: str,
     weights: Path | None,
     output: Path,
@@ -99,6 +103,8 @@ def command(
     if weights and suppress != "unet" and method != "unrolled":
         found = f"--method {method} and --suppress {suppress}"
         raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
+    if stop_at_noise and method in ("backproject", "unrolled"):
+        raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
     chosen = read_unrolled(weights) if weights and method == "unrolled" else METHODS[method](steps)
     inversion = _with(chosen, method, tv=tv, sparsity=sparsity)
     network = read_weights(weights) if weights and suppress == "unet" else None
@@ -114,7 +120,9 @@ def command(
         if suppress == "points":
             volume = _volume_of_points(found, grid)
         else:
-            volume = volume_of(image, imager, grid, inversion, optics=optics, progress=progress)
+            volume = volume_of(
+                image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
+            )
         if suppress == "clusters":
             with progress.step("Clustering"):
                 found = find_clusters(volume, grid)

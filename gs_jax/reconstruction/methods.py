@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..base.errors import InputError
 from ..solvers.admm import ADMM
 from ..solvers.fista import FISTA
-from ..solvers.iteration import Solver, check_options
+from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
 
@@ -49,15 +49,19 @@ class ListRichardsonLucy(eqx.Module):
 
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
+    slow: int = eqx.field(static=True, default=0)
     accelerate: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        check_options(self)
+        self.solver()
 
     def solver(self, background: Float[np.ndarray, "row column"] | float = 0.0) -> RichardsonLucy:
         """The solver that does it, with a known background."""
-        return RichardsonLucy(self.steps, self.tolerance, background, accelerate=self.accelerate)
+        return RichardsonLucy(self.steps, self.tolerance, background, self.slow, self.accelerate)
 
+
+# Tents of the slow background along a side of the sensor, by default: wider than the halo of a spot.
+_SLOW = 8
 
 Method = BackProjection | ListRichardsonLucy | Solver
 
@@ -65,8 +69,8 @@ Method = BackProjection | ListRichardsonLucy | Solver
 # ADMM holds few conjugate gradients, as each starts from the last; unrolled steps are as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
-    "list-rl": lambda steps: ListRichardsonLucy(steps, accelerate=True),
-    "richardson-lucy": lambda steps: RichardsonLucy(steps, accelerate=True),
+    "list-rl": lambda steps: ListRichardsonLucy(steps, slow=_SLOW, accelerate=True),
+    "richardson-lucy": lambda steps: RichardsonLucy(steps, slow=_SLOW, accelerate=True),
     "fista": FISTA,
     "admm": lambda steps: ADMM(steps, cg_steps=3),
     "unrolled": lambda steps: Unrolled.pretrained(),

@@ -26,6 +26,7 @@ from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unmatched import Unmatched
 from ..solvers.unrolled import Unrolled
 from ..suppression.consistency import local_levels
+from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
@@ -80,6 +81,7 @@ def reconstruct(
     method: Method = BackProjection(),
     *,
     optics: Optics | str = "full",
+    stop_at_noise: bool = False,
     progress: Progress | None = None,
 ) -> Float32[np.ndarray, "depth y x"]:
     """The volume that an image shows.
@@ -103,6 +105,9 @@ def reconstruct(
     optics
         As for `forward`, or its name for `optics_of`. By name, "full" or "near", back-projection reads the bright cores
         of the spots; otherwise it follows the chief rays, as the paper does.
+    stop_at_noise
+        End before the last step where no more is left to explain than the image's own noise, by the discrepancy
+        principle; `BackProjection` and `Unrolled` do not.
     progress
         Shows how far it is; by default nothing does.
 
@@ -128,16 +133,19 @@ def reconstruct(
     if isinstance(method, BackProjection):
         return _back_projected(image, imager, seen, method, progress)
     light, imager, background, optics = explainable(image, imager, grid, optics, progress)
+    counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
+    enough = misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
     if isinstance(method, ListRichardsonLucy):
-        return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen))
+        return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen), enough)
     if isinstance(method, RichardsonLucy):
         method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
-        return _iterated(method, progress, light, System(imager, grid, optics))
+        return _iterated(method, progress, light, System(imager, grid, optics), enough)
     light = light - background
     if isinstance(method, Unrolled):
+        # Its steps were trained together.
         return _iterated(method, progress, light, System(imager, grid, optics, seen))
     system = System(imager, grid, optics, slow=_slow_waves(imager, optics) if by_name else 0)
-    return _iterated(method, progress, np.asarray(system.fast(light), light.dtype), system)
+    return _iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
 
 
 def explainable(
@@ -232,15 +240,15 @@ def _back_projected(image, imager, grid, method, progress):
     return volume
 
 
-def _iterated(solver, progress, light, system):
+def _iterated(solver, progress, light, system, enough=0.0):
     # How many steps and until when is decided here: other numbers need no other code.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, system)
     with progress.counter("Iterating", solver.steps) as advance:
         for _ in range(solver.steps):
-            state, residual = _step(state, compiled, light, system)
-            # To read the number waits for the step: what is shown has been done, and Ctrl-C ends it here.
-            if float(residual) < solver.tolerance:
+            state, cost, residual = _step(state, compiled, light, system)
+            # To read the numbers waits for the step: what is shown has been done, and Ctrl-C ends it here.
+            if float(residual) < solver.tolerance or float(cost) < enough:
                 break
             advance()
     return np.asarray(solver.estimate(state), np.float32)
@@ -253,5 +261,4 @@ def _start(solver, light, system):
 
 @partial(jax.jit, donate_argnums=0)
 def _step(state, solver, light, system):
-    state, _, residual = solver.step(system.operator, light, state)
-    return state, residual
+    return solver.step(system.operator, light, state)

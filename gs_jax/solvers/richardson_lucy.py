@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
+from ..base.errors import InputError
 from ..base.safe import Real, divide
 from .iteration import as_image, check_options, norm
 from .unmatched import Unmatched
@@ -22,14 +23,19 @@ from .variation import differences, differences_adjoint, magnitude
 _LEAST_DENOMINATOR = 0.1
 # In units of the type's precision, relative to the largest sensitivity.
 _ROUNDING = 100
+# Part of the light that a slow background has at first: the voxels may explain it before the background does.
+_SLOW_START = 0.02
 
 
 class State(NamedTuple):
-    """Of `RichardsonLucy`: the estimate, `A'1`, and where it accelerates the last estimate, product and gain."""
+    """Of `RichardsonLucy`: the estimate, `A'1`, and where it accelerates the last estimate, product and gain; and the
+    slow background's tents, if it has one.
+    """
 
     x: Array
     sensitivity: Array
     momentum: tuple[Array, Array, Array] | None
+    slow: Float[Array, "tent tent"] | None = None
 
 
 class RichardsonLucy(eqx.Module):
@@ -45,6 +51,9 @@ class RichardsonLucy(eqx.Module):
         As for `Solver`; the residual is the relative change of `x`.
     background
         Light that comes from no voxel: a number or an image.
+    slow
+        So many tents along rows, and along columns, are a background that is fitted, too, to images of two dimensions:
+        light that varies slowly and comes from no voxel. 0 is none.
     accelerate
         Extrapolate along the last change before each step, by the ratio of the last two steps' products (Biggs and
         Andrews, Appl. Opt. 36, 1766, 1997): many times fewer steps, not monotone.
@@ -55,51 +64,87 @@ class RichardsonLucy(eqx.Module):
     Raises
     ------
     InputError
-        If an option is negative, or a number of steps 0.
+        If an option is negative, or a number of steps 0, or a single tent is slow.
     """
 
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
     background: Real | Float[Array, "..."] = 0.0
+    slow: int = eqx.field(static=True, default=0)
     accelerate: bool = eqx.field(static=True, default=False)
     tv: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         check_options(self)
+        if self.slow == 1 or self.slow < 0:
+            raise InputError(f"slow: found {self.slow}, allowed: 0, or 2 and more.")
 
     def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
+        if self.slow and image.ndim != 2:
+            raise InputError(f"slow: found {self.slow} and an image of {image.ndim} dimensions, allowed: of 2.")
         sensitivity = without_rounding(A.T.mv(jnp.ones_like(image)))
         # The scale of the start does not matter without a background; this one has the image's light.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
         momentum = (x, jnp.zeros_like(x), jnp.zeros((), x.dtype)) if self.accelerate else None
-        return State(x, sensitivity, momentum)
+        slow = jnp.full((self.slow, self.slow), _SLOW_START * jnp.mean(image)) if self.slow else None
+        return State(x, sensitivity, momentum, slow)
 
     def step(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
-        x, sensitivity, momentum = state
+        x, sensitivity, momentum, slow = state
         point = _ahead(x, momentum) if momentum else x
-        expected = A.mv(point) + jnp.asarray(self.background, image.dtype)
+        expected = jnp.maximum(A.mv(point) + jnp.asarray(self.background, image.dtype) + of_tents(slow, image), 0)
         # An FFT's rounding must not turn a dark pixel into a huge ratio.
         ratio = divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
         scale = sensitivity * _hold(point, self.tv) if self.tv else sensitivity
         new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
         momentum = momentum and (x, new - point, _gain(new - point, momentum[1]))
         residual = divide(norm(new - x), norm(new))
-        return State(new, sensitivity, momentum), divergence(image, expected), residual
+        return State(new, sensitivity, momentum, climbed(slow, ratio)), divergence(image, expected), residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
 
 
+def of_tents(slow: Float[Array, "tent tent"] | None, image: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A slow background of the image's shape, linear between the tents; 0 if there is none."""
+    if slow is None:
+        return jnp.zeros((), image.dtype)
+    rows, columns = (_tents(n, len(slow), slow.dtype) for n in image.shape)
+    return rows @ slow @ columns.T
+
+
+def climbed(slow: Float[Array, "tent tent"] | None, ratio: Float[Array, "..."]) -> Float[Array, "tent tent"] | None:
+    """The step of Richardson-Lucy of a slow background: each tent by the mean ratio under it."""
+    if slow is None:
+        return None
+    rows, columns = (_tents(n, len(slow), slow.dtype) for n in ratio.shape)
+    # A sensor may have fewer pixels than tents.
+    return divide(slow * (rows.T @ ratio @ columns), jnp.outer(rows.sum(0), columns.sum(0)))
+
+
+def _tents(size, count, dtype):
+    """Each is 1 in its place, 0 in the others', and all add up to 1: `(size, count)`."""
+    place = np.linspace(0, count - 1, size)
+    return jnp.asarray(np.maximum(1 - np.abs(place[:, None] - np.arange(count)), 0), dtype)
+
+
 def divergence(image: Float[Array, "*shape"], expected: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Kullback-Leibler divergence of counts `b` from what was expected, `sum(e - b + b log(b / e))`."""
+    """Kullback-Leibler divergence of counts `b` from what was expected, `sum(e - b + b log(b / e))`.
+
+    Where nothing is expected it leaves counts out, which no estimate explains.
+    """
     both = (image > 0) & (expected > 0)
-    log = jnp.log(jnp.where(both, image, 1) / jnp.where(both, expected, 1))
-    return jnp.sum(expected - image + jnp.where(both, image * log, 0))
+    counts, likely = jnp.where(both, image, 1), jnp.where(both, expected, 1)
+    # Where they are nearly equal, the logarithm of their ratio would leave nothing but rounding.
+    relative = (likely - counts) / counts
+    near = jnp.abs(relative) < 0.5
+    log = jnp.where(near, jnp.log1p(jnp.where(near, relative, 0)), jnp.log(likely / counts))
+    return jnp.sum(jnp.where(expected > 0, expected - image, 0) - jnp.where(both, image * log, 0))
 
 
 def _ahead(x, momentum):

@@ -1,9 +1,9 @@
 """Unrolled inversion: an iterative solver, whose last steps have small networks between them, trained together.
 
 What a capture says of a volume is in the operators of its own microscope, which the networks do not hold: they are the
-same for every layout of lenses. The first steps are those of accelerated list-Richardson-Lucy. In each of the others
-its step is taken to a power that was learned, and a network then weighs each voxel by what it and its neighbours look
-like.
+same for every layout of lenses. The first steps are those of accelerated list-Richardson-Lucy. In each of the next its
+step is taken to a power that was learned, and a network then weighs each voxel by what it and its neighbours look like.
+The last have no networks again: in the voxels that were left, the capture says how bright they are.
 """
 
 import os
@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..base.safe import divide
 from ..io import weights
 from .iteration import as_image, check_options, norm
-from .richardson_lucy import RichardsonLucy, State as LucyState, divergence
+from .richardson_lucy import RichardsonLucy, State as LucyState, climbed, divergence, of_tents
 from .unmatched import Unmatched
 
 # Channels that a network sees: the voxel after the step and before it, the largest and the mean over its column, how
@@ -37,7 +37,8 @@ _MOST = 20.0
 # Rows of voxels at a time, which bounds the memory: what a network sees does not depend on them.
 _ROWS = 128
 _MOST_STEPS, _MOST_WIDTH = 64, 1024
-_LUCY = RichardsonLucy(accelerate=True)
+# With a background as slow as in the other methods' defaults.
+_LUCY = RichardsonLucy(slow=8, accelerate=True)
 
 
 class Layer(eqx.Module):
@@ -60,7 +61,8 @@ class Unrolled(eqx.Module):
 
     `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
     power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
-    accelerated Richardson-Lucy with `A` and `B`. A dark image gives zeros.
+    accelerated Richardson-Lucy with `A` and `B`, and after it the last, where `w = p = 1`. All fit a slow background,
+    too. A dark image gives zeros.
 
     Parameters
     ----------
@@ -68,10 +70,10 @@ class Unrolled(eqx.Module):
         Of the networks.
     power
         One for each step with a network.
-    first
-        Steps without.
+    first, last
+        Steps without, before and after those.
     steps, tolerance
-        As for `Solver`; there are `first` steps and as many more as there are networks, or fewer.
+        As for `Solver`; `first`, one for each network, and `last`, or fewer.
 
     Raises
     ------
@@ -82,13 +84,14 @@ class Unrolled(eqx.Module):
     layers: tuple[Layer, ...]
     power: Float[Array, " step"]
     first: int = eqx.field(static=True)
+    last: int = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         check_options(self)
         # Where modules are made of shapes or of nothing, there is nothing to check.
-        if isinstance(self.power, jax.Array) and self.steps > (most := self.first + self.power.size):
+        if isinstance(self.power, jax.Array) and self.steps > (most := self.first + self.power.size + self.last):
             raise InputError(
                 f"steps: found {self.steps}, allowed: 1 to {most}, {self.power.size} of them with networks."
             )
@@ -106,19 +109,21 @@ class Unrolled(eqx.Module):
         self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
-        plain = lambda lucy: _LUCY.step(A, image, lucy)
-        learned = lambda lucy: self.learned(A, image, state._replace(lucy=lucy))
-        lucy, cost, residual = lax.cond(state.number < self.first, plain, learned, state.lucy)
+        kinds = (
+            lambda lucy: _LUCY.step(A, image, lucy),
+            lambda lucy: self.learned(A, image, state._replace(lucy=lucy)),
+            lambda lucy: self.plain(A, image, lucy),
+        )
+        ended = jnp.array([self.first, self.first + self.power.size], jnp.int32)
+        lucy, cost, residual = lax.switch(jnp.sum(state.number >= ended), kinds, state.lucy)
         return State(lucy, state.agreement, state.number + 1), cost, residual
 
     def learned(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], state: State
     ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
         """A step with a network: the new estimate, the cost of the old one, and the relative change."""
-        (x, sensitivity, momentum), number = state.lucy, state.number - self.first
-        expected = jnp.maximum(A.mv(x), 0)
-        ratio = divide(image, expected + _FAINT * jnp.mean(image))
-        asked = jnp.clip(divide(A.T.mv(ratio), sensitivity), 1 / _MOST, _MOST)
+        (x, sensitivity, *_), number = state.lucy, state.number - self.first
+        expected, slow, asked = _asked(A, image, state.lucy)
         ahead = x * asked ** self.power[number].astype(x.dtype)
         unit = _rms(ahead)
         in_unit = lambda volume, unit: jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
@@ -134,8 +139,14 @@ class Unrolled(eqx.Module):
         ]
         layers = jax.tree.map(lambda part: part[number], self.layers)
         new = ahead * 2 * jax.nn.sigmoid(_weighed(layers, jnp.stack(seen, -1)))
-        residual = divide(norm(new - x), norm(new))
-        return LucyState(new, sensitivity, momentum), divergence(image, expected), residual
+        return _moved(state.lucy, new, slow, divergence(image, expected))
+
+    def plain(
+        self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], lucy: LucyState
+    ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
+        """A step after the networks: as `learned`."""
+        expected, slow, asked = _asked(A, image, lucy)
+        return _moved(lucy, lucy.x * asked, slow, divergence(image, expected))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.lucy.x
@@ -148,7 +159,8 @@ class Unrolled(eqx.Module):
 
 def write_unrolled(path: str | os.PathLike[str], networks: Unrolled) -> None:
     """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
-    about = {"first": networks.first, "networks": networks.power.size, "width": networks.layers[0].bias.shape[-1]}
+    width = networks.layers[0].bias.shape[-1]
+    about = {"first": networks.first, "networks": networks.power.size, "last": networks.last, "width": width}
     weights.write_weights(path, networks, about)
 
 
@@ -163,15 +175,16 @@ def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:
     return weights.read_weights(path, _skeleton)
 
 
-def _skeleton(first: int, networks: int, width: int) -> Unrolled:
+def _skeleton(first: int, networks: int, last: int, width: int) -> Unrolled:
     """The shapes of the networks, checked: what a file says decides how much memory is asked for."""
     whole = lambda n, least, most: type(n) is int and least <= n <= most
-    if not (whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(width, 1, _MOST_WIDTH)):
+    steps = whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(last, 0, _MOST_STEPS)
+    if not (steps and whole(width, 1, _MOST_WIDTH)):
         raise ValueError("its number of steps or its width is out of range")
-    return eqx.filter_eval_shape(lambda key: untrained(first, networks, width, key=key), jax.random.key(0))
+    return eqx.filter_eval_shape(lambda key: untrained(first, networks, last, width, key=key), jax.random.key(0))
 
 
-def untrained(first: int = 15, networks: int = 3, width: int = 16, *, key: PRNGKeyArray) -> Unrolled:
+def untrained(first: int = 25, networks: int = 3, last: int = 2, width: int = 24, *, key: PRNGKeyArray) -> Unrolled:
     """Networks before their training: they leave nearly every voxel as it is."""
     widths = (_SEEN, *(len(_SIDES) - 1) * (width,), 1)
     layers = []
@@ -180,7 +193,19 @@ def untrained(first: int = 15, networks: int = 3, width: int = 16, *, key: PRNGK
         weight = jax.random.normal(one, (networks, side, side, side * seen, made)) * (2 / (side**3 * seen)) ** 0.5
         layers.append(Layer(weight.astype(jnp.float32), jnp.zeros((networks, made), jnp.float32)))
     layers[-1] = eqx.tree_at(lambda layer: layer.weight, layers[-1], 0.1 * layers[-1].weight)
-    return Unrolled(tuple(layers), jnp.full(networks, 1.3, jnp.float32), first, first + networks)
+    return Unrolled(tuple(layers), jnp.full(networks, 1.3, jnp.float32), first, last, first + networks + last)
+
+
+def _asked(A, image, lucy: LucyState):
+    """The image of an estimate and its background, the next background, and the factors of Richardson-Lucy's step."""
+    expected = jnp.maximum(A.mv(lucy.x) + of_tents(lucy.slow, image), 0)
+    ratio = divide(image, expected + _FAINT * jnp.mean(image))
+    asked = jnp.clip(divide(A.T.mv(ratio), lucy.sensitivity), 1 / _MOST, _MOST)
+    return expected, climbed(lucy.slow, ratio), asked
+
+
+def _moved(lucy: LucyState, new, slow, cost):
+    return lucy._replace(x=new, slow=slow), cost, divide(norm(new - lucy.x), norm(new))
 
 
 def _rms(x):

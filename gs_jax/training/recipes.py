@@ -1,6 +1,5 @@
 """How the networks that come with the package are trained: the paper's, the one of seven slices, and the unrolled."""
 
-import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -25,8 +24,6 @@ from .slices import Batch, Stack, paper_batch, patches
 UNROLLED = Kind(288, 0.018, 0.064, 7, binning=4)
 # Of an empty scene errors are relative to this much of the start's squares.
 _OF_THE_START = 0.2
-# Steps before the networks, once they are trained.
-_FIRST = 25
 
 
 class Case(NamedTuple):
@@ -65,22 +62,15 @@ def unrolled_loss(network: Unrolled, case: Case) -> Float[Array, ""]:
     """Squared error of the volume, relative to what it should be, and to a part of what the networks started from."""
     truth, light, operator = jnp.asarray(case.truth), jnp.asarray(case.light), case.system.operator
 
-    def step(state, _):
+    def learned(state, _):
         lucy, cost, _ = network.learned(operator, light, state)
         return State(lucy, state.agreement, state.number + 1), cost
 
-    found = network.estimate(lax.scan(step, case.start, length=network.power.size)[0])
+    plain = lambda lucy, _: network.plain(operator, light, lucy)[:2]
+    state = lax.scan(learned, case.start, length=network.power.size)[0]
+    found = lax.scan(plain, state.lucy, length=network.last)[0].x
     start = network.estimate(case.start)
     return jnp.mean((found - truth) ** 2) / (jnp.mean(truth**2) + _OF_THE_START * jnp.mean(start**2))
-
-
-def finished(network: Unrolled) -> Unrolled:
-    """Trained networks as they are used: whole captures need more steps before them than the small ones of training.
-
-    On ray-traced letters 25 give 30.5 dB, the 15 of training 29.8.
-    """
-    more = _FIRST - network.first
-    return dataclasses.replace(network, first=_FIRST, steps=network.steps + more)
 
 
 def unrolled_cases(count: int, seed: int, progress: Progress | None = None, kind: Kind = UNROLLED) -> list[Case]:
