@@ -80,6 +80,9 @@ def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
 def _scores(found, truth, expected, grid) -> dict:
     score = localization(found, truth)
     stack = quality(np.asarray(rasterize(found, grid)), expected)
+    a, b = found[score.pairs[:, 0]], truth[score.pairs[:, 1]]
+    ratio = a[:, 3] / b[:, 3]
+    paired = len(ratio) > 0
     return {
         "found": len(found),
         "precision": score.precision,
@@ -87,6 +90,9 @@ def _scores(found, truth, expected, grid) -> dict:
         "f1": score.f1,
         "lateral_rmse_um": 1000 * score.lateral_rmse,
         "axial_rmse_um": 1000 * score.axial_rmse,
+        "axial_bias_um": 1000 * float((a[:, 2] - b[:, 2]).mean()) if paired else None,
+        # Of the ratio of intensities, in parts of its mean.
+        "intensity_sd": float(ratio.std() / ratio.mean()) if paired else None,
     } | stack._asdict()
 
 

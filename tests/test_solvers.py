@@ -280,6 +280,17 @@ def test_richardson_lucy_fits_a_slow_background():
     assert not jitted(3)(jnp.zeros(shape)).x.any()
 
 
+def test_light_that_no_voxel_explains_does_not_go_to_those_that_few_pixels_see():
+    """A column of 16 pixels on a voxel of each, but for the last, which half a percent of a pixel sees."""
+    A = lx.MatrixLinearOperator(jnp.diag(jnp.append(jnp.ones(15), 0.005)))
+    image = jnp.ones(16)
+    run = lambda **options: solve(A, image, RichardsonLucy(steps=10, **options)).x
+    assert run()[-1] == pytest.approx(200)
+    held = run(least_seen=0.3)
+    np.testing.assert_allclose(held[:-1], 1)
+    assert held[-1] < 4
+
+
 def test_tents_are_climbed_where_there_are_fewer_pixels():
     image = jnp.ones((3, 40))
     slow = jnp.ones((8, 8))

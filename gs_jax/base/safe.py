@@ -19,7 +19,9 @@ def safe_quotient(above: Real, below: Real) -> Float[Array, "..."]:
     return jnp.where(positive, above / jnp.where(positive, below, 1), jnp.inf)
 
 
-def divide(a: Float[Array, "*shape"], b: Float[Array, "*shape"], least: Real | Float[Array, ""] = 0) -> Float[Array, "*shape"]:
+def divide(
+    a: Float[Array, "*shape"], b: Float[Array, "*shape"], least: Real | Float[Array, ""] = 0
+) -> Float[Array, "*shape"]:
     """`a / b` where `b` is above `least`, else 0, with finite gradients."""
     ok = b > least
     return jnp.where(ok, a / jnp.where(ok, b, 1), 0)

@@ -50,6 +50,7 @@ class ListRichardsonLucy(eqx.Module):
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
     slow: int = eqx.field(static=True, default=0)
+    least_seen: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
@@ -57,11 +58,13 @@ class ListRichardsonLucy(eqx.Module):
 
     def solver(self, background: Float[np.ndarray, "row column"] | float = 0.0) -> RichardsonLucy:
         """The solver that does it, with a known background."""
-        return RichardsonLucy(self.steps, self.tolerance, background, self.slow, self.accelerate)
+        return RichardsonLucy(self.steps, self.tolerance, background, self.slow, self.least_seen, self.accelerate)
 
 
 # Tents of the slow background along a side of the sensor, by default: wider than the halo of a spot.
 _SLOW = 8
+# Near the field's edge one lens sees a voxel, in its middle a dozen.
+_LEAST_SEEN = 0.3
 
 Method = BackProjection | ListRichardsonLucy | Solver
 
@@ -69,8 +72,8 @@ Method = BackProjection | ListRichardsonLucy | Solver
 # ADMM holds few conjugate gradients, as each starts from the last; unrolled steps are as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
-    "list-rl": lambda steps: ListRichardsonLucy(steps, slow=_SLOW, accelerate=True),
-    "richardson-lucy": lambda steps: RichardsonLucy(steps, slow=_SLOW, accelerate=True),
+    "list-rl": lambda steps: ListRichardsonLucy(steps, slow=_SLOW, least_seen=_LEAST_SEEN, accelerate=True),
+    "richardson-lucy": lambda steps: RichardsonLucy(steps, slow=_SLOW, least_seen=_LEAST_SEEN, accelerate=True),
     "fista": FISTA,
     "admm": lambda steps: ADMM(steps, cg_steps=3),
     "unrolled": lambda steps: Unrolled.pretrained(),

@@ -113,7 +113,7 @@ def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> S
 
 def check_options(solver: Any) -> None:
     """Raises an `InputError` if an option that the solver has is below the least that it may be."""
-    for name, least in {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0}.items():
+    for name, least in {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0, "least_seen": 0}.items():
         found = getattr(solver, name, least)
         if isinstance(found, int | float) and not found >= least:
             raise InputError(f"{name}: found {found}, allowed: {least} or more.")

@@ -28,8 +28,8 @@ _SLOW_START = 0.02
 
 
 class State(NamedTuple):
-    """Of `RichardsonLucy`: the estimate, `A'1`, and where it accelerates the last estimate, product and gain; and the
-    slow background's tents, if it has one.
+    """Of `RichardsonLucy`: the estimate, what it is divided by (`A'1`), and if it has them what accelerates, which is
+    the last estimate, product and gain, and the slow background's tents.
     """
 
     x: Array
@@ -54,6 +54,9 @@ class RichardsonLucy(eqx.Module):
     slow
         So many tents along rows, and along columns, are a background that is fitted, too, to images of two dimensions:
         light that varies slowly and comes from no voxel. 0 is none.
+    least_seen
+        Voxels that few pixels see are divided as if these were this share of the mean voxel's: with a model that does
+        not hold all light, they would take what it cannot explain.
     accelerate
         Extrapolate along the last change before each step, by the ratio of the last two steps' products (Biggs and
         Andrews, Appl. Opt. 36, 1766, 1997): many times fewer steps, not monotone.
@@ -71,6 +74,7 @@ class RichardsonLucy(eqx.Module):
     tolerance: float = eqx.field(static=True, default=0.0)
     background: Real | Float[Array, "..."] = 0.0
     slow: int = eqx.field(static=True, default=0)
+    least_seen: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
     tv: float = eqx.field(static=True, default=0.0)
 
@@ -84,6 +88,9 @@ class RichardsonLucy(eqx.Module):
         if self.slow and image.ndim != 2:
             raise InputError(f"slow: found {self.slow} and an image of {image.ndim} dimensions, allowed: of 2.")
         sensitivity = without_rounding(A.T.mv(jnp.ones_like(image)))
+        if self.least_seen:
+            least = self.least_seen * jnp.mean(sensitivity)
+            sensitivity = jnp.where(sensitivity > 0, jnp.maximum(sensitivity, least), 0)
         # The scale of the start does not matter without a background; this one has the image's light.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
