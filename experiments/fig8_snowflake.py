@@ -3,8 +3,8 @@
 Captures are reconstructed by plain back-projection and then cleaned by the paper's network, which sees one slice at
 a time, and by ours, which sees seven. Neither saw these scenes or this layout in training, and neither did our voxel
 model render them: two captures come from an independent ray tracer (if DATA is given), two from points that are finer
-than any voxel, with the PSF of diffraction, and all have a camera's noise. The truth is the scene on the voxels,
-blurred laterally by one voxel (standard deviation), so that sub-voxel shifts of the uncalibrated map do not decide.
+than any voxel, with all of the light, and all have a camera's noise. The truth is the scene on the voxels, blurred
+laterally by one voxel (standard deviation), so that sub-voxel shifts do not decide.
 
     python -m experiments.fig8_snowflake [DATA] [--out DIR]
 
@@ -25,6 +25,7 @@ from rich.json import JSON
 from scipy.ndimage import gaussian_filter
 
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
+from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.demo.scene import words
@@ -35,7 +36,6 @@ from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.simulation.phantoms import rasterize, snowflake
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
@@ -60,36 +60,23 @@ def run(design: Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progre
     """For each scene the truth and, by method, volumes and scores; what is made of noise; and the time of a slice."""
     imager = design.imager()
     grid = Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
-    captures = {name: (*each, grid) for name, each in _simulations(design, progress).items()}
+    captures = {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
     if data:
-        calibrated = grid.at(_apparent(np.array(DEPTHS), data, imager, progress))
-        for name, scene, emitters in (("letters", "h", traced_letters), ("USAF target", "f", traced_bars)):
+        words_of = json.loads((data / "h.json").read_text())["planes"]
+        elements = json.loads((data / "f.json").read_text())["elements"]
+        emitters = {"h": np.concatenate([strokes(word) for word in words_of]), "f": bars(elements)}
+        for name, scene in (("letters", "h"), ("USAF target", "f")):
             image = read_capture(data / f"P1_{scene}.tif", imager.sensor.shape)
-            captures[f"{name}, ray-traced"] = image, emitters(data), grid
-            captures[f"{name}, ray-traced, depths calibrated"] = image, emitters(data), calibrated
+            captures[f"{name}, ray-traced"] = image, emitters[scene]
     scenes = {}
-    for name, (counts, emitters, planes) in captures.items():
+    for name, (counts, emitters) in captures.items():
         truth = gaussian_filter(np.asarray(rasterize(emitters, grid), np.float32), (0, 1, 1))
         # The target is small: its part of the field only.
         half = round(_TARGET_MM / voxel_mm) if "USAF" in name else max(grid.shape)
         part = slice(None), *(slice(max(n // 2 - half, 0), n // 2 + half + 1) for n in grid.shape)
-        volume = _back_projected(counts, imager, planes, progress)
+        volume = _back_projected(counts, imager, grid, progress)
         scenes[name] = {"truth": truth[part], **_judged(volume[part], truth[part])}
     return {"scenes": scenes, "noise": _of_noise(imager, grid, progress), "seconds_per_slice": _seconds()}
-
-
-def _apparent(depths: np.ndarray, data: Path, imager: Imager, progress: Progress) -> np.ndarray:
-    """Where back-projection with the design as it is sees objects at these depths: a line through three points.
-
-    Aberrations shift them; the captures of a point on the axis at 18, 20 and 22 mm are there to calibrate that.
-    """
-    seen = []
-    for z in (known := (18, 20, 22)):
-        around = Grid.over(imager.sensor, depths=z + np.arange(-1, 1.01, 0.25), pitch=VOXEL_MM)
-        image = read_capture(data / f"P1_i_{z}_c.tif", imager.sensor.shape)
-        seen.append(find_points(image, imager, around, progress=progress)[0, 2])
-    slope, offset = np.polyfit(known, seen, 1)
-    return offset + slope * depths
 
 
 def _judged(volume: np.ndarray, truth: np.ndarray) -> dict:
@@ -108,48 +95,10 @@ def simulated_scenes() -> dict[str, np.ndarray]:
     return {"snowflake, simulated": flake, "letters, simulated": words(EMITTERS_MM)}
 
 
-def _simulations(design: Design, progress: Progress) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    return {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
-
-
 def _simulated(emitters: np.ndarray, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
-    light = simulate_points(emitters, design.imager(), progress=progress)
+    light = simulate_points(emitters, design.imager(), kind="full", progress=progress)
     counts = expose(np.maximum(light, 0), Camera(), jax.random.key(0), peak_electrons=PEAK_ELECTRONS)
     return np.asarray(counts), emitters
-
-
-def traced_letters(data: Path, pitch: float = 0.01) -> np.ndarray:
-    """Emitters in the strokes that were traced: all points within half a width of a segment."""
-    planes = json.loads((data / "h.json").read_text())["planes"]
-    return np.concatenate([_strokes(np.array(p["segments_xy"]), p["width_mm"], p["z_mm"], pitch) for p in planes])
-
-
-def _strokes(segments: np.ndarray, width: float, depth: float, pitch: float) -> np.ndarray:
-    ends = segments.reshape(-1, 2, 2)
-    low, high = ends.min((0, 1)) - width, ends.max((0, 1)) + width
-    x, y = np.meshgrid(*(np.arange(a, b, pitch) for a, b in zip(low, high, strict=True)))
-    point, inside = x + 1j * y, np.zeros(x.shape, bool)
-    for start, end in ends[..., 0] + 1j * ends[..., 1]:
-        step, line = point - start, end - start
-        inside |= np.abs(step - line * np.clip((step / line).real, 0, 1)) <= width / 2
-    return np.column_stack([x[inside], y[inside], *np.full((2, inside.sum()), [[depth], [pitch**2]])])
-
-
-def traced_bars(data: Path, pitch: float = 0.005) -> np.ndarray:
-    """Emitters in the bars that were traced, at 18 mm."""
-    elements = json.loads((data / "f.json").read_text())["elements"]
-    bars = [bar for element in elements for side in ("vertical", "horizontal") for bar in element[f"{side}_bars"]]
-    return np.concatenate([_rectangle(bar, 18.0, pitch) for bar in bars])
-
-
-def _rectangle(bar: list[float], depth: float, pitch: float) -> np.ndarray:
-    left, right, top, bottom = bar
-    sides = []
-    for low, high in ((left, right), (top, bottom)):
-        count = round((high - low) / pitch)
-        sides.append(low + (np.arange(count) + 0.5) * (high - low) / count)
-    x, y = (each.ravel() for each in np.meshgrid(*sides))
-    return np.column_stack([x, y, *np.full((2, x.size), [[depth], [(right - left) * (bottom - top) / x.size]])])
 
 
 def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
