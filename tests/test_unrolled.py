@@ -14,7 +14,7 @@ from gs_jax.solvers import unrolled
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
 from gs_jax.training.examples import SCENES, Kind, example
 from gs_jax.training.loop import start, train
-from gs_jax.training.recipes import Case, unrolled_cases, unrolled_loss, unrolled_recipe
+from gs_jax.training.recipes import Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
 
 KEY = jax.random.key(0)
 TINY = Kind(64, 0.06, 0.25, 3, binning=4)
@@ -124,5 +124,5 @@ def test_a_volume_imaged_again():
 
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
-    found, made = Unrolled.pretrained(), untrained(key=KEY)
+    found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
     assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 30

@@ -12,7 +12,7 @@ from ..io.disk import check_input, check_output, write_json
 from ..solvers.unrolled import write_unrolled
 from ..suppression.unet import write_weights
 from ..training.loop import read_checkpoint, start, train as run, write_checkpoint
-from ..training.recipes import multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
+from ..training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
 from ..training.slices import stacks
 
 # Those of the weights that come with the package.
@@ -67,7 +67,7 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
 
         state = run(recipe, state, each=each)
     if network == "unrolled":
-        write_unrolled(output, state.network)
+        write_unrolled(output, finished(state.network))
     else:
         write_weights(output, state.network)
     click.echo(f"{output}: {network}, {steps} steps, loss {recent(state):.4f}")

@@ -184,7 +184,7 @@ def _skeleton(first: int, networks: int, last: int, width: int) -> Unrolled:
     return eqx.filter_eval_shape(lambda key: untrained(first, networks, last, width, key=key), jax.random.key(0))
 
 
-def untrained(first: int = 25, networks: int = 3, last: int = 2, width: int = 24, *, key: PRNGKeyArray) -> Unrolled:
+def untrained(first: int = 15, networks: int = 3, last: int = 0, width: int = 16, *, key: PRNGKeyArray) -> Unrolled:
     """Networks before their training: they leave nearly every voxel as it is."""
     widths = (_SEEN, *(len(_SIDES) - 1) * (width,), 1)
     layers = []
