@@ -1,10 +1,10 @@
 """The forward model: what it costs, and how far the paper's zones are from the exact sum.
 
 Cost: `gs_jax.forward` at full scale (5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at
-each depth) and with more or fewer depths, lenses and pixels; in focus also with all of the light, and the adjoints of
-both, in turns. Zones: Eq. (2) takes the envelope C from the centre of
-the zone that a voxel lies in, `gs_jax.forward` from the voxel; nothing else differs. The zone of a lens is its
-Voronoi cell, so the departure follows from the envelope alone.
+each depth) and with more or fewer depths, lenses and pixels; in focus also with all of the light, the cores of six
+rings or of two, and the adjoints, in turns. Zones: Eq. (2) takes the envelope C from the centre of the zone that a
+voxel lies in, `gs_jax.forward` from the voxel; nothing else differs. The zone of a lens is its Voronoi cell, so the
+departure follows from the envelope alone.
 
     python -m experiments.forward_model [--out DIR]
 
@@ -36,6 +36,7 @@ STUDY = {
 # Where all of the light is compared with one PSF.
 FOCUSED = Job(sensor_distance_mm=5.8)
 PSF_PIXELS = 65
+TWO_RINGS = (1.0, 2.5)
 
 
 def cost(job: Job, rounds: int = 3) -> dict[str, float]:
@@ -45,11 +46,12 @@ def cost(job: Job, rounds: int = 3) -> dict[str, float]:
 
 
 def levels(job: Job, rounds: int = 3) -> dict[str, dict[str, float]]:
-    """`cost` with one PSF ("near") and with all of the light ("full"), and of their adjoints."""
+    """`cost` with one PSF ("near") and all of the light ("full"; "two rings"), and of their adjoints."""
     s: Inputs = inputs(job)
     adjoint = jax.jit(lambda image, imager, grid, optics: forward_operator(imager, grid, optics).T.mv(image))
     calls = {}
-    for name, optics in (("near", _psf(job)), ("full", full_optics(s.imager, s.grid.depths))):
+    full = lambda **options: full_optics(s.imager, s.grid.depths, **options)
+    for name, optics in (("near", _psf(job)), ("full", full()), ("two rings", full(rings=TWO_RINGS))):
         calls[name] = forward, (s.volume, s.imager, s.grid, optics)
         calls[f"{name}, adjoint"] = adjoint, (s.image, s.imager, s.grid, optics)
     return _in_turns(calls, rounds)

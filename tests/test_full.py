@@ -105,6 +105,15 @@ def test_it_holds_the_light_that_rays_bring(point):
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
 
 
+def test_fewer_rings_hold_the_same_light():
+    scope, voxels = imager(), grid()
+    x = volume(voxels.volume_shape)
+    six, two = (forward(x, scope, voxels, full_optics(scope, voxels.depths, **o)) for o in ({}, {"rings": (1.0, 2.5)}))
+    np.testing.assert_allclose(two.sum(), six.sum(), rtol=0.02)
+    assert np.corrcoef(six.ravel(), two.ravel())[0, 1] > 0.95
+    assert not np.array_equal(six, two)
+
+
 def test_points_are_voxels_that_lie_anywhere():
     scope = imager(pixels=(200, 200), pitch=0.03)
     point = np.array([[0.2, -0.1, 20.0, 1.0]])

@@ -65,6 +65,8 @@ class FullOptics(eqx.Module):
         Of the outer rings, on pixels twice as large.
     halo
         The rest.
+    rings
+        Where the rings end, in field radii.
     """
 
     stretch: Float[Array, "depth ring"]
@@ -72,6 +74,7 @@ class FullOptics(eqx.Module):
     kernel: Float[Array, "depth size size"]
     wide_kernels: Float[Array, "depth outer small small"]
     halo: Halo
+    rings: tuple[float, ...] = eqx.field(static=True)
 
 
 def full_optics(
@@ -80,6 +83,7 @@ def full_optics(
     *,
     extent: float | None = None,
     nodes: HaloGrid | None = None,
+    rings: Sequence[float] = RINGS,
     progress: Progress | None = None,
 ) -> FullOptics:
     """The tables of a microscope at some depths, by exact rays; a second each, and the last ones are kept.
@@ -98,6 +102,9 @@ def full_optics(
     nodes
         Of the halo, by `halo_nodes`: what is compiled for tables of some nodes serves others of the same. By default
         those that suit the depths.
+    rings
+        Where the rings of the field end that have a core each, in field radii. Fewer are faster and less true,
+        such as `(1.0, 2.5)`.
     progress
         Shows how many depths are done.
 
@@ -108,7 +115,8 @@ def full_optics(
     depths = np.asarray(depths, np.float64)
     leaves, structure = jax.tree.flatten(imager)
     same = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
-    return _tables(_Wanted(same, nodes or halo_nodes(imager, depths, extent=extent), imager, depths, progress))
+    nodes = nodes or halo_nodes(imager, depths, extent=extent)
+    return _tables(_Wanted(same, nodes, tuple(rings), imager, depths, progress))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +125,7 @@ class _Wanted:
 
     same: tuple
     grid: HaloGrid
+    rings: tuple[float, ...]
     imager: Imager = dataclasses.field(compare=False)
     depths: Float64[np.ndarray, " depth"] = dataclasses.field(compare=False)
     progress: Progress | None = dataclasses.field(compare=False)
@@ -126,15 +135,15 @@ class _Wanted:
 @lru_cache(maxsize=2)
 def _tables(wanted):
     imager, depths, grid, progress = wanted.imager, wanted.depths, wanted.grid, wanted.progress
-    cores = core_tables(imager, depths, CORE_REACH * grid.pixel, progress=progress)
-    halo = halo_of(imager, depths, grid, cores, progress=progress)
+    cores = core_tables(imager, depths, CORE_REACH * grid.pixel, wanted.rings, progress)
+    halo = halo_of(imager, depths, grid, cores, wanted.rings, progress)
     size = kernel_size(imager, halo)
     kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
     outer = cores.profile[:, 1:]
-    wide = np.stack([[drawn(profile, size // 4 * 2 + 1, 0.5) for profile in rings] for rings in outer])
+    wide = np.stack([[drawn(profile, size // 4 * 2 + 1, 0.5) for profile in profiles] for profiles in outer])
     tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.stretch, cores.light, kernel, wide))
     stretch, light, kernel, wide = tables
-    return FullOptics(stretch, light, kernel, wide, halo)
+    return FullOptics(stretch, light, kernel, wide, halo, wanted.rings)
 
 
 def halo_nodes(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> HaloGrid:

@@ -48,7 +48,7 @@ def halved(imager: Imager) -> Imager:
 
 def _cores_image(volume, imager, grid, optics):
     """The inner ring on the sensor's pixels, the others on pixels twice as large: their cores are wider."""
-    sensor, rings = imager.sensor, ring_edges(imager)
+    sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
     size = optics.kernel.shape[-1]
     # Even: a pixel that is twice as large is two pixels.
     padded = padded_shape(sensor, size + 1)
