@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -108,7 +109,8 @@ def test_it_holds_the_light_that_rays_bring(point):
 def test_fewer_rings_hold_the_same_light():
     scope, voxels = imager(), grid()
     x = volume(voxels.volume_shape)
-    six, two = (forward(x, scope, voxels, full_optics(scope, voxels.depths, **o)) for o in ({}, {"rings": (1.0, 2.5)}))
+    wanted: tuple[dict[str, Any], ...] = ({}, {"rings": (1.0, 2.5)})
+    six, two = (forward(x, scope, voxels, full_optics(scope, voxels.depths, **o)) for o in wanted)
     np.testing.assert_allclose(two.sum(), six.sum(), rtol=0.02)
     assert np.corrcoef(six.ravel(), two.ravel())[0, 1] > 0.95
     assert not np.array_equal(six, two)
