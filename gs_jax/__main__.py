@@ -1,15 +1,18 @@
 """The command line: what runs a command and says what went wrong.
 
-Exit status 0 on success, 2 on wrong input (one line, no traceback), 1 otherwise.
+Exit status 0 on success; 2 on wrong input, 1 where files cannot be read or written, 130 on Ctrl-C and 143 on SIGTERM,
+each with one line and no traceback; 1 otherwise.
 """
 
 import sys
+from collections.abc import Callable
 from importlib import import_module
 
 import click
 
 from ._version import __version__
 from .base.errors import InputError
+from .cli.interrupt import end, ending_soon, kept, message, status_of
 
 # Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
@@ -27,18 +30,32 @@ COMMANDS = (
 )
 
 
-def main() -> None:
-    """Run the command line, and exit."""
+def main(leave: Callable[[int], object] = sys.exit) -> None:
+    """Run the command line, and exit; `leave` is how, after an interrupt."""
+    kept.clear()
     try:
         status = commands.main(standalone_mode=False, prog_name="gs-jax")
     except InputError as error:
         _fail(str(error), 2)
     except click.ClickException as error:
         _fail(" ".join(error.format_message().split()), 2)
-    except (click.Abort, KeyboardInterrupt):
-        _fail("interrupted", 1)
+    except (click.Abort, KeyboardInterrupt) as error:
+        click.echo(message(), err=True)
+        leave(status_of(error.__cause__ or error))
+    except OSError as error:
+        # A full disk or a vanished folder is nobody's wrong input; what has no number is a fault of ours.
+        if error.errno is None:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        _fail(f"{where}{error.strerror or error}", 1)
     else:
         sys.exit(status if isinstance(status, int) else 0)
+
+
+def script() -> None:
+    """`main` as a process of its own, which signals end soon."""
+    with ending_soon():
+        main(end)
 
 
 def _fail(message: str, status: int) -> None:
@@ -56,11 +73,14 @@ class _Commands(click.Group):
         return import_module(f".cli.{cmd_name}", __package__).command
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=False)
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
 @click.version_option(__version__, prog_name="gs-jax")
 def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
+    context = click.get_current_context()
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 if __name__ == "__main__":
-    main()
+    script()

@@ -178,7 +178,7 @@ def test_stacks_are_kept(tmp_path):
 @pytest.fixture
 def toy_command(monkeypatch):
     module = sys.modules["gs_jax.cli.train"]
-    monkeypatch.setattr(module, "paper_recipe", toy)
+    monkeypatch.setattr("gs_jax.training.recipes.paper_recipe", toy)
     monkeypatch.setattr(module, "_EVERY", 2)
 
     def invoke(*arguments):
@@ -227,7 +227,7 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
         return paper_batch(rng, 16)
 
     with monkeypatch.context() as patched:
-        patched.setattr(sys.modules["gs_jax.cli.train"], "paper_recipe", lambda: toy(batch=batch))
+        patched.setattr(sys.modules["gs_jax.training.recipes"], "paper_recipe", lambda: toy(batch=batch))
         assert toy_command("--steps", 5, "-o", broken).exit_code == 1
     assert not broken.exists() and broken.with_suffix(".checkpoint").exists()
     assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0

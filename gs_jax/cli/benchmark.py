@@ -5,8 +5,6 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..benchmark.compare import run
-from ..benchmark.report import write
 from ..io.disk import make_folder
 
 
@@ -14,6 +12,9 @@ from ..io.disk import make_folder
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
+    from ..benchmark.compare import run
+    from ..benchmark.report import write
+
     folder = make_folder(out)
     with Progress() as progress:
         records, left_out = run(progress=progress)

@@ -5,13 +5,14 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..demo.story import run
 
 
 @click.command("demo")
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with a report."""
+    from ..demo.story import run
+
     with Progress() as progress:
         report = run(out, progress)
     click.echo(f"{report}: what was made, and what it shows")

@@ -2,11 +2,11 @@
 
 import click
 
-from ..base.info import describe
-
 
 @click.command("info")
 def command():
     """Show versions, devices and memory."""
+    from ..base.info import describe
+
     for name, value in describe().items():
         click.echo(f"{name:<12} {value}")

@@ -4,10 +4,8 @@ from pathlib import Path
 
 import click
 
-from ..designs.design import write_centers
 from ..io.disk import check_output
-from ..layouts.cells import coverage, nearest_neighbour_distances
-from ..layouts.patterns import random_layout
+from .files import check_may_write, force_option
 from .options import MM
 
 
@@ -18,9 +16,17 @@ from .options import MM
 @click.option("--diameter-mm", type=MM, default=2.0, show_default=True, help="Of the lenses; they leave no hole.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
-def command(count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path):
+@force_option
+def command(
+    count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path, force: bool
+):
     """Make a random layout of lenses, for the key `centers_file` of a design."""
+    from ..designs.design import write_centers
+    from ..layouts.cells import coverage, nearest_neighbour_distances
+    from ..layouts.patterns import random_layout
+
     check_output(output, [".csv"])
+    check_may_write(output, inputs=(), force=force)
     centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)
     write_centers(output, centers)
     distances = nearest_neighbour_distances(centers)

@@ -3,12 +3,9 @@
 from pathlib import Path
 
 import click
-from rich.console import Console
 
-from ..designs.design import read_design
-from ..designs.problems import findings
-from ..designs.sheet import datasheet, summary, tables
 from ..io.disk import check_output, write_json
+from .files import check_may_write
 from .options import UM, Depths
 
 
@@ -19,8 +16,15 @@ from .options import UM, Depths
 @click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
 def command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
     """Show what the microscope of the file DESIGN promises (the paper's Eqs. 1-11), and what is out of focus."""
+    from rich.console import Console
+
+    from ..designs.design import read_design
+    from ..designs.problems import findings
+    from ..designs.sheet import datasheet, summary, tables
+
     if output:
         check_output(output, [".json"])
+        check_may_write(output, inputs=(design,))
     confusion = confusion_um and confusion_um / 1000
     microscope = read_design(design)
     sheet = datasheet(microscope, depths, confusion=confusion)

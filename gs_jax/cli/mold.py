@@ -7,9 +7,7 @@ import click
 
 from ..base.errors import errors_name_file
 from ..base.progress import Progress
-from ..designs.design import read_design
-from ..mold.make import make_mold, report_text
-from ..mold.solids import MoldShape
+from .files import check_may_write
 from .options import Number
 
 
@@ -70,6 +68,11 @@ def command(
     A picture (.png) and a report (.json, .txt) of the same name are written beside it; what was written is read back
     and measured.
     """
+    from ..designs.design import read_design
+    from ..mold.make import make_mold, report_text
+    from ..mold.solids import MoldShape
+
+    check_may_write(output, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
         draft=math.radians(draft_deg),

@@ -3,13 +3,11 @@
 from pathlib import Path
 
 import click
-import jax
-from rich.console import Console
 
+from ..base.errors import InputError
 from ..base.progress import Progress
-from ..codesign import search
-from ..codesign.checkpoint import checkpoint_path
-from ..codesign.outcome import before_and_after, check_outputs, write_outcome
+from .files import check_may_write, force_option
+from .interrupt import kept
 
 
 @click.command("optimize")
@@ -17,15 +15,28 @@ from ..codesign.outcome import before_and_after, check_outputs, write_outcome
 @click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
 @click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")
-def command(design: Path, study: Path, resume: bool, output: Path):
+@force_option
+def command(design: Path, study: Path, resume: bool, output: Path, force: bool):
     """Search for a better microscope than that of the file DESIGN, and show before and after.
 
     Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).
     """
+    import jax
+    from rich.console import Console
+
+    from ..codesign import search
+    from ..codesign.checkpoint import checkpoint_path
+    from ..codesign.outcome import before_and_after, check_outputs, write_outcome
+
     check_outputs(output)
+    beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))
+    check_may_write(output, *beside, inputs=(design, study), force=force)
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output)
+    if resume and not checkpoint.exists():
+        raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
+    kept.append(checkpoint)
     with Progress() as progress:
         outcome = search.optimize(design, study, progress=progress, checkpoint=checkpoint, resume=resume)
     write_outcome(output, outcome, parent=design, source=study)

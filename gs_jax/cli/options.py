@@ -1,4 +1,8 @@
-"""Kinds of arguments that several commands take."""
+"""Arguments that several commands take, and names that one has.
+
+Commands import what they run when they run: their help needs none of it. So the names of methods and models are here
+again.
+"""
 
 import math
 
@@ -8,6 +12,12 @@ import click
 _MOST_DEPTHS = 10_000
 # The nearest depth that a volume on disk may have, mm.
 _NEAREST = 1e-6
+
+
+METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
+LEVELS = ("full", "near", "pinhole")
+SIMULATED = ("full", "near")
+PSFS = ("diffraction", "geometric", "gaussian")
 
 
 class Number(click.ParamType):
@@ -29,7 +39,7 @@ class Number(click.ParamType):
 
 
 class Depths(click.ParamType):
-    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step."""
+    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step; or one depth."""
 
     name = "start:stop:step"
 
@@ -37,9 +47,9 @@ class Depths(click.ParamType):
         if isinstance(value, list):
             return value
         try:
-            start, stop, step = map(float, value.split(":"))
+            start, stop, step = map(float, value.split(":") if ":" in value else (value, value, 1))
         except ValueError:
-            self.fail(f"found {value!r}, allowed: START:STOP:STEP, three numbers of mm such as 18:22:0.25.", param, ctx)
+            self.fail(f"found {value!r}, allowed: START:STOP:STEP, mm, such as 18:22:0.25, or one depth.", param, ctx)
         if not all(map(math.isfinite, (start, stop, step))) or not _NEAREST <= start <= stop or not step > 0:
             self.fail(f"found {value!r}, allowed: {_NEAREST:g} <= START <= STOP and STEP > 0, in mm.", param, ctx)
         # A step that misses STOP by rounding alone falls on it.

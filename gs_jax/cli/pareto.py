@@ -3,16 +3,9 @@
 from pathlib import Path
 
 import click
-import jax
-from rich.console import Console
-from rich.table import Table
 
 from ..base.progress import Progress
-from ..codesign.pareto import as_json, picture, sweep_of, trade_off
-from ..codesign.search import opened
-from ..codesign.study import parent_path, read_study
 from ..io.disk import check_output, make_folder, write_json
-from ..io.figures import write_figure
 
 
 @click.command("pareto")
@@ -23,6 +16,15 @@ def command(study: Path, out: Path):
 
     The folder gets pareto.json, the designs' numbers, and pareto.png.
     """
+    import jax
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..codesign.pareto import as_json, picture, sweep_of, trade_off
+    from ..codesign.search import opened
+    from ..codesign.study import parent_path, read_study
+    from ..io.figures import write_figure
+
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
     design = parent_path(study, read_study(study))

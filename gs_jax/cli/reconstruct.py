@@ -1,41 +1,31 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..designs.design import read_design
-from ..geometry import Grid
-from ..io.captures import read_capture
 from ..io.disk import check_output
-from ..io.points import write_points
-from ..io.volumes import VOLUME_SUFFIXES, write_volume
-from ..projection.levels import LEVELS
-from ..reconstruction.methods import METHODS
-from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
-from ..reconstruction.reprojection import reproject
-from ..simulation.phantoms import rasterize
-from ..solvers.unrolled import read_unrolled
-from ..suppression.clustering import find_clusters
-from ..suppression.locate import find_points
-from ..suppression.unet import read_weights, suppress as without_background
-from .options import UM, Depths, Number, depth_range
+from .files import check_may_write, force_option
+from .options import LEVELS, METHODS, UM, Depths, Number, depth_range
 
 
 @click.command("reconstruct")
 @click.argument("capture", type=Path)
 @click.argument("design", type=Path)
-@click.option("--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included.")
+@click.option(
+    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included; or one."
+)
 @click.option(
     "--voxel-um",
     type=UM,
     help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
 )
-@click.option("--method", type=click.Choice(list(METHODS)), default="backproject", show_default=True)
+@click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
 @click.option(
     "--steps",
     type=click.IntRange(1, 100_000),
@@ -73,6 +63,7 @@ from .options import UM, Depths, Number, depth_range
 )
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+@force_option
 def command(
     capture: Path,
     design: Path,
@@ -88,14 +79,23 @@ def command(
     weights: Path | None,
     output: Path,
     points: Path | None,
+    force: bool,
 ):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
 
     CAPTURE is a grey TIFF, PNG or .npy of the sensor's size; the volume is written to scale, for Fiji and napari.
     """
+    from ..designs.design import read_design
+    from ..io.captures import read_capture
+    from ..io.volumes import VOLUME_SUFFIXES, write_volume
+    from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
+
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
+    check_may_write(output, points, inputs=(capture, design, weights), force=force)
+    if capture.suffix.lower() == ".toml":
+        raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
     if suppress != "none" and method != "backproject":
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
     if suppress == "points" and optics != "full":
@@ -105,17 +105,18 @@ def command(
         raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
     if stop_at_noise and method in ("backproject", "unrolled"):
         raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
-    chosen = read_unrolled(weights) if weights and method == "unrolled" else METHODS[method](steps)
-    inversion = _with(chosen, method, tv=tv, sparsity=sparsity)
-    network = read_weights(weights) if weights and suppress == "unet" else None
+    inversion = _inversion(method, steps, weights, tv=tv, sparsity=sparsity)
+    cleaned = _network(weights) if suppress == "unet" else None
     microscope = read_design(design)
     imager = microscope.imager()
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
     image = read_capture(capture, imager.sensor.shape)
-    found = np.zeros((0, 4))
+    found = None
     with Progress() as progress:
         if suppress == "points" or (points and suppress != "clusters"):
+            from ..suppression.locate import find_points
+
             found = find_points(image, imager, grid, progress=progress)
         if suppress == "points":
             volume = _volume_of_points(found, grid)
@@ -124,38 +125,59 @@ def command(
                 image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
             )
         if suppress == "clusters":
+            from ..suppression.clustering import find_clusters
+
             with progress.step("Clustering"):
                 found = find_clusters(volume, grid)
                 volume = _volume_of_points(found, grid)
-        if suppress == "unet":
+        if cleaned:
             with progress.step("Suppressing the background"):
-                volume = without_background(volume, network)
+                volume = cleaned(volume)
         check = None
-        if method == "unrolled" or suppress == "unet":
+        if method == "unrolled" or cleaned:
+            from ..reconstruction.reprojection import reproject
+
             check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
         with progress.step("Writing"):
             write_volume(output, volume, grid)
-            if points:
+            if points and found is not None:
+                from ..io.points import write_points
+
                 write_points(points, found)
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
     if check:
-        found = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
-        click.echo(f"{output}: imaged again it is {found}, {check.regions.max():.0%} where it is farthest")
-    if points or suppress in ("points", "clusters"):
+        error = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
+        click.echo(f"{output}: imaged again it is {error}, {check.regions.max():.0%} where it is farthest")
+    if found is not None:
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
 
 
-def _with(method, name: str, **options):
-    """The method with the options that were given, if it has them."""
+def _inversion(name: str, steps: int, weights: Path | None, **options) -> Any:
+    """The method of this name, with the options that were given, if it has them."""
+    from ..reconstruction.methods import METHODS as BY_NAME
+    from ..solvers.unrolled import read_unrolled
+
+    method: Any = read_unrolled(weights) if weights and name == "unrolled" else BY_NAME[name](steps)
     given = {option: value for option, value in options.items() if value is not None}
     for option in given:
         if not hasattr(method, option):
-            has = [other for other, make in METHODS.items() if hasattr(make(1), option)]
+            has = [other for other, make in BY_NAME.items() if hasattr(make(1), option)]
             raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
     return dataclasses.replace(method, **given)
 
 
-def _volume_of_points(points: np.ndarray, grid: Grid) -> np.ndarray:
+def _network(weights: Path | None):
+    """What cleans a volume: our network, or that of a file."""
+    from ..suppression.unet import read_weights, suppress
+
+    return partial(suppress, network=read_weights(weights) if weights else None)
+
+
+def _volume_of_points(points, grid):
+    import numpy as np
+
+    from ..simulation.phantoms import rasterize
+
     return np.asarray(rasterize(points, grid), np.float32)

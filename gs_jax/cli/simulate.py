@@ -3,18 +3,12 @@
 from pathlib import Path
 
 import click
-import jax
-import numpy as np
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..designs.design import read_design
-from ..io.captures import CAPTURE_SUFFIXES, write_capture
 from ..io.disk import check_output
-from ..optics.window import PSFS
-from ..simulation.camera import Camera, expose
-from ..simulation.scene import OPTICS, read_scene, simulate
-from .options import Number
+from .files import check_may_write
+from .options import PSFS, SIMULATED, Number
 
 
 @click.command("simulate")
@@ -22,12 +16,12 @@ from .options import Number
 @click.argument("design", type=Path)
 @click.option(
     "--optics",
-    type=click.Choice(OPTICS),
+    type=click.Choice(SIMULATED),
     default="full",
     show_default=True,
     help="All of the light, where it lands; or Eq. (2), with one PSF for all lenses near a point.",
 )
-@click.option("--psf", type=click.Choice(list(PSFS)), help="Of --optics near.  [default: diffraction]")
+@click.option("--psf", type=click.Choice(PSFS), help="Of --optics near.  [default: diffraction]")
 @click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
 @click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
@@ -47,7 +41,16 @@ def command(
     SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
     lit boxes. The camera has 16 bits of 10 electrons, an offset of 16 and 2 electrons of read noise.
     """
+    import jax
+    import numpy as np
+
+    from ..designs.design import read_design
+    from ..io.captures import CAPTURE_SUFFIXES, write_capture
+    from ..simulation.camera import Camera, expose
+    from ..simulation.scene import read_scene, simulate
+
     check_output(output, CAPTURE_SUFFIXES)
+    check_may_write(output, inputs=(scene, design))
     if not noise and output.suffix.lower() == ".png":
         raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
     if scene.suffix.lower() == ".toml":

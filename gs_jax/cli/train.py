@@ -5,15 +5,12 @@ from functools import partial
 from pathlib import Path
 
 import click
-import numpy as np
 
+from ..base.errors import InputError
 from ..base.progress import Progress
-from ..io.disk import check_input, check_output, write_json
-from ..solvers.unrolled import write_unrolled
-from ..suppression.unet import write_weights
-from ..training.loop import read_checkpoint, start, train as run, write_checkpoint
-from ..training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
-from ..training.slices import stacks
+from ..io.disk import check_output, write_json
+from .files import check_may_write
+from .interrupt import kept
 
 # Those of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
@@ -36,12 +33,22 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     seven slices also the folder WEIGHTS-stacks, the simulated captures that they are trained on (0.4 GB; it may be
     deleted).
     """
+    import numpy as np
+
+    from ..solvers.unrolled import write_unrolled
+    from ..suppression.unet import write_weights
+    from ..training.loop import read_checkpoint, start, train as run, write_checkpoint
+    from ..training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
+    from ..training.slices import stacks
+
     check_output(output, [".npz"])
     steps = steps or STEPS[network]
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
-    if resume:
-        check_input(checkpoint)
+    check_may_write(output, inputs=())
+    kept.append(checkpoint)
+    if resume and not checkpoint.exists():
+        raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
     with Progress() as progress:
         if network == "paper":
             recipe = paper_recipe()
@@ -60,7 +67,7 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
 
         def each(state):
             done = int(state.step)
-            if done % _EVERY == 0 or done == steps:
+            if done % _EVERY == 0 or done in (1, steps):
                 write_checkpoint(checkpoint, state)
                 write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
             bar.update(1, f"{recent(state):.4f}")

@@ -6,6 +6,7 @@ a log, and the log and the solver's state make a checkpoint.
 """
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -121,10 +122,10 @@ def _optimize(
 
 
 class _Saver:
-    """Writes a checkpoint now and then."""
+    """Writes a checkpoint after the first step, and then now and then."""
 
     def __init__(self, path: Path | None, every: float, log: Log, study: Study, design: Design):
-        self.path, self.every, self.last = path, every, time.monotonic()
+        self.path, self.every, self.last = path, every, -math.inf
         self.log, self.study, self.design = log, study, design
 
     def __call__(self, state: State) -> None:

@@ -22,6 +22,8 @@ from jaxtyping import Float64
 from ..base.errors import InputError, short_repr
 
 MAX_TEXT_BYTES = 2**26
+# What is being written.
+_TEMPORARY: set[Path] = set()
 # Of a number in a table: a float64 with all its digits and a separator has up to 25. What plain numbers are made of.
 _NUMBER_BYTES, _PLAIN = 32, b"0123456789+-.eE, \t\r\n"
 
@@ -141,6 +143,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(os.path.realpath(path))
     _check_target(path)
     temporary = _temporary_beside(path)
+    _TEMPORARY.add(temporary)
     try:
         yield temporary
         if not temporary.is_dir():
@@ -148,6 +151,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
                 os.fsync(file.fileno())
         _replace(temporary, path)
     finally:
+        _remove(temporary)
+        _TEMPORARY.discard(temporary)
+
+
+def remove_temporaries() -> None:
+    """Removes what `atomic_write` has not finished, when the process ends without its own cleaning up."""
+    for temporary in list(_TEMPORARY):
         _remove(temporary)
 
 

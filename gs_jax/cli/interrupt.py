@@ -1,0 +1,81 @@
+"""Ctrl-C and SIGTERM end a command soon, whatever compiled code it is in, and leave nothing half-written."""
+
+import multiprocessing
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..io.disk import remove_temporaries
+
+# Seconds that Python has to end by itself: to close files, and to say what it wants to say.
+PATIENCE = 1.0
+# Exit status of a command that a signal ended, as shells have it.
+_BY_SIGNAL = 128
+# Files that `--resume` goes on from: to be named after an interrupt.
+kept: list[Path] = []
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as an exception like that of Ctrl-C."""
+
+
+def status_of(interrupt: BaseException | None) -> int:
+    """130 for Ctrl-C, 143 for SIGTERM."""
+    return _BY_SIGNAL + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
+
+
+def message() -> str:
+    """The line that an interrupted command ends with."""
+    there = [f"{path} has what is done, and --resume goes on from it" for path in kept if path.exists()]
+    return f"gs-jax: {'; '.join(['interrupted', *there])}"
+
+
+@contextmanager
+def ending_soon() -> Iterator[None]:
+    """Within it, a signal raises an exception, as always, and if that has not ended the process soon, ends it.
+
+    Compiled code returns to Python when it is done, minutes later at full scale; until then there is no exception.
+    Only the main thread may call it.
+    """
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    wakeup = signal.set_wakeup_fd(theirs.fileno())
+    handler = signal.signal(signal.SIGTERM, _terminate)
+    threading.Thread(target=_watch, args=(ours,), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+        signal.set_wakeup_fd(wakeup)
+        theirs.close()
+
+
+def end(status: int) -> None:
+    """Ends the process here and now. An interpreter that shuts down under running compiled code may crash."""
+    remove_temporaries()
+    for child in multiprocessing.active_children():
+        child.terminate()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
+
+
+def _terminate(number, frame):
+    raise Terminated
+
+
+def _watch(ours):
+    with ours:
+        while number := ours.recv(1):
+            if number[0] in (signal.SIGINT, signal.SIGTERM):
+                break
+        else:
+            return
+    threading.Event().wait(PATIENCE)
+    print(f"\n{message()}", file=sys.stderr)
+    end(_BY_SIGNAL + number[0])

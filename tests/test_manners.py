@@ -1,0 +1,180 @@
+"""What commands never do: lose a file, hide what happened, or go on after an interrupt."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from errno import ENOSPC
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from gs_jax.__main__ import COMMANDS, commands
+from gs_jax.cli import options
+from gs_jax.cli.interrupt import message
+from gs_jax.io.disk import atomic_write
+from gs_jax.optics.window import PSFS
+from gs_jax.projection.levels import LEVELS
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.simulation.scene import OPTICS
+
+from .test_cli import RECONSTRUCT, folder, run
+
+__all__ = ["folder"]
+GS_JAX = [sys.executable, "-m", "gs_jax"]
+
+
+def test_names_are_those_of_the_library():
+    assert options.METHODS == tuple(METHODS) and options.LEVELS == LEVELS
+    assert options.SIMULATED == OPTICS and options.PSFS == tuple(PSFS)
+
+
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_help_imports_nothing_heavy(name):
+    code = (
+        f"import sys; sys.argv = ['gs-jax', *'{name}'.split(), '--help']\n"
+        "from gs_jax.__main__ import main\n"
+        "try:\n    main()\n"
+        "finally:\n    assert not {'jax', 'equinox', 'scipy', 'skimage', 'matplotlib', 'zarr'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and "Usage: gs-jax" in done.stdout, done.stderr
+
+
+def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
+    os.link(folder / "capture.tif", folder / "linked.tif")
+    (folder / "pointer.tif").symlink_to("capture.tif")
+    for arguments in (
+        (*RECONSTRUCT, "-o", "capture.tif"),
+        (*RECONSTRUCT, "-o", f"../{folder.name}/capture.tif"),
+        (*RECONSTRUCT, "-o", "linked.tif"),
+        (*RECONSTRUCT, "-o", "pointer.tif"),
+        ("simulate", "scene.ome.tif", "design.toml", "-o", "scene.ome.tif"),
+        ("optimize", "design.toml", "--study", "study.toml", "-o", "design.toml"),
+        ("optimize", "design.toml", "--study", "study.toml", "-o", "study.toml"),
+    ):
+        for name in ("scene.ome.tif", "study.toml"):
+            (folder / name).touch()
+        before = {path: path.read_bytes() for path in folder.iterdir()}
+        status, _, err = run(monkeypatch, capsys, *arguments)
+        assert status == 2 and "found an input of this command in the place of its output" in err, arguments
+        assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_what_people_write_is_replaced_by_force_alone(folder, monkeypatch, capsys):
+    layout = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "-o", "c.csv")
+    (folder / "c.csv").write_text("mine")
+    status, _, err = run(monkeypatch, capsys, *layout)
+    assert status == 2 and "c.csv: found a file that is there already" in err and "--force" in err
+    assert (folder / "c.csv").read_text() == "mine"
+    status, _, err = run(monkeypatch, capsys, *layout, "--force")
+    assert status == 0 and "replaced c.csv" in err and "x_mm" in (folder / "c.csv").read_text()
+
+
+def test_results_are_replaced_and_it_is_said(folder, monkeypatch, capsys):
+    (folder / "v.tif").write_text("old")
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    assert status == 0 and err.strip() == "gs-jax: replaced v.tif"
+
+
+def test_a_full_disk_is_one_line_and_status_1(folder, monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(ENOSPC, "No space left on device", "v.tif")
+
+    monkeypatch.setattr("gs_jax.io.volumes.write_volume", full)
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
+    assert (status, err.strip()) == (1, "gs-jax: v.tif: No space left on device")
+    assert not list(folder.glob(".gs-jax*"))
+
+
+def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
+    (folder / "study.toml").touch()
+    optimize = ("optimize", "design.toml", "--study", "study.toml", "-o", "new.toml")
+    for arguments in (optimize, ("train", "-o", "w.npz")):
+        status, _, err = run(monkeypatch, capsys, *arguments, "--resume")
+        assert status == 2 and "--resume: found no checkpoint" in err and "study" not in err
+
+
+def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("gs_jax.cli.interrupt.kept", [tmp_path / "w.checkpoint"])
+    assert message() == "gs-jax: interrupted"
+    (tmp_path / "w.checkpoint").touch()
+    assert message().endswith("w.checkpoint has what is done, and --resume goes on from it")
+
+
+# A call that never returns to Python, as compiled code may for minutes, while a file is being written.
+BUSY = """
+import ctypes, gs_jax.__main__ as cli
+from gs_jax.io.disk import atomic_write
+def busy(*_, **__):
+    with atomic_write("half.tif") as temporary:
+        temporary.write_bytes(b"half")
+        print("busy", flush=True)
+        mutex = ctypes.create_string_buffer(128)
+        for _ in range(2):  # nobody unlocks it
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+cli.commands.main = busy
+cli.script()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its zeros are an open mutex")
+@pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_compiled_code_and_leaves_nothing(tmp_path, number, status):
+    process = subprocess.Popen(
+        [sys.executable, "-c", BUSY], cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout and process.stdout.readline() == "busy\n"
+    process.send_signal(number)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == status and err.strip() == "gs-jax: interrupted"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_interrupts_at_any_moment(folder):
+    """Between the first import and the last byte."""
+    rng = np.random.default_rng(0)
+    command = [*GS_JAX, *RECONSTRUCT, "-o", "v.tif", "--method", "richardson-lucy", "--steps", "200"]
+    before = set(folder.iterdir())
+    for wait in rng.uniform(0.3, 6, 20):
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        time.sleep(wait)
+        sent = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate()
+        took = time.monotonic() - sent
+        assert process.returncode in (130, 0), (wait, process.returncode, err)
+        assert took < 4 and "Traceback" not in err
+        assert set(folder.iterdir()) - before <= {folder / "v.tif"}
+        Path("v.tif").unlink(missing_ok=True)
+
+
+def test_help_says_what_each_command_does():
+    context = click.Context(commands)
+    for name in COMMANDS:
+        command = commands.get_command(context, name)
+        assert command and command.help and command.get_short_help_str(200).endswith(".")
+
+
+def test_what_is_being_written_is_removed_with_the_process(tmp_path):
+    from gs_jax.io.disk import remove_temporaries
+
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.json") as temporary:
+        temporary.write_text("{")
+        remove_temporaries()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_depth_is_one_number(folder, monkeypatch, capsys):
+    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")
+    assert status == 0 and "at 20 mm" in out
+
+
+def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
+    status, out, _ = run(monkeypatch, capsys)
+    assert status == 0 and out.startswith("Usage: gs-jax") and "reconstruct" in out
