@@ -241,7 +241,7 @@ WRONG_ARGUMENTS = [
     ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "p.txt: found the suffix"),
     (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
     (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
-    (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "found a design in the place of CAPTURE"),
+    (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "in the place of CAPTURE"),
     (("reconstruct", "capture.tif", "capture.tif", *RECONSTRUCT[3:], "-o", "v.tif"), "capture.tif"),
     (("layout", "--count", "0", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
     (("layout", "--count", "2.5", "--size-mm", "20", "20", "--pitch-mm", "1.2", "-o", "c.csv"), "--count"),
