@@ -1,6 +1,5 @@
 """`gs-jax train`: the weights of a network."""
 
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -60,17 +59,14 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     state = begin(recipe, steps=steps, seed=seed)
     recent = lambda state: float(np.mean(state.losses[max(int(state.step) - _EVERY, 0) : int(state.step)]))
 
-    with click.progressbar(
-        length=steps, label="Training", file=sys.stderr, item_show_func=lambda loss: f"loss {loss}"
-    ) as bar:
-        bar.update(int(state.step))
+    with Progress() as progress, progress.counter("Training", steps - int(state.step)) as advance:
 
         def each(state):
             done = int(state.step)
             if done % _EVERY == 0 or done in (1, steps):
                 write_checkpoint(checkpoint, state)
                 write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
-            bar.update(1, f"{recent(state):.4f}")
+            advance()
 
         state = run(recipe, state, each=each)
     if network == "unrolled":

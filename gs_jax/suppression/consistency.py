@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from ..geometry import Imager, chief_ray
 
@@ -138,7 +138,8 @@ def log_false_alarms(
     tests
         Number of places that were tried.
     """
-    chance = binom.logsf(_of(share, count) - 1, count, survival(level))
+    with np.errstate(divide="ignore"):  # smaller than any number
+        chance = np.log(bdtrc(_of(share, count) - 1, count, survival(level)))
     return np.where(count > 0, math.log(tests) + chance, np.inf)
 
 
