@@ -68,7 +68,7 @@ How good it is:
 
 Around all:
 
-    Progress             Bars that show how far long work is, on standard error where that is a terminal
+    Progress             How far long work is, on standard error: bars on a terminal, else a line every ten seconds
     InputError           Wrong input from a user, explained in one line
 
 """

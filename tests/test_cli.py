@@ -328,7 +328,8 @@ def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys
     output = tmp_path / "v.ome.tif"
     arguments = ("--depths", "19.5:20.5:0.05", "--voxel-um", "20", "-o", output)
     status, _, err = run(monkeypatch, capsys, "reconstruct", capture, design, *arguments)
-    assert (status, err) == (0, "")
+    # On a busy machine it says how far it is.
+    assert status == 0 and all(line.startswith("gs-jax: ") for line in err.splitlines())
     with tifffile.TiffFile(output) as file:
         assert file.is_ome and file.series[0].axes == "ZYX" and file.series[0].dtype == np.float32
         pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]  # pyright: ignore[reportArgumentType]

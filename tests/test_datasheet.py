@@ -221,7 +221,7 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     ("options", "words"),
     [
         (["--json", "sheet.txt"], "sheet.txt"),
-        (["--depths", "20"], "allowed: START:STOP:STEP"),
+        (["--depths", "20:22"], "allowed: START:STOP:STEP"),
         (["--confusion-um", "0"], "allowed: 0.01 to 1e"),
     ],
 )

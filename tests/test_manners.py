@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from errno import ENOSPC
 from pathlib import Path
 
@@ -24,7 +25,6 @@ from gs_jax.simulation.scene import OPTICS
 from .test_cli import RECONSTRUCT, folder, run
 
 __all__ = ["folder"]
-GS_JAX = [sys.executable, "-m", "gs_jax"]
 
 
 def test_names_are_those_of_the_library():
@@ -105,8 +105,13 @@ def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
     assert message().endswith("w.checkpoint has what is done, and --resume goes on from it")
 
 
+# A job that a shell starts in the background ignores Ctrl-C, and so would its children.
+HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+
+
 # A call that never returns to Python, as compiled code may for minutes, while a file is being written.
-BUSY = """
+BUSY = f"""
+{HEARD}
 import ctypes, gs_jax.__main__ as cli
 from gs_jax.io.disk import atomic_write
 def busy(*_, **__):
@@ -124,12 +129,10 @@ cli.script()
 @pytest.mark.skipif(sys.platform != "linux", reason="its zeros are an open mutex")
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_compiled_code_and_leaves_nothing(tmp_path, number, status):
-    process = subprocess.Popen(
-        [sys.executable, "-c", BUSY], cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    assert process.stdout and process.stdout.readline() == "busy\n"
-    process.send_signal(number)
-    _, err = process.communicate(timeout=20)
+    with _started(BUSY, cwd=tmp_path) as process:
+        assert process.stdout and process.stdout.readline() == "busy\n"
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20)
     assert process.returncode == status and err.strip() == "gs-jax: interrupted"
     assert list(tmp_path.iterdir()) == []
 
@@ -139,19 +142,32 @@ def test_a_signal_ends_compiled_code_and_leaves_nothing(tmp_path, number, status
 def test_interrupts_at_any_moment(folder):
     """Between the first import and the last byte."""
     rng = np.random.default_rng(0)
-    command = [*GS_JAX, *RECONSTRUCT, "-o", "v.tif", "--method", "richardson-lucy", "--steps", "200"]
+    code = f"{HEARD}; from gs_jax.__main__ import script; script()"
+    options = ("-o", "v.tif", "--method", "richardson-lucy", "--steps", "200")
     before = set(folder.iterdir())
     for wait in rng.uniform(0.3, 6, 20):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        time.sleep(wait)
-        sent = time.monotonic()
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate()
+        with _started(code, *RECONSTRUCT, *options) as process:
+            time.sleep(wait)
+            sent = time.monotonic()
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate()
         took = time.monotonic() - sent
         assert process.returncode in (130, 0), (wait, process.returncode, err)
         assert took < 4 and "Traceback" not in err
         assert set(folder.iterdir()) - before <= {folder / "v.tif"}
         Path("v.tif").unlink(missing_ok=True)
+
+
+@contextmanager
+def _started(code, *arguments, cwd=None):
+    """A process of Python, that does not outlive the test."""
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def test_help_says_what_each_command_does():

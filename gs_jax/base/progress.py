@@ -20,7 +20,7 @@ _EVERY = 10.0
 
 
 class Progress:
-    """How far long work is, on standard error: bars where that is a terminal, else a line every ten seconds.
+    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds.
 
     It is shown within `with Progress() as progress:`; one that is not entered shows nothing.
     """

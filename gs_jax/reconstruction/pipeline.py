@@ -37,6 +37,8 @@ _DARKEST = 1
 _SLOW = 6.5
 # Of the default voxel of an iterative method, which is as wide as so many pixels.
 COARSE = 4
+# In units of the misfit of noise, which is known to a few percent.
+_ENOUGH = 1.1
 _ROUNDING = 0.02
 
 
@@ -134,7 +136,7 @@ def reconstruct(
         return _back_projected(image, imager, seen, method, progress)
     light, imager, background, optics = explainable(image, imager, grid, optics, progress)
     counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
-    enough = misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
+    enough = _ENOUGH * misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
     if isinstance(method, ListRichardsonLucy):
         return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen), enough)
     if isinstance(method, RichardsonLucy):
