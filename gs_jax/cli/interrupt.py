@@ -46,10 +46,12 @@ def ending_soon() -> Iterator[None]:
     theirs.setblocking(False)
     wakeup = signal.set_wakeup_fd(theirs.fileno())
     handler = signal.signal(signal.SIGTERM, _terminate)
+    hook, sys.unraisablehook = sys.unraisablehook, _unraisable
     threading.Thread(target=_watch, args=(ours,), daemon=True).start()
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, handler)
         signal.set_wakeup_fd(wakeup)
         theirs.close()
@@ -67,6 +69,12 @@ def end(status: int) -> None:
 
 def _terminate(number, frame):
     raise Terminated
+
+
+def _unraisable(found):
+    """An interrupt within a garbage collector's callback goes no farther; the watch ends the process."""
+    if not (found.exc_type and issubclass(found.exc_type, KeyboardInterrupt)):
+        sys.__unraisablehook__(found)
 
 
 def _watch(ours):
