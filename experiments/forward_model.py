@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.common import Report, main, table
+from experiments.true_image import TWO_RINGS
 from gs_jax import Imager, forward, forward_operator
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
@@ -36,7 +37,6 @@ STUDY = {
 # Where all of the light is compared with one PSF.
 FOCUSED = Job(sensor_distance_mm=5.8)
 PSF_PIXELS = 65
-TWO_RINGS = (1.0, 2.5)
 
 
 def cost(job: Job, rounds: int = 3) -> dict[str, float]:

@@ -17,7 +17,7 @@ from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.iteration import least_weight_of_darkness, solve
-from gs_jax.solvers.richardson_lucy import RichardsonLucy, climbed, of_tents
+from gs_jax.solvers.richardson_lucy import RichardsonLucy, tent_background, tent_step
 
 from .helpers import scene
 
@@ -273,8 +273,8 @@ def test_richardson_lucy_fits_a_slow_background():
     truth = light(A)
     shape = A.out_structure().shape
     slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
-    jitted = cache(lambda slow: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, slow=slow))))
-    error = lambda image, slow: float(jnp.linalg.norm(jitted(slow)(image).x - truth) / jnp.linalg.norm(truth))
+    jitted = cache(lambda tents: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, tents=tents))))
+    error = lambda image, tents: float(jnp.linalg.norm(jitted(tents)(image).x - truth) / jnp.linalg.norm(truth))
     assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
     assert error(A.mv(truth), 3) < 0.1
     assert not jitted(3)(jnp.zeros(shape)).x.any()
@@ -293,9 +293,9 @@ def test_light_that_no_voxel_explains_does_not_go_to_those_that_few_pixels_see()
 
 def test_tents_are_climbed_where_there_are_fewer_pixels():
     image = jnp.ones((3, 40))
-    slow = jnp.ones((8, 8))
-    np.testing.assert_allclose(of_tents(slow, image), 1, rtol=1e-12)
-    found = np.asarray(climbed(slow, 2 * image))
+    tents = jnp.ones((8, 8))
+    np.testing.assert_allclose(tent_background(tents, image), 1, rtol=1e-12)
+    found = np.asarray(tent_step(tents, 2 * image))
     assert np.isfinite(found).all() and set(np.round(np.unique(found), 9)) == {0.0, 2.0}
 
 
@@ -325,7 +325,7 @@ def test_wrong_arguments_are_named(solver):
         SOLVERS[solver](tolerance=-1.0)
     with pytest.raises(InputError, match="sparsity: found nan, allowed: 0 or more"):
         ADMM(sparsity=float("nan"))
-    with pytest.raises(InputError, match="slow: found 1, allowed: 0, or 2 and more"):
-        RichardsonLucy(slow=1)
-    with pytest.raises(InputError, match="slow: found 2 and an image of 1 dimensions, allowed: of 2"):
-        solve(dense(), jnp.zeros(30), RichardsonLucy(slow=2))
+    with pytest.raises(InputError, match="tents: found 1, allowed: 0, or 2 and more"):
+        RichardsonLucy(tents=1)
+    with pytest.raises(InputError, match="tents: found 2 and an image of 1 dimensions, allowed: of 2"):
+        solve(dense(), jnp.zeros(30), RichardsonLucy(tents=2))

@@ -63,7 +63,9 @@ class Progress:
         """Work of `total` parts; what it yields is called after each."""
         if bars := self._bars:
             task = bars.add_task(description, total=total)
-            yield lambda: bars.update(task, total=total or 1, advance=1)
+            yield lambda: bars.advance(task)
+            if total is None:
+                bars.update(task, total=bars.tasks[task].completed)
         elif self._lines:
             yield _Lines(description, total)
         else:

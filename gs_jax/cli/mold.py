@@ -72,7 +72,8 @@ def command(
     from ..mold.make import make_mold, report_text
     from ..mold.solids import MoldShape
 
-    check_may_write(output, inputs=(design,))
+    beside = (output.with_suffix(suffix) for suffix in (".png", ".json", ".txt"))
+    check_may_write(output, *beside, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
         draft=math.radians(draft_deg),

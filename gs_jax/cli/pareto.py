@@ -6,6 +6,7 @@ import click
 
 from ..base.progress import Progress
 from ..io.disk import check_output, make_folder, write_json
+from .files import check_may_write
 
 
 @click.command("pareto")
@@ -32,6 +33,7 @@ def command(study: Path, out: Path):
         sweep_of(parent, question)
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
+    check_may_write(numbers, drawing, inputs=(study,))
     with Progress() as progress:
         front = trade_off(design, study, progress=progress)
     write_json(numbers, as_json(front))

@@ -44,7 +44,7 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     steps = steps or STEPS[network]
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
-    check_may_write(output, inputs=())
+    check_may_write(output, history, inputs=())
     kept.append(checkpoint)
     if resume and not checkpoint.exists():
         raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
@@ -55,22 +55,20 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
             recipe = multislice_recipe(stacks(output.with_name(f"{output.stem}-stacks"), _STACKS, seed, progress))
         else:
             recipe = unrolled_recipe(unrolled_cases(_CASES, seed, progress))
-    begin = partial(read_checkpoint, checkpoint) if resume else start
-    state = begin(recipe, steps=steps, seed=seed)
-    recent = lambda state: float(np.mean(state.losses[max(int(state.step) - _EVERY, 0) : int(state.step)]))
+        begin = partial(read_checkpoint, checkpoint) if resume else start
+        state = begin(recipe, steps=steps, seed=seed)
+        with progress.counter("Training", steps - int(state.step)) as advance:
 
-    with Progress() as progress, progress.counter("Training", steps - int(state.step)) as advance:
+            def each(state):
+                done = int(state.step)
+                if done % _EVERY == 0 or done in (1, steps):
+                    write_checkpoint(checkpoint, state)
+                    write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
+                advance()
 
-        def each(state):
-            done = int(state.step)
-            if done % _EVERY == 0 or done in (1, steps):
-                write_checkpoint(checkpoint, state)
-                write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
-            advance()
-
-        state = run(recipe, state, each=each)
+            state = run(recipe, state, each=each)
     if network == "unrolled":
         write_unrolled(output, finished(state.network))
     else:
         write_weights(output, state.network)
-    click.echo(f"{output}: {network}, {steps} steps, loss {recent(state):.4f}")
+    click.echo(f"{output}: {network}, {steps} steps, loss {np.mean(state.losses[-_EVERY:]):.4f}")

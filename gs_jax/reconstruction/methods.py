@@ -10,7 +10,7 @@ from ..base.errors import InputError
 from ..solvers.admm import ADMM
 from ..solvers.fista import FISTA
 from ..solvers.iteration import Solver
-from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.richardson_lucy import TENTS, RichardsonLucy
 from ..solvers.unrolled import Unrolled
 
 
@@ -49,22 +49,21 @@ class ListRichardsonLucy(eqx.Module):
 
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
-    slow: int = eqx.field(static=True, default=0)
-    least_seen: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
+    tents: int = eqx.field(static=True, default=0)
+    least_seen: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         self.solver()
 
     def solver(self, background: Float[np.ndarray, "row column"] | float = 0.0) -> RichardsonLucy:
         """The solver that does it, with a known background."""
-        return RichardsonLucy(self.steps, self.tolerance, background, self.slow, self.least_seen, self.accelerate)
+        options = {"accelerate": self.accelerate, "tents": self.tents, "least_seen": self.least_seen}
+        return RichardsonLucy(self.steps, self.tolerance, background, **options)
 
 
-# Tents of the slow background along a side of the sensor, by default: wider than the halo of a spot.
-_SLOW = 8
-# Near the field's edge one lens sees a voxel, in its middle a dozen.
-_LEAST_SEEN = 0.3
+# What both kinds of Richardson-Lucy have. Near the field's edge one lens sees a voxel, in its middle a dozen.
+_LUCY = {"accelerate": True, "tents": TENTS, "least_seen": 0.3}
 
 Method = BackProjection | ListRichardsonLucy | Solver
 
@@ -72,8 +71,8 @@ Method = BackProjection | ListRichardsonLucy | Solver
 # ADMM holds few conjugate gradients, as each starts from the last; unrolled steps are as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
-    "list-rl": lambda steps: ListRichardsonLucy(steps, slow=_SLOW, least_seen=_LEAST_SEEN, accelerate=True),
-    "richardson-lucy": lambda steps: RichardsonLucy(steps, slow=_SLOW, least_seen=_LEAST_SEEN, accelerate=True),
+    "list-rl": lambda steps: ListRichardsonLucy(steps, **_LUCY),
+    "richardson-lucy": lambda steps: RichardsonLucy(steps, **_LUCY),
     "fista": FISTA,
     "admm": lambda steps: ADMM(steps, cg_steps=3),
     "unrolled": lambda steps: Unrolled.pretrained(),

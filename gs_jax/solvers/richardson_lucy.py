@@ -19,12 +19,14 @@ from .iteration import as_image, check_options, norm
 from .unmatched import Unmatched
 from .variation import differences, differences_adjoint, magnitude
 
+# Tents that make a background slow, by default: wider than the halo of a spot.
+TENTS = 8
 # The most that total variation may hold back a voxel in one step: Dey's denominator must stay positive.
 _LEAST_DENOMINATOR = 0.1
 # In units of the type's precision, relative to the largest sensitivity.
 _ROUNDING = 100
-# Part of the light that a slow background has at first: the voxels may explain it before the background does.
-_SLOW_START = 0.02
+# Part of the light that tents have at first: the voxels may explain it before the background does.
+_FIRST_TENTS = 0.02
 
 
 class State(NamedTuple):
@@ -35,7 +37,7 @@ class State(NamedTuple):
     x: Array
     sensitivity: Array
     momentum: tuple[Array, Array, Array] | None
-    slow: Float[Array, "tent tent"] | None = None
+    tents: Float[Array, "tent tent"] | None = None
 
 
 class RichardsonLucy(eqx.Module):
@@ -51,43 +53,43 @@ class RichardsonLucy(eqx.Module):
         As for `Solver`; the residual is the relative change of `x`.
     background
         Light that comes from no voxel: a number or an image.
-    slow
-        So many tents along rows, and along columns, are a background that is fitted, too, to images of two dimensions:
-        light that varies slowly and comes from no voxel. 0 is none.
-    least_seen
-        Voxels that few pixels see are divided as if these were this share of the mean voxel's: with a model that does
-        not hold all light, they would take what it cannot explain.
     accelerate
         Extrapolate along the last change before each step, by the ratio of the last two steps' products (Biggs and
         Andrews, Appl. Opt. 36, 1766, 1997): many times fewer steps, not monotone.
     tv
         Weight of total variation, about 1e-3 to 1e-2 (Dey et al., Microsc. Res. Tech. 69, 260, 2006): the step is
         divided by `1 - tv div(grad x / |grad x|)`.
+    tents
+        So many along rows, and along columns, are a background that is fitted, too, to images of two dimensions: light
+        that varies slowly and comes from no voxel. 0 is none.
+    least_seen
+        Voxels that few pixels see are divided as if these were this share of the mean voxel's: with a model that does
+        not hold all light, they would take what it cannot explain.
 
     Raises
     ------
     InputError
-        If an option is negative, or a number of steps 0, or a single tent is slow.
+        If an option is negative, or a number of steps 0, or of tents 1.
     """
 
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
     background: Real | Float[Array, "..."] = 0.0
-    slow: int = eqx.field(static=True, default=0)
-    least_seen: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
     tv: float = eqx.field(static=True, default=0.0)
+    tents: int = eqx.field(static=True, default=0)
+    least_seen: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         check_options(self)
-        if self.slow == 1 or self.slow < 0:
-            raise InputError(f"slow: found {self.slow}, allowed: 0, or 2 and more.")
+        if self.tents == 1 or self.tents < 0:
+            raise InputError(f"tents: found {self.tents}, allowed: 0, or 2 and more.")
 
     def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
-        if self.slow and image.ndim != 2:
-            raise InputError(f"slow: found {self.slow} and an image of {image.ndim} dimensions, allowed: of 2.")
-        sensitivity = without_rounding(A.T.mv(jnp.ones_like(image)))
+        if self.tents and image.ndim != 2:
+            raise InputError(f"tents: found {self.tents} and an image of {image.ndim} dimensions, allowed: of 2.")
+        sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
         if self.least_seen:
             least = self.least_seen * jnp.mean(sensitivity)
             sensitivity = jnp.where(sensitivity > 0, jnp.maximum(sensitivity, least), 0)
@@ -95,43 +97,45 @@ class RichardsonLucy(eqx.Module):
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
         x = jnp.where(sensitivity > 0, level, 0)
         momentum = (x, jnp.zeros_like(x), jnp.zeros((), x.dtype)) if self.accelerate else None
-        slow = jnp.full((self.slow, self.slow), _SLOW_START * jnp.mean(image)) if self.slow else None
-        return State(x, sensitivity, momentum, slow)
+        tents = jnp.full((self.tents, self.tents), _FIRST_TENTS * jnp.mean(image)) if self.tents else None
+        return State(x, sensitivity, momentum, tents)
 
     def step(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
-        x, sensitivity, momentum, slow = state
+        x, sensitivity, momentum, tents = state
         point = _ahead(x, momentum) if momentum else x
-        expected = jnp.maximum(A.mv(point) + jnp.asarray(self.background, image.dtype) + of_tents(slow, image), 0)
+        expected = jnp.maximum(
+            A.mv(point) + jnp.asarray(self.background, image.dtype) + tent_background(tents, image), 0
+        )
         # An FFT's rounding must not turn a dark pixel into a huge ratio.
         ratio = divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
         scale = sensitivity * _hold(point, self.tv) if self.tv else sensitivity
         new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
         momentum = momentum and (x, new - point, _gain(new - point, momentum[1]))
         residual = divide(norm(new - x), norm(new))
-        return State(new, sensitivity, momentum, climbed(slow, ratio)), divergence(image, expected), residual
+        return State(new, sensitivity, momentum, tent_step(tents, ratio)), divergence(image, expected), residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
 
 
-def of_tents(slow: Float[Array, "tent tent"] | None, image: Float[Array, "..."]) -> Float[Array, "..."]:
+def tent_background(tents: Float[Array, "tent tent"] | None, image: Float[Array, "..."]) -> Float[Array, "..."]:
     """A slow background of the image's shape, linear between the tents; 0 if there is none."""
-    if slow is None:
+    if tents is None:
         return jnp.zeros((), image.dtype)
-    rows, columns = (_tents(n, len(slow), slow.dtype) for n in image.shape)
-    return rows @ slow @ columns.T
+    rows, columns = (_tents(n, len(tents), tents.dtype) for n in image.shape)
+    return rows @ tents @ columns.T
 
 
-def climbed(slow: Float[Array, "tent tent"] | None, ratio: Float[Array, "..."]) -> Float[Array, "tent tent"] | None:
+def tent_step(tents: Float[Array, "tent tent"] | None, ratio: Float[Array, "..."]) -> Float[Array, "tent tent"] | None:
     """The step of Richardson-Lucy of a slow background: each tent by the mean ratio under it."""
-    if slow is None:
+    if tents is None:
         return None
-    rows, columns = (_tents(n, len(slow), slow.dtype) for n in ratio.shape)
+    rows, columns = (_tents(n, len(tents), tents.dtype) for n in ratio.shape)
     # A sensor may have fewer pixels than tents.
-    return divide(slow * (rows.T @ ratio @ columns), jnp.outer(rows.sum(0), columns.sum(0)))
+    return divide(tents * (rows.T @ ratio @ columns), jnp.outer(rows.sum(0), columns.sum(0)))
 
 
 def _tents(size, count, dtype):
@@ -163,7 +167,7 @@ def _gain(product, last):
     return jnp.clip(divide(jnp.vdot(product, last), jnp.vdot(last, last)), 0, 1)
 
 
-def without_rounding(sensitivity):
+def _without_rounding(sensitivity):
     """What an FFT leaves in voxels that no pixel sees is taken for 0: rounding over rounding would grow without end."""
     least = _ROUNDING * jnp.finfo(sensitivity.dtype).eps * lax.stop_gradient(sensitivity.max())
     return jnp.where(sensitivity > least, sensitivity, 0)

@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..base.safe import divide
 from ..io import weights
 from .iteration import as_image, check_options, norm
-from .richardson_lucy import RichardsonLucy, State as LucyState, climbed, divergence, of_tents
+from .richardson_lucy import TENTS, RichardsonLucy, State as LucyState, divergence, tent_background, tent_step
 from .unmatched import Unmatched
 
 # Channels that a network sees: the voxel after the step and before it, the largest and the mean over its column, how
@@ -37,8 +37,7 @@ _MOST = 20.0
 # Rows of voxels at a time, which bounds the memory: what a network sees does not depend on them.
 _ROWS = 128
 _MOST_STEPS, _MOST_WIDTH = 64, 1024
-# With a background as slow as in the other methods' defaults.
-_LUCY = RichardsonLucy(slow=8, accelerate=True)
+_LUCY = RichardsonLucy(accelerate=True, tents=TENTS)
 
 
 class Layer(eqx.Module):
@@ -123,7 +122,7 @@ class Unrolled(eqx.Module):
     ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
         """A step with a network: the new estimate, the cost of the old one, and the relative change."""
         (x, sensitivity, *_), number = state.lucy, state.number - self.first
-        expected, slow, asked = _asked(A, image, state.lucy)
+        expected, tents, asked = _asked(A, image, state.lucy)
         ahead = x * asked ** self.power[number].astype(x.dtype)
         unit = _rms(ahead)
         in_unit = lambda volume, unit: jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
@@ -139,14 +138,14 @@ class Unrolled(eqx.Module):
         ]
         layers = jax.tree.map(lambda part: part[number], self.layers)
         new = ahead * 2 * jax.nn.sigmoid(_weighed(layers, jnp.stack(seen, -1)))
-        return _moved(state.lucy, new, slow, divergence(image, expected))
+        return _moved(state.lucy, new, tents, divergence(image, expected))
 
     def plain(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], lucy: LucyState
     ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
         """A step after the networks: as `learned`."""
-        expected, slow, asked = _asked(A, image, lucy)
-        return _moved(lucy, lucy.x * asked, slow, divergence(image, expected))
+        expected, tents, asked = _asked(A, image, lucy)
+        return _moved(lucy, lucy.x * asked, tents, divergence(image, expected))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.lucy.x
@@ -198,14 +197,14 @@ def untrained(first: int = 15, networks: int = 3, last: int = 0, width: int = 16
 
 def _asked(A, image, lucy: LucyState):
     """The image of an estimate and its background, the next background, and the factors of Richardson-Lucy's step."""
-    expected = jnp.maximum(A.mv(lucy.x) + of_tents(lucy.slow, image), 0)
+    expected = jnp.maximum(A.mv(lucy.x) + tent_background(lucy.tents, image), 0)
     ratio = divide(image, expected + _FAINT * jnp.mean(image))
     asked = jnp.clip(divide(A.T.mv(ratio), lucy.sensitivity), 1 / _MOST, _MOST)
-    return expected, climbed(lucy.slow, ratio), asked
+    return expected, tent_step(lucy.tents, ratio), asked
 
 
-def _moved(lucy: LucyState, new, slow, cost):
-    return lucy._replace(x=new, slow=slow), cost, divide(norm(new - lucy.x), norm(new))
+def _moved(lucy: LucyState, new, tents, cost):
+    return lucy._replace(x=new, tents=tents), cost, divide(norm(new - lucy.x), norm(new))
 
 
 def _rms(x):

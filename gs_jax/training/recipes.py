@@ -65,6 +65,7 @@ def unrolled_loss(network: Unrolled, case: Case) -> Float[Array, ""]:
     """Squared error of the volume, relative to what it should be, and to a part of what the networks started from."""
     truth, light, operator = jnp.asarray(case.truth), jnp.asarray(case.light), case.system.operator
 
+    # Not `step`, which would keep what the gradient needs of its other kinds of step, too.
     def learned(state, _):
         lucy, cost, _ = network.learned(operator, light, state)
         return State(lucy, state.agreement, state.number + 1), cost

@@ -1,0 +1,96 @@
+"""What the solvers' defaults are for: three words of a ray-traced capture, with and without each of them.
+
+- Three planes, 30 plain steps of Richardson-Lucy: what the full model alone makes of it.
+- Background: the capture as it is, and under a wide glow that no voxel emits, by list-RL with and without tents.
+- Rims: the near model, whose light is a sixth of the capture's, with and without holding back what few lenses see.
+- Unrolled: with and without the steps after its networks.
+
+    python -m experiments.solver_options DATA [--out DIR]
+
+DATA holds `P1.toml`, `P1_h.tif` and `h.json`. Writes `options.json` and `options.md`; about twenty minutes on two
+cores.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from experiments.common import Report, main, table
+from experiments.fig9_benchmark import SCENES, Scene
+from gs_jax import ListRichardsonLucy, RichardsonLucy, Unrolled, quality, reconstruct
+from gs_jax.base.progress import Progress
+from gs_jax.benchmark.report import markdown_table
+from gs_jax.reconstruction.methods import METHODS, Method
+
+STEPS = 20
+# The glow: its standard deviation in parts of the sensor, and its peak in means of the capture above its offset.
+_WIDE, _BRIGHT = 0.25, 2.0
+_MIDDLE = (0.2, 0.7)
+
+
+def glow(image: np.ndarray) -> np.ndarray:
+    """A Gaussian over the sensor, in the capture's unit."""
+    rows, columns = (
+        np.exp(-((np.linspace(0, 1, n) - m) ** 2) / (2 * _WIDE**2)) for n, m in zip(image.shape, _MIDDLE, strict=True)
+    )
+    return _BRIGHT * float(image.mean() - np.percentile(image, 1)) * np.outer(rows, columns)
+
+
+def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
+    """By name: the scene, the method, and the optics."""
+    planes = s.truth.any((1, 2))
+    few = s._replace(grid=s.grid.at(np.asarray(s.grid.depths)[planes]), truth=s.truth[planes])
+    bright = s._replace(image=s.image + glow(s.image).astype(np.float32))
+    found: dict[str, tuple[Scene, Method, str]] = {
+        "three planes, Richardson-Lucy, 30 plain steps": (few, RichardsonLucy(steps=30), "full")
+    }
+    default: ListRichardsonLucy = METHODS["list-rl"](25)  # pyright: ignore[reportAssignmentType]
+    for name, scene in (("as it is", s), ("under a glow", bright)):
+        found[f"{name}, list-RL, 25 steps"] = scene, default, "full"
+        found[f"{name}, list-RL, 25 steps, no tents"] = scene, dataclasses.replace(default, tents=0), "full"
+    for name in ("list-rl", "richardson-lucy"):
+        method = METHODS[name](STEPS)
+        found[f"near, {name}"] = s, method, "near"
+        found[f"near, {name}, rims not held back"] = s, dataclasses.replace(method, least_seen=0.0), "near"  # pyright: ignore[reportArgumentType]
+    networks = Unrolled.pretrained()
+    found["unrolled"] = s, networks, "full"
+    without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)
+    found["unrolled, no steps after the networks"] = s, without, "full"
+    return found
+
+
+def run(s: Scene, *, progress: Progress) -> dict:
+    """PSNR, that of an empty volume, dB, and how many lenses see the brightest voxel, by name."""
+    found = {}
+    for name, (each, method, optics) in progress.track(cases(s).items(), "Options"):
+        volume = reconstruct(each.image, each.imager, each.grid, method, optics=optics, progress=progress)
+        found[name] = {
+            "psnr_db": quality(volume, each.truth).psnr_db,
+            "empty_db": quality(np.zeros_like(each.truth), each.truth).psnr_db,
+            "lenses_of_the_brightest": _lenses(volume, each),
+        }
+    return found
+
+
+def _lenses(volume: np.ndarray, s: Scene) -> int:
+    """How many lenses see the brightest voxel."""
+    _, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
+    place = np.array([float(s.grid.x[column]), float(s.grid.y[row])])
+    distance = np.linalg.norm(np.asarray(s.imager.centers) - place, axis=1)
+    return int((distance < float(s.imager.field_radius)).sum())
+
+
+def report(data: Path, progress: Progress) -> Report:
+    found = run(SCENES["letters"](data), progress=progress)
+    columns = ("", "PSNR, dB", "empty, dB", "lenses that see the brightest voxel")
+    rows = [
+        [name, f"{r['psnr_db']:.1f}", f"{r['empty_db']:.1f}", str(r["lenses_of_the_brightest"])]
+        for name, r in found.items()
+    ]
+    text = markdown_table(columns, rows) + "\n"
+    return Report({"options.json": found, "options.md": text}, [table(columns, rows)])
+
+
+if __name__ == "__main__":
+    main(report, {"data": {"type": Path}})
