@@ -12,18 +12,22 @@ import click
 
 from ._version import __version__
 from .base.errors import InputError
+from .base.progress import QUIET, VERBOSE, shown
+from .cli.files import ARGUMENTS
 from .cli.interrupt import end, ending_soon, kept, message, status_of
 
 # Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
     "reconstruct",
     "simulate",
+    "deconvolve",
     "metrics",
     "layout",
     "optimize",
     "pareto",
     "benchmark",
     "mold",
+    "mask",
     "train",
     "demo",
     "info",
@@ -64,13 +68,35 @@ def _fail(message: str, status: int) -> None:
 
 
 class _Commands(click.Group):
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta[ARGUMENTS] = list(args)
+        return super().parse_args(ctx, args)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        return import_module(f".cli.{cmd_name}", __package__).command
+        command = import_module(f".cli.{cmd_name}", __package__).command
+        if not any(param.name == "quiet" for param in command.params):
+            command.params += _LEVELS
+        return command
+
+
+def _set_level(context: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        token = shown.set(QUIET if param.name == "quiet" else VERBOSE)
+        context.call_on_close(lambda: shown.reset(token))
+
+
+_LEVELS = [
+    click.Option(names, is_flag=True, expose_value=False, callback=_set_level, help=text)
+    for names, text in (
+        (["-q", "--quiet"], "Show no progress, and not what is replaced."),
+        (["-v", "--verbose"], "Say after each piece of work how long it took."),
+    )
+]
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)

@@ -24,7 +24,7 @@ from .test_cli import run
 
 LISTS = (
     "depth_mm magnification scale lateral_resolution_um axial_resolution_um depth_of_field_mm near_limit_mm "
-    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um"
+    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um spot_width_um spot_radius_um"
 ).split()
 SCALARS = "f_number numerical_aperture focal_length_mm pitch_mm pitch_sd_mm field_radius_mm coverage".split()
 
@@ -113,7 +113,12 @@ def test_what_is_wrong_with_the_design_in_focus(table1):
     design = changed(table1, "imaging", sensor_distance_mm=5.8)
     text = "\n".join(findings(design, datasheet(design)))
     assert "At 30 mm the image forms 320 um before the sensor" in text
-    assert "In focus are 22.26 to 23.33 mm; the working distance is 18 to 30 mm." in text
+    assert (
+        "In focus by Eqs. 7 and 8, of a thin lens, are 22.26 to 23.33 mm; the working distance is 18 to 30 mm." in text
+    )
+    # Traced rays focus best from 20 mm with the sensor at 5.75 to 5.85 mm.
+    assert "cores of spots hold half of the most light, or more, at 17.7 to 22 mm" in text
+    assert "Exact rays spread a point over 330 to 1000 um of the object" in text and "mask" not in text
     assert "At 18 mm the occupancy is 1.4" in text
     # Traced rays are sharpest 0.15 to 0.25 mm before the thin lens's image; the least variance is farther.
     assert "draws the sharpest image of 18 mm toward the lens, by up to 460 um" in text
@@ -135,7 +140,9 @@ def test_nothing_is_wrong_with_a_small_lens_in_focus(table1):
     design = changed(design, "imaging", sensor_distance_mm=6.0, field_radius_mm=1.0)
     sheet = datasheet(design, [20.0])
     sentences = findings(design, sheet)
-    assert len(sentences) == 1 and "takes the pitch" in sentences[0]
+    assert len(sentences) == 2 and "takes the pitch" in sentences[0]
+    # 200 lenses, 0.06 mm wide, on 20 x 20 mm.
+    assert sentences[1].startswith("99.9 % of the plate is no lens's: an opaque mask must cover it")
 
 
 @pytest.mark.parametrize(

@@ -353,10 +353,10 @@ def test_ome_tiff_metadata(tmp_path):
         assert plane["PositionX"] == pytest.approx(float(GRID.x[0]) * 1000, rel=1e-12)
         assert plane["PositionY"] == pytest.approx(float(GRID.y[0]) * 1000, rel=1e-12)
         assert {plane[f"Position{axis}Unit"] for axis in "XYZ"} == {"µm"}
-    with tifffile.TiffFile(tmp_path / "a.ome.tif") as file:  # for programs that know plain TIFF only
-        assert file.pages.first.tags["ResolutionUnit"].value == 3
-        per_cm, one = file.pages.first.tags["XResolution"].value
-        assert per_cm / one == pytest.approx(10 / 0.0123, rel=1e-6)
+    with tifffile.TiffFile(tmp_path / "a.ome.tif") as file:  # for ImageJ, which has the unit in its description
+        assert file.pages.first.tags["ResolutionUnit"].value == 1
+        pixels, um = file.pages.first.tags["XResolution"].value
+        assert pixels / um == pytest.approx(1 / 12.3, rel=1e-6)
 
 
 def test_the_schemas_fields_by_hand(tmp_path):

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from experiments import mold_check
 from gs_jax.base.errors import InputError
 from gs_jax.cli.mold import command as mold
+from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make
@@ -211,3 +212,18 @@ def test_the_experiment_runs_small():
     assert abs(record["block_filled_error"]) < 1e-6 and abs(record["cast_is_array_error"]) < 1e-12
     assert len(mold_check.rows([record])[0]) == len(mold_check.COLUMNS)
     assert len(mold_check.draw(small, [record]).axes) == 5
+
+
+def test_layers_are_compared_with_the_lenses():
+    """Half a wave of path is 0.6 um of silicone; steps of 10 um are 2.4 waves."""
+    checks = lambda layer: check_design(geomscope(), MoldShape(), chord=4e-4, resolution=0.025, layer=layer)
+    coarse, fine = (checks(layer)[-1] for layer in (0.01, 2e-4))
+    assert (coarse.check, coarse.level, fine.level) == ("layers", "warning", "ok")
+    assert "26.8 layers of 10 um high; their steps are 2.4 waves RMS" in coarse.text
+    assert "print layers of 0.3 um" in coarse.text
+
+
+def test_the_defaults_do_not_warn_of_themselves(tmp_path):
+    report = make_mold(geomscope(), tmp_path / "m.stl")
+    found = {finding["check"]: finding["level"] for finding in report["checks"]}
+    assert found["facets"] == found["facets' wavefront"] == "ok"

@@ -3,7 +3,7 @@
 import pytest
 
 from gs_jax.base import progress as module
-from gs_jax.base.progress import Progress
+from gs_jax.base.progress import QUIET, VERBOSE, Progress, shown
 
 
 @pytest.fixture
@@ -42,3 +42,12 @@ def test_a_terminal_gets_a_bar_with_count_and_time_left(monkeypatch, capsys):
         list(progress.track(range(5), "Imaging"))
     err = capsys.readouterr().err
     assert "Imaging" in err and "5/5" in err and "left:" in err
+
+
+def test_how_much_is_shown(clock, capsys):
+    for level, said in ((QUIET, ""), (VERBOSE, "gs-jax: Reading: 2, 8.00 s\n")):
+        token = shown.set(level)
+        with Progress() as progress:
+            list(progress.track(iter("ab"), "Reading"))
+        shown.reset(token)
+        assert capsys.readouterr().err == said

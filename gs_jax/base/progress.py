@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from rich.console import Console
 from rich.progress import (
@@ -17,10 +18,13 @@ from rich.progress import (
 
 # Seconds between two lines.
 _EVERY = 10.0
+# How much is shown: QUIET is nothing, VERBOSE a line after every piece of work.
+QUIET, NORMAL, VERBOSE = -1, 0, 1
+shown: ContextVar[int] = ContextVar("shown", default=NORMAL)
 
 
 class Progress:
-    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds.
+    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds; as `shown` says.
 
     It is shown within `with Progress() as progress:`; one that is not entered shows nothing.
     """
@@ -29,14 +33,14 @@ class Progress:
     _lines = False
 
     def __enter__(self) -> "Progress":
-        console = Console(stderr=True)
-        if console.is_terminal:
+        console, level = Console(stderr=True), shown.get()
+        if console.is_terminal and level == NORMAL:
             times = TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()
             self._bars = Bars(
                 TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times, console=console
             )
             self._bars.start()
-        self._lines = not console.is_terminal
+        self._lines = level == VERBOSE or (level == NORMAL and not console.is_terminal)
         return self
 
     def __exit__(self, *_) -> None:
@@ -67,7 +71,9 @@ class Progress:
             if total is None:
                 bars.update(task, total=bars.tasks[task].completed)
         elif self._lines:
-            yield _Lines(description, total)
+            yield (lines := _Lines(description, total))
+            if shown.get() == VERBOSE:
+                lines.say(time.monotonic())
         else:
             yield lambda: None
 
@@ -82,9 +88,14 @@ class _Lines:
     def __call__(self) -> None:
         self.done += 1
         now = time.monotonic()
-        if now - self.last < _EVERY:
-            return
-        self.last, taken = now, now - self.began
-        left = "" if self.total is None else f", about {taken / self.done * (self.total - self.done):.0f} s left"
-        of = "" if self.total is None else f" of {self.total}"
-        print(f"gs-jax: {self.description}: {self.done}{of}, {taken:.0f} s{left}", file=sys.stderr, flush=True)
+        if now - self.last >= _EVERY:
+            self.say(now)
+
+    def say(self, now: float) -> None:
+        self.last = now
+        taken, left = self.last - self.began, (self.total or self.done) - self.done
+        time_left = f", about {taken / self.done * left:.0f} s left" if left and self.done else ""
+        of, digits = f" of {self.total}" if self.total else "", 0 if taken >= _EVERY else 2
+        print(
+            f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{time_left}", file=sys.stderr, flush=True
+        )

@@ -8,7 +8,7 @@ from ..base.progress import Progress
 from ..io.disk import make_folder
 
 
-@click.command("benchmark")
+@click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""

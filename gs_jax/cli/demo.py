@@ -7,7 +7,7 @@ import click
 from ..base.progress import Progress
 
 
-@click.command("demo")
+@click.command("demo", epilog="Example: gs-jax demo --out demo")
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with a report."""

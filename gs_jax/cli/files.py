@@ -1,6 +1,7 @@
 """What a command may write: nothing over what it reads, and over what a person may have made only if told to."""
 
 import os
+import shlex
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import click
 
 from ..base.errors import InputError
+from ..base.progress import QUIET, shown
 
 # Designs, studies, points and centres: what people write by hand.
 _BY_HAND = (".toml", ".csv")
@@ -32,10 +34,22 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
             raise InputError(f"{path}: found a file that is there already, allowed: another, or --force to replace it.")
     # Said when it has happened: a command that fails leaves them as they are.
     if there:
-        names = ", ".join(map(str, there))
-        click.get_current_context().call_on_close(lambda: _say_replaced(names))
+        names, quiet = ", ".join(map(str, there)), shown.get() == QUIET
+        click.get_current_context().call_on_close(lambda: _say_replaced(names, quiet))
 
 
-def _say_replaced(names):
-    if sys.exc_info()[0] is None:
+ARGUMENTS = "gs_jax.arguments"
+
+
+def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
+    """What the running command writes into its files: itself, what it read, and the text of the design."""
+    from ..io.provenance import made_by
+
+    context = click.get_current_context()
+    command = shlex.join(["gs-jax", *context.meta.get(ARGUMENTS, [context.info_name])])
+    return made_by(command, [path for path in inputs if path is not None], design)
+
+
+def _say_replaced(names, quiet):
+    if sys.exc_info()[0] is None and not quiet:
         click.echo(f"gs-jax: replaced {names}", err=True)

@@ -1,12 +1,23 @@
-"""`gs-jax info`: what it runs on."""
+"""`gs-jax info`: what it runs on, and where a file comes from."""
+
+from pathlib import Path
 
 import click
 
 
-@click.command("info")
-def command():
-    """Show versions, devices and memory."""
-    from ..base.info import describe
+@click.command("info", epilog="Example: gs-jax info volume.ome.tif")
+@click.argument("file", type=Path, required=False)
+def command(file: Path | None):
+    """Show versions, devices and memory; or of a FILE that gs-jax wrote, which command made it and of what."""
+    if file:
+        from ..io.provenance import read_provenance
 
-    for name, value in describe().items():
-        click.echo(f"{name:<12} {value}")
+        found = read_provenance(file) or {"provenance": f"{file} says nothing of where it comes from."}
+    else:
+        from ..base.info import describe
+
+        found = describe()
+    width = max(map(len, found))
+    for name, value in found.items():
+        # The text of a design has many lines.
+        click.echo(f"{name:<{width}} {value}" if "\n" not in value else f"{name}\n\n{value}")

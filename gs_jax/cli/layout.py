@@ -5,11 +5,11 @@ from pathlib import Path
 import click
 
 from ..io.disk import check_output
-from .files import check_may_write, force_option
+from .files import check_may_write, force_option, provenance_of
 from .options import MM
 
 
-@click.command("layout")
+@click.command("layout", epilog="Example: gs-jax layout --count 200 --size-mm 20 20 --pitch-mm 1.23 -o centers.csv")
 @click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
 @click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
 @click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
@@ -28,7 +28,7 @@ def command(
     check_output(output, [".csv"])
     check_may_write(output, inputs=(), force=force)
     centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)
-    write_centers(output, centers)
+    write_centers(output, centers, provenance_of())
     distances = nearest_neighbour_distances(centers)
     covered = coverage(centers, size_mm, diameter=diameter_mm)
     spread = f"pitch {distances.mean():.3f} mm, SD {distances.std():.3f} mm, " if count > 1 else ""

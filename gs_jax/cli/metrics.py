@@ -9,7 +9,7 @@ from .files import check_may_write
 from .options import UM, Depths
 
 
-@click.command("metrics")
+@click.command("metrics", epilog="Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
 @click.argument("design", type=Path)
 @click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")

@@ -7,18 +7,18 @@ import click
 
 from ..base.errors import errors_name_file
 from ..base.progress import Progress
-from .files import check_may_write
+from .files import check_may_write, provenance_of
 from .options import Number
 
 
-@click.command("mold")
+@click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
 @click.argument("design", type=Path)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
 @click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
 @click.option(
     "--chord-um",
     type=Number(least=1e-3, most=1e3, unit="um"),
-    default=0.5,
+    default=0.4,
     show_default=True,
     help="Largest distance between a facet and its lens.",
 )
@@ -50,6 +50,9 @@ from .options import Number
     show_default=True,
     help="Smallest feature that the printer makes.",
 )
+@click.option(
+    "--layer-um", type=Number(least=1e-2, most=1e3, unit="um"), help="Thickness of the printer's layers, if it has any."
+)
 @click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
 def command(
     design: Path,
@@ -60,6 +63,7 @@ def command(
     draft_deg: float,
     headroom_mm: float,
     resolution_um: float,
+    layer_um: float | None,
     label: bool,
 ):
     """Make the negative mold of the array of the file DESIGN, to print and to cast the array in.
@@ -68,7 +72,7 @@ def command(
     A picture (.png) and a report (.json, .txt) of the same name are written beside it; what was written is read back
     and measured.
     """
-    from ..designs.design import read_design
+    from ..designs.design import design_text, read_design
     from ..mold.make import make_mold, report_text
     from ..mold.solids import MoldShape
 
@@ -89,6 +93,8 @@ def command(
             shape=shape,
             chord=chord_um / 1000,
             resolution=resolution_um / 1000,
+            layer=layer_um and layer_um / 1000,
+            provenance=provenance_of(design, design=design_text(microscope)),
             progress=progress,
         )
     click.echo(report_text(report), nl=False)

@@ -6,11 +6,14 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from .files import check_may_write, force_option
+from .files import check_may_write, force_option, provenance_of
 from .interrupt import kept
 
 
-@click.command("optimize")
+@click.command(
+    "optimize",
+    epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml",
+)
 @click.argument("design", type=Path)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
@@ -39,7 +42,7 @@ def command(design: Path, study: Path, resume: bool, output: Path, force: bool):
     kept.append(checkpoint)
     with Progress() as progress:
         outcome = search.optimize(design, study, progress=progress, checkpoint=checkpoint, resume=resume)
-    write_outcome(output, outcome, parent=design, source=study)
+    write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study))
     checkpoint.unlink(missing_ok=True)
     Console().print(before_and_after(outcome))
     for end in outcome.log.ends:

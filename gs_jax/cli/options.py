@@ -23,10 +23,8 @@ PSFS = ("diffraction", "geometric", "gaussian")
 class Number(click.ParamType):
     """A number within bounds."""
 
-    name = "number"
-
     def __init__(self, *, least: float, most: float, unit: str):
-        self.least, self.most, self.unit = least, most, unit
+        self.least, self.most, self.unit, self.name = least, most, unit, unit or "number"
 
     def convert(self, value, param, ctx):
         try:

@@ -9,7 +9,7 @@ from ..io.disk import check_output, make_folder, write_json
 from .files import check_may_write
 
 
-@click.command("pareto")
+@click.command("pareto", epilog="Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
 @click.argument("study", type=Path)
 @click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
 def command(study: Path, out: Path):

@@ -10,11 +10,14 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output
-from .files import check_may_write, force_option
+from .files import check_may_write, force_option, provenance_of
 from .options import LEVELS, METHODS, UM, Depths, Number, depth_range
 
 
-@click.command("reconstruct")
+@click.command(
+    "reconstruct",
+    epilog="Example: gs-jax reconstruct capture.tif design/geomscope.toml --depths 18:22:0.25 -o volume.ome.tif",
+)
 @click.argument("capture", type=Path)
 @click.argument("design", type=Path)
 @click.option(
@@ -85,7 +88,7 @@ def command(
 
     CAPTURE is a grey TIFF, PNG or .npy of the sensor's size; the volume is written to scale, for Fiji and napari.
     """
-    from ..designs.design import read_design
+    from ..designs.design import design_text, read_design
     from ..io.captures import read_capture
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
@@ -112,12 +115,10 @@ def command(
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
     image = read_capture(capture, imager.sensor.shape)
-    found = None
+    found = evidence = warning = None
     with Progress() as progress:
         if suppress == "points" or (points and suppress != "clusters"):
-            from ..suppression.locate import find_points
-
-            found = find_points(image, imager, grid, progress=progress)
+            found, evidence, warning = _points(image, imager, grid, progress)
         if suppress == "points":
             volume = _volume_of_points(found, grid)
         else:
@@ -139,11 +140,12 @@ def command(
 
             check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
         with progress.step("Writing"):
-            write_volume(output, volume, grid)
+            provenance = provenance_of(capture, weights, design=design_text(microscope))
+            write_volume(output, volume, grid, provenance)
             if points and found is not None:
                 from ..io.points import write_points
 
-                write_points(points, found)
+                write_points(points, found, evidence, provenance=provenance)
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
@@ -152,6 +154,8 @@ def command(
         click.echo(f"{output}: imaged again it is {error}, {check.regions.max():.0%} where it is farthest")
     if found is not None:
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
+    if warning:
+        click.echo(f"gs-jax: warning: {warning}", err=True)
 
 
 def _inversion(name: str, steps: int, weights: Path | None, **options) -> Any:
@@ -166,6 +170,22 @@ def _inversion(name: str, steps: int, weights: Path | None, **options) -> Any:
             has = [other for other, make in BY_NAME.items() if hasattr(make(1), option)]
             raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
     return dataclasses.replace(method, **given)
+
+
+def _points(image, imager, grid, progress):
+    """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
+    import numpy as np
+
+    from ..suppression.evidence import LEAST_SHARP, point_evidence, sharpness
+    from ..suppression.locate import find_points
+
+    points, warning = find_points(image, imager, grid, progress=progress), None
+    sharp = sharpness(imager, grid)
+    if sharp < LEAST_SHARP:
+        share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
+        warning = f"out of focus at these depths: {share}; no point is to be trusted"
+    columns = point_evidence(points, image, imager, grid)._asdict()
+    return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
 
 
 def _network(weights: Path | None):

@@ -1,5 +1,6 @@
 """`gs-jax simulate`: a scene to a capture."""
 
+import math
 from pathlib import Path
 
 import click
@@ -7,11 +8,16 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output
-from .files import check_may_write
+from .files import check_may_write, provenance_of
 from .options import PSFS, SIMULATED, Number
 
+ELECTRONS = Number(least=0.0, most=1e9, unit="electrons")
+GAIN = Number(least=1e-3, most=1e6, unit="electrons")
+WELL = Number(least=1.0, most=1e9, unit="electrons")
+COUNTS = Number(least=0.0, most=65535.0, unit="counts")
 
-@click.command("simulate")
+
+@click.command("simulate", epilog="Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
 @click.argument("scene", type=Path)
 @click.argument("design", type=Path)
 @click.option(
@@ -24,6 +30,11 @@ from .options import PSFS, SIMULATED, Number
 @click.option("--psf", type=click.Choice(PSFS), help="Of --optics near.  [default: diffraction]")
 @click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
 @click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
+@click.option("--gain", type=GAIN, default=10.0, show_default=True, help="Electrons a count.")
+@click.option("--offset", type=COUNTS, default=16.0, show_default=True, help="Of dark pixels.")
+@click.option("--read-noise", type=ELECTRONS, default=2.0, show_default=True, help="Standard deviation.")
+@click.option("--full-well", type=WELL, help="The most that a pixel holds.  [default: no limit]")
+@click.option("--bits", type=click.IntRange(1, 16), default=16, show_default=True, help="Of the converter.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
 def command(
@@ -33,18 +44,23 @@ def command(
     psf: str | None,
     peak_electrons: float,
     noise: bool,
+    gain: float,
+    offset: float,
+    read_noise: float,
+    full_well: float | None,
+    bits: int,
     seed: int,
     output: Path,
 ):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
     SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
-    lit boxes. The camera has 16 bits of 10 electrons, an offset of 16 and 2 electrons of read noise.
+    lit boxes.
     """
     import jax
     import numpy as np
 
-    from ..designs.design import read_design
+    from ..designs.design import design_text, read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
     from ..simulation.camera import Camera, expose
     from ..simulation.scene import read_scene, simulate
@@ -64,8 +80,9 @@ def command(
             image = simulate(light, microscope.imager(), grid, optics=optics, psf=psf, progress=progress)
         if noise:
             with progress.step("Exposing"):
-                image = np.asarray(expose(image, Camera(), jax.random.key(seed), peak_electrons=peak_electrons))
+                camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
+                image = np.asarray(expose(image, camera, jax.random.key(seed), peak_electrons=peak_electrons))
         with progress.step("Writing"):
-            write_capture(output, image)
+            write_capture(output, image, provenance_of(scene, design=design_text(microscope)))
     size = " x ".join(map(str, image.shape))
     click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}")

@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output, write_json
-from .files import check_may_write
+from .files import check_may_write, provenance_of
 from .interrupt import kept
 
 # Those of the weights that come with the package.
@@ -18,7 +18,7 @@ _STACKS, _CASES = 96, 112
 _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
-@click.command("train")
+@click.command("train", epilog="Example: gs-jax train --network unrolled -o weights.npz")
 @click.option("--network", type=click.Choice(list(STEPS)), default="multislice", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
@@ -68,7 +68,7 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
 
             state = run(recipe, state, each=each)
     if network == "unrolled":
-        write_unrolled(output, finished(state.network))
+        write_unrolled(output, finished(state.network), provenance_of())
     else:
-        write_weights(output, state.network)
+        write_weights(output, state.network, provenance_of())
     click.echo(f"{output}: {network}, {steps} steps, loss {np.mean(state.losses[-_EVERY:]):.4f}")

@@ -9,24 +9,18 @@ Bare equation numbers mean the GEOMScope paper.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_sqrt
 from ..designs.microscope import Microscope
-from ..geometry import envelope
+from ..designs.spots import encircled_radius, field_heights, psf_width
 from ..optics import aberrations, theory
-from ..optics.unit import pupil_disc, unit_rays
 from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
 
 Result = Float[Array, "..."]
 
 UM = 1000.0
-# Heights at which a lens is judged over its field, at the middles of rings of equal area.
-_FIELDS = 4
-_ENCIRCLED = 0.8
 # Places along a side of the plate where a hole is looked for.
 _PLACES = 41
 
@@ -55,12 +49,12 @@ def focus_offset(c: Microscope) -> Float[Array, ""]:
 
 def log_strehl(c: Microscope) -> Float[Array, "depth field"]:
     """Logarithm of Eq. 9 with Eq. 10, sensor where it is, at four heights of the field."""
-    return aberrations.log_strehl(aberrations.linear_rms(c.wavefront(_heights(c))), c.imager.wavelength)
+    return aberrations.log_strehl(aberrations.linear_rms(c.wavefront(field_heights(c))), c.imager.wavelength)
 
 
 def wavefront(c: Microscope) -> Float[Array, "depth field"]:
     """RMS of the third-order wavefront with astigmatism and field curvature, in waves, at four heights."""
-    return aberrations.independent_rms(c.wavefront(_heights(c))) / c.imager.wavelength
+    return aberrations.independent_rms(c.wavefront(field_heights(c))) / c.imager.wavelength
 
 
 def light(c: Microscope) -> Float[Array, " depth"]:
@@ -78,76 +72,6 @@ def field_of_view(c: Microscope) -> Float[Array, "depth axis"]:
 def thickness(c: Microscope) -> Float[Array, ""]:
     """From the plate's front to the sensor, `t + v`."""
     return c.imager.sensor_distance + c.imager.array.substrate_thickness
-
-
-def psf_width(c: Microscope) -> Float[Array, " depth"]:
-    """Width of the spot on the sensor, seen in the object: that of a Gaussian of the same variance, at half height.
-
-    Exact rays through the clear aperture, with all that defocus and aberrations do, averaged over the lens's field
-    with its envelope; plus the variances of the pixel and of a Gaussian as wide as the Airy disc. Light far from the
-    core counts, so for a caustic this is wider than the core.
-    """
-    landing, weight, lit = _spots(c)
-    squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
-    rays = jnp.sum(weight * squared, -1)
-    airy = theory.airy_deviation(c.imager.wavelength, c.imager.sensor_distance, c.clear_diameter)
-    total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
-    return UM * theory.FWHM * jnp.sqrt(total) / c.magnification
-
-
-def encircled_radius(c: Microscope) -> Float[Array, " depth"]:
-    """Radius about the rays' centroid that holds 80 % of them, seen in the object; rays as for `psf_width`.
-
-    A ray counts as within by a logistic curve half a pixel wide: without it the radius would have a kink wherever
-    one ray overtakes another.
-    """
-    landing, weight, lit = _spots(c)
-    radius = safe_sqrt(jnp.sum((landing - _centroid(landing, lit)) ** 2, -1))
-    share = weight[..., None] * lit
-    radius, share = (x.reshape(x.shape[0], -1) for x in (radius, share))
-    return UM * jax.vmap(_quantile, (0, 0, None))(radius, share, c.imager.sensor.pixel_pitch / 2) / c.magnification
-
-
-def _quantile(x: Float[Array, " entry"], share: Float[Array, " entry"], width: float) -> Float[Array, ""]:
-    """Where `_ENCIRCLED` of the entries are below, each counted by a logistic curve; bisection, then Newton's step.
-
-    The step changes next to nothing but has the derivatives of the implicit function.
-    """
-    below = lambda at: jnp.sum(share * jax.nn.sigmoid((at - x) / width)) - _ENCIRCLED
-    fixed = jax.lax.stop_gradient
-
-    def halve(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        under = fixed(below(middle)) < 0
-        return jnp.where(under, middle, low), jnp.where(under, high, middle)
-
-    top = fixed(jnp.max(x)) + 20 * width
-    at, _ = jax.lax.fori_loop(0, 40, halve, (jnp.zeros_like(top), top))
-    slope = fixed(jax.grad(below)(at))
-    lit = slope > 0
-    return at - jnp.where(lit, below(at) / jnp.where(lit, slope, 1), 0)
-
-
-def _spots(c: Microscope):
-    """Where rays land, `(depth, field, ray, 2)`; the share of each height, and of each ray of it."""
-    points, weights = pupil_disc(c.clear_diameter / 2)
-    heights = _heights(c)
-    trace = lambda z, h: unit_rays(c.imager, z, points, (h, jnp.zeros_like(h)))
-    rays = jax.vmap(jax.vmap(trace, (None, 0)), (0, None))(c.depths, heights)
-    lit = jnp.where(rays.valid, weights[None, None], 0)
-    total = jnp.sum(lit, -1, keepdims=True)
-    weight = envelope(heights[None] ** 2, c.reduced[:, None], c.imager.field_radius)
-    return rays.landing, weight / jnp.sum(weight, -1, keepdims=True), lit / jnp.where(total > 0, total, 1)
-
-
-def _centroid(landing, lit):
-    return jnp.sum(lit[..., None] * landing, -2, keepdims=True)
-
-
-def _heights(c: Microscope) -> Float[Array, " field"]:
-    rings = (np.arange(_FIELDS) + 0.5) / _FIELDS
-    return c.imager.field_radius * jnp.sqrt(jnp.asarray(rings, c.depths.dtype))
 
 
 def spacing(c: Microscope) -> Float[Array, " lens"]:
@@ -200,8 +124,8 @@ TERMS: dict[str, Term] = {
     "light_percent": Term("share of a point's light that is used", light),
     "field_of_view_mm": Term("width of the field of view", field_of_view),
     "thickness_mm": Term("thickness, plate and sensor distance", thickness),
-    "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", psf_width),
-    "encircled_radius_um": Term("radius of 80 % of the rays, in the object", encircled_radius),
+    "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", lambda c: UM * psf_width(c)),
+    "encircled_radius_um": Term("radius of 80 % of the rays, in the object", lambda c: UM * encircled_radius(c)),
     "depth_span_mm": Term("span of the depths", lambda c: c.depths[-1] - c.depths[0]),
     "spacing_mm": Term("distance of nearest lenses", spacing),
     "web_mm": Term("mask left between neighbouring apertures", web),

@@ -15,6 +15,7 @@ from rich.table import Table
 from ..designs.design import Design, write_design
 from ..io.disk import check_output, write_json
 from ..io.figures import write_figure
+from ..io.provenance import Provenance
 from .objectives import TERMS, unit_of
 from .search import Outcome, PathLike
 from .stages import best_end
@@ -41,7 +42,9 @@ def span(row: Row) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def write_outcome(path: PathLike, outcome: Outcome, *, parent: PathLike, source: PathLike) -> list[Path]:
+def write_outcome(
+    path: PathLike, outcome: Outcome, *, parent: PathLike, source: PathLike, provenance: Provenance | None = None
+) -> list[Path]:
     """Writes the design with its provenance, and beside it the numbers (.json) and a picture (.png).
 
     Parameters
@@ -50,6 +53,8 @@ def write_outcome(path: PathLike, outcome: Outcome, *, parent: PathLike, source:
         Of the new design.
     parent, source
         The files of the old design and of the study, for the provenance.
+    provenance
+        What else the provenance says.
 
     Returns
     -------
@@ -61,7 +66,8 @@ def write_outcome(path: PathLike, outcome: Outcome, *, parent: PathLike, source:
     history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
     write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
     write_figure(paths[2], picture(outcome))
-    provenance = {
+    table = {
+        **(provenance or {}),
         "parent": Path(parent).name,
         "study": Path(source).name,
         "seed": study.seed,
@@ -69,7 +75,7 @@ def write_outcome(path: PathLike, outcome: Outcome, *, parent: PathLike, source:
         "reason": best_end(outcome.log, len(study.stages) - 1)["reason"],
         "objectives": {record["term"]: record["after"] for record in records if None not in record["after"]},
     }
-    write_design(paths[0], outcome.design.model_copy(update={"provenance": provenance}))
+    write_design(paths[0], outcome.design.model_copy(update={"provenance": table}))
     return paths
 
 

@@ -18,7 +18,8 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError, short_repr
 from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
-from ..io.disk import check_output, read_table, read_text, write_text
+from ..io.disk import read_table, read_text, write_text
+from ..io.provenance import Provenance, write_sidecar
 from ..io.tables import Table, one_line
 
 CENTERS_HEADER = "x_mm,y_mm"
@@ -179,12 +180,17 @@ def write_design(path: str | os.PathLike[str], design: Design) -> None:
     InputError
         As `check_output`, for `.toml`.
     """
-    check_output(path, [".toml"])
-    text = tomli_w.dumps(design.model_dump(exclude_defaults=True))
-    write_text(path, _PAIR.sub(r"[\1, \2]", text), [".toml"])
+    write_text(path, design_text(design), [".toml"])
 
 
-def write_centers(path: str | os.PathLike[str], centers: Float[np.ndarray, "lens 2"]) -> None:
+def design_text(design: Design) -> str:
+    """A design as TOML, its centres inside."""
+    return _PAIR.sub(r"[\1, \2]", tomli_w.dumps(design.model_dump(exclude_defaults=True)))
+
+
+def write_centers(
+    path: str | os.PathLike[str], centers: Float[np.ndarray, "lens 2"], provenance: Provenance | None = None
+) -> None:
     """Writes lens centres, mm, as the CSV file that the key `array.centers_file` names.
 
     Raises
@@ -194,6 +200,7 @@ def write_centers(path: str | os.PathLike[str], centers: Float[np.ndarray, "lens
     """
     rows = [",".join(map(str, row)) for row in centers.tolist()]
     write_text(path, "\n".join([CENTERS_HEADER, *rows]) + "\n", [".csv"])
+    write_sidecar(path, provenance)
 
 
 # An array of two numbers on one line, as people write it. `tomli_w` has no line end within a string.

@@ -3,14 +3,23 @@
 import dataclasses
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..optics import aberrations, theory
+from ..optics.unit import unit_rays
 from .design import Design
 from .microscope import Microscope
 from .sheet import confusion_of, microscope_of
 
+# Spots so many times wider than promised are said to be.
+_FAR = 2.0
+# Depths at which the brightest core is looked for, rays across the pupil, and how bright the others are at least.
+_DEPTHS, _RAYS, _NEARLY = 300, 4000, 0.5
+# Share of the plate without lenses that needs no mask.
+_LEAST_BETWEEN = 0.005
 # Eq. 9 holds below this RMS wavefront error, in waves.
 _STREHL_DOMAIN = 0.1
 
@@ -32,8 +41,39 @@ def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None =
     """
     confusion = confusion_of(design, confusion)
     m = microscope_of(design, sheet["depth_mm"], confusion=confusion, coverage=sheet["coverage"])
-    checks = (_focus(design, sheet, m), _strehl(design, sheet, m), _pixels(design, sheet), _pitch(sheet))
-    return [sentence for check in (*checks, _occupancy(sheet)) for sentence in check]
+    checks = (_rays(sheet), _focus(design, sheet, m), _strehl(design, sheet, m), _pixels(design, sheet))
+    return [sentence for check in (*checks, _pitch(sheet), _occupancy(sheet), _mask(sheet)) for sentence in check]
+
+
+def _rays(sheet: dict[str, Any]) -> list[str]:
+    """What exact rays say where it is far from what the formulas promise."""
+    wide, promised = np.array(sheet["spot_width_um"]), np.array(sheet["lateral_resolution_um"])
+    if not (wide > _FAR * promised).any():
+        return []
+    return [
+        f"Exact rays spread a point over {_span(wide)} um of the object (width at half height), where Eq. 5 promises "
+        f"{_span(promised)}: expect a bright core within a wide halo."
+    ]
+
+
+def _sharp_cores(m: Microscope) -> list[str]:
+    """Where most light falls into a core three pixels wide, on the axis."""
+    depths = jnp.geomspace(m.depths[0] / 2, 2 * m.depths[-1], _DEPTHS)
+    within = np.asarray(_light_within(m, depths, 1.5 * m.imager.sensor.pixel_pitch))
+    best = within.argmax()
+    if best in (0, _DEPTHS - 1):
+        return []
+    near, far = (float(depths[i]) for i in np.flatnonzero(within >= _NEARLY * within[best])[[0, -1]])
+    return [f"By exact rays cores of spots hold half of the most light, or more, at {near:.3g} to {far:.3g} mm."]
+
+
+@eqx.filter_jit
+def _light_within(m: Microscope, depths, radius):
+    """Of a point on a lens's axis, by exact rays, relative."""
+    radii = jnp.asarray((np.arange(_RAYS) + 0.5) / _RAYS, depths.dtype) * m.clear_diameter / 2
+    pupil = jnp.stack([radii, jnp.zeros_like(radii)], -1)
+    rays = jax.vmap(lambda depth: unit_rays(m.imager, depth, pupil))(depths)
+    return jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
 
 
 def _focus(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
@@ -46,6 +86,7 @@ def _focus(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
         *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
         f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
         _sharp_range(design, m),
+        *_sharp_cores(m),
     ]
 
 
@@ -68,7 +109,7 @@ def _sharp_range(design: Design, m: Microscope) -> str:
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
     if far <= 0:
         return f"The sensor at {v:g} mm is so far that only points within the plate are in focus; {working}."
-    return f"In focus are {near:.4g} to {far:.4g} mm; {working}."
+    return f"In focus by Eqs. 7 and 8, of a thin lens, are {near:.4g} to {far:.4g} mm; {working}."
 
 
 def _strehl(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
@@ -123,6 +164,13 @@ def _occupancy(sheet: dict[str, Any]) -> list[str]:
     if occupancy <= 1:
         return []
     return [f"At {depth:g} mm the occupancy is {occupancy:.2g}: sub-images of an object that fills the field overlap."]
+
+
+def _mask(sheet: dict[str, Any]) -> list[str]:
+    between = 1 - sheet["coverage"]
+    if between < _LEAST_BETWEEN:
+        return []
+    return [f"{100 * between:.1f} % of the plate is no lens's: an opaque mask must cover it (`gs-jax mask`)."]
 
 
 def _length(mm: float) -> str:

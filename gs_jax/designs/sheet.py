@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
@@ -14,6 +15,7 @@ from ..layouts.cells import check_positive, coverage, nearest_neighbour_distance
 from ..optics import aberrations
 from .design import Design
 from .microscope import Microscope
+from .spots import encircled_radius, psf_width
 
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7
@@ -64,6 +66,7 @@ def datasheet(
     covered = coverage(centers, size, diameter=design.lens.aperture_diameter_mm)
     m = microscope_of(design, depths, confusion=confusion_of(design, confusion), coverage=covered)
     distances, axis = nearest_neighbour_distances(centers), jnp.zeros(1)
+    width, radius = eqx.filter_jit(lambda m: (psf_width(m), encircled_radius(m)))(m)
     columns = {
         "magnification": m.magnification,
         "scale": m.scale,
@@ -77,6 +80,8 @@ def datasheet(
         "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(m.wavefront(axis))[:, 0], m.imager.wavelength),
         "focus_distance_mm": m.focus_distance,
         "blur_um": m.blur * 1000,
+        "spot_width_um": width * 1000,
+        "spot_radius_um": radius * 1000,
     }
     return {
         "depth_mm": depths,
@@ -92,7 +97,7 @@ def datasheet(
 
 
 def tables(sheet: dict[str, Any]) -> list[Table]:
-    """A datasheet to read: what an image in focus shows, and how far out of focus it is. Both fit 80 columns."""
+    """A datasheet to read: an image in focus, how far out of focus it is, and what to expect. All fit 80 columns."""
     return [_table(title, columns, sheet) for title, columns in _TABLES.items()]
 
 
@@ -125,7 +130,14 @@ _TABLES = {
         "blur_um": "blur\num",
         "strehl_on_axis": "Strehl\nratio",
     },
+    "What becomes of a point, by exact rays over the field: in the object, um": {
+        "depth_mm": "depth\nmm",
+        "spot_width_um": "width at half\nheight",
+        "spot_radius_um": "radius of\n80 % of the light",
+    },
 }
+# Below it a Strehl ratio only says that diffraction does not limit the image.
+_LEAST_STREHL = 0.01
 
 
 def _table(title: str, columns: dict[str, str], sheet: dict[str, Any]) -> Table:
@@ -133,8 +145,13 @@ def _table(title: str, columns: dict[str, str], sheet: dict[str, Any]) -> Table:
     for header in columns.values():
         table.add_column(header, justify="right")
     for row in zip(*(sheet[key] for key in columns), strict=True):
-        table.add_row(*map(_plain, row))
+        table.add_row(*(_cell(key, value) for key, value in zip(columns, row, strict=True)))
     return table
+
+
+def _cell(key: str, value: float | None) -> str:
+    is_low = key == "strehl_on_axis" and value is not None and value < _LEAST_STREHL
+    return f"< {_LEAST_STREHL:g}" if is_low else _plain(value)
 
 
 def _plain(value: float | None) -> str:

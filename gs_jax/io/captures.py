@@ -5,6 +5,7 @@ suffix to `_FORMATS` with a function that reads it and one that writes it.
 """
 
 import contextlib
+import json
 import os
 import struct
 from collections.abc import Callable
@@ -15,9 +16,11 @@ import numpy as np
 import tifffile
 from jaxtyping import Array, Float32, Shaped, UInt8, UInt16
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from ..base.errors import InputError, short_repr
 from .disk import atomic_write, check_input, check_output, decoding
+from .provenance import KEY, Provenance, write_sidecar
 from .tiff import decode_page
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
@@ -56,13 +59,17 @@ def read_capture(path: str | os.PathLike[str], shape: tuple[int, int] | None = N
     return pixels
 
 
-def write_capture(path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"]) -> None:
+def write_capture(
+    path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"], provenance: Provenance | None = None
+) -> None:
     """Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all.
 
     Parameters
     ----------
     image
         `(row, column)` of uint8, uint16 or float32.
+    provenance
+        Where it comes from; beside an .npy.
 
     Raises
     ------
@@ -80,7 +87,9 @@ def write_capture(path: str | os.PathLike[str], image: Shaped[Array | np.ndarray
         allowed = f"{', '.join(form.dtypes)} in {path.suffix}; use .tif or .npy"
         raise InputError(f"{path}: found pixels of type {pixels.dtype.name}, allowed: {allowed}.")
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        form.write(file, pixels)
+        form.write(file, pixels, provenance)
+    if path.suffix.lower() == ".npy":
+        write_sidecar(path, provenance)
 
 
 def _check_declared(path: Path, size: tuple[int, ...], dtype: str, shape: tuple[int, int] | None) -> None:
@@ -140,15 +149,18 @@ def _read_npy(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
     return np.array(pixels)
 
 
-def _write_tiff(file: BinaryIO, pixels: np.ndarray) -> None:
-    tifffile.imwrite(file, pixels, photometric="minisblack")
+def _write_tiff(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
+    tifffile.imwrite(file, pixels, photometric="minisblack", metadata={KEY: dict(provenance)} if provenance else {})
 
 
-def _write_png(file: BinaryIO, pixels: np.ndarray) -> None:
-    Image.fromarray(pixels).save(file, format="PNG")
+def _write_png(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
+    texts = PngInfo()
+    if provenance:
+        texts.add_itxt(KEY, json.dumps(dict(provenance), ensure_ascii=False))
+    Image.fromarray(pixels).save(file, format="PNG", pnginfo=texts)
 
 
-def _write_npy(file: BinaryIO, pixels: np.ndarray) -> None:
+def _write_npy(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
     np.save(file, pixels, allow_pickle=False)
 
 
@@ -156,7 +168,7 @@ class _Format(NamedTuple):
     """How files of one suffix are read, given the size that they must have, and written, and what they can hold."""
 
     read: Callable[[Path, tuple[int, int] | None], np.ndarray]
-    write: Callable[[BinaryIO, np.ndarray], None]
+    write: Callable[[BinaryIO, np.ndarray, Provenance | None], None]
     dtypes: tuple[str, ...] = _DTYPES
 
 

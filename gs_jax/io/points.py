@@ -1,26 +1,33 @@
 """Points on disk: CSV."""
 
 import os
+from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Shaped
 
 from ..base.errors import InputError, short_repr
-from .disk import read_table, write_text
+from .disk import check_input, read_table, write_text
+from .provenance import Provenance, write_sidecar
 
 MAX_POINTS = 1_000_000
+# Of the first line, bytes.
+_LONGEST = 1000
 POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 
 
 def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
-    """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`.
+    """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`, or more columns.
 
     Raises
     ------
     InputError
         As `read_table`, and if a depth is not above 0 or an intensity is below 0.
     """
-    points = read_table(path, POINTS_HEADER, MAX_POINTS)
+    with check_input(path).open("rb") as file:
+        first = file.readline(_LONGEST).decode("utf-8-sig", "replace").rstrip("\r\n")
+    header = first if first.startswith(f"{POINTS_HEADER},") else POINTS_HEADER
+    points = np.ascontiguousarray(read_table(path, header, MAX_POINTS)[:, :4])
     for column, wrong, allowed in ((2, points[:, 2] <= 0, "a depth above 0"), (3, points[:, 3] < 0, "0 or more")):
         if wrong.any():
             row = int(np.argmax(wrong))
@@ -30,15 +37,33 @@ def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
     return points
 
 
-def write_points(path: str | os.PathLike[str], points: Float[Array | np.ndarray, "point 4"]) -> None:
-    """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal.
+def write_points(
+    path: str | os.PathLike[str],
+    points: Float[Array | np.ndarray, "point 4"],
+    more: Mapping[str, Shaped[np.ndarray, " point"]] | None = None,
+    *,
+    provenance: Provenance | None = None,
+) -> None:
+    """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal. Their provenance goes beside them.
+
+    Parameters
+    ----------
+    path, points
+        The file, and what it holds.
+    more
+        Further columns, by name.
+    provenance
+        Where they come from.
 
     Raises
     ------
     InputError
         As `check_output`, for `.csv`.
     """
-    rows = np.asarray(points)
+    rows, more = np.asarray(points), more or {}
     # `str` of the array's own scalars: the shortest digits that read back as the same float32 or float64.
-    lines = [POINTS_HEADER, *(",".join(str(value) for value in row) for row in rows)]
+    further = zip(*more.values(), strict=True) if more else [()] * len(rows)
+    lines = [",".join([POINTS_HEADER, *more])]
+    lines += [",".join(str(value) for value in (*row, *others)) for row, others in zip(rows, further, strict=True)]
     write_text(path, "\n".join(lines) + "\n", [".csv"])
+    write_sidecar(path, provenance)

@@ -1,4 +1,4 @@
-"""One page of a TIFF file, decoded or refused in words."""
+"""TIFF: one page decoded or refused in words, and a second description of a file."""
 
 import math
 from pathlib import Path
@@ -8,6 +8,9 @@ import tifffile
 
 from ..base.errors import InputError
 from .disk import decoding
+
+# TIFF's number of a description, and of the tag after it, whose place a second one takes.
+_DESCRIPTION, _AFTER = 270, 271
 
 
 def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
@@ -43,3 +46,17 @@ def _check_segments(path: Path, page: tifffile.TiffPage) -> None:
     missing = (offsets < 1) | (counts < 1) | (offsets > end) | (counts > end - offsets)
     if missing.any() or (raw and 8 * counts.sum() < bits):
         raise InputError(f"{path}: not a whole and valid TIFF: a part of page {page.index + 1} is not in the file.")
+
+
+def place_for_description(text: str) -> tuple[int, int, int, str, bool]:
+    """An extra tag for `tifffile`, which writes one description itself: a second one, until it takes its place."""
+    return (_AFTER, 2, 0, text, True)
+
+
+def take_place(path: Path) -> None:
+    """Makes a description of the first page's tag of `place_for_description`."""
+    with tifffile.TiffFile(path) as tiff:
+        entry, order = tiff.pages.first.tags[_AFTER].offset, tiff.byteorder
+    with path.open("r+b") as file:
+        file.seek(entry)
+        file.write(_DESCRIPTION.to_bytes(2, "little" if order == "<" else "big"))

@@ -1,7 +1,11 @@
 """Volumes on disk: OME-TIFF, or OME-Zarr when the name ends in `.zarr`.
 
 Both hold float32 voxels `[depth, row, column]` as they are, and the grid in micrometres: the lateral pitch, every
-depth, and the centre of the first voxel, so that Fiji and napari show the volume to scale and in place.
+depth, and the centre of the first voxel, so that Fiji and napari show the volume to scale and in place; and the range
+of values to show.
+
+OME-TIFF has a second description after OME's, as ImageJ writes it: without Bio-Formats ImageJ knows no other. Readers
+of TIFF take the first, ImageJ takes the last.
 
 OME-Zarr is written in version 0.4 (Zarr 2), not 0.5 (Zarr 3): every reader of Fiji (n5-viewer, MoBIE, Bio-Formats)
 and of napari knows 0.4, while 0.5 needs recent versions of each; both are read here. Chunks are compressed with
@@ -26,17 +30,23 @@ from jaxtyping import Array, Float32, Shaped
 from ..base.errors import InputError, short_repr
 from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
-from .tiff import decode_page
+from .provenance import KEY, NAMESPACE, Provenance
+from .tiff import decode_page, place_for_description, take_place
 
 MAX_VOXELS = 10**10
 CHUNK = 1024
+# Percentiles of the values shown, of up to so many rows and columns.
+_SHOWN, _SAMPLED = (1, 99.9), 512
 
 _MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 _MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 
 def write_volume(
-    path: str | os.PathLike[str], volume: Shaped[Array | np.ndarray, "depth row column"], grid: Grid
+    path: str | os.PathLike[str],
+    volume: Shaped[Array | np.ndarray, "depth row column"],
+    grid: Grid,
+    provenance: Provenance | None = None,
 ) -> None:
     """Writes a volume, never rescaled or clipped, whole or not at all.
 
@@ -48,6 +58,8 @@ def write_volume(
         `(depth, row, column)` of float32, or of a type whose values float32 holds exactly.
     grid
         Where its voxels are.
+    provenance
+        Where it comes from.
 
     Raises
     ------
@@ -64,7 +76,7 @@ def write_volume(
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
-    _FORMATS[path.suffix.lower()].write(path, voxels, depths, grid)
+    _FORMATS[path.suffix.lower()].write(path, voxels, depths, grid, provenance or {})
 
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
@@ -94,6 +106,19 @@ def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth ro
         if (cast.astype(np.float64) == voxels).all():
             return cast
     raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: float32, or values that it holds exactly.")
+
+
+def _title(path: Path) -> str:
+    return path.name.removesuffix(path.suffix).removesuffix(".ome")
+
+
+def _display_range(voxels: np.ndarray) -> tuple[float, float]:
+    """What a viewer should show as black and white: few voxels are darker or brighter."""
+    some = voxels[:, :: max(voxels.shape[1] // _SAMPLED, 1), :: max(voxels.shape[2] // _SAMPLED, 1)]
+    for low, high in (np.percentile(some, _SHOWN), (voxels.min(), voxels.max())):
+        if low < high:
+            return float(low), float(high)
+    return float(low), float(low) + 1
 
 
 def _um(mm: float) -> float:
@@ -138,18 +163,26 @@ def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitch
 # OME-TIFF
 
 
-def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid) -> None:
+def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
     planes, pitch, (first_y, first_x) = len(depths), grid.pitch, _first_um(grid)
     plane: dict[str, Any] = {"PositionZ": [_um(depth) for depth in depths]}
     plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
-    metadata = {"axes": "ZYX", "PhysicalSizeX": _um(pitch), "PhysicalSizeY": _um(pitch), "Plane": plane}
+    metadata = {
+        "axes": "ZYX",
+        "Name": _title(path),
+        "PhysicalSizeX": _um(pitch),
+        "PhysicalSizeY": _um(pitch),
+        "Plane": plane,
+    }
     # Uneven depths: the mean step is what a viewer that knows one step only can show; the planes keep the truth.
     step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
     if step > 0:
         metadata["PhysicalSizeZ"] = _um(step)
     metadata |= {f"{name}Unit": "µm" for name in list(metadata) if name.startswith("PhysicalSize")}
     plane |= {f"{name}Unit": ["µm"] * planes for name in list(plane)}
-    per_cm = 10 / pitch  # for readers of plain TIFF, such as ImageJ without Bio-Formats
+    if provenance:
+        metadata["MapAnnotation"] = {"Namespace": NAMESPACE, **provenance}
+    per_um = 1 / _um(pitch)  # the unit is in ImageJ's description: TIFF knows inches and centimetres alone
     with atomic_write(path) as temporary:
         tifffile.imwrite(
             temporary,
@@ -157,9 +190,19 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid)
             ome=True,
             photometric="minisblack",
             metadata=metadata,
-            resolution=(per_cm, per_cm),
-            resolutionunit="CENTIMETER",
+            resolution=(per_um, per_um),
+            resolutionunit="NONE",
+            extratags=[place_for_description(_imagej(voxels, step))],
         )
+        take_place(temporary)
+
+
+def _imagej(voxels: np.ndarray, step: float) -> str:
+    """ImageJ's description of a stack."""
+    low, high = _display_range(voxels)
+    stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
+    spacing = f"spacing={_um(step)}\n" if step > 0 else ""
+    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}loop=false\nmin={low}\nmax={high}\n"
 
 
 def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
@@ -216,7 +259,7 @@ def _length(path: Path, element: ElementTree.Element, name: str, default_unit: s
 # OME-Zarr
 
 
-def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid) -> None:
+def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
     import zarr  # 0.15 s that TIFF does not need
 
     pitch = grid.pitch
@@ -228,14 +271,20 @@ def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid)
     scale = [_um(step), _um(pitch), _um(pitch)]
     first = [_um(depths[0]), *_first_um(grid)]
     transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
+    low, high = _display_range(voxels)
+    window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
+    channel = {"active": True, "color": "FFFFFF", "label": _title(path), "window": window}
     multiscale = {
         "version": "0.4",
-        "name": path.stem,
+        "name": _title(path),
         "axes": [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"],
         "datasets": [{"path": "0", "coordinateTransformations": transforms}],
     }
+    attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
+    if provenance:
+        attributes[KEY] = dict(provenance)
     with atomic_write(path) as temporary:
-        group = zarr.create_group(store=temporary, zarr_format=2, attributes={"multiscales": [multiscale]})
+        group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
         array = group.create_array(
             "0",
             shape=voxels.shape,
@@ -292,7 +341,7 @@ class _Format(NamedTuple):
     """How a volume is read, and how voxels of float32 are written with their depths (mm) and grid."""
 
     read: Callable[[Path], tuple[np.ndarray, Grid]]
-    write: Callable[[Path, np.ndarray, list[float], Grid], None]
+    write: Callable[[Path, np.ndarray, list[float], Grid, Provenance], None]
 
 
 _TIFF, _ZARR = _Format(_read_tiff, _write_tiff), _Format(_read_zarr, _write_zarr)

@@ -13,11 +13,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .disk import atomic_write, check_input, check_output, decoding
+from .provenance import KEY, Provenance
 
 _MOST_BYTES = 2**27
 
 
-def write_weights(path: str | os.PathLike[str], network: PyTree, about: dict[str, Any]) -> None:
+def write_weights(
+    path: str | os.PathLike[str], network: PyTree, about: dict[str, Any], provenance: Provenance | None = None
+) -> None:
     """Writes the arrays of a network as `.npz`, in float16, with what makes another of its kind; whole or not at all.
 
     Raises
@@ -27,6 +30,8 @@ def write_weights(path: str | os.PathLike[str], network: PyTree, about: dict[str
     """
     arrays = {f"array_{i}": np.asarray(leaf, np.float16) for i, leaf in enumerate(jax.tree.leaves(network))}
     with atomic_write(check_output(path, [".npz"])) as temporary:
+        if provenance:
+            arrays[KEY] = np.array(json.dumps(dict(provenance)))
         np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
 
 

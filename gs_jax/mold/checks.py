@@ -22,6 +22,8 @@ from .solids import STEEPEST, MoldShape, engravings, mold_block, plate_thickness
 VOLUME_TOLERANCE = 1e-4
 # Thinner sheets of cast silicone tear when they are peeled off, thinner prints warp.
 THINNEST_MM = 0.3
+# Of steps in a surface, RMS: a Strehl ratio of 0.8, Marechal's criterion.
+MOST_WAVES = 1 / 14
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,9 @@ def refuse_errors(findings: list[Finding], place: str) -> None:
             raise InputError(f"{place}: {finding.text}")
 
 
-def check_design(design: Design, shape: MoldShape, *, chord: float, resolution: float) -> list[Finding]:
+def check_design(
+    design: Design, shape: MoldShape, *, chord: float, resolution: float, layer: float | None = None
+) -> list[Finding]:
     """What can be said before anything is built.
 
     Parameters
@@ -53,6 +57,8 @@ def check_design(design: Design, shape: MoldShape, *, chord: float, resolution: 
         The largest distance between a facet and its sphere, mm.
     resolution
         The smallest feature that the printer makes, mm.
+    layer
+        Thickness of its layers, mm, if it prints any.
     """
     array = design.imager().array
     return [
@@ -64,6 +70,7 @@ def check_design(design: Design, shape: MoldShape, *, chord: float, resolution: 
         _ridges(array, resolution),
         _holes(array),
         _chord(array, chord, resolution),
+        *([] if layer is None else [_layers(design, array, layer)]),
     ]
 
 
@@ -148,7 +155,7 @@ def _holes(array: MicrolensArray) -> Finding:
         return Finding("coverage", "ok", "lenses cover the whole plate.")
     area = share * math.prod(array.size)
     text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is flat, up to {hole:.3g} mm from the nearest lens"
-    return Finding("coverage", "warning", f"{text}: light goes through it unfocused.")
+    return Finding("coverage", "warning", f"{text}: without a mask (`gs-jax mask`) light goes through it unfocused.")
 
 
 def _chord(array: MicrolensArray, chord: float, resolution: float) -> Finding:
@@ -163,6 +170,17 @@ def _chord(array: MicrolensArray, chord: float, resolution: float) -> Finding:
     if chord > resolution / 4:
         return Finding("facets", "warning", f"{text}: the printer, with {1000 * resolution:g} um, may show them.")
     return Finding("facets", "ok", f"{text}.")
+
+
+def _layers(design: Design, array: MicrolensArray, layer: float) -> Finding:
+    """Steps of the surface: evenly spread errors of a layer have a standard deviation of a layer over root 12."""
+    sag, wavelength = cap_sag(array), design.imaging.wavelength_nm * 1e-6
+    waves = (float(array.refractive_index) - 1) * layer / math.sqrt(12) / wavelength
+    text = f"a lens is {sag / layer:.3g} layers of {1000 * layer:g} um high; their steps are {waves:.2g} waves RMS"
+    if waves > MOST_WAVES:
+        finest = 1000 * layer * MOST_WAVES / waves
+        return Finding("layers", "warning", f"{text}: smooth them, or print layers of {finest:.2g} um.")
+    return Finding("layers", "ok", f"{text}.")
 
 
 def caps_volume(array: MicrolensArray, nodes: int = 64) -> float:

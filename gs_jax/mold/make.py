@@ -11,6 +11,7 @@ from ..base.progress import Progress
 from ..designs.design import Design, read_design
 from ..io.disk import atomic_write, check_output, write_json, write_text
 from ..io.figures import write_figure
+from ..io.provenance import KEY, Provenance
 from .caps import facet_surface
 from .checks import (
     Finding,
@@ -39,8 +40,10 @@ def make_mold(
     *,
     positive: bool = False,
     shape: MoldShape = MoldShape(),
-    chord: float = 5e-4,
+    chord: float = 4e-4,
     resolution: float = 0.025,
+    layer: float | None = None,
+    provenance: Provenance | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Writes the mold of a design, or the array, to print; and a picture and a report beside it.
@@ -61,6 +64,10 @@ def make_mold(
         The largest distance between a facet and its sphere, mm.
     resolution
         The smallest feature that the printer makes, mm.
+    layer
+        Thickness of its layers, mm, if it prints any.
+    provenance
+        Where it comes from, for 3MF and the report.
     progress
         Shows how far it is; nothing by default.
 
@@ -81,7 +88,7 @@ def make_mold(
     picture, record, text = (check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt"))
     source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
     design = design if isinstance(design, Design) else read_design(design)
-    findings = check_design(design, shape, chord=chord, resolution=resolution)
+    findings = check_design(design, shape, chord=chord, resolution=resolution, layer=layer)
     refuse_errors(findings, source)
     imager = design.imager()
     array = imager.array
@@ -96,7 +103,7 @@ def make_mold(
         _stop_at_fault(findings)
     # A part that is not the design does not get its name.
     with progress.step("Writing and measuring"), atomic_write(path) as temporary:
-        write_mesh(temporary, mesh, f"{design.name} {name}")
+        write_mesh(temporary, mesh, f"{design.name} {name}", provenance)
         lenses = verify(read_mesh(temporary), array, scale=shape.scale)
         measured = quality(lenses, imager)
         findings += judge(measured, chord=chord, radius=design.lens.radius_of_curvature_mm)
@@ -124,7 +131,7 @@ def make_mold(
     }
     with progress.step("Drawing"):
         write_figure(picture, preview(array, None if positive else shape, design.name))
-    write_json(record, report)
+    write_json(record, report | ({KEY: dict(provenance)} if provenance else {}))
     write_text(text, report_text(report), [".txt"])
     return report
 

@@ -234,17 +234,20 @@ def engravings(array: MicrolensArray, shape: MoldShape) -> list[m3.Manifold]:
     """The tools that cut the marks and the label into the rim."""
     low, high = mold_block(array, shape)
     middle = high[:2] - shape.wall / 2
-    plans = []
-    if shape.marks:
-        arm = 0.6 * shape.wall
-        bar = m3.CrossSection.square([arm, arm / 6], center=True)
-        cross = bar + bar.rotate(90)
-        plans += [cross.translate([sx * middle[0], sy * middle[1]]) for sx, sy in ((-1, -1), (1, -1), (-1, 1))]
+    plans = mark_plans(array, shape) if shape.marks else []
     text = _text(shape.label, height=0.4 * shape.wall, width=2 * (middle[0] - shape.wall))
     if not text.is_empty():
         plans.append(text.translate([0.0, -middle[1]]))
     depth = min(ENGRAVED, (high[2] - low[2]) / 4)
     return [plan.extrude(depth + _BEYOND).translate([0, 0, high[2] - depth]) for plan in plans]
+
+
+def mark_plans(array: MicrolensArray, shape: MoldShape) -> list[m3.CrossSection]:
+    """The crosses in the mold's rim, seen from above."""
+    middle, arm = mold_block(array, shape)[1, :2] - shape.wall / 2, 0.6 * shape.wall
+    bar = m3.CrossSection.square([arm, arm / 6], center=True)
+    cross = bar + bar.rotate(90)
+    return [cross.translate([sx * middle[0], sy * middle[1]]) for sx, sy in ((-1, -1), (1, -1), (-1, 1))]
 
 
 def _text(label: str, *, height: float, width: float) -> m3.CrossSection:

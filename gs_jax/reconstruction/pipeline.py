@@ -138,16 +138,16 @@ def reconstruct(
     counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
     enough = _ENOUGH * misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
     if isinstance(method, ListRichardsonLucy):
-        return _iterated(method.solver(background), progress, light, System(imager, grid, optics, seen), enough)
+        return iterated(method.solver(background), progress, light, System(imager, grid, optics, seen), enough)
     if isinstance(method, RichardsonLucy):
         method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
-        return _iterated(method, progress, light, System(imager, grid, optics), enough)
+        return iterated(method, progress, light, System(imager, grid, optics), enough)
     light = light - background
     if isinstance(method, Unrolled):
         # Its steps were trained together.
-        return _iterated(method, progress, light, System(imager, grid, optics, seen))
+        return iterated(method, progress, light, System(imager, grid, optics, seen))
     system = System(imager, grid, optics, slow=_slow_waves(imager, optics) if by_name else 0)
-    return _iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
+    return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
 
 
 def explainable(
@@ -242,7 +242,8 @@ def _back_projected(image, imager, grid, method, progress):
     return volume
 
 
-def _iterated(solver, progress, light, system, enough=0.0):
+def iterated(solver, progress, light, system, enough=0.0):
+    """What a solver makes of an image, step by step; `system` is a module whose `operator` it inverts."""
     # How many steps and until when is decided here: other numbers need no other code.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, system)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 from ..base.errors import InputError
 from ..base.safe import divide
 from ..io import weights
+from ..io.provenance import Provenance
 from .iteration import as_image, check_options, norm
 from .richardson_lucy import TENTS, RichardsonLucy, State as LucyState, divergence, tent_background, tent_step
 from .unmatched import Unmatched
@@ -156,11 +157,11 @@ class Unrolled(eqx.Module):
         return weights.shipped("unrolled", _skeleton)
 
 
-def write_unrolled(path: str | os.PathLike[str], networks: Unrolled) -> None:
+def write_unrolled(path: str | os.PathLike[str], networks: Unrolled, provenance: Provenance | None = None) -> None:
     """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
     width = networks.layers[0].bias.shape[-1]
     about = {"first": networks.first, "networks": networks.power.size, "last": networks.last, "width": width}
-    weights.write_weights(path, networks, about)
+    weights.write_weights(path, networks, about, provenance)
 
 
 def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:

@@ -36,9 +36,9 @@ Points = Float64[np.ndarray, "_ 4"]
 Places = Float64[np.ndarray, "_ 3"]
 
 # Share of its lenses that must see a point; the others may be blocked, scratched, or under a brighter point.
-_SHARE = 0.7
+SHARE = 0.7
 # Lit is what exceeds the noise this many times. Back-projected are the logarithms of what exceeds it half as much.
-_LIT = 5.0
+LIT = 5.0
 # Three numbers are found from two of each lens.
 _FEWEST = 3
 # Part of its light that a point must keep when the points that were found before it are taken away.
@@ -53,7 +53,7 @@ _COARSE = 2
 _PLANES = 16
 # Half the side, in pixels, of the square in which the light of a spot is summed; depths and fields at which the share
 # of the light in it is computed.
-_APERTURE, _DEPTHS, _FIELDS = 3, 5, 17
+APERTURE, _DEPTHS, FIELDS = 3, 5, 17
 # Depths whose cores are traced, and how far they go beyond the grid, in depths.
 _TRACED, _BEYOND = 9, 0.05
 # Searches: the second, without the light that the first explains, finds what is close to brighter points.
@@ -105,7 +105,7 @@ def find_points(
     depths = _around(grid)
     apparent = np.asarray(apparent_depths(imager, depths), np.float64)
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
-    seen, voxels = signal(image), _voxels(imager, searched)
+    seen, voxels = signal(image), searched_voxels(imager, searched)
     rest, candidates = seen, np.zeros((0, 3))
     points, spots, own = _consistent(candidates, seen, imager, voxels)
     for _ in range(_SEARCHES):
@@ -113,7 +113,7 @@ def find_points(
         wide = rest._replace(light=np.asarray(_brightest_neighbour(rest.light)))
         new = _candidates(wide, imager, voxels, progress)
         with progress.step("Comparing lenses"):
-            lit = _lit(readings(new, wide, imager), survival(wide.light), _count(voxels))
+            lit = _lit(readings(new, wide, imager), survival(wide.light), count_of(voxels))
             new = _refined(new[lit], voxels, rest, imager)
             points, spots, own = _consistent(np.concatenate([points, new]), seen, imager, voxels)
             rest = seen._replace(light=without_spots(seen.light, spots, own))
@@ -131,7 +131,7 @@ def _around(grid: Grid) -> Float64[np.ndarray, " depth"]:
     return np.linspace(near - min(beyond, near / 2), far + beyond, _TRACED)
 
 
-def _voxels(imager: Imager, grid: Grid) -> Grid:
+def searched_voxels(imager: Imager, grid: Grid) -> Grid:
     """Coarse voxels that fill the sensor and the grid's depths, and a plane beyond: maxima need neighbours."""
     near, far = float(grid.depths.min()), float(grid.depths.max())
     middle = (near + far) / 2
@@ -151,14 +151,14 @@ def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point
     return lateral & (near - step / 2 <= z) & (z <= far + step / 2)
 
 
-def _count(voxels: Grid) -> int:
+def count_of(voxels: Grid) -> int:
     """Places that are told apart: voxels of a pixel."""
     return voxels.depths.size * math.prod(voxels.shape) * _COARSE**3
 
 
 def _brightness(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """What is summed over the lenses: the logarithm of what exceeds the noise, so that no lens outweighs the others."""
-    return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (_LIT / 2), 1))
+    return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (LIT / 2), 1))
 
 
 @jax.jit
@@ -192,7 +192,7 @@ def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) 
 def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
     """Which inner voxels exceed what three lenses would read, and all 26 neighbours; the last of equal neighbours."""
     inner = volume[1:-1, 1:-1, 1:-1]
-    highest = inner > _FEWEST * _SHARE * math.log(2)
+    highest = inner > _FEWEST * SHARE * math.log(2)
     for step in np.ndindex(3, 3, 3):
         there = volume[tuple(slice(at, at + n) for at, n in zip(step, inner.shape, strict=True))]
         highest &= inner >= there if step <= (1, 1, 1) else inner > there
@@ -215,9 +215,9 @@ def _refined(points: Places, voxels: Grid, rest: Signal, imager: Imager) -> Plac
 def _lit(seen: Readings, as_bright, tests: int) -> np.ndarray:
     """Which points enough of their lenses see, and more than by chance."""
     count, noise = seen.seen.sum(1), seen.noise.max(1, initial=0)
-    level = agreed_level(seen.light, seen.seen, _SHARE)
-    log_alarms = log_false_alarms(level, count, _SHARE, as_bright, tests)
-    return (level > _LIT * noise) & (log_alarms <= np.log(_FALSE_ALARMS)) & (count >= _FEWEST)
+    level = agreed_level(seen.light, seen.seen, SHARE)
+    log_alarms = log_false_alarms(level, count, SHARE, as_bright, tests)
+    return (level > LIT * noise) & (log_alarms <= np.log(_FALSE_ALARMS)) & (count >= _FEWEST)
 
 
 def _consistent(
@@ -229,9 +229,9 @@ def _consistent(
     voxel to one of them there is no other point, only the rim of its spot.
     """
     seen = readings(candidates, signal, imager)
-    order = np.argsort(-agreed_level(seen.light, seen.seen, _SHARE), kind="stable")
+    order = np.argsort(-agreed_level(seen.light, seen.seen, SHARE), kind="stable")
     candidates, seen = candidates[order], select_readings(seen, order)
-    as_bright, tests = survival(signal.light), _count(voxels)
+    as_bright, tests = survival(signal.light), count_of(voxels)
     profile = spot_profile(seen, signal.light)
     spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
     tree = KDTree(spots)
@@ -241,7 +241,7 @@ def _consistent(
         if (np.linalg.norm(places[height > 0] - places[number], axis=1) < 1).any():
             continue
         one = select_readings(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
-        bright = agreed_level(one.light, one.seen, _SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
+        bright = agreed_level(one.light, one.seen, SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
         if not (bright and _lit(one, as_bright, tests)[0]):
             continue
         height[number] = np.median(left[number, mine])
@@ -261,7 +261,7 @@ def _intensity(
     Summed in a square about each spot; of it the part that is the point's own in the middle; over the share of the
     point's light that falls into the square.
     """
-    side = np.arange(-_APERTURE, _APERTURE + 1)
+    side = np.arange(-APERTURE, APERTURE + 1)
     middle = np.floor(seen.pixels + 0.5).astype(int)
     row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
     total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
@@ -276,8 +276,8 @@ def _expected(points: Places, seen: Readings, imager: Imager) -> Float64[np.ndar
     if not len(points):
         return np.zeros_like(seen.light)
     depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
-    fields = np.linspace(0, imager.field_radius, _FIELDS)
-    side = (2 * _APERTURE + 1) * imager.sensor.pixel_pitch
+    fields = np.linspace(0, imager.field_radius, FIELDS)
+    side = (2 * APERTURE + 1) * imager.sensor.pixel_pitch
     shares = core_shares(imager, depths, fields, side)
     place = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
     at = np.stack(np.broadcast_arrays(place, seen.field / fields[1]))

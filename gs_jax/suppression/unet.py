@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ..base.errors import InputError, short_repr
 from ..io import weights
+from ..io.provenance import Provenance
 
 # The networks that come with the package, and what a file of weights may hold at most.
 PRETRAINED = ("paper", "multislice")
@@ -192,10 +193,10 @@ def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
     return np.minimum(index, 2 * size - 1 - index)
 
 
-def write_weights(path: str | os.PathLike[str], network: UNet) -> None:
+def write_weights(path: str | os.PathLike[str], network: UNet, provenance: Provenance | None = None) -> None:
     """Writes a network as `.npz`; see `gs_jax.io.weights`."""
     about = {"offsets": network.offsets, "widths": network.widths, "standardized": network.standardized}
-    weights.write_weights(path, network, about)
+    weights.write_weights(path, network, about, provenance)
 
 
 def read_weights(path: str | os.PathLike[str]) -> UNet:

@@ -1,0 +1,49 @@
+"""`gs-jax deconvolve`: a capture and a point spread function to a picture."""
+
+from pathlib import Path
+
+import click
+
+from ..base.progress import Progress
+from ..io.disk import check_output
+from .files import check_may_write, provenance_of
+from .options import Number
+
+
+@click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf.tif --tv 1e-3 -o scene.tif")
+@click.argument("capture", type=Path)
+@click.argument("psf", type=Path)
+@click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm", show_default=True)
+@click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True)
+@click.option(
+    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation.  [default: 1e-3 of admm]"
+)
+@click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
+def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path):
+    """Reconstruct the plane that CAPTURE shows, through a diffuser or another mask whose PSF is the file PSF.
+
+    PSF is the image of a point on the axis, of any size; both may be grey TIFF, PNG or .npy.
+    """
+    from ..base.errors import InputError
+    from ..io.captures import read_capture, write_capture
+    from ..reconstruction.deconvolution import deconvolve
+    from ..solvers.convolution_admm import ConvolutionADMM
+    from ..solvers.fista import FISTA
+    from ..solvers.richardson_lucy import RichardsonLucy
+
+    check_output(output, [".tif", ".tiff", ".npy"])
+    check_may_write(output, inputs=(capture, psf))
+    if tv is not None and method == "fista":
+        raise InputError("--tv: found --method fista, allowed: admm, richardson-lucy.")
+    solver = {
+        "admm": lambda: ConvolutionADMM(steps, sparsity=0.0, tv=1e-3 if tv is None else tv),
+        "fista": lambda: FISTA(steps),
+        "richardson-lucy": lambda: RichardsonLucy(steps, accelerate=True, tv=tv or 0.0),
+    }[method]()
+    image, spot = read_capture(capture), read_capture(psf)
+    with Progress() as progress:
+        scene = deconvolve(image, spot, solver, progress=progress)
+        with progress.step("Writing"):
+            write_capture(output, scene, provenance_of(capture, psf))
+    size = " x ".join(map(str, scene.shape))
+    click.echo(f"{output}: {size} pixels, {method}, {steps} steps")

@@ -1,0 +1,66 @@
+"""Deconvolution of a capture by a measured point spread function, of a diffuser or any other mask before a camera."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float32, Num
+
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..solvers.convolution import Convolution
+from ..solvers.convolution_admm import ConvolutionADMM
+from ..solvers.fista import FISTA
+from ..solvers.richardson_lucy import RichardsonLucy
+from .pipeline import above_offset, iterated
+
+Deconvolver = ConvolutionADMM | FISTA | RichardsonLucy
+
+
+def deconvolve(
+    image: Num[Array | np.ndarray, "row column"],
+    psf: Num[Array | np.ndarray, "high wide"],
+    solver: Deconvolver = ConvolutionADMM(steps=100, tv=1e-3),
+    *,
+    progress: Progress | None = None,
+) -> Float32[np.ndarray, "row column"]:
+    """The scene that an image shows, seen through a system that is everywhere alike.
+
+    Points beside the sensor whose light falls on it are reconstructed, too, and then cut off (Antipa et al., Optica 5,
+    1, 2018). Both the image and the PSF are taken above their darkest percent, the camera's offset.
+
+    Parameters
+    ----------
+    image
+        Linear, in any unit.
+    psf
+        The image of a point on the axis, its place in the middle; any unit.
+    solver
+        What inverts the convolution.
+    progress
+        Shows how far it is.
+
+    Returns
+    -------
+    ndarray
+        `image.shape`, in the image's unit: its sum is about that of the light that reaches the sensor.
+
+    Raises
+    ------
+    InputError
+        If the PSF is dark.
+    """
+    progress = progress or Progress()
+    light, spot = (above_offset(np.asarray(part, np.float32)) for part in (image, psf))
+    if not spot.sum() > 0:
+        raise InputError("psf: found no light above the darkest percent, allowed: the image of a point.")
+    system = Convolution.of(spot[None] / spot.sum(), light.shape)
+    # Solvers weigh their priors against an image of the order of 1.
+    unit = float(np.abs(light).max()) or 1.0
+    inverted = _Itself(system) if isinstance(solver, ConvolutionADMM) else system
+    scene = iterated(solver, progress, light / np.float32(unit), inverted)
+    return np.float32(unit) * scene[0][system.place]
+
+
+class _Itself(eqx.Module):
+    """A convolution for the solver that needs more of it than its operator."""
+
+    operator: Convolution

@@ -1,0 +1,127 @@
+"""Where files say that they come from, and what other programs read in them."""
+
+import json
+
+import numpy as np
+import pytest
+import tifffile
+from click.testing import CliRunner
+
+from gs_jax import Grid, InputError
+from gs_jax.__main__ import commands
+from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.points import read_points, write_points
+from gs_jax.io.provenance import made_by, read_provenance, sidecar
+from gs_jax.io.volumes import read_volume, write_volume
+from gs_jax.io.weights import read_weights, write_weights
+from gs_jax.mold.mesh_files import Mesh, read_mesh, write_mesh
+
+ORIGIN = {"software": "gs_jax 1", "command": "gs-jax 'a <b> & \"c\"'", "design": 'name = "µ"\n\n[sensor]\n'}
+VOXELS = np.random.default_rng(0).random((3, 5, 4), np.float32)
+GRID = Grid([18.0, 18.5, 19.0], (5, 4), 0.04)
+TETRAHEDRON = Mesh(
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+)
+WRITE = {
+    "v.ome.tif": lambda path, **o: write_volume(path, VOXELS, GRID, **o),
+    "v.zarr": lambda path, **o: write_volume(path, VOXELS, GRID, **o),
+    "c.tif": lambda path, **o: write_capture(path, VOXELS[0], **o),
+    "c.npy": lambda path, **o: write_capture(path, VOXELS[0], **o),
+    "c.png": lambda path, **o: write_capture(path, np.ones((5, 4), np.uint16), **o),
+    "p.csv": lambda path, **o: write_points(path, np.ones((2, 4)), **o),
+    "w.npz": lambda path, **o: write_weights(path, np.ones(3), {"n": 1}, **o),
+    "m.3mf": lambda path, **o: write_mesh(path, TETRAHEDRON, "a <part>", **o),
+}
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_a_file_says_where_it_comes_from(tmp_path, name):
+    path = tmp_path / name
+    WRITE[name](path, provenance=ORIGIN)
+    assert read_provenance(path) == ORIGIN
+    shown = CliRunner().invoke(commands, ["info", str(path)])
+    assert shown.exit_code == 0 and ORIGIN["command"] in shown.stdout
+    WRITE[name](path)
+    assert read_provenance(path) == {}
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_what_a_file_holds_is_the_same_with_it(tmp_path, name):
+    path = tmp_path / name
+    WRITE[name](path, provenance=ORIGIN)
+    read = {".npz": lambda path: read_weights(path, lambda n: np.zeros(3)), ".csv": read_points, ".zarr": read_volume}
+    read |= {".npy": read_capture, ".png": read_capture}
+    kind = read_volume if name.startswith("v") else read_mesh if name.startswith("m") else read_capture
+    read.get(path.suffix, kind)(path)
+
+
+def test_inputs_are_named_with_their_hash(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"abc")
+    found = made_by("gs-jax", [tmp_path / "a.bin", tmp_path])
+    # The digest of FIPS 180-4's example.
+    assert found["input a.bin"] == "sha256 ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert found[f"input {tmp_path.name}"] == "a folder"
+
+
+def test_commands_sign_what_they_write(tmp_path):
+    path = tmp_path / "centers.csv"
+    arguments = ["layout", "--count", "9", "--size-mm", "4", "4", "--pitch-mm", "1.2", "-o", str(path)]
+    assert CliRunner().invoke(commands, arguments).exit_code == 0
+    found = read_provenance(path)
+    assert found["command"] == f"gs-jax {' '.join(arguments)}" and found["software"].startswith("gs_jax ")
+    assert json.loads(sidecar(path).read_text()) == {"provenance": found}
+
+
+def test_another_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="found the suffix '.txt', allowed: .tif"):
+        read_provenance(tmp_path / "a.txt")
+    (tmp_path / "a.tif").write_bytes(b"no")
+    with pytest.raises(InputError, match="not a whole and valid .tif file"):
+        read_provenance(tmp_path / "a.tif")
+
+
+def test_imagej_reads_the_scale(tmp_path):
+    """Its reader takes the last description, if that begins with its name, and pixels in one piece."""
+    path = tmp_path / "v.ome.tif"
+    write_volume(path, VOXELS, GRID)
+    with tifffile.TiffFile(path) as tiff:
+        first = tiff.pages.first
+        entries = [tag.code for tag in first.tags]
+        said = dict(line.split("=") for line in first.description1.splitlines())
+        assert entries == sorted(entries) and first.description.startswith("<?xml")
+        assert tiff.is_ome and tiff.is_imagej
+        offsets = [page.dataoffsets[0] for page in tiff.pages]
+        assert set(np.diff(offsets)) == {VOXELS[0].nbytes}
+        per_um = [first.tags[name].value for name in ("XResolution", "YResolution")]
+        assert first.tags["ResolutionUnit"].value == 1 and all(n / d == pytest.approx(1 / 40) for n, d in per_um)
+    assert list(said)[0] == "ImageJ" and (said["unit"], float(said["spacing"]), said["images"]) == ("um", 500, "3")
+    assert VOXELS.min() <= float(said["min"]) < float(said["max"]) <= VOXELS.max()
+
+
+@pytest.mark.parametrize("voxels, shown", [(VOXELS, (0, 1)), (np.zeros((3, 5, 4)), (0, 1)), (VOXELS > 0.99, (0, 1))])
+def test_viewers_are_told_what_to_show(tmp_path, voxels, shown):
+    path = tmp_path / "v.zarr"
+    write_volume(path, voxels, GRID)
+    (channel,) = json.loads((path / ".zattrs").read_text())["omero"]["channels"]
+    start, end = channel["window"]["start"], channel["window"]["end"]
+    assert channel["label"] == "v" and shown[0] <= start < end <= shown[1]
+
+
+def test_a_3mf_passes_the_strict_reader(tmp_path):
+    lib3mf = pytest.importorskip("lib3mf")
+    path, again = tmp_path / "a.3mf", tmp_path / "b.3mf"
+    for each in (path, again):
+        write_mesh(each, TETRAHEDRON, 'a "part" & more', ORIGIN)
+    assert path.read_bytes() == again.read_bytes()
+    model = lib3mf.get_wrapper().CreateModel()
+    reader = model.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(path))
+    assert reader.GetWarningCount() == 0
+    meshes = model.GetMeshObjects()
+    assert meshes.MoveNext()
+    found = meshes.GetCurrentMeshObject()
+    assert (found.GetTriangleCount(), found.IsManifoldAndOriented()) == (4, True)
+    assert found.GetName() == 'a "part" & more'
