@@ -16,6 +16,8 @@ from .base.progress import QUIET, VERBOSE, shown
 from .cli.files import ARGUMENTS
 from .cli.interrupt import end, ending_soon, kept, message, status_of
 
+# Of a message; what is at its end is the least.
+_LONGEST = 380
 # Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
     "reconstruct",
@@ -63,7 +65,7 @@ def script() -> None:
 
 
 def _fail(message: str, status: int) -> None:
-    click.echo(f"gs-jax: {message}", err=True)
+    click.echo(f"gs-jax: {message}" if len(message) <= _LONGEST else f"gs-jax: {message[:_LONGEST]} ...", err=True)
     sys.exit(status)
 
 

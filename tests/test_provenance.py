@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.napari import reader
 from gs_jax.io.points import read_points, write_points
 from gs_jax.io.provenance import made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
@@ -107,6 +108,23 @@ def test_viewers_are_told_what_to_show(tmp_path, voxels, shown):
     (channel,) = json.loads((path / ".zattrs").read_text())["omero"]["channels"]
     start, end = channel["window"]["start"], channel["window"]["end"]
     assert channel["label"] == "v" and shown[0] <= start < end <= shown[1]
+
+
+def test_napari_shows_volume_and_points_in_one_place(tmp_path):
+    """Both in um; a point lies in the voxel of its place."""
+    grid = Grid([18.0, 18.5, 19.0], (5, 4), 0.04, (1.0, -2.0))
+    place = grid.to_mm(np.array([[1, 3, 2]]))
+    write_points(tmp_path / "p.csv", np.column_stack([place, [1.0]]), {"lenses": np.array([7])})
+    for name in ("v.ome.tif", "v.zarr"):
+        write_volume(tmp_path / name, VOXELS, grid)
+        (voxels, image, kind), (points, marks, other) = (
+            read(str(tmp_path / each))[0] for each in (name, "p.csv") if (read := reader(str(tmp_path / each)))
+        )
+        assert (kind, other) == ("image", "points") and image["units"] == marks["units"]
+        np.testing.assert_allclose((points[0] - image["translate"]) / image["scale"], [1, 3, 2], atol=1e-9)
+        np.testing.assert_array_equal(voxels, VOXELS)
+    (tmp_path / "other.csv").write_text("index,axis-0\n")
+    assert reader(str(tmp_path / "other.csv")) is None and reader("a.png") is None and reader(["a.zarr"]) is None
 
 
 def test_a_3mf_passes_the_strict_reader(tmp_path):

@@ -5,9 +5,10 @@ from typing import get_args
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.codesign.objectives import TERMS
+from gs_jax.codesign import objectives
+from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.parameters import NAMES
-from gs_jax.codesign.study import KINDS, Solver, Study, parent_path, read_study
+from gs_jax.codesign.study import KINDS, Solver, Study, TermTable, parent_path, read_study
 
 STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
 
@@ -56,7 +57,7 @@ def test_what_a_study_says(read):
         ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
         ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]`: found 0.0, allowed"),
         ("[18.0, 23.0]", "[18.0]", "`depths_mm"),
-        ('"occupancy"', '"ocupancy"', "`terms` 1: found the name 'ocupancy', allowed: lateral_reso"),
+        ('"occupancy"', '"ocupancy"', "`terms` 1: found the name 'ocupancy', allowed: occupancy or 27 others"),
         ("at_most = 0.5", "", "found no kind, allowed: one of at_most"),
         ("at_most = 0.5", "at_most = 0.5\nat_least = 0.1", r"found \['at_most', 'at_least'\]"),
         ("at_most = 0.5", "at_most = -0.5", "found -0.5, allowed: a positive number"),
@@ -89,3 +90,21 @@ def test_the_readme_names_everything():
     for name in (*TERMS, *NAMES, *get_args(Solver), *KINDS):
         assert f"`{name}`" in text or f"`{name} =" in text, name
     Study.model_validate(tomllib.loads(text.split("```toml")[1].split("```")[0]))
+
+
+def test_terms_of_other_packages_are_found(monkeypatch):
+    """By entry points, when a study names them."""
+    mine = Term("twice the sensor's distance", lambda c: 2 * c.imager.sensor_distance)
+
+    class Point:
+        name = "mine_mm"
+
+        def load(self):
+            return mine
+
+    found = lambda group, name: [Point()] if (group, name) == ("gs_jax.terms", "mine_mm") else []
+    monkeypatch.setattr(objectives, "entry_points", found)
+    monkeypatch.setattr(objectives, "TERMS", dict(objectives.TERMS))
+    assert TermTable(name="mine_mm", at_most=3.0).kind == "at_most" and objectives.TERMS["mine_mm"] is mine
+    with pytest.raises(ValueError, match="found the name 'other_mm', allowed: .* or [0-9]+ others"):
+        TermTable(name="other_mm", at_most=3.0)

@@ -6,10 +6,11 @@ import click
 
 from ..base.errors import errors_name_file
 from .files import check_may_write, provenance_of
+from .options import DESIGN
 
 
 @click.command("mask", epilog="Example: gs-jax mask design/geomscope-optimized.toml -o mask.dxf")
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option("-o", "--output", type=Path, required=True, help="MASK.dxf, MASK.svg, or MASK.gds for GDSII.")
 def command(design: Path, output: Path):
     """Draw the opaque mask between the lenses of the file DESIGN, to have it made.

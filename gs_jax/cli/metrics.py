@@ -6,16 +6,19 @@ import click
 
 from ..io.disk import check_output, write_json
 from .files import check_may_write
-from .options import UM, Depths
+from .options import DESIGN, UM, Depths
 
 
 @click.command("metrics", epilog="Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
 @click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
 def command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
-    """Show what the microscope of the file DESIGN promises (the paper's Eqs. 1-11), and what is out of focus."""
+    """Show what the microscope of DESIGN promises (the paper's Eqs. 1-11), and what becomes of it.
+
+    DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+    """
     from rich.console import Console
 
     from ..designs.design import read_design

@@ -8,11 +8,11 @@ import click
 from ..base.errors import errors_name_file
 from ..base.progress import Progress
 from .files import check_may_write, provenance_of
-from .options import Number
+from .options import DESIGN, Number
 
 
 @click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
 @click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
 @click.option(

@@ -8,13 +8,14 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from .files import check_may_write, force_option, provenance_of
 from .interrupt import kept
+from .options import DESIGN
 
 
 @click.command(
     "optimize",
     epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml",
 )
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
 @click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")

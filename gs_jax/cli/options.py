@@ -5,6 +5,7 @@ again.
 """
 
 import math
+from pathlib import Path
 
 import click
 
@@ -57,6 +58,25 @@ class Depths(click.ParamType):
         return [round(start + i * step, 9) for i in range(int(count))]
 
 
+class DesignFile(click.ParamType):
+    """A file, or the name of a design that comes with the package."""
+
+    name = "design"
+
+    def convert(self, value, param, ctx):
+        path = Path(value)
+        if path.parent == Path() and not path.suffix and not path.exists():
+            return next((each for each in shipped_designs() if each.stem == value), path)
+        return path
+
+
+def shipped_designs() -> list[Path]:
+    """The designs that come with the package; of a checkout, those in its folder."""
+    inside = Path(__file__).parents[1] / "designs" / "shipped"
+    return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
+
+
+DESIGN = DesignFile()
 MM = Number(least=1e-3, most=1e4, unit="mm")
 UM = Number(least=1e-2, most=1e6, unit="um")
 

@@ -11,7 +11,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output
 from .files import check_may_write, force_option, provenance_of
-from .options import LEVELS, METHODS, UM, Depths, Number, depth_range
+from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
 
 
 @click.command(
@@ -19,7 +19,7 @@ from .options import LEVELS, METHODS, UM, Depths, Number, depth_range
     epilog="Example: gs-jax reconstruct capture.tif design/geomscope.toml --depths 18:22:0.25 -o volume.ome.tif",
 )
 @click.argument("capture", type=Path)
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option(
     "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included; or one."
 )

@@ -9,7 +9,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output
 from .files import check_may_write, provenance_of
-from .options import PSFS, SIMULATED, Number
+from .options import DESIGN, PSFS, SIMULATED, Number
 
 ELECTRONS = Number(least=0.0, most=1e9, unit="electrons")
 GAIN = Number(least=1e-3, most=1e6, unit="electrons")
@@ -19,7 +19,7 @@ COUNTS = Number(least=0.0, most=65535.0, unit="counts")
 
 @click.command("simulate", epilog="Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
 @click.argument("scene", type=Path)
-@click.argument("design", type=Path)
+@click.argument("design", type=DESIGN)
 @click.option(
     "--optics",
     type=click.Choice(SIMULATED),

@@ -6,12 +6,15 @@ everything that may be free, and finite where lenses coincide or rays do not get
 Bare equation numbers mean the GEOMScope paper.
 """
 
+import difflib
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..base.errors import short_repr
 from ..base.safe import safe_sqrt
 from ..designs.microscope import Microscope
 from ..designs.spots import encircled_radius, field_heights, psf_width
@@ -21,6 +24,8 @@ from .layout_terms import conditioning, flatness, ghosts, localization, log_erro
 Result = Float[Array, "..."]
 
 UM = 1000.0
+# Of the entry points that are terms.
+_GROUP = "gs_jax.terms"
 # Places along a side of the plate where a hole is looked for.
 _PLACES = 41
 
@@ -142,6 +147,25 @@ TERMS: dict[str, Term] = {
 }
 
 _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
+
+
+def check_term(name: str) -> None:
+    """Whether there is a term of this name; those of other installed packages are looked up when they are asked for.
+
+    A package has its own as entry points of the group `gs_jax.terms`, whose names are the terms' and whose objects are
+    `Term`s. Python callers may also put theirs into `TERMS`.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if name not in TERMS:
+        TERMS.update({point.name: point.load() for point in entry_points(group=_GROUP, name=name)})
+    if name not in TERMS:
+        near = difflib.get_close_matches(name, TERMS, n=3) or list(TERMS)[:3]
+        others = len(TERMS) - len(near)
+        raise ValueError(f"found the name {short_repr(name)}, allowed: {', '.join(near)} or {others} others")
 
 
 def unit_of(name: str) -> str:

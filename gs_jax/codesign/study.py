@@ -28,7 +28,7 @@ from pydantic import Field, ValidationError, model_validator
 from ..base.errors import InputError, short_repr
 from ..io.disk import read_text
 from ..io.tables import Table, one_line
-from .objectives import TERMS
+from .objectives import check_term
 from .parameters import NAMES
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
@@ -56,8 +56,7 @@ class TermTable(Table):
 
     @model_validator(mode="after")
     def _says_one_thing(self) -> "TermTable":
-        if self.name not in TERMS:
-            raise ValueError(f"found the name {short_repr(self.name)}, allowed: {', '.join(TERMS)}")
+        check_term(self.name)
         found = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(found) != 1:
             raise ValueError(f"{self.name}: found {found or 'no kind'}, allowed: one of {', '.join(KINDS)}")
@@ -102,8 +101,7 @@ class LimitTable(Table):
 
     @model_validator(mode="after")
     def _says_one_thing(self) -> "LimitTable":
-        if self.name not in TERMS:
-            raise ValueError(f"found the name {short_repr(self.name)}, allowed: {', '.join(TERMS)}")
+        check_term(self.name)
         if bool(self.at_most) == bool(self.at_least):
             found = "both" if self.at_most else "neither"
             raise ValueError(f"{self.name}: found {found}, allowed: one of at_most, at_least")

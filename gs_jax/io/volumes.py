@@ -112,7 +112,7 @@ def _title(path: Path) -> str:
     return path.name.removesuffix(path.suffix).removesuffix(".ome")
 
 
-def _display_range(voxels: np.ndarray) -> tuple[float, float]:
+def display_range(voxels: np.ndarray) -> tuple[float, float]:
     """What a viewer should show as black and white: few voxels are darker or brighter."""
     some = voxels[:, :: max(voxels.shape[1] // _SAMPLED, 1), :: max(voxels.shape[2] // _SAMPLED, 1)]
     for low, high in (np.percentile(some, _SHOWN), (voxels.min(), voxels.max())):
@@ -199,7 +199,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
 
 def _imagej(voxels: np.ndarray, step: float) -> str:
     """ImageJ's description of a stack."""
-    low, high = _display_range(voxels)
+    low, high = display_range(voxels)
     stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
     spacing = f"spacing={_um(step)}\n" if step > 0 else ""
     return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}loop=false\nmin={low}\nmax={high}\n"
@@ -271,7 +271,7 @@ def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     scale = [_um(step), _um(pitch), _um(pitch)]
     first = [_um(depths[0]), *_first_um(grid)]
     transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
-    low, high = _display_range(voxels)
+    low, high = display_range(voxels)
     window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
     channel = {"active": True, "color": "FFFFFF", "label": _title(path), "window": window}
     multiscale = {
