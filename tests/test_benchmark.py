@@ -99,7 +99,7 @@ def test_what_is_too_large_or_too_slow_is_left_out_in_words():
 def test_command(found, tmp_path, monkeypatch):
     from gs_jax.cli.benchmark import command
 
-    monkeypatch.setattr("gs_jax.benchmark.compare.run", lambda progress: found)
+    monkeypatch.setattr("gs_jax.benchmark.compare.run", lambda each, progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
     assert result.exit_code == 0 and "benchmark.json" in result.output
     assert len(json.loads((tmp_path / "new" / "benchmark.json").read_text())) == len(found[0])

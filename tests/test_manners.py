@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from errno import ENOSPC
@@ -15,7 +16,7 @@ import pytest
 
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.cli import options
-from gs_jax.cli.interrupt import message
+from gs_jax.cli.interrupt import RESUMABLE, message
 from gs_jax.io.disk import atomic_write
 from gs_jax.optics.window import PSFS
 from gs_jax.projection.levels import LEVELS
@@ -99,7 +100,7 @@ def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr("gs_jax.cli.interrupt.kept", [tmp_path / "w.checkpoint"])
+    monkeypatch.setattr("gs_jax.cli.interrupt.kept", {tmp_path / "w.checkpoint": RESUMABLE})
     assert message() == "gs-jax: interrupted"
     (tmp_path / "w.checkpoint").touch()
     assert message().endswith("w.checkpoint has what is done, and --resume goes on from it")
@@ -194,3 +195,50 @@ def test_one_depth_is_one_number(folder, monkeypatch, capsys):
 def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
     status, out, _ = run(monkeypatch, capsys)
     assert status == 0 and out.startswith("Usage: gs-jax") and "reconstruct" in out
+
+
+IMPORTING = f"""
+{HEARD}
+from gs_jax.cli.interrupt import ending_soon
+with ending_soon():
+    try:
+        import slow_extension
+    except BaseException as error:
+        print("seen", error)
+"""
+
+
+def test_an_interrupt_within_an_import_is_no_exception(tmp_path):
+    """It would be raised in the middle of an extension's initialisation, which may crash."""
+    (tmp_path / "slow_extension.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTING],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "gs-jax: interrupted\n")
+
+
+def test_a_folder_that_threads_still_write_to_is_removed(tmp_path):
+    """As Zarr's do for a moment after an interrupt."""
+
+    def write(folder):
+        for number in range(20):
+            folder.mkdir(exist_ok=True)
+            (folder / str(number)).touch()
+            time.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "a.zarr") as temporary:
+        threading.Thread(target=write, args=(temporary,)).start()
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_design_is_found_by_its_name(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert {path.stem for path in options.shipped_designs()} >= {"geomscope", "geomscope-optimized", "endoscope"}
+    status, out, _ = run(monkeypatch, capsys, "metrics", "endoscope")
+    assert status == 0 and out.startswith("endoscope: ")
+    status, _, err = run(monkeypatch, capsys, "metrics", "endoskop")
+    assert status == 2 and "endoskop: the file cannot be read" in err

@@ -92,7 +92,9 @@ SPLIT = STUDY | {
 def test_stages_keep_what_the_one_before_found():
     """Stages that free different parameters; each search ends where `optimize` does with the same limit."""
     start = geomscope(sensor_distance_mm=4.0)
-    found = trade_off(start, Study.model_validate(SPLIT))
+    sizes = []
+    found = trade_off(start, Study.model_validate(SPLIT), each=lambda front: sizes.append(len(front.points)))
+    assert sizes == list(range(1, len(found.points) + 1))  # what is done is shown as it is found
     for point, wanted in zip(found.points, (3.0, 6.0, 12.0), strict=True):
         offset, light, depth = point.rows
         assert point.feasible and offset.high <= 0.2 and depth.low >= wanted

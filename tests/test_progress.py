@@ -51,3 +51,9 @@ def test_how_much_is_shown(clock, capsys):
             list(progress.track(iter("ab"), "Reading"))
         shown.reset(token)
         assert capsys.readouterr().err == said
+
+
+def test_work_over_a_minute_is_announced(clock, capsys):
+    with Progress() as progress:
+        list(progress.track(range(20), "Iterating"))
+    assert capsys.readouterr().err.splitlines()[0] == "gs-jax: Iterating: about 1 min in all"

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
+from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.reconstruction.pipeline import System
 from gs_jax.reconstruction.reprojection import reproject
@@ -14,7 +16,7 @@ from gs_jax.solvers import unrolled
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
 from gs_jax.training.examples import SCENES, Kind, example
 from gs_jax.training.loop import start, train
-from gs_jax.training.recipes import Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
+from gs_jax.training.recipes import UNROLLED, Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
 
 KEY = jax.random.key(0)
 TINY = Kind(64, 0.06, 0.25, 3, binning=4)
@@ -126,3 +128,14 @@ def test_the_networks_of_the_package():
     """They are what the recipe makes."""
     found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
     assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 30
+
+
+@pytest.mark.slow
+def test_little_is_invented_on_noise():
+    """A capture that shows nothing: the volume, imaged again, is to be a tenth of the noise."""
+    found = learned.run(1, TINY._replace(pixels=96), progress=Progress())
+    assert found["unrolled"]["gains"]
+    e = example(1, 15, UNROLLED)
+    assert not e.truth.any()
+    volume = learned.solved(e, Unrolled.pretrained(), Progress())
+    assert learned.imaged_noise(volume, e) < 0.15

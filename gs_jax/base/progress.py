@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 
 from rich.console import Console
 from rich.progress import (
@@ -16,8 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-# Seconds between two lines.
-_EVERY = 10.0
+# Seconds between two lines; what takes longer than a minute is announced.
+_EVERY, _LONG = 10.0, 60.0
 # How much is shown: QUIET is nothing, VERBOSE a line after every piece of work.
 QUIET, NORMAL, VERBOSE = -1, 0, 1
 shown: ContextVar[int] = ContextVar("shown", default=NORMAL)
@@ -66,8 +67,13 @@ class Progress:
     def counter(self, description: str, total: int | None) -> Iterator[Callable[[], None]]:
         """Work of `total` parts; what it yields is called after each."""
         if bars := self._bars:
-            task = bars.add_task(description, total=total)
-            yield lambda: bars.advance(task)
+            task, forecast = bars.add_task(description, total=total), _Forecast(description, total, bars.console.print)
+
+            def advance():
+                bars.advance(task)
+                forecast(time.monotonic())
+
+            yield advance
             if total is None:
                 bars.update(task, total=bars.tasks[task].completed)
         elif self._lines:
@@ -78,16 +84,34 @@ class Progress:
             yield lambda: None
 
 
+class _Forecast:
+    """Called after each part; after the second, without what the first compiled, it says how long all will take."""
+
+    def __init__(self, description: str, total: int | None, say: Callable[[str], object]):
+        self.description, self.total, self.say, self.done, self.first = description, total, say, 0, 0.0
+
+    def __call__(self, now: float) -> None:
+        self.done += 1
+        if self.total is None or self.done > 2:
+            return
+        if self.done == 1:
+            self.first = now
+        elif (whole := (now - self.first) * self.total) > _LONG:
+            self.say(f"gs-jax: {self.description}: about {whole / 60:.0f} min in all")
+
+
 class _Lines:
     """Called after each part, it prints a line where the last is old."""
 
     def __init__(self, description: str, total: int | None):
         self.description, self.total, self.done = description, total, 0
         self.began = self.last = time.monotonic()
+        self.forecast = _Forecast(description, total, partial(print, file=sys.stderr, flush=True))
 
     def __call__(self) -> None:
         self.done += 1
         now = time.monotonic()
+        self.forecast(now)
         if now - self.last >= _EVERY:
             self.say(now)
 

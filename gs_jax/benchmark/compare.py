@@ -174,6 +174,7 @@ def run(
     methods: Sequence[str] = tuple(METHODS),
     seeds: Sequence[int] = (0, 1, 2),
     limit: float = LIMIT,
+    each: Callable[[list[dict[str, Any]]], object] = lambda records: None,
     progress: Progress | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The records of all methods and sizes, and what was left out: `method`, `pairs`, `reason`.
@@ -188,6 +189,8 @@ def run(
         One scene each; above 1e10 pairs only the first.
     limit
         A method is not run at a size where an image would take longer, by its time at the last, seconds.
+    each
+        Called with the records so far after each method at each size.
     """
     progress = progress or Progress()
     records, left_out = [], []
@@ -208,6 +211,7 @@ def run(
                         found = pool.submit(measure, name, side, cases[side]).result()
                         last = found[0]
                         records += [record | {"seed": seed} for record, seed in zip(found, seeds, strict=False)]
+                        each(records)
                         continue
                     except BrokenProcessPool:
                         reason = "the process was ended, for want of memory"

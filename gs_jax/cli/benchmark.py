@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..io.disk import make_folder
+from ..io.disk import make_folder, write_json
+from .interrupt import PARTIAL, kept
 
 
 @click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
@@ -16,8 +17,14 @@ def command(out: Path):
     from ..benchmark.report import write
 
     folder = make_folder(out)
+    numbers = folder / "benchmark.json"
+
+    def each(records):
+        write_json(numbers, records)
+        kept[numbers] = PARTIAL
+
     with Progress() as progress:
-        records, left_out = run(progress=progress)
+        records, left_out = run(each=each, progress=progress)
     write(records, left_out, folder)
     for missing in left_out:
         click.echo(f"left out: {missing['method']} at {missing['pairs']:.1e} pairs: {missing['reason']}")

@@ -16,8 +16,9 @@ from ..io.disk import remove_temporaries
 PATIENCE = 1.0
 # Exit status of a command that a signal ended, as shells have it.
 _BY_SIGNAL = 128
-# Files that `--resume` goes on from: to be named after an interrupt.
-kept: list[Path] = []
+# Files to be named after an interrupt, and what to say of them.
+kept: dict[Path, str] = {}
+RESUMABLE, PARTIAL = "has what is done, and --resume goes on from it", "has what is done"
 
 
 class Terminated(KeyboardInterrupt):
@@ -31,7 +32,7 @@ def status_of(interrupt: BaseException | None) -> int:
 
 def message() -> str:
     """The line that an interrupted command ends with."""
-    there = [f"{path} has what is done, and --resume goes on from it" for path in kept if path.exists()]
+    there = [f"{path} {text}" for path, text in kept.items() if path.exists()]
     return f"gs-jax: {'; '.join(['interrupted', *there])}"
 
 
@@ -45,14 +46,17 @@ def ending_soon() -> Iterator[None]:
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     wakeup = signal.set_wakeup_fd(theirs.fileno())
-    handler = signal.signal(signal.SIGTERM, _terminate)
+    # A process in the background may ignore Ctrl-C, and goes on to.
+    heard = {number: own for number, own in _HANDLERS.items() if signal.getsignal(number) != signal.SIG_IGN}
+    handlers = {number: signal.signal(number, own) for number, own in heard.items()}
     hook, sys.unraisablehook = sys.unraisablehook, _unraisable
     threading.Thread(target=_watch, args=(ours,), daemon=True).start()
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.set_wakeup_fd(wakeup)
         theirs.close()
 
@@ -67,8 +71,26 @@ def end(status: int) -> None:
     os._exit(status)
 
 
+def _interrupt(number, frame):
+    _end_while_importing(number, frame)
+    raise KeyboardInterrupt
+
+
 def _terminate(number, frame):
+    _end_while_importing(number, frame)
     raise Terminated
+
+
+_HANDLERS = {signal.SIGINT: _interrupt, signal.SIGTERM: _terminate}
+
+
+def _end_while_importing(number, frame):
+    """An exception within an extension's initialisation may crash it; nothing has been written that early."""
+    while frame:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            print(message(), file=sys.stderr)
+            end(_BY_SIGNAL + number)
+        frame = frame.f_back
 
 
 def _unraisable(found):

@@ -7,7 +7,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from .files import check_may_write, force_option, provenance_of
-from .interrupt import kept
+from .interrupt import RESUMABLE, kept
 from .options import DESIGN
 
 
@@ -40,7 +40,7 @@ def command(design: Path, study: Path, resume: bool, output: Path, force: bool):
     checkpoint = checkpoint_path(output)
     if resume and not checkpoint.exists():
         raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
-    kept.append(checkpoint)
+    kept[checkpoint] = RESUMABLE
     with Progress() as progress:
         outcome = search.optimize(design, study, progress=progress, checkpoint=checkpoint, resume=resume)
     write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study))

@@ -7,6 +7,7 @@ import click
 from ..base.progress import Progress
 from ..io.disk import check_output, make_folder, write_json
 from .files import check_may_write
+from .interrupt import PARTIAL, kept
 
 
 @click.command("pareto", epilog="Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
@@ -15,7 +16,7 @@ from .files import check_may_write
 def command(study: Path, out: Path):
     """Show the trade-off that the file STUDY asks for: its one goal against one or two moving limits.
 
-    The folder gets pareto.json, the designs' numbers, and pareto.png.
+    The folder gets pareto.json, the designs' numbers, which grows as they are found, and pareto.png.
     """
     import jax
     from rich.console import Console
@@ -34,9 +35,13 @@ def command(study: Path, out: Path):
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
     check_may_write(numbers, drawing, inputs=(study,))
+
+    def each(front):
+        write_json(numbers, as_json(front))
+        kept[numbers] = PARTIAL
+
     with Progress() as progress:
-        front = trade_off(design, study, progress=progress)
-    write_json(numbers, as_json(front))
+        front = trade_off(design, study, each=each, progress=progress)
     write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):

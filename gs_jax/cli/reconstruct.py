@@ -26,7 +26,8 @@ from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
 @click.option(
     "--voxel-um",
     type=UM,
-    help="Lateral voxel pitch, um.  [default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
+    help="Lateral voxel pitch; twice as wide takes about a quarter of the time.  "
+    "[default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
 )
 @click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
 @click.option(

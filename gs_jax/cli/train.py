@@ -9,7 +9,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output, write_json
 from .files import check_may_write, provenance_of
-from .interrupt import kept
+from .interrupt import RESUMABLE, kept
 
 # Those of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
@@ -45,7 +45,7 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
     check_may_write(output, history, inputs=())
-    kept.append(checkpoint)
+    kept[checkpoint] = RESUMABLE
     if resume and not checkpoint.exists():
         raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
     with Progress() as progress:

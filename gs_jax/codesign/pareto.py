@@ -8,6 +8,7 @@ may be better, not worse.
 
 import contextlib
 import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -59,7 +60,13 @@ def non_dominated(losses: Float[np.ndarray, "point objective"]) -> Bool[np.ndarr
     return np.logical_not((no_worse & better).any(0))
 
 
-def trade_off(design: Design | PathLike, study: Study | PathLike, *, progress: Progress | None = None) -> Front:
+def trade_off(
+    design: Design | PathLike,
+    study: Study | PathLike,
+    *,
+    each: Callable[[Front], object] = lambda front: None,
+    progress: Progress | None = None,
+) -> Front:
     """What a study's one goal costs in its one or two moving limits.
 
     Parameters
@@ -69,6 +76,8 @@ def trade_off(design: Design | PathLike, study: Study | PathLike, *, progress: P
     study
         With one term to minimise or maximise and one or two `[[pareto]]` tables, or its file. Its stages run one after
         the other for each combination of limits. Its own `design` is not looked at.
+    each
+        Called with the front so far after each point.
 
     Raises
     ------
@@ -76,7 +85,7 @@ def trade_off(design: Design | PathLike, study: Study | PathLike, *, progress: P
         If a file cannot be read, the study does not fit the design or moves no limit.
     """
     with opened(design, study) as (parent, question):
-        return _trade_off(sweep_of(parent, question), progress or Progress())
+        return _trade_off(sweep_of(parent, question), each, progress or Progress())
 
 
 class Sweep(NamedTuple):
@@ -97,11 +106,12 @@ def sweep_of(design: Design, study: Study) -> Sweep:
     return Sweep(problem_of(design, wider), kept, moving)
 
 
-def _trade_off(sweep: Sweep, progress: Progress) -> Front:
+def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress) -> Front:
     problem, kept, moving = sweep
     study, entries = problem.study, entries_of(problem.parent, [*kept, *moving])
     stages = [make_stage(problem, index) for index in range(len(study.stages))]
     points, last = [], start_values(problem.parent)
+    front = lambda: _front([*kept, *moving], [next(t for t in kept if t.is_goal), *moving], points)
     combinations = list(itertools.product(*(limit.targets for limit in study.pareto)))
     for limits in progress.track(combinations, "Trade-off"):
         now = _with_targets(kept, moving, limits)
@@ -109,7 +119,8 @@ def _trade_off(sweep: Sweep, progress: Progress) -> Front:
         with contextlib.suppress(InputError):
             last = run_stages(problem, stages, now, last, log=Log())
         points.append(Point(last, rows_of(now, entries, last)))
-    return _front([*kept, *moving], [next(t for t in kept if t.is_goal), *moving], points)
+        each(front())
+    return front()
 
 
 def _term(limit: LimitTable) -> TermTable:

@@ -10,6 +10,7 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 import uuid
 import warnings
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ from jaxtyping import Float64
 from ..base.errors import InputError, short_repr
 
 MAX_TEXT_BYTES = 2**26
+# To remove a folder, and the seconds between them.
+_ATTEMPTS, _PAUSE = 30, 0.05
 # What is being written.
 _TEMPORARY: set[Path] = set()
 # Of a number in a table: a float64 with all its digits and a separator has up to 25. What plain numbers are made of.
@@ -182,7 +185,12 @@ def _replace(temporary: Path, path: Path) -> None:
 
 def _remove(path: Path) -> None:
     if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
+        # Zarr's own threads go on writing for a moment after an interrupt.
+        for _ in range(_ATTEMPTS):
+            shutil.rmtree(path, ignore_errors=True)
+            time.sleep(_PAUSE)
+            if not path.exists():
+                break
     else:
         path.unlink(missing_ok=True)
 

@@ -17,7 +17,9 @@ POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 
 
 def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
-    """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`, or more columns.
+    """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`.
+
+    Further columns after these are left out.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def write_points(
     *,
     provenance: Provenance | None = None,
 ) -> None:
-    """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal. Their provenance goes beside them.
+    """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ def write_points(
     more
         Further columns, by name.
     provenance
-        Where they come from.
+        Where they come from, for a file beside this.
 
     Raises
     ------
