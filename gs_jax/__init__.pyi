@@ -18,7 +18,6 @@ from .projection.backprojection import backproject as backproject, backproject_a
 from .projection.forward_model import forward as forward
 from .projection.levels import optics_of as optics_of
 from .projection.operators import forward_operator as forward_operator
-from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.reprojection import reproject as reproject

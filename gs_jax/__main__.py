@@ -21,6 +21,7 @@ _LONGEST = 380
 # Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
     "reconstruct",
+    "calibrate",
     "simulate",
     "deconvolve",
     "metrics",

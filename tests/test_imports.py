@@ -23,6 +23,7 @@ ORDER = [
     "designs",
     "solvers",
     "suppression",
+    "calibration",
     "reconstruction",
     "training",
     "codesign",

@@ -1,0 +1,125 @@
+"""Calibration: geometry found in captures of single points, on another group's tracer and on random devices.
+
+- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm beside it): what is fitted, and how far spots
+  are from where a geometry that was fitted to other depths puts them. Then `find_points` on 120 points, with it.
+- Random devices, simulated with all of the light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of
+  up to 2 mm, a sensor distance up to 20 % off; three captures each. Deviations from what is true, in the standard
+  deviations that the calibration gives.
+
+    python -m experiments.calibration [DATA] [--devices N] [--out DIR]
+
+DATA holds `P1.toml` and `P1_i_*.tif`; without it there are only the random devices. Writes `calibration.json`,
+`calibration.md` and `calibration.png`; about half an hour on two cores.
+"""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
+from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
+from gs_jax.base.progress import Progress
+from gs_jax.benchmark.report import markdown_table
+from gs_jax.calibration.fit import NAMES, Calibration, calibrate, residuals_of
+from gs_jax.calibration.outcome import picture, values_of
+from gs_jax.designs.design import read_design
+from gs_jax.io.captures import read_capture
+from gs_jax.metrics import localization
+from gs_jax.projection.points import full_image_of_points
+from gs_jax.reconstruction.pipeline import voxel_grid
+
+DEPTHS = (18.0, 20.0, 22.0)
+# Of a random device: lenses on a plate, mm, and a sensor that sees about a third of them.
+LENSES, PLATE, PIXELS, PIXEL, FIELD = 60, 11.0, 1536, 0.006, 2.5
+
+
+def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
+    """What the ray-traced captures say of a microscope whose geometry is known."""
+    imager = read_design(data / "P1.toml").imager()
+    names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*.tif"))
+    points = np.array([points_of(data, name)[0, :3] for name in names])
+    images = [read_capture(data / f"P1_{name}.tif", imager.sensor.shape) for name in names]
+    whole = calibrate(images, points, imager, progress=progress)
+    held_out = {}
+    for depth in DEPTHS:
+        others, these = np.flatnonzero(points[:, 2] != depth), np.flatnonzero(points[:, 2] == depth)
+        fitted = calibrate([images[k] for k in others], points[others], imager, progress=progress)
+        away = residuals_of(fitted, [images[k] for k in these], points[these])
+        held_out[f"{depth:g} mm"] = float(np.sqrt((away**2).sum(1).mean()))
+    scene, truth = read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
+    found = find_points(scene, whole.imager, voxel_grid(whole.imager, [17.5, 22.5]), progress=progress)
+    score = localization(found, truth, axial=0.6)
+    return {
+        "values": values_of(whole),
+        "deviations": whole.deviations,
+        "rms_pixels": whole.rms,
+        "spots": len(whole.residuals),
+        "held_out_rms_pixels": held_out,
+        "points_f1": score.f1,
+        "points_axial_um": 1000 * score.axial_rmse,
+    }, whole
+
+
+def device(seed: int) -> tuple[Imager, Imager, bool]:
+    """A device as it is, as its design has it, and whether it is mirrored."""
+    rng = np.random.default_rng(seed)
+    centers = np.asarray(random_layout(LENSES, (PLATE, PLATE), diameter=None, seed=seed))
+    sensor, mirrored = Sensor((PIXELS, PIXELS), PIXEL), bool(rng.random() < 0.5)
+    design = Imager(MicrolensArray(centers), sensor, rng.uniform(5.7, 5.9), FIELD)
+    built = MicrolensArray(centers * (1, -1) if mirrored else centers)
+    rotation, shift = rng.uniform(-np.pi, np.pi), rng.uniform(-2, 2, 2)
+    actual = Imager(built, sensor, design.sensor_distance, FIELD, rotation=rotation, shift=shift)
+    wrong = design.sensor_distance * rng.uniform(0.8, 1.2)
+    return actual, eqx.tree_at(lambda i: i.sensor_distance, design, jnp.asarray(wrong)), mirrored
+
+
+def on_device(seed: int, progress: Progress) -> dict:
+    """Deviations of a calibrated device, in standard deviations and in their units."""
+    actual, design, mirrored = device(seed)
+    rng = np.random.default_rng([seed, 1])
+    points = np.column_stack([rng.uniform(-1.5, 1.5, (len(DEPTHS), 2)), DEPTHS])
+    images = []
+    for number, point in enumerate(points):
+        light = full_image_of_points(np.append(point, 1.0)[None], actual, progress)
+        key = jax.random.key(1000 * seed + number)
+        images.append(np.asarray(expose(light, Camera(gain=1.0), key, peak_electrons=5000)))
+    found = calibrate(images, points, design, progress=progress)
+    true = values_of(found._replace(imager=actual))
+    off = {name: value - true[name] for name, value in values_of(found).items()}
+    off["rotation_deg"] = (off["rotation_deg"] + 180) % 360 - 180
+    in_sd = {name: off[name] / found.deviations[name] for name in NAMES}
+    return {"mirrored": found.mirrored == mirrored, "off": off, "in_sd": in_sd, "rms_pixels": found.rms}
+
+
+def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, Calibration | None]:
+    """What `calibration.json` holds, and the calibration of the captures."""
+    captures, whole = on_captures(data, progress) if data else ({}, None)
+    found = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
+    return {"captures": captures, "devices": found}, whole
+
+
+def report(data: Path | None, devices: int, progress: Progress) -> Report:
+    found, whole = run(data, devices, progress=progress)
+    columns = ("", "median deviation", "largest", "within 3 SD", "SD of the deviations, in SD")
+    rows = []
+    for name in NAMES:
+        off = np.abs([each["off"][name] for each in found["devices"].values()])
+        in_sd = np.array([each["in_sd"][name] for each in found["devices"].values()])
+        within = f"{np.mean(np.abs(in_sd) < 3):.0%}"
+        rows.append([name, f"{np.median(off):.2g}", f"{off.max():.2g}", within, f"{in_sd.std():.2f}"])
+    right = sum(each["mirrored"] for each in found["devices"].values())
+    text = f"# Calibration\n\n{markdown_table(columns, rows)}\n\nMirrored or not: {right} of {devices} right.\n"
+    text += f"\n```\n{json.dumps(found['captures'], indent=2)}\n```\n"
+    files: dict[str, dict | str | Figure] = {"calibration.json": found, "calibration.md": text}
+    if whole:
+        files["calibration.png"] = picture(whole)
+    return Report(files, [table(columns, rows), text])
+
+
+if __name__ == "__main__":
+    main(report, {"data": OPTIONAL_PATH, "--devices": {"type": int, "default": 50}})

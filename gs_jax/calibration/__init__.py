@@ -1,0 +1,1 @@
+"""The geometry of a real microscope from captures of point sources."""
