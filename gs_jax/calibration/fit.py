@@ -10,21 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Float64, Num
-from scipy.interpolate import RegularGridInterpolator
 
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager, MicrolensArray, chief_ray
-from .match import Similarity, match
+from .matching import Similarity, match
 from .spots import core_offsets, find_spots
 
 # Spots looked for in a capture.
 _SPOTS = 60
 # How far the sensor's distance may be off, relative, and what lens a spot is of, mm on the sensor: wide, then narrow.
 _DISTANCE, _WITHIN = 0.25, (0.06, 0.03, 0.015)
+# Of the sensor's distance, relative, for the slope of what exact rays say.
+_STEP = 1e-2
 # Residuals beyond so many pixels count less (Huber).
 _OUTLIER = 0.5
-_FIELDS = 13
+# Fields at which exact rays are traced, and the degree of what is laid through them.
+_FIELDS, _DEGREE = 13, 7
 # Parameters whose common direction changes nothing by more than this, relative, are not determined.
 _LEAST = 1e-6
 NAMES = ("sensor_distance_mm", "rotation_deg", "shift_x_mm", "shift_y_mm")
@@ -161,17 +163,27 @@ def _seen(found: Similarity, point, imager: Imager) -> Imager:
 
 def _mirrored(array: MicrolensArray) -> MicrolensArray:
     """The complex conjugate of the matches, and a turn, are x against -x: y against -y is what they say."""
-    return eqx.tree_at(lambda a: a.centers, array, array.centers * jnp.asarray([1.0, -1.0], array.centers.dtype))
+    return eqx.tree_at(lambda a: a.centers, array, array.centers * jnp.asarray([[1.0, -1.0]], array.centers.dtype))
 
 
-def _offsets(imager: Imager, points) -> RegularGridInterpolator:
-    """Of cores from chief rays, by depth and field."""
-    depths = np.unique(points[:, 2])
-    fields = np.linspace(0, imager.field_radius, _FIELDS)
-    table = core_offsets(imager, depths, fields)
-    if depths.size == 1:
-        depths, table = np.array([depths[0], depths[0] + 1]), np.concatenate([table, table])
-    return RegularGridInterpolator((depths, fields), table, bounds_error=False)
+def _offsets(imager: Imager, points) -> dict[float, np.ndarray]:
+    """Of cores from chief rays, by depth, and how they change with the sensor's distance: `(2, power)`.
+
+    Coefficients of odd powers of the field, which even out the rays' noise.
+    """
+    depths, fields = np.unique(points[:, 2]), np.linspace(0, imager.field_radius, _FIELDS)
+    powers, v = _powers(fields / imager.field_radius), float(imager.sensor_distance)
+    moved = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
+    here, beyond = (core_offsets(each, depths, fields) for each in (imager, moved))
+    fit = lambda row: np.linalg.lstsq(powers, row)[0]
+    return {
+        float(z): np.stack([fit(row), fit(slope / (v * _STEP))])
+        for z, row, slope in zip(depths, here, beyond - here, strict=True)
+    }
+
+
+def _powers(part):
+    return part[:, None] ** np.arange(1, _DEGREE + 1, 2)
 
 
 def _assigned(found, points, imager: Imager, offset, within: float) -> Spots:
@@ -196,12 +208,14 @@ def _expected(imager: Imager, points, lenses, offset) -> Float64[np.ndarray, "sp
     return _residuals_of(imager, at_0, offset) * imager.sensor.pixel_pitch
 
 
-def _shift_of_cores(imager: Imager, spots: Spots, offset) -> Float64[np.ndarray, "spot 2"]:
-    """Where exact rays put the core of each spot, from its chief ray, mm."""
+def _shift_of_cores(imager: Imager, spots: Spots, offset) -> Float64[np.ndarray, "2 spot 2"]:
+    """Where exact rays put the core of each spot, from its chief ray, mm, and its slope by the sensor's distance."""
     beside = spots.points[:, :2] - np.asarray(imager.centers, np.float64)[spots.lenses]
     field = np.hypot(*beside.T)
     away = np.divide(beside, field[:, None], out=np.zeros_like(beside), where=field[:, None] > 0)
-    return offset(np.stack([spots.points[:, 2], field], -1))[:, None] * away
+    coefficients = np.array([offset[float(z)] for z in spots.points[:, 2]]).reshape(len(field), 2, -1)
+    along = (_powers(field / imager.field_radius)[:, None] * coefficients).sum(-1)
+    return along.T[..., None] * away
 
 
 def _known(spots: Spots, cores) -> tuple[Array, ...]:
@@ -221,10 +235,11 @@ def _with(imager: Imager, free: Float[Array, "4"]) -> Imager:
 def _residuals(free: Float[Array, "4"], known: Any) -> Float[Array, "spot 2"]:
     """Where spots should be, less where they are, pixels."""
     imager, points, lenses, places, cores = known
-    imager = _with(imager, free)
+    before, imager = imager.sensor_distance, _with(imager, free)
     points, places, cores = (x.astype(free.dtype) for x in (points, places, cores))
     magnification = imager.magnification(points[:, 2])[:, None]
-    expected = chief_ray(imager.centers[lenses], points[:, :2], magnification) + cores
+    moved = cores[0] + (free[0] - before) * cores[1]
+    expected = chief_ray(imager.centers[lenses], points[:, :2], magnification) + moved
     return (expected - places) / imager.sensor.pixel_pitch
 
 
@@ -240,7 +255,7 @@ def _robust(free, known):
 def _fitted(imager: Imager, spots: Spots, offset) -> Imager:
     known = (imager, *_known(spots, _shift_of_cores(imager, spots, offset)))
     _check_determined(jax.jacfwd(_residuals)(_free(imager), known), imager)
-    solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-6)
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
     return _with(imager, optx.least_squares(_robust, solver, _free(imager), known, throw=False).value)
 
 

@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from pydantic import ValidationError
 from rich.table import Table
 
+from ..base.errors import InputError
 from ..designs.design import CalibrationTable, Design
 from ..io.provenance import Provenance
+from ..io.tables import one_line
 from .fit import NAMES, Calibration
 
 # Length of the longest arrow in a picture, in sides of the sensor.
@@ -23,7 +26,7 @@ def values_of(found: Calibration) -> dict[str, float]:
 
 
 def calibrated(design: Design, found: Calibration, provenance: Provenance | None = None) -> Design:
-    """The design with what was found, which it says in its provenance, too."""
+    """The design with what was found, which it says in its provenance, too; `InputError` if it is none."""
     values = {name: float(f"{value:.9g}") for name, value in values_of(found).items()}
     shift = (values["shift_x_mm"], values["shift_y_mm"])
     array = design.array
@@ -37,7 +40,7 @@ def calibrated(design: Design, found: Calibration, provenance: Provenance | None
         "mirrored": found.mirrored,
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in found.deviations.items()},
     }
-    return design.model_copy(
+    new = design.model_copy(
         update={
             "array": array,
             "imaging": design.imaging.model_copy(update={"sensor_distance_mm": values["sensor_distance_mm"]}),
@@ -45,6 +48,10 @@ def calibrated(design: Design, found: Calibration, provenance: Provenance | None
             "provenance": {**design.provenance, **said},
         }
     )
+    try:
+        return Design.model_validate(new.model_dump())
+    except ValidationError as error:
+        raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
 
 
 def table(design: Design, found: Calibration) -> Table:

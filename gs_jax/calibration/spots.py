@@ -12,8 +12,8 @@ from ..geometry import Imager
 from ..optics.light import SpotRays, spot_rays, zones
 from ..suppression.consistency import signal
 
-# Of the window, pixels: standard deviation, half its side, and how often it is moved.
-_WINDOW, _HALF, _MOVES = 1.5, 4, 20
+# Of the window, pixels: standard deviation, half its side; how often it is moved at most, and when it rests.
+_WINDOW, _HALF, _MOVES, _RESTS = 1.5, 4, 300, 1e-4
 # A spot is so many times brighter than the noise, and so many pixels from the next.
 _ABOVE, _APART = 8.0, 6
 # Rays of a spot, and pixels about its chief ray within which its core lies.
@@ -21,10 +21,7 @@ _RAYS, _REACH = 8192, 40
 
 
 def find_spots(image: Shaped[Array | np.ndarray, "row column"], most: int) -> Float64[np.ndarray, "spot 2"]:
-    """The brightest spots, brightest first, as fractional `(row, column)`; single pixels are none.
-
-    What is near the image's edge, or stays no brighter than its neighbours when it is smoothed, is left out.
-    """
+    """The brightest spots, brightest first, as fractional `(row, column)`; none within six pixels of the edge."""
     light, noise = signal(image)
     threshold = _ABOVE * float(np.median(noise))
     peaks = peak_local_max(light, min_distance=_APART, threshold_abs=threshold, num_peaks=most)
@@ -41,6 +38,8 @@ def _middle_of_pixels(light, peak):
             break
         step = np.array([seen.sum(1) @ side, seen.sum(0) @ side]) / seen.sum() - (place - peak)
         place = np.clip(place + step, peak - 2, peak + 2)
+        if np.abs(step).max() < _RESTS:
+            break
     return place
 
 
@@ -70,5 +69,7 @@ def _middle_of_rays(rays: SpotRays, field: int, chief: float, pixel: float) -> f
     place, width = (edges[line.argmax()] + pixel / 2), _WINDOW * pixel
     for _ in range(_MOVES):
         weight = light * np.exp(-((along - place) ** 2 + across**2) / (2 * width**2))
-        place = float(weight @ along / weight.sum())
+        last, place = place, float(weight @ along / weight.sum())
+        if abs(place - last) < _RESTS * pixel:
+            break
     return place
