@@ -25,9 +25,9 @@ shown: ContextVar[int] = ContextVar("shown", default=NORMAL)
 
 
 class Progress:
-    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds; as `shown` says.
+    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds.
 
-    It is shown within `with Progress() as progress:`; one that is not entered shows nothing.
+    As much as `shown` says, within `with Progress() as progress:`; one that is not entered shows nothing.
     """
 
     _bars: Bars | None = None
