@@ -17,6 +17,7 @@ import pytest
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.cli import options
 from gs_jax.cli.interrupt import RESUMABLE, message
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import atomic_write
 from gs_jax.optics.window import PSFS
 from gs_jax.projection.levels import LEVELS
@@ -114,6 +115,7 @@ HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
 BUSY = f"""
 {HEARD}
 import ctypes, gs_jax.__main__ as cli
+from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import atomic_write
 def busy(*_, **__):
     with atomic_write("half.tif") as temporary:
@@ -242,3 +244,16 @@ def test_a_design_is_found_by_its_name(folder, monkeypatch, capsys):
     assert status == 0 and out.startswith("endoscope: ")
     status, _, err = run(monkeypatch, capsys, "metrics", "endoskop")
     assert status == 2 and "endoskop: the file cannot be read" in err
+
+
+def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
+    options = "--optics near --bits 8 --gain 20 --offset 7 --read-noise 0 --full-well 900".split()
+    (folder / "scene.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.1,0.1,20,1\n")
+    monkeypatch.chdir(folder)
+    status, _, err = run(monkeypatch, capsys, "simulate", "scene.csv", "design.toml", *options, "-o", "c8.tif")
+    assert status == 0, err
+    counts = read_capture(folder / "c8.tif")
+    # 900 electrons of 20 a count, on an offset of 7.
+    assert counts.dtype == np.uint8 and counts.min() == 7 and counts.max() == 52
+    status, _, err = run(monkeypatch, capsys, "simulate", "scene.csv", "design.toml", "--gain", "0", "-o", "c.tif")
+    assert status == 2 and "found '0', allowed: 0.001 to 1e+06 electrons" in err
