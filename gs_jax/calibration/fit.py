@@ -47,7 +47,7 @@ class Calibration(NamedTuple):
     Parameters
     ----------
     imager
-        The microscope; its array's centres are mirrored, x against -x, if `mirrored`.
+        The microscope; its array's centres are mirrored, y against -y, if `mirrored`.
     mirrored
         Whether the array is the other way round than in the design.
     deviations
@@ -99,10 +99,7 @@ def calibrate(
     progress = progress or Progress()
     if not len(images) or len(images) != len(points):
         raise InputError(f"positions: found {len(points)} for {len(images)} captures, allowed: one for each.")
-    found = [
-        np.asarray(imager.sensor.to_mm(find_spots(image, _SPOTS)), np.float64)
-        for image in progress.track(images, "Finding spots")
-    ]
+    found = [_spots_in(image, imager) for image in progress.track(images, "Finding spots")]
     with progress.step("Matching lenses"):
         start, mirrored = _start(found, points, imager)
     fitted, spots = start, None
@@ -123,14 +120,18 @@ def residuals_of(
 ) -> Float64[np.ndarray, "spot 2"]:
     """How far the spots of other captures are from where a calibration puts them, `(x, y)`, pixels."""
     imager = found.imager
-    seen = [np.asarray(imager.sensor.to_mm(find_spots(image, _SPOTS)), np.float64) for image in images]
+    seen = [_spots_in(image, imager) for image in images]
     offset = _offsets(imager, points)
     return _residuals_of(imager, _assigned(seen, points, imager, offset, _WITHIN[0]), offset)
 
 
+def _spots_in(image, imager: Imager) -> Float64[np.ndarray, "spot 2"]:
+    """Places on the sensor, mm."""
+    return np.asarray(imager.sensor.to_mm(find_spots(image, _SPOTS)), np.float64)
+
+
 def _residuals_of(imager: Imager, spots: Spots, offset) -> Float64[np.ndarray, "spot 2"]:
-    known = (imager, *_known(spots, _shift_of_cores(imager, spots, offset)))
-    return np.asarray(_residuals(_free(imager), known), np.float64)
+    return np.asarray(_residuals(_free(imager), _known(imager, spots, offset)), np.float64)
 
 
 def _start(found, points, imager) -> tuple[Imager, bool]:
@@ -218,8 +219,10 @@ def _shift_of_cores(imager: Imager, spots: Spots, offset) -> Float64[np.ndarray,
     return along.T[..., None] * away
 
 
-def _known(spots: Spots, cores) -> tuple[Array, ...]:
-    return tuple(map(jnp.asarray, (spots.points, spots.lenses, spots.places, cores)))
+def _known(imager: Imager, spots: Spots, offset) -> tuple[Any, ...]:
+    """What `_residuals` does not change."""
+    cores = _shift_of_cores(imager, spots, offset)
+    return (imager, *map(jnp.asarray, (spots.points, spots.lenses, spots.places, cores)))
 
 
 def _free(imager: Imager) -> Float[Array, "4"]:
@@ -253,7 +256,7 @@ def _robust(free, known):
 
 
 def _fitted(imager: Imager, spots: Spots, offset) -> Imager:
-    known = (imager, *_known(spots, _shift_of_cores(imager, spots, offset)))
+    known = _known(imager, spots, offset)
     _check_determined(jax.jacfwd(_residuals)(_free(imager), known), imager)
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
     return _with(imager, optx.least_squares(_robust, solver, _free(imager), known, throw=False).value)
@@ -268,7 +271,7 @@ def _check_determined(jacobian, imager: Imager) -> None:
 
 
 def _deviations(imager: Imager, spots: Spots, offset) -> dict[str, float]:
-    known = (imager, *_known(spots, _shift_of_cores(imager, spots, offset)))
+    known = _known(imager, spots, offset)
     residual = _residuals_of(imager, spots, offset).ravel()
     jacobian = np.asarray(jax.jacfwd(_residuals)(_free(imager), known), np.float64).reshape(-1, len(NAMES))
     # The median: outliers are not the noise.

@@ -26,7 +26,6 @@ def command(design: Path, captures: tuple[Path, ...], positions: Path, output: P
     array may be mirrored. Positions are in the sensor's frame, z from the plate. One capture does; several depths and
     places are better.
     """
-    import numpy as np
     from rich.console import Console
 
     from ..calibration.fit import calibrate
@@ -42,11 +41,10 @@ def command(design: Path, captures: tuple[Path, ...], positions: Path, output: P
     microscope = read_design(design)
     imager = microscope.imager()
     points = read_table(positions, "x_mm,y_mm,z_mm", len(captures) + 1)
-    with errors_name_file(positions), Progress() as progress:
-        images = [
-            np.asarray(read_capture(path, imager.sensor.shape)) for path in progress.track(captures, "Reading captures")
-        ]
-        found = calibrate(images, points, imager, progress=progress)
+    with Progress() as progress:
+        images = [read_capture(path, imager.sensor.shape) for path in progress.track(captures, "Reading captures")]
+        with errors_name_file(positions):
+            found = calibrate(images, points, imager, progress=progress)
     new = calibrated(microscope, found, provenance_of(design, *captures, positions))
     write_design(output, new)
     write_figure(drawing, picture(found))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output
 from .files import check_may_write, provenance_of
@@ -24,7 +25,6 @@ def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None,
 
     PSF is the image of a point on the axis, of any size; both may be grey TIFF, PNG or .npy.
     """
-    from ..base.errors import InputError
     from ..io.captures import read_capture, write_capture
     from ..reconstruction.deconvolution import deconvolve
     from ..solvers.convolution_admm import ConvolutionADMM

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..base.errors import InputError
 from .points import POINTS_HEADER, read_points
-from .volumes import VOLUME_SUFFIXES, display_range, read_volume
+from .viewers import display_range
+from .volumes import VOLUME_SUFFIXES, read_volume
 
 Layer = tuple[np.ndarray, dict[str, Any], str]
 

@@ -32,11 +32,10 @@ from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, NAMESPACE, Provenance
 from .tiff import decode_page, place_for_description, take_place
+from .viewers import display_range, imagej_description, title
 
 MAX_VOXELS = 10**10
 CHUNK = 1024
-# Percentiles of the values shown, of up to so many rows and columns.
-_SHOWN, _SAMPLED = (1, 99.9), 512
 
 _MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 _MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
@@ -108,19 +107,6 @@ def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth ro
     raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: float32, or values that it holds exactly.")
 
 
-def _title(path: Path) -> str:
-    return path.name.removesuffix(path.suffix).removesuffix(".ome")
-
-
-def display_range(voxels: np.ndarray) -> tuple[float, float]:
-    """What a viewer should show as black and white: few voxels are darker or brighter."""
-    some = voxels[:, :: max(voxels.shape[1] // _SAMPLED, 1), :: max(voxels.shape[2] // _SAMPLED, 1)]
-    for low, high in (np.percentile(some, _SHOWN), (voxels.min(), voxels.max())):
-        if low < high:
-            return float(low), float(high)
-    return float(low), float(low) + 1
-
-
 def _um(mm: float) -> float:
     return float(f"{mm * 1000:.12g}")  # 18100, not 18100.000000000004
 
@@ -169,7 +155,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
     metadata = {
         "axes": "ZYX",
-        "Name": _title(path),
+        "Name": title(path),
         "PhysicalSizeX": _um(pitch),
         "PhysicalSizeY": _um(pitch),
         "Plane": plane,
@@ -192,17 +178,9 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
             metadata=metadata,
             resolution=(per_um, per_um),
             resolutionunit="NONE",
-            extratags=[place_for_description(_imagej(voxels, step))],
+            extratags=[place_for_description(imagej_description(voxels, _um(step)))],
         )
         take_place(temporary)
-
-
-def _imagej(voxels: np.ndarray, step: float) -> str:
-    """ImageJ's description of a stack."""
-    low, high = display_range(voxels)
-    stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
-    spacing = f"spacing={_um(step)}\n" if step > 0 else ""
-    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}loop=false\nmin={low}\nmax={high}\n"
 
 
 def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
@@ -273,10 +251,10 @@ def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
     low, high = display_range(voxels)
     window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
-    channel = {"active": True, "color": "FFFFFF", "label": _title(path), "window": window}
+    channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
     multiscale = {
         "version": "0.4",
-        "name": _title(path),
+        "name": title(path),
         "axes": [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"],
         "datasets": [{"path": "0", "coordinateTransformations": transforms}],
     }

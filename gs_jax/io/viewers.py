@@ -1,0 +1,30 @@
+"""What programs that show volumes are told beside the voxels: a name, what is black and white, ImageJ's own words."""
+
+from pathlib import Path
+
+import numpy as np
+
+# Percentiles of the values shown, of up to so many rows and columns.
+_SHOWN, _SAMPLED = (1, 99.9), 512
+
+
+def title(path: Path) -> str:
+    """The name of a volume in a file."""
+    return path.name.removesuffix(path.suffix).removesuffix(".ome")
+
+
+def display_range(voxels: np.ndarray) -> tuple[float, float]:
+    """What a viewer should show as black and white: few voxels are darker or brighter."""
+    some = voxels[:, :: max(voxels.shape[1] // _SAMPLED, 1), :: max(voxels.shape[2] // _SAMPLED, 1)]
+    for low, high in (np.percentile(some, _SHOWN), (voxels.min(), voxels.max())):
+        if low < high:
+            return float(low), float(high)
+    return float(low), float(low) + 1
+
+
+def imagej_description(voxels: np.ndarray, step_um: float) -> str:
+    """ImageJ's description of a stack; without a step it is one plane, or has no one step."""
+    low, high = display_range(voxels)
+    stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
+    spacing = f"spacing={step_um}\n" if step_um > 0 else ""
+    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}loop=false\nmin={low}\nmax={high}\n"
