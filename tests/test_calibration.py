@@ -105,6 +105,14 @@ def test_geometry_is_found_from_a_poor_start(seed):
     assert len(found.residuals) > 20 and np.hypot(*found.residuals.T).max() < 1
 
 
+def test_one_capture_does():
+    actual, design, mirrored = device(0)
+    found = calibrate(captures(actual)[1:2], POINTS[1:2], design)
+    assert found.mirrored == mirrored
+    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=2e-3)
+    assert abs(float(found.imager.sensor_distance - actual.sensor_distance)) < 4 * found.deviations[NAMES[0]]
+
+
 def test_what_cannot_be_calibrated_is_refused_in_words():
     _, design, _ = device(0)
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
@@ -112,6 +120,8 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
         calibrate([blank], POINTS[:1], design)
     with pytest.raises(InputError, match="positions: found 3 for 1 captures, allowed: one for each"):
         calibrate([blank], POINTS, design)
+    with pytest.raises(InputError, match="positions: found the depth -20 mm, allowed: above 0"):
+        calibrate([blank], np.array([[0.0, 0.0, -20.0]]), design)
 
 
 def test_the_command(tmp_path):

@@ -94,11 +94,10 @@ def calibrate(
     Raises
     ------
     InputError
-        If there is no image, no pattern of lenses is seen in any, or the spots do not determine the geometry.
+        As `check_positions`; if no pattern of lenses is seen in any image, or the spots do not determine the geometry.
     """
     progress = progress or Progress()
-    if not len(images) or len(images) != len(points):
-        raise InputError(f"positions: found {len(points)} for {len(images)} captures, allowed: one for each.")
+    check_positions(points, len(images))
     found = [_spots_in(image, imager) for image in progress.track(images, "Finding spots")]
     with progress.step("Matching lenses"):
         start, mirrored = _start(found, points, imager)
@@ -113,6 +112,14 @@ def calibrate(
     offset = _offsets(fitted, points)
     residuals = _residuals_of(fitted, spots, offset)
     return Calibration(fitted, mirrored, _deviations(fitted, spots, offset), spots, residuals)
+
+
+def check_positions(points: Float[np.ndarray, "image 3"], count: int) -> None:
+    """`InputError` unless there is a point for each of some captures, in front of the plate."""
+    if not count or len(points) != count:
+        raise InputError(f"positions: found {len(points)} for {count} captures, allowed: one for each.")
+    if not (points[:, 2] > 0).all():
+        raise InputError(f"positions: found the depth {points[:, 2].min():g} mm, allowed: above 0.")
 
 
 def residuals_of(

@@ -28,7 +28,7 @@ def command(design: Path, captures: tuple[Path, ...], positions: Path, output: P
     """
     from rich.console import Console
 
-    from ..calibration.fit import calibrate
+    from ..calibration.fit import calibrate, check_positions
     from ..calibration.outcome import calibrated, picture, table
     from ..designs.design import read_design, write_design
     from ..io.captures import read_capture
@@ -41,10 +41,11 @@ def command(design: Path, captures: tuple[Path, ...], positions: Path, output: P
     microscope = read_design(design)
     imager = microscope.imager()
     points = read_table(positions, "x_mm,y_mm,z_mm", len(captures) + 1)
+    with errors_name_file(positions):
+        check_positions(points, len(captures))
     with Progress() as progress:
         images = [read_capture(path, imager.sensor.shape) for path in progress.track(captures, "Reading captures")]
-        with errors_name_file(positions):
-            found = calibrate(images, points, imager, progress=progress)
+        found = calibrate(images, points, imager, progress=progress)
     new = calibrated(microscope, found, provenance_of(design, *captures, positions))
     write_design(output, new)
     write_figure(drawing, picture(found))
