@@ -190,6 +190,9 @@ class Imager(eqx.Module):
         `(x, y)` of the array after the rotation, mm.
     wavelength
         Of the light, mm: 520e-6 for 520 nm.
+    tilt
+        Slopes `(x, y)` of the array's plane, which goes through the point `v` above the sensor's centre: by how much it
+        rises toward the object along +x and +y. None, the default, is an array parallel to the sensor.
 
     Raises
     ------
@@ -204,6 +207,7 @@ class Imager(eqx.Module):
     rotation: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
     wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
+    tilt: Float[Array, "2"] | None = eqx.field(converter=_as_float_or_none, default=None)
 
     def __check_init__(self):
         if not self.field_radius > 0:
@@ -217,11 +221,34 @@ class Imager(eqx.Module):
         """Lens vertices in the sensor's frame, mm.
 
         A rotated array is nothing but moved centres: in the sensor's frame the chief-ray map stays
-        separable in x and y, which is what makes back-projection fast.
+        separable in x and y, which is what makes back-projection fast. So does a tilted one, seen from above; its
+        `heights` give each lens a magnification of its own.
         """
+        centers = self._in_plane
+        if self.tilt is None:
+            return centers
+        cosine = self._cosine
+        return centers - (centers @ self.tilt)[:, None] * self.tilt[None] * (cosine**2 / (1 + cosine))
+
+    @property
+    def heights(self) -> Float[Array, " lens"]:
+        """Lens vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
+        if self.tilt is None:
+            return jnp.zeros(len(self.array.centers), self.sensor_distance.dtype)
+        return self._cosine * (self._in_plane @ self.tilt)
+
+    @property
+    def _in_plane(self):
+        """Lens vertices after rotation and shift, before the tilt."""
         cos, sin = jnp.cos(self.rotation), jnp.sin(self.rotation)
         x, y = self.array.centers.T
         return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
+
+    @property
+    def _cosine(self):
+        """Of the angle of the tilt."""
+        assert self.tilt is not None
+        return 1 / jnp.sqrt(1 + jnp.sum(self.tilt**2))
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """`z' = z + t/n`: what the optics sees of a depth `z`, mm (the plate counts as `t/n` of air)."""
@@ -231,14 +258,24 @@ class Imager(eqx.Module):
         """Lateral magnification `M_z = v / z'` (Eq. 3)."""
         return self.sensor_distance / self.reduced_depth(depth)
 
+    def magnifications(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "lens depth"]:
+        """Of each lens: `(v + h) / (z' - h)` at the height `h`. One row for all lenses unless the array is tilted."""
+        if self.tilt is None:
+            return self.magnification(depth)[None]
+        return self.magnification_of(self.magnification(depth)[None], self.heights[:, None])
+
+    def magnification_of(self, magnification, height):
+        """What `M = v/z'` becomes for a lens at a height, mm: `(v + h) / (z' - h)`; they broadcast."""
+        v = self.sensor_distance
+        return magnification * (v + height) / (v - height * magnification)
+
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v) / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)
 
     def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array, "lens point 2"]:
         """Where each lens images each point `(x, y, z)`, mm on the sensor."""
-        magnification = self.magnification(points[:, 2])[:, None]
-        return chief_ray(self.centers[:, None, :], points[None, :, :2], magnification[None])
+        return chief_ray(self.centers[:, None, :], points[None, :, :2], self.magnifications(points[:, 2])[..., None])
 
 
 class Grid(eqx.Module):

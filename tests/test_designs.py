@@ -143,6 +143,7 @@ WRONG = [
     ({"calibration.rotation_deg": "1"}, ["`calibration.rotation_deg`", "'1'", "degrees"]),
     ({"calibration.rotation_rad": 1.0}, ["`calibration.rotation_rad`", "`rotation_deg`"]),
     ({"calibration.shift_mm": [1.0]}, ["`calibration.shift_mm", "[x, y] in mm"]),
+    ({"calibration.tilt_deg": [1.0, 30.0]}, ["`calibration.tilt_deg", "from -10 to 10"]),
     ({"calibration.shift_mm": [9.0, 0.0]}, ["`array.centers_mm`", "lens", "beside the sensor"]),
     ({"calibration": 3}, ["`calibration`", "found 3", "a table"]),
     ({"provenance": "me"}, ["`provenance`", "'me'", "a table"]),
@@ -253,7 +254,9 @@ def test_values_reach_the_geometry_in_mm(tmp_path):
     assert float(imager.sensor_distance) == 5.8 and float(imager.array.substrate_thickness) == 1.0
     x, y = np.array(BASE["array"]["centers_mm"]).T
     np.testing.assert_allclose(imager.centers, np.stack([-y + 0.25, x - 0.5], 1), atol=1e-15)
-    assert imager.centers.dtype == jnp.float64
+    assert imager.centers.dtype == jnp.float64 and imager.tilt is None
+    tilted = read_design(written(tmp_path, {"calibration.tilt_deg": [1.0, 0.0]})).imager()
+    np.testing.assert_allclose(tilted.heights, np.sin(np.radians(1)) * x, atol=1e-15)
 
 
 def test_reach_is_the_radius_of_the_sub_image(tmp_path):

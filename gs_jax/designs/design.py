@@ -40,6 +40,8 @@ Range = Annotated[tuple[Length, Length], Field(strict=False, description="[near,
 Shape = Annotated[
     tuple[Pixels, Pixels], Field(strict=False, description="[rows, columns], whole numbers from 2 to 65536")
 ]
+Slope = Annotated[float, Field(ge=-10, le=10)]
+Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
 Centers = Annotated[
     tuple[Point, ...],
     Field(
@@ -85,10 +87,14 @@ class ImagingTable(Table):
 
 
 class CalibrationTable(Table):
-    """`[calibration]`: the array as found on the sensor, rotated about its centre (+x toward +y), then shifted."""
+    """`[calibration]`: the array as found on the sensor, rotated about its centre (+x toward +y), shifted, then tilted.
+
+    The tilt is by how much the array's plane rises toward the object along +x and +y.
+    """
 
     rotation_deg: float = Field(default=0.0, ge=-360, le=360, description="a number of degrees from -360 to 360")
     shift_mm: Point = (0.0, 0.0)
+    tilt_deg: Tilt = (0.0, 0.0)
 
 
 class Design(Table):
@@ -148,6 +154,7 @@ class Design(Table):
             wavelength=imaging.wavelength_nm * 1e-6,
             rotation=math.radians(calibration.rotation_deg),
             shift=calibration.shift_mm,
+            tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
         )
 
 

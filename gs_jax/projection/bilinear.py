@@ -77,25 +77,25 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
     taps = jnp.floor(2 / rays.spacing.min() + 1e-3).astype(jnp.int32) + 1
 
     def add_lens(image, lens):
-        y, x = lens
+        y, x, spacing = lens
         weighted = lambda: _weights(shapes, y, x, rays.parameters) * _patch(volume, y, x)
         patch = _if_seen(shapes, y, x, weighted)
         columns_of, rows_of = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
 
         def add_columns(block, image):
             left, columns, fresh = columns_of.block(block)
-            spread = _spread_columns(patch, x, rays.spacing, columns, fresh, taps)
+            spread = _spread_columns(patch, x, spacing, columns, fresh, taps)
 
             def add_rows(block, image):
                 top, rows, fresh = rows_of.block(block)
-                return _add_rows(image, spread, y, rays.spacing, rows, fresh, taps, (top, left))
+                return _add_rows(image, spread, y, spacing, rows, fresh, taps, (top, left))
 
             return lax.fori_loop(0, rows_of.blocks, add_rows, image)
 
         return lax.fori_loop(0, columns_of.blocks, add_columns, image), None
 
     image = jnp.zeros(shapes.image, volume.dtype)
-    return lax.scan(add_lens, image, (rays.y, rays.x))[0]
+    return lax.scan(add_lens, image, (rays.y, rays.x, rays.spacing))[0]
 
 
 def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:

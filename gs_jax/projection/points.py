@@ -173,6 +173,7 @@ def _add_spots(
     near = between.astype(int)
     far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
 
+    magnification = imager.magnification_of(magnification, imager.heights[lenses])
     place = imager.sensor.to_pixels(chief_ray(center, point, magnification[:, None]))
     fifths = jnp.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
     (i, j), corner = (fifths % STEPS).T, fifths // STEPS + size // 2

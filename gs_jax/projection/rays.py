@@ -36,7 +36,7 @@ class Rays(NamedTuple):
 
     y: Axis
     x: Axis
-    spacing: Float[Array, " depth"]  # of neighbouring voxels on the sensor, pixels
+    spacing: Float[Array, "lens depth"]  # of neighbouring voxels on the sensor, pixels
     parameters: Float[Array, "depth parameter"]  # of the lenses' weight at each depth
 
 
@@ -85,9 +85,11 @@ def trace(
     """
     if parameters is None:
         parameters = imager.reduced_depth(grid.depths)[:, None]
-    magnification = imager.magnification(grid.depths)
+    order = _snake(imager.centers)
+    magnification = imager.magnifications(grid.depths)
+    magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
-    x, y = imager.centers[_snake(imager.centers)].T
+    x, y = imager.centers[order].T
 
     def axis(center, origin, voxels, pixels):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
@@ -106,7 +108,9 @@ def trace(
     return Rays(
         y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0]),
         x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1]),
-        spacing=jax.lax.stop_gradient(magnification * (grid.pitch / imager.sensor.pixel_pitch)),
+        spacing=jax.lax.stop_gradient(
+            jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
+        ),
         parameters=parameters.astype(dtype),
     )
 
@@ -114,14 +118,15 @@ def trace(
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
     """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the axis.
 
-    `from_origin` is the lens's centre as seen from the grid's origin; voxels are counted from there.
+    `from_origin` is the lens's centre as seen from the grid's origin; voxels are counted from there. `magnification` is
+    `(lens, depth)`.
     """
     # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
     # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.
     whole = jax.lax.stop_gradient(jnp.round(center / pixel_pitch))
     center_here = _minus_multiple(center, whole, pixel_pitch)[:, None, None]
     offset = _minus_multiple(from_origin[:, None], index, voxel_pitch)
-    ray = chief_ray(center_here, center_here - offset[:, None, :], magnification[None, :, None])
+    ray = chief_ray(center_here, center_here - offset[:, None, :], magnification[:, :, None])
     middle = (pixels - 1) / 2
     coordinate = ray / pixel_pitch + middle % 1
     below = jax.lax.stop_gradient(jnp.floor(coordinate + 0.5 if nearest else coordinate))

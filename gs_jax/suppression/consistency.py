@@ -93,8 +93,11 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     seen = np.isfinite(distance)
     distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
     depth = jnp.asarray(points[:, 2], imager.sensor_distance.dtype)
-    magnification = np.asarray(imager.magnification(depth), np.float64)
-    landing = chief_ray(centers[lens], points[:, None, :2], magnification[:, None, None])
+    magnification = np.asarray(imager.magnifications(depth), np.float64)
+    of_each = (
+        magnification[0][:, None] if len(magnification) == 1 else magnification[lens, np.arange(len(lens))[:, None]]
+    )
+    landing = chief_ray(centers[lens], points[:, None, :2], of_each[..., None])
     pixels = np.asarray(imager.sensor.to_pixels(landing), np.float64)
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
