@@ -3,8 +3,8 @@
 - Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm beside it): what is fitted, and how far spots
   are from where a geometry that was fitted to other depths puts them. Then `find_points` on 120 points, with it.
 - Random devices, simulated with all of the light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of
-  up to 2 mm, a sensor distance up to 20 % off; three captures each. Deviations from what is true, in the standard
-  deviations that the calibration gives.
+  up to 2 mm, a tilt up to 1 degree each way, a sensor distance up to 20 % off; three captures each. Deviations from
+  what is true, in the standard deviations that the calibration gives.
 
     python -m experiments.calibration [DATA] [--devices N] [--out DIR]
 
@@ -25,14 +25,15 @@ from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.report import markdown_table
-from gs_jax.calibration.fit import NAMES, Calibration, calibrate, residuals_of
-from gs_jax.calibration.outcome import picture, values_of
+from gs_jax.calibration.fit import Calibration, calibrate, residuals_of
+from gs_jax.calibration.outcome import picture
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.reconstruction.pipeline import voxel_grid
 
+NAMES = ("sensor_distance_mm", "rotation_deg", "shift_x_mm", "shift_y_mm", "tilt_x_deg", "tilt_y_deg")
 DEPTHS = (18.0, 20.0, 22.0)
 # Of a random device: lenses on a plate, mm, and a sensor that sees about a third of them.
 LENSES, PLATE, PIXELS, PIXEL, FIELD = 60, 11.0, 1536, 0.006, 2.5
@@ -55,7 +56,7 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     found = find_points(scene, whole.imager, voxel_grid(whole.imager, [17.5, 22.5]), progress=progress)
     score = localization(found, truth, axial=0.6)
     return {
-        "values": values_of(whole),
+        "values": whole.values,
         "deviations": whole.deviations,
         "rms_pixels": whole.rms,
         "spots": len(whole.residuals),
@@ -73,9 +74,17 @@ def device(seed: int) -> tuple[Imager, Imager, bool]:
     design = Imager(MicrolensArray(centers), sensor, rng.uniform(5.7, 5.9), FIELD)
     built = MicrolensArray(centers * (1, -1) if mirrored else centers)
     rotation, shift = rng.uniform(-np.pi, np.pi), rng.uniform(-2, 2, 2)
-    actual = Imager(built, sensor, design.sensor_distance, FIELD, rotation=rotation, shift=shift)
+    tilt = np.tan(np.radians(rng.uniform(-1, 1, 2)))
+    actual = Imager(built, sensor, design.sensor_distance, FIELD, rotation=rotation, shift=shift, tilt=tilt)
     wrong = design.sensor_distance * rng.uniform(0.8, 1.2)
     return actual, eqx.tree_at(lambda i: i.sensor_distance, design, jnp.asarray(wrong)), mirrored
+
+
+def true_values(imager: Imager) -> dict[str, float]:
+    """What a calibration should find."""
+    assert imager.tilt is not None
+    numbers = (imager.sensor_distance, np.degrees(imager.rotation), *imager.shift, *np.degrees(np.arctan(imager.tilt)))
+    return dict(zip(NAMES, map(float, numbers), strict=True))
 
 
 def on_device(seed: int, progress: Progress) -> dict:
@@ -89,8 +98,8 @@ def on_device(seed: int, progress: Progress) -> dict:
         key = jax.random.key(1000 * seed + number)
         images.append(np.asarray(expose(light, Camera(gain=1.0), key, peak_electrons=5000)))
     found = calibrate(images, points, design, progress=progress)
-    true = values_of(found._replace(imager=actual))
-    off = {name: value - true[name] for name, value in values_of(found).items()}
+    true = true_values(actual)
+    off = {name: value - true[name] for name, value in found.values.items()}
     off["rotation_deg"] = (off["rotation_deg"] + 180) % 360 - 180
     in_sd = {name: off[name] / found.deviations[name] for name in NAMES}
     return {"mirrored": found.mirrored == mirrored, "off": off, "in_sd": in_sd, "rms_pixels": found.rms}

@@ -7,16 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
-from experiments.calibration import device, on_captures
-from gs_jax import Imager, InputError, Sensor, read_design, write_capture, write_design
+from experiments.calibration import NAMES, device, on_captures, true_values
+from gs_jax import Grid, Imager, InputError, Sensor, read_design, write_capture, write_design
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.fit import NAMES, calibrate
-from gs_jax.calibration.matching import match
-from gs_jax.calibration.outcome import values_of
+from gs_jax.calibration.fit import Calibration, calibrate
+from gs_jax.calibration.matching import match, match_shift
+from gs_jax.calibration.outcome import picture, scales
+from gs_jax.calibration.scene import calibrate_by_scene
 from gs_jax.calibration.spots import core_offsets, find_spots
+from gs_jax.calibration.unknowns import FITTABLE, FITTED
 from gs_jax.designs.builtin import geomscope
+from gs_jax.io.positions import read_positions
 from gs_jax.io.provenance import read_provenance
 
 from .helpers import needs
@@ -39,19 +44,45 @@ def drawn(places, shape, seed=0, noise=2.0) -> np.ndarray:
 
 
 def spots_of(imager: Imager, point) -> np.ndarray:
-    """Where exact rays put the cores of a point's spots, `(row, column)`, nearest lenses first; a tenth is missing."""
-    beside = np.asarray(imager.centers) - point[:2]
+    """Where exact rays put the cores of a point's spots, `(row, column)`, nearest lenses first; a tenth is missing.
+
+    In the plate's own frame, from which vertices and rays are turned into the sensor's: the tilt is exact.
+    """
+    tilt = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt)
+    steepest = np.append(tilt, 0) / max(np.linalg.norm(tilt), 1e-12)
+    turn = Rotation.from_rotvec(np.arctan(np.linalg.norm(tilt)) * np.cross(steepest, [0, 0, 1]))
+    level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
+    front, v = float(imager.reduced_depth(0.0)), float(imager.sensor_distance)
+    source = turn.inv().apply([*point[:2], point[2] + front])
+    centers = np.asarray(level.centers)
+    beside = source[:2] - centers
     field = np.hypot(*beside.T)
     order = np.argsort(field)[: int(0.9 * len(field))]
-    beside, field = beside[order], field[order]
-    offset = core_offsets(imager, point[2:], field)[0]
-    away = -beside / np.maximum(field, 1e-12)[:, None]
-    landing = point[:2] + beside * float(imager.scale(point[2])) + offset[:, None] * away
-    return np.asarray(imager.sensor.to_pixels(landing))[1:]
+    order = order[field[order] < 1.1 * imager.field_radius][1:]
+    centers, beside, field = centers[order], beside[order], field[order]
+    some = np.linspace(0, 1.1 * imager.field_radius, 13)
+    offset = np.interp(field, some, core_offsets(level, source[2:] - front, some)[0])
+    landing = centers - v / source[2] * beside + (offset / np.maximum(field, 1e-12))[:, None] * beside
+    vertices = turn.apply(np.column_stack([centers, 0 * field]))
+    onward = turn.apply(np.column_stack([landing, 0 * field - v])) - vertices
+    onward = onward[:, :2] * ((v + vertices[:, 2]) / -onward[:, 2])[:, None]
+    return np.asarray(imager.sensor.to_pixels(vertices[:, :2] + onward))
 
 
-def captures(imager: Imager) -> list[np.ndarray]:
-    return [drawn(spots_of(imager, point), imager.sensor.shape, seed) for seed, point in enumerate(POINTS)]
+def captures(imager: Imager, points=POINTS, of=None) -> list[np.ndarray]:
+    """Each with the points that `of` says, by default one."""
+    of = np.arange(len(points)) if of is None else np.asarray(of)
+    places = [np.concatenate([spots_of(imager, p) for p in points[of == k]]) for k in range(of.max() + 1)]
+    return [drawn(each, imager.sensor.shape, seed) for seed, each in enumerate(places)]
+
+
+def check(found: Calibration, actual: Imager, names=NAMES, **also):
+    """Within four standard deviations, and a fiftieth of a pixel's worth."""
+    true = true_values(actual) | also
+    for name in names:
+        off = found.values[name] - true[name]
+        off = (off + 180) % 360 - 180 if name == "rotation_deg" else off
+        assert abs(off) < 4 * found.deviations[name] + (0.01 if "tilt" in name else 1e-6), (name, off)
 
 
 def test_spots_are_found_within_a_fiftieth_of_a_pixel():
@@ -95,14 +126,13 @@ def test_chance_is_no_pattern():
 def test_geometry_is_found_from_a_poor_start(seed):
     actual, design, mirrored = device(seed)
     found = calibrate(captures(actual), POINTS, design)
-    true = values_of(found._replace(imager=actual))
     assert found.mirrored == mirrored and found.rms < 0.1
-    for name in NAMES:
-        off = values_of(found)[name] - true[name]
-        off = (off + 180) % 360 - 180 if name == "rotation_deg" else off
-        assert abs(off) < max(4 * found.deviations[name], 1e-6), name
+    check(found, actual)
     # Spots near to where they are due, though the image has others.
     assert len(found.residuals) > 20 and np.hypot(*found.residuals.T).max() < 1
+    depth, seen, fitted = scales(found).T
+    np.testing.assert_allclose(seen, fitted, atol=2e-4)
+    assert set(depth) <= {18.0, 20.0, 22.0} and len(picture(found).axes) == 3
 
 
 def test_one_capture_does():
@@ -110,7 +140,70 @@ def test_one_capture_does():
     found = calibrate(captures(actual)[1:2], POINTS[1:2], design)
     assert found.mirrored == mirrored
     np.testing.assert_allclose(found.imager.centers, actual.centers, atol=2e-3)
-    assert abs(float(found.imager.sensor_distance - actual.sensor_distance)) < 4 * found.deviations[NAMES[0]]
+    check(found, actual, NAMES[:1])
+
+
+MANY = np.array([[x, y, z] for z in (18.0, 20.0, 22.0) for x, y in ((-1.2, 0.3), (1.1, 0.8), (0.1, -1.0))])
+
+
+def test_several_sources_in_a_capture_and_some_places_unknown():
+    actual, design, _ = device(5)
+    given, of = MANY.copy(), [0, 1, 2, 0, 1, 2, 0, 1, 2]
+    given[[0, 4], :2] = np.nan
+    given[8] = np.nan
+    # An unknown depth is looked for in a capture of its own.
+    of[8] = 3
+    found = calibrate(captures(actual, MANY, of), given, design, captures=np.array(of))
+    check(found, actual)
+    np.testing.assert_allclose(found.sources.points, MANY, atol=0.05)
+    assert np.abs(found.sources.points - MANY)[:, :2].max() < 5e-3 and len(found.residuals) > 60
+
+
+def test_places_unknown_in_the_plane():
+    """The shift is the design's: any other shows the same spots, from sources that are displaced."""
+    actual, design, _ = device(6)
+    design = eqx.tree_at(lambda i: i.shift, design, actual.shift)
+    given = POINTS * [np.nan, np.nan, 1]
+    found = calibrate(captures(actual), given, design, fit=[name for name in FITTED if name != "shift"])
+    check(found, actual, [name for name in NAMES if "shift" not in name])
+    np.testing.assert_allclose(found.sources.points, POINTS, atol=5e-3)
+
+
+def test_scale_offset_and_each_lens():
+    actual, design, _ = device(7)
+    moves = np.random.default_rng(0).normal(0, 0.008, design.array.centers.shape)
+    actual = eqx.tree_at(lambda i: i.array.centers, actual, 1.004 * actual.array.centers + moves)
+    found = calibrate(captures(actual, MANY), MANY - [0, 0, 0.15], design, fit=FITTABLE)
+    check(found, actual, scale=1.004, depth_offset_mm=0.15)
+    seen = np.unique(found.spots.lenses)
+    away = np.asarray(found.imager.centers - actual.centers)[seen]
+    assert np.sqrt((away**2).mean()) < 0.001 and found.rms < 0.1
+
+
+def test_lenses_of_no_list_are_found():
+    actual, design, _ = device(5)
+    design = eqx.tree_at(lambda i: i.array.centers, design, 1.7 * design.array.centers[::-1])
+    found = calibrate(captures(actual, MANY), MANY, design, find_lenses=True)
+    away = np.asarray(KDTree(np.asarray(actual.centers)).query(np.asarray(found.imager.centers))[0])
+    assert len(away) >= 10 and np.median(away) < 0.002 and away.max() < 0.01
+    check(found, actual, NAMES[:1])
+
+
+def test_a_scene_that_nobody_knows():
+    actual, design, mirrored = device(4)
+    assert not mirrored
+    # What a scene cannot tell is right; the rotation is two degrees off, and the tilt is unknown.
+    start = eqx.tree_at(lambda i: (i.rotation, i.tilt), actual, (actual.rotation + np.radians(2), None))
+    image = captures(actual, MANY, np.zeros(9, int))[0]
+    grid = Grid([17.0, 23.0], (121, 121), 0.05)
+    found = calibrate_by_scene(image, start, grid)
+    check(found, actual, [name for name in NAMES if "rotation" in name or "tilt" in name])
+    assert len(found.sources.points) >= 7 and found.rms < 0.2
+    with pytest.raises(InputError, match="--from-scene: found shift to fit, allowed: rotation, tilt, lenses"):
+        calibrate_by_scene(image, start, grid, fit=["shift"])
+    blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
+    with pytest.raises(InputError, match="capture: found 0 points that the lenses agree on, allowed: 5 or more"):
+        calibrate_by_scene(blank, start, grid)
 
 
 def test_what_cannot_be_calibrated_is_refused_in_words():
@@ -118,10 +211,62 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
     with pytest.raises(InputError, match="captures: found 0 of 0 bright spots on lenses at best"):
         calibrate([blank], POINTS[:1], design)
-    with pytest.raises(InputError, match="positions: found 3 for 1 captures, allowed: one for each"):
-        calibrate([blank], POINTS, design)
-    with pytest.raises(InputError, match="positions: found the depth -20 mm, allowed: above 0"):
-        calibrate([blank], np.array([[0.0, 0.0, -20.0]]), design)
+    with pytest.raises(InputError, match="captures: found 0 of 0 spots on lenses that several captures show"):
+        calibrate([blank, blank], POINTS[:2], design, find_lenses=True)
+    with pytest.raises(InputError, match="positions: found 1 of 2 points unknown, allowed: known points, two or more"):
+        calibrate([blank, blank], POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]], design, find_lenses=True)
+    for points, of, message in (
+        (POINTS, None, "found a source in capture 2, allowed: 1 to 1"),
+        (POINTS[:0], None, "found 0 sources for 1 captures, none in capture 1, allowed: one or more in each"),
+        (np.array([[0.0, 0.0, -20.0]]), None, "found the depth -20 mm, allowed: above 0"),
+        (np.array([[0.0, 0.0, np.nan]]), None, "no known depth to fit sensor_distance by, allowed: the depth of"),
+        (np.array([[np.nan, 0.0, 20]]), None, "no source with known x and y to fit shift by, allowed: x and y of"),
+    ):
+        with pytest.raises(InputError, match="positions: .*" + message):
+            calibrate([blank], points, design, captures=of)
+
+
+def test_numbers_that_the_spots_do_not_determine_are_refused():
+    actual, design, _ = device(0)
+    with pytest.raises(InputError, match="spots that do not determine sensor_distance_mm.*depth_offset"):
+        calibrate(captures(actual)[1:2], POINTS[1:2], design, fit=FITTABLE[:-1])
+
+
+def test_a_displaced_pattern():
+    pattern = np.random.default_rng(0).uniform(-4, 4, (30, 2))
+    spots = np.concatenate([pattern[::2] + [0.7, -1.3], [[0.0, 0.0]]])
+    shift, count = match_shift(spots, pattern)
+    np.testing.assert_allclose(shift, [0.7, -1.3], atol=0.01)
+    assert count >= 15 and match_shift(spots[:0], pattern)[1] == 0
+
+
+def test_positions_are_read_with_what_is_known(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("capture, x_mm, z_mm\nb.tif, 0.5, 18\n1,,20\n2,-1,\n")
+    points, of = read_positions(path, ["some/a.tif", "b.tif"])
+    np.testing.assert_array_equal(points, [[0.5, np.nan, 18], [np.nan, np.nan, 20], [-1, np.nan, np.nan]])
+    assert of.tolist() == [1, 0, 1]
+    path.write_text("x_mm,y_mm,z_mm\n1,2,3\n4,5,6\n")
+    assert read_positions(path, ["a.tif", "b.tif"])[1].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,z\n1,2,3\n", "found the header 'x,y,z', allowed: some of capture,x_mm,y_mm,z_mm"),
+        ("", "found the header '', allowed"),
+        ("x_mm,x_mm\n1,2\n", "found the header"),
+        ("x_mm,y_mm,z_mm\n1,2,far\n", "line 2, z_mm: found 'far', allowed: a number of mm, or nothing"),
+        ("x_mm,y_mm,z_mm\n1,2,3,4\n", "line 2: found more values than the header has"),
+        ("capture,z_mm\nc.tif,3\n", "line 2, capture: found 'c.tif', allowed: a number from 1 to 2 or the name"),
+        ("capture,z_mm\n3,3\n", "line 2, capture: found '3', allowed"),
+    ],
+)
+def test_wrong_positions_are_one_line(tmp_path, text, message):
+    path = tmp_path / "p.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_positions(path, ["a.tif", "b.tif"])
 
 
 def test_the_command(tmp_path):
@@ -151,9 +296,15 @@ def test_the_command(tmp_path):
     np.testing.assert_allclose(new.centers, actual.centers, atol=2e-3)
     assert float(new.sensor_distance) == pytest.approx(float(actual.sensor_distance), abs=5e-3)
     assert "standard_deviations" in read_provenance(tmp_path / "new.toml") and (tmp_path / "new.png").exists()
+    assert new.tilt is not None and "calibrated_values" in read_provenance(tmp_path / "new.toml")
     (tmp_path / "p.csv").write_text("x_mm,y_mm,z_mm\n0,0,20\n")
-    wrong = CliRunner().invoke(commands, [*arguments, str(tmp_path / "other.toml")])
-    assert isinstance(wrong.exception, InputError) and "p.csv: positions: found 1 for 3" in str(wrong.exception)
+    for more, message in (
+        ([], "p.csv: positions: found 1 sources for 3 captures, none in capture 2, allowed: one or more in each"),
+        (["--from-scene"], "--positions, --from-scene: found both, allowed: --positions"),
+        (["--fit", "focus"], "found 'focus', allowed: sensor-distance, rotation"),
+    ):
+        wrong = CliRunner().invoke(commands, [*arguments, str(tmp_path / "other.toml"), *more])
+        assert message in f"{wrong.exception} {wrong.output}" and wrong.exit_code
 
 
 @pytest.mark.slow

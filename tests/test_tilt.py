@@ -29,7 +29,7 @@ def test_vertices_are_those_of_a_turned_plane():
     flat, imager = tilted(None), tilted()
     plane = np.column_stack([flat.centers, np.zeros(len(PLACES))])
     angle = np.arctan(np.linalg.norm(TILT))
-    axis = np.cross([0, 0, 1], [*-TILT, 0] / np.linalg.norm(TILT))
+    axis = np.cross([0, 0, 1], np.array([*-TILT, 0]) / np.linalg.norm(TILT))
     turned = Rotation.from_rotvec(angle * axis).apply(plane)
     np.testing.assert_allclose(np.column_stack([imager.centers, imager.heights]), turned, atol=1e-12)
     np.testing.assert_allclose(imager.heights, imager.centers @ TILT, atol=1e-12)

@@ -46,7 +46,7 @@ def _middle_of_pixels(light, peak):
 def core_offsets(
     imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"]
 ) -> Float64[np.ndarray, "depth field"]:
-    """How far the core of a spot is from its chief ray, away from the point's side, mm, by exact rays.
+    """How far the core of a spot is from its chief ray, toward the point's side, mm, by exact rays.
 
     A point `field` beside a lens's axis is imaged at `-M_z field` from the axis, plus this.
     """

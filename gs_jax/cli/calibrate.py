@@ -4,51 +4,110 @@ from pathlib import Path
 
 import click
 
-from ..base.errors import errors_name_file
+from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN
+
+_NAMES = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
+
+
+class _Names(click.ParamType):
+    """Names of what is fitted, with commas between them."""
+
+    name = "NAMES"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, tuple):
+            return value
+        names = tuple(name.strip() for name in value.split(","))
+        if wrong := [name for name in names if name not in _NAMES]:
+            self.fail(f"found {wrong[0]!r}, allowed: {', '.join(_NAMES)}.", param, ctx)
+        return tuple(name.replace("-", "_") for name in names)
 
 
 @click.command("calibrate", epilog="Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")
 @click.argument("design", type=DESIGN)
 @click.argument("captures", type=Path, nargs=-1, required=True)
 @click.option(
-    "--positions", type=Path, required=True, help="POINTS.csv: x_mm,y_mm,z_mm of the source, a line for each capture."
+    "--positions",
+    type=Path,
+    help="POINTS.csv: x_mm,y_mm,z_mm of the source, a line for each capture; with a first column `capture` (number or "
+    "file name), of several sources. Empty cells are not known and are fitted.",
+)
+@click.option(
+    "--fit", type=_Names(), default=(), help=f"Fit these, too: {', '.join(_NAMES[4:])}. Always fitted: the others."
+)
+@click.option("--hold", type=_Names(), default=(), help="Take these from the design.")
+@click.option("--find-lenses", is_flag=True, help="Find the lenses, whatever centres DESIGN lists; needs positions.")
+@click.option(
+    "--from-scene", is_flag=True, help="One capture of any sparse scene, without positions: finds rotation and tilt."
 )
 @click.option("-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of residuals beside it.")
 @force_option
-def command(design: Path, captures: tuple[Path, ...], positions: Path, output: Path, force: bool):
-    """Find sensor distance, rotation and shift of a real microscope, from CAPTURES of one point source each.
+def command(
+    design: Path,
+    captures: tuple[Path, ...],
+    positions: Path | None,
+    fit: tuple[str, ...],
+    hold: tuple[str, ...],
+    find_lenses: bool,
+    from_scene: bool,
+    output: Path,
+    force: bool,
+):
+    """Find the geometry of a real microscope, from CAPTURES of point sources: a pinhole or a bead at known places.
 
-    DESIGN has the lens centres; its sensor distance may be off by a fifth, its rotation and shift by anything, and the
-    array may be mirrored. Positions are in the sensor's frame, z from the plate. One capture does; several depths and
-    places are better.
+    Sensor distance, rotation, shift and tilt are fitted. DESIGN has the lens centres; its sensor distance may be off by
+    a fifth, its rotation and shift by anything, and the array may be mirrored. Positions are in the sensor's frame, z
+    from the plate. One capture does; several depths and places are better.
     """
     from rich.console import Console
 
-    from ..calibration.fit import calibrate, check_positions
+    from ..calibration.fit import calibrate
     from ..calibration.outcome import calibrated, picture, table
+    from ..calibration.scene import FITTED as OF_SCENES, calibrate_by_scene
+    from ..calibration.sources import Sources
+    from ..calibration.unknowns import FITTED
     from ..designs.design import read_design, write_design
     from ..io.captures import read_capture
-    from ..io.disk import read_table
     from ..io.figures import write_figure
+    from ..io.positions import read_positions
+    from ..reconstruction.pipeline import voxel_grid
 
+    if from_scene == (positions is not None) or (from_scene and (find_lenses or len(captures) > 1)):
+        found = "both" if from_scene and positions else "several captures" if len(captures) > 1 else "neither"
+        allowed = "--positions POINTS.csv, or --from-scene with one capture and without --find-lenses"
+        raise InputError(f"--positions, --from-scene: found {found}, allowed: {allowed}.")
     check_output(output, [".toml"])
     drawing = check_output(output.with_suffix(".png"), [".png"])
-    check_may_write(output, drawing, inputs=(design, *captures, positions), force=force)
+    inputs = (design, *captures, *([positions] if positions else []))
+    check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
     imager = microscope.imager()
-    points = read_table(positions, "x_mm,y_mm,z_mm", len(captures) + 1)
-    with errors_name_file(positions):
-        check_positions(points, len(captures))
+    names = [name for name in (*(OF_SCENES if from_scene else FITTED), *fit) if name not in hold]
     with Progress() as progress:
-        images = [read_capture(path, imager.sensor.shape) for path in progress.track(captures, "Reading captures")]
-        found = calibrate(images, points, imager, progress=progress)
-    new = calibrated(microscope, found, provenance_of(design, *captures, positions))
+        if positions is None:
+            (capture,) = captures
+            image = read_capture(capture, imager.sensor.shape)
+            grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
+            with errors_name_file(capture):
+                found = calibrate_by_scene(image, imager, grid, fit=names, progress=progress)
+        else:
+            points, of = read_positions(positions, captures)
+            sources = Sources(points, of)
+            with errors_name_file(positions):
+                sources.check(len(captures))
+                sources.check_fit(names)
+            images = [read_capture(path, imager.sensor.shape) for path in progress.track(captures, "Reading captures")]
+            found = calibrate(
+                images, points, imager, captures=of, fit=names, find_lenses=find_lenses, progress=progress
+            )
+    new = calibrated(microscope, found, provenance_of(*inputs))
     write_design(output, new)
     write_figure(drawing, picture(found))
     Console().print(table(microscope, found))
     mirrored = ", the array mirrored (y against -y) and turned" if found.mirrored else ""
-    click.echo(f"{output}: {len(found.residuals)} spots, {found.rms:.3f} pixels RMS{mirrored}")
+    lenses = f", {len(found.imager.array.centers)} lenses found" if find_lenses else ""
+    click.echo(f"{output}: {len(found.residuals)} spots, {found.rms:.3f} pixels RMS{mirrored}{lenses}")

@@ -1,0 +1,151 @@
+"""Where a calibration begins: rotation, mirror, shift and sensor distance from the pattern of the lenses."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from ..base.errors import InputError
+from ..geometry import Imager, MicrolensArray
+from .matching import Similarity, match, match_shift, meeting_lenses
+from .sources import Sources, assigned
+from .unknowns import moved_lenses, offsets_of
+
+# How far the sensor's distance may be off, relative, and in how many steps it is searched for without known lenses.
+_DISTANCE, _STEPS = 0.25, 51
+# Without a known depth: scale of the pattern, and how far it may be off, relative.
+_SCALE, _SCALE_OFF = 1.3, 0.2
+# How near to where it is due a spot is counted, mm, and guesses that are compared.
+_NEAR, _GUESSES = 0.06, 6
+# Share of the spots that must be on lenses which other captures show, too.
+_SHARED = 0.5
+
+
+class Start(NamedTuple):
+    """A geometry and sources that explain most spots."""
+
+    imager: Imager
+    mirrored: bool
+    sources: Sources
+
+
+def begin(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:
+    """From the capture with the clearest pattern; of several sources, that which explains most spots of all captures.
+
+    Parameters
+    ----------
+    found
+        Spots of each capture, `(x, y)`, mm, brightest first.
+    sources, imager
+        What is known.
+
+    Raises
+    ------
+    InputError
+        If no capture has a clear pattern.
+    """
+    centers = np.asarray(imager.array.centers, np.float64)
+    guesses = []
+    for source, point in enumerate(sources.points):
+        capture = int(sources.captures[source])
+        scale, tolerance = _scale(imager, point[2])
+        others = int((sources.captures == capture).sum())
+        guesses.append((match(found[capture], centers, scale, tolerance, others), source))
+    guesses.sort(key=lambda guess: -guess[0].on_lenses)
+    best = guesses[0][0]
+    if not best.is_clear:
+        text = f"{best.on_lenses} of {best.tried} bright spots on lenses at best"
+        raise InputError(f"captures: found {text}, allowed: the spots of point sources in most, and this array.")
+    # Points that lack a coordinate say less of the geometry.
+    clear = [(each, source) for each, source in guesses if each.is_clear]
+    clear.sort(key=lambda guess: int(np.isnan(sources.points[guess[1]]).sum()))
+    starts = [_begun(each, source, found, sources, imager) for each, source in clear[:_GUESSES]]
+    if len(starts) == 1 or (sources.captures[:, None] == sources.captures).sum() == len(sources.captures):
+        return starts[0]
+    return max(starts, key=lambda start: _explained(found, start))
+
+
+def _scale(imager: Imager, depth: float) -> tuple[float, float]:
+    """Of the pattern on the sensor, and how far it may be off, relative."""
+    if np.isnan(depth):
+        return _SCALE, _SCALE_OFF
+    scale = float(imager.scale(depth))
+    return scale, _DISTANCE * (1 - 1 / scale)
+
+
+def _explained(found, start: Start) -> int:
+    offsets = offsets_of(start.imager, start.sources.points[:, 2])
+    return len(assigned(found, start.sources, start.imager, offsets, _NEAR).lenses)
+
+
+def _begun(best: Similarity, source: int, found, sources: Sources, imager: Imager) -> Start:
+    seen = _seen(best, sources.points[source], imager)
+    return Start(seen, best.mirrored, _placed(found, sources, seen))
+
+
+def _seen(found: Similarity, point, imager: Imager) -> Imager:
+    """`p = s c - M q` with `s = 1 + M`: scale, rotation and shift of the pattern say where the array is."""
+    scale, (x, y, z) = abs(found.factor), point
+    magnification = scale - 1
+    array = _mirrored(imager.array) if found.mirrored else imager.array
+    distance = imager.sensor_distance if np.isnan(z) else magnification * float(imager.reduced_depth(z))
+    shift = (found.shift + magnification * complex(x, y)) / scale
+    shift = imager.shift if np.isnan(shift) else (shift.real, shift.imag)
+    where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
+    typed = lambda value: jnp.asarray(value, imager.sensor_distance.dtype)
+    return eqx.tree_at(where, imager, (array, typed(distance), typed(found.rotation), typed(shift)))
+
+
+def _mirrored(array: MicrolensArray) -> MicrolensArray:
+    """The complex conjugate of the matches: y against -y."""
+    return moved_lenses(array, array.centers * jnp.asarray([[1.0, -1.0]], array.centers.dtype))
+
+
+def _placed(found, sources: Sources, imager: Imager) -> Sources:
+    """Sources with coordinates that nobody gave, from where the pattern of the lenses is in their captures."""
+    points, centers = sources.points.copy(), np.asarray(imager.centers, np.float64)
+    for source in np.flatnonzero(np.isnan(points).any(1)):
+        spots = found[int(sources.captures[source])]
+        depth = points[source, 2]
+        if np.isnan(depth):
+            near = match(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
+            magnification = abs(near.factor) - 1
+            reduced = float(imager.sensor_distance) / max(magnification, 1e-3)
+            depth = reduced - float(imager.reduced_depth(0.0))
+        magnification = float(imager.magnification(depth))
+        shift, _ = match_shift(spots, (1 + magnification) * centers)
+        place = [*(-shift / magnification), max(depth, 1e-3)]
+        points[source] = np.where(np.isnan(points[source]), place, points[source])
+    return sources._replace(points=points)
+
+
+def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:
+    """Lens centres from what the captures of known points have in common, at the sensor distance that agrees best.
+
+    Raises
+    ------
+    InputError
+        If a point is not known, a capture has several, or too few spots meet.
+    """
+    points = sources.points
+    if np.isnan(points).any() or len(np.unique(sources.captures)) < len(points) or len(points) < 2:
+        text = f"{int(np.isnan(points).any(1).sum())} of {len(points)} points unknown"
+        allowed = "known points, two or more, one in each capture, to find lenses"
+        raise InputError(f"positions: found {text}, allowed: {allowed}.")
+    spots = [found[int(k)] for k in sources.captures]
+    nominal = np.asarray(imager.magnification(points[:, 2]), np.float64)
+    steps = np.linspace(1 - _DISTANCE, 1 + _DISTANCE, _STEPS)
+    met = np.array([meeting_lenses(spots, points[:, :2], step * nominal, _NEAR / 4)[2] for step in steps])
+    step = float(steps[met == met.max()].mean())
+    centers, count, _ = meeting_lenses(spots, points[:, :2], step * nominal, _NEAR)
+    if not count or count < _SHARED * sum(map(len, spots)):
+        text = f"{count} of {sum(map(len, spots))} spots on lenses that several captures show"
+        allowed = "half of them; are positions and the sensor's pixels right?"
+        raise InputError(f"captures: found {text}, allowed: {allowed}")
+    where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
+    zero = jnp.zeros((), imager.sensor_distance.dtype)
+    new = (moved_lenses(imager.array, centers), imager.sensor_distance * step, zero, jnp.zeros(2, zero.dtype))
+    return Start(eqx.tree_at(where, imager, new), False, sources)
