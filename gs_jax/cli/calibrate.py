@@ -89,7 +89,7 @@ def command(
     names = [name for name in (*(OF_SCENES if from_scene else FITTED), *fit) if name not in hold]
     with Progress() as progress:
         if positions is None:
-            (capture,) = captures
+            capture = next(iter(captures))
             image = read_capture(capture, imager.sensor.shape)
             grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
             with errors_name_file(capture):
