@@ -20,13 +20,14 @@ from .cli.interrupt import end, ending_soon, kept, message, status_of
 
 # Of a message; what is at its end is the least.
 _LONGEST = 380
-# Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
+# Each is `gs_jax/cli/NAME.py` (`_` for `-`), imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
     "reconstruct",
     "calibrate",
     "simulate",
     "deconvolve",
     "metrics",
+    "new-design",
     "layout",
     "optimize",
     "pareto",
@@ -83,7 +84,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = import_module(f".cli.{cmd_name}", __package__).command
+        command = import_module(f".cli.{cmd_name.replace('-', '_')}", __package__).command
         if not any(param.name == "quiet" for param in command.params):
             command.params += _LEVELS
         return command

@@ -112,7 +112,7 @@ def read_centers(
     unit: str | None = None,
     origin: str | None = None,
     mirror: bool = False,
-    size: tuple[float, float],
+    size: tuple[float, float] | None,
     shape: tuple[float, float],
     pixel_pitch: float,
 ) -> Float[np.ndarray, "lens 2"]:
@@ -123,7 +123,7 @@ def read_centers(
     columns, unit, origin, mirror
         As the keys of `CentersTable`.
     size
-        `(x, y)` of the plate, mm.
+        `(x, y)` of the plate, mm; None: its corners are as far from the lenses as its others.
     shape, pixel_pitch
         Of the sensor: `(rows, columns)`, and mm.
 
@@ -138,19 +138,27 @@ def read_centers(
     # A division is exact to the last digit, which a product with 0.001 is not.
     centers = numbers / {"mm": 1.0, "um": 1000.0, "px": 1 / pixel_pitch}[unit]
     if (origin or ("corner" if unit == "px" else "center")) == "corner":
-        middle = [(n - 1) / 2 * pixel_pitch for n in shape[::-1]] if unit == "px" else [side / 2 for side in size]
-        centers = centers - np.array(middle)
+        if unit == "px":
+            middle = np.array([(n - 1) / 2 * pixel_pitch for n in shape[::-1]])
+        else:
+            middle = np.array(size) / 2 if size else (centers.min(axis=0) + centers.max(axis=0)) / 2
+        centers = centers - middle
     return (centers * [-1.0, 1.0] if mirror else centers) + 0.0  # not -0.0
 
 
-def unit_in(names: tuple[str, str] | None) -> str | None:
+def unit_of_file(path: str | os.PathLike[str], columns: tuple[str, str] | None = None) -> str | None:
+    """The unit that a file's header says of x and y; None if it says none. `InputError` as `read_columns`."""
+    return _unit_in(read_columns(Path(path), columns, most=MAX_LENSES).names)
+
+
+def _unit_in(names: tuple[str, str] | None) -> str | None:
     """The unit that names of columns end in or have in brackets; None if they say none or two."""
     found = {unit for name in names or () for unit in UNITS if _says(name, unit)}
     return found.pop() if len(found) == 1 else None
 
 
 def other_reading(centers: np.ndarray, half: np.ndarray) -> str:
-    """A question, after `; `, if centres that are not on the plate (of half the size `half`) would be, read otherwise."""
+    """A question, after `; `, where centres that are not on a plate of half the size `half` would be otherwise."""
     reach, positive = np.abs(centers).max(axis=0), (centers >= 0).all()
     if positive and (reach <= 2 * half).all():
         return '; are they counted from a corner (`centers_origin = "corner"`)?'
@@ -178,7 +186,7 @@ def write_centers(
 
 
 def _unit(path: Path, names: tuple[str, str] | None, unit: str | None) -> str:
-    found = unit_in(names)
+    found = _unit_in(names)
     if unit and found and unit != found:
         header = ",".join(names or ())
         raise InputError(f"{path}: found the header {header:.120} and the unit {unit}, allowed: one unit.")

@@ -14,16 +14,14 @@ from typing import Annotated, Any
 import numpy as np
 import tomli_w
 from pydantic import Field, ValidationError, model_validator
-from scipy.spatial import KDTree
 
 from ..base.errors import InputError, InputWarning
 from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
 from ..io.disk import read_text, write_text
 from ..io.tables import Table, one_line
-from .centers import MAX_LENSES, CentersTable, inline_centers, other_reading
+from .centers import MAX_LENSES, CentersTable, inline_centers
+from .checks import check_whole
 from .plausible import doubts, slips
-
-MIN_SPACING_MM = 1e-3
 
 # Every description is what the error message says is allowed, every title what the key means: comments in files, the
 # schema for editors and the page of keys are made of both.
@@ -60,7 +58,7 @@ class SensorTable(Table):
         title="distance of neighbouring pixels' centres; pixels are square",
         description="a number of micrometres from 1e-3 to 1e4",
     )
-    shape: Shape = Field(title="of the image in pixels: rows (y) first, then columns (x)")
+    shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
 
 
 class LensTable(Table):
@@ -79,6 +77,7 @@ class LensTable(Table):
     focal_length_mm: Length | None = Field(
         default=None,
         title="f of an ideal thin lens, in place of the sphere that the radius describes; leave it out for real lenses",
+        description="a number of mm from 1e-6 to 1e4",
     )
 
 
@@ -93,7 +92,7 @@ class ArrayTable(Table):
         description="a number of mm from 0 to 1e4",
     )
     centers_mm: Centers = Field(
-        title="lens vertices from the plate's middle: x along the sensor's columns (right), y along its rows (down)"
+        title="lens vertices from the plate's middle: +x right (increasing column), +y down (increasing row)"
     )
 
 
@@ -104,7 +103,7 @@ class ImagingTable(Table):
     working_distance_mm: Range = Field(
         title="nearest and farthest object: depths z from the plate's plano front, positive away from the sensor"
     )
-    wavelength_nm: Wavelength = Field(title="of the light that is detected, in air")
+    wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
     field_radius_mm: Length = Field(
         title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
     )
@@ -117,10 +116,12 @@ class CalibrationTable(Table):
         default=0.0,
         ge=-360,
         le=360,
-        title="of the array about its middle, from +x toward +y: clockwise in the image as it is shown",
+        title="turn of the array about its middle, from +x toward +y: clockwise in the image as it is shown",
         description="a number of degrees from -360 to 360",
     )
-    shift_mm: Point = Field(default=(0.0, 0.0), title="[x, y] of the array's middle from the sensor's, once turned")
+    shift_mm: Point = Field(
+        default=(0.0, 0.0), title="where the array's middle is, from the sensor's, once it is turned"
+    )
 
 
 class Design(Table):
@@ -142,8 +143,7 @@ class Design(Table):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Design":
-        for check in (_check_numbers, _check_plate, _check_spacing, _check_reach):
-            check(self)
+        check_whole(self)
         return self
 
     def __repr__(self) -> str:
@@ -209,6 +209,11 @@ def read_design(path: str | os.PathLike[str]) -> Design:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
     inline_centers(Path(path), data)
+    return checked_design(path, data)
+
+
+def checked_design(path: str | os.PathLike[str], data: dict[str, Any]) -> Design:
+    """The design of the tables that the file `path` has, or will have; it raises and warns as `read_design`."""
     try:
         design = Design.model_validate(data)
     except ValidationError as error:
@@ -217,7 +222,7 @@ def read_design(path: str | os.PathLike[str]) -> Design:
         end = "" if problems[-1].endswith("?") else "."
         raise InputError(f"{path}: {' '.join(problems)}{end}") from error
     for question in doubts(data):
-        warnings.warn(f"{path}: {question}", InputWarning, stacklevel=2)
+        warnings.warn(f"{path}: {question}", InputWarning, stacklevel=3)
     return design
 
 
@@ -234,68 +239,13 @@ def write_design(path: str | os.PathLike[str], design: Design) -> None:
 
 def design_text(design: Design) -> str:
     """A design as TOML, its centres inside."""
-    return _PAIR.sub(r"[\1, \2]", tomli_w.dumps(design.model_dump(exclude_defaults=True)))
+    return as_toml(design.model_dump(exclude_defaults=True))
+
+
+def as_toml(data: dict[str, Any]) -> str:
+    """TOML, points in a line each."""
+    return _PAIR.sub(r"[\1, \2]", tomli_w.dumps(data))
 
 
 # An array of two numbers on one line, as people write it. `tomli_w` has no line end within a string.
 _PAIR = re.compile(r"""\[\n\s+([^\[\],\n"']+),\n\s+([^\[\],\n"']+),\n\s*\]""")
-
-
-# What only the whole design shows. One problem at a time; each message names its key.
-
-
-def _check_numbers(design: Design) -> None:
-    near, far = design.imaging.working_distance_mm
-    if not near < far:
-        raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
-    aperture, sphere = design.lens.aperture_diameter_mm, 2 * design.lens.radius_of_curvature_mm
-    if aperture > sphere:
-        limit = f"at most {sphere} mm, twice `lens.radius_of_curvature_mm`"
-        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: {limit}")
-
-
-def _check_plate(design: Design) -> None:
-    centers = np.array(design.array.centers_mm)
-    half = np.array(design.array.size_mm) / 2
-    outside = (np.abs(centers) > half + 1e-9).any(axis=1)
-    if outside.any():
-        allowed = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
-        lens = _lens(design, int(np.argmax(outside)))
-        raise ValueError(f"{lens}, allowed: {allowed}{other_reading(centers, half)}")
-
-
-def _check_spacing(design: Design) -> None:
-    if pair := _close_pair(np.array(design.array.centers_mm)):
-        found = f"{_lens(design, pair[0])} and lens {pair[1] + 1} less than {MIN_SPACING_MM} mm from it"
-        raise ValueError(f"{found}, allowed: lenses at least that far apart")
-
-
-def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
-    # Two in one cell of half the spacing are too close. Without them a tree of any input is quick to search.
-    _, cells = np.unique(np.floor(centers / (MIN_SPACING_MM / 2)), axis=0, return_inverse=True)
-    order = np.argsort(cells.ravel(), kind="stable")
-    together = np.flatnonzero(np.diff(cells.ravel()[order]) == 0)
-    if together.size:
-        return int(order[together[0]]), int(order[together[0] + 1])
-    pairs = KDTree(centers).query_pairs(MIN_SPACING_MM * (1 - 1e-9))
-    return min(pairs, default=None)
-
-
-def _check_reach(design: Design) -> None:
-    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth."""
-    imaging, calibration = design.imaging, design.calibration
-    angle = math.radians(calibration.rotation_deg)
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
-    half = np.array(design.sensor.shape)[::-1] * design.sensor.pixel_pitch_um / 2000
-    distance = np.hypot(*np.maximum(np.abs(centers) - half, 0).T)
-    plate = design.array.substrate_thickness_mm / design.lens.refractive_index
-    radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
-    if (distance > radius).any():
-        index = int(np.argmax(distance > radius))
-        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
-        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
-
-
-def _lens(design: Design, index: int) -> str:
-    return f"`array.centers_mm`: found lens {index + 1} at {list(design.array.centers_mm[index])} mm"

@@ -44,21 +44,23 @@ def slips(data: Mapping[str, Any]) -> list[str]:
 
 def slip(key: str, value: Any) -> str | None:
     """The question that a value of a key raises; None if it is usual, or no positive number."""
+    numbers = _positive(value)
     low, high = USUAL[key]
-    numbers = list(value) if isinstance(value, list | tuple) else [value]
-    if not numbers or not all(type(each) in (int, float) and 0 < each < _ENDLESS for each in numbers):
+    if not numbers or all(low <= each <= high for each in numbers):
         return None
-    numbers = [float(each) for each in numbers]
-    if all(low <= each <= high for each in numbers):
+    found, unit = f"{key} = {_numbers(numbers)}", unit_of(key)
+    if (other := _other(key, numbers)) is None:
+        return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    meant, their_unit = other
+    said = f" ({_numbers(numbers)} {their_unit})" if their_unit else ""
+    return f"{found}: did you mean {_numbers(meant)} {unit}{said}?"
+
+
+def meant(key: str, value: Any) -> float | list[float] | None:
+    """What a value was that is another unit's: a usual one in the key's own unit; None if there is none."""
+    if slip(key, value) is None or (other := _other(key, _positive(value))) is None:
         return None
-    unit = unit_of(key)
-    for factor in _FACTORS if unit in _LADDER else ():
-        meant = [float(f"{each * factor:.9g}") for each in numbers]
-        if all(low <= each <= high for each in meant):
-            found = other_unit(unit, factor)
-            said = f" ({_numbers(numbers)} {found})" if found else ""
-            return f"{key} = {_numbers(numbers)}: did you mean {_numbers(meant)} {unit}{said}?"
-    return f"{key} = {_numbers(numbers)}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    return other[0] if isinstance(value, list | tuple) else other[0][0]
 
 
 def doubts(data: Mapping[str, Any]) -> list[str]:
@@ -72,10 +74,24 @@ def unit_of(key: str) -> str:
     return unit if unit in (*_LADDER, "deg") else ""
 
 
-def other_unit(unit: str, factor: float) -> str | None:
-    """The unit that a number has if `factor` makes it one of `unit`."""
-    step = _LADDER.index(unit) + round(math.log10(factor) / 3)
-    return _LADDER[step] if 0 <= step < len(_LADDER) else None
+def _positive(value: Any) -> list[float]:
+    """As floats, the positive numbers that a value is; none if it is anything else."""
+    numbers = list(value) if isinstance(value, list | tuple) else [value]
+    right = all(type(each) in (int, float) and 0 < each < _ENDLESS for each in numbers)
+    return [float(each) for each in numbers] if right else []
+
+
+def _other(key: str, numbers: list[float]) -> tuple[list[float], str | None] | None:
+    """The usual numbers that a power of a thousand makes of these, and the name of the unit that these then have."""
+    low, high = USUAL[key]
+    if (unit := unit_of(key)) not in _LADDER:
+        return None
+    for factor in _FACTORS:
+        usual = [float(f"{each * factor:.9g}") for each in numbers]
+        if all(low <= each <= high for each in usual):
+            step = _LADDER.index(unit) + round(math.log10(factor) / 3)
+            return usual, _LADDER[step] if 0 <= step < len(_LADDER) else None
+    return None
 
 
 def _value(data: Mapping[str, Any], key: str) -> Any:
