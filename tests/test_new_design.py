@@ -123,6 +123,16 @@ def test_lenses_beyond_the_sensor_are_left_out_on_demand(lab, monkeypatch, capsy
     assert read_design("my.toml").array.centers_mm == CENTERS
 
 
+def test_which_are_beyond_depends_on_the_turn(lab, monkeypatch, capsys):
+    """Along the short side of the sensor, which a quarter turn makes the long one."""
+    (lab / "long.csv").write_text("x_mm,y_mm\n0,1.1\n0,-1.1\n0.1,0\n-0.1,0\n")
+    long = options(centers=("long.csv",), field_radius_mm=(1.5,))
+    for angle, status in ((0, 2), (90, 0), (-90, 0)):
+        done, _, err = run(monkeypatch, capsys, "new-design", *long, "--rotation-deg", angle, "-o", f"{angle}.toml")
+        assert done == status, err
+    assert read_design("90.toml").calibration.rotation_deg == 90.0
+
+
 WRONG = [
     (["--shape"], {"shape": None}),
     (["--pixel-pitch-um", "--working-distance-mm"], {"pixel_pitch_um": None, "working_distance_mm": None}),

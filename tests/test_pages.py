@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
+from experiments.calibration_errors import run
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.designs.keys import design_keys
 
@@ -63,3 +64,11 @@ def test_the_commands_of_the_lab_page_exist():
         assert command is not None
         known = {option for param in command.params for option in param.opts}
         assert {word for word in rest if word.startswith("-")} <= known, (name, rest)
+
+
+def test_what_mistakes_of_calibration_leave():
+    """As the page for the lab has it, in pixels RMS."""
+    left = {name: rms for name, rms, _ in run()}
+    said = {"nothing": 0.0, "each centre, 3 um": 1.2, "tilt, 0.5 degrees": 1.2, "all centres, 0.2 %": 0.8}
+    said |= {"one place, 20 um sideways": 0.5, "one depth, 50 um": 0.3, "all depths, 200 um": 0.2}
+    assert {name: round(left[name], 1) for name in said} == said and left["two captures swapped"] > 40

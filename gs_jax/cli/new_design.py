@@ -64,6 +64,7 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
     help="Where they are counted from: the plate's middle or its corner; px: the sensor's first pixel is the corner.",
 )
 @click.option("--mirror", is_flag=True, help="Take x for -x: the list shows the plate from its other side.")
+@click.option("--rotation-deg", type=float, help="About how the array is turned, from +x toward +y.  [default: 0]")
 @click.option("--crop", is_flag=True, help="Leave out lenses beyond the sensor's reach, where the array is larger.")
 @click.option(
     "--count", type=click.IntRange(1, 100_000), help="Make a random layout of so many lenses, without a list."
@@ -115,6 +116,8 @@ def command(output: Path, centers: Path | None, name: str | None, force: bool, *
     for key, table in _PLACES.items():
         tables[table][key] = list(known[key]) if isinstance(known[key], tuple) else known[key]
     tables["array"]["centers_mm"] = known["centers"].round(6).tolist()
+    if "rotation_deg" in known:
+        tables["calibration"] = {"rotation_deg": known["rotation_deg"]}
     tables["provenance"] = provenance_of(known.get("file"))
     design = checked_design(output, tables)
     write_text(output, commented(design), [".toml"])

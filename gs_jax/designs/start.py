@@ -73,7 +73,9 @@ def within_reach(known: Known) -> Bool[np.ndarray, " lens"]:
     """Which lenses have an image on the sensor: those that a design may have."""
     plate = known["substrate_thickness_mm"] / known["refractive_index"]
     near = known["working_distance_mm"][0] + plate
-    distance = beside_sensor(known["centers"], tuple(known["shape"]), known["pixel_pitch_um"])
+    angle = math.radians(known.get("rotation_deg", 0.0))
+    turned = known["centers"] @ np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    distance = beside_sensor(turned, tuple(known["shape"]), known["pixel_pitch_um"])
     return distance <= known["sensor_distance_mm"] / near * known["field_radius_mm"]
 
 
