@@ -167,10 +167,12 @@ def _image(axes: Axes) -> None:
     axes.text(0, height / 2 + 0.12, "+y  row", ha="center", va="top", fontsize=12)
     for axis in (0, 1):
         end = shift + 2.6 * turn[:, axis]
-        axes.annotate("", end, shift, arrowprops={"arrowstyle": "-|>", "color": "#3572a5", "lw": 1.2, "shrinkA": 0})
+        axes.annotate(
+            "", tuple(end), tuple(shift), arrowprops={"arrowstyle": "-|>", "color": "#3572a5", "lw": 1.2, "shrinkA": 0}
+        )
     ends = shift + 2.85 * turn.T
     for end, name in zip(ends, "xy", strict=True):
-        axes.text(*end, name, color="#3572a5", fontsize=12, ha="center", va="center")
+        axes.text(end[0], end[1], name, color="#3572a5", fontsize=12, ha="center", va="center")
     axes.text(-3.7, -2.75, "centers_mm: [x, y] of each lens on the plate", color="#3572a5", fontsize=9)
     axes.add_patch(Arc(tuple(shift), 4.2, 4.2, theta1=0, theta2=math.degrees(angle), color="#cc0000", lw=1.6))
     axes.plot([shift[0], shift[0] + 2.35], [shift[1]] * 2, ":", color="#cc0000", lw=1)

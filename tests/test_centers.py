@@ -41,6 +41,14 @@ def test_forms(tmp_path, text):
     assert read_design(with_file(tmp_path, text)).array.centers_mm == CENTERS
 
 
+def test_a_spreadsheets_micrometres(tmp_path):
+    """Of Windows: one byte for the Greek letter, a line end of its own, decimal commas."""
+    path = with_file(tmp_path, "")
+    text = "Nr.;X [µm];Y [µm]\r\n1;-1000,0;-500,0\r\n2;500,0;1250,0\r\n3;1000,0;-1000,0\r\n"
+    (tmp_path / "c.csv").write_bytes(text.encode("cp1252"))
+    assert read_design(path).array.centers_mm == CENTERS
+
+
 def test_columns_by_name_and_unit_by_key(tmp_path):
     text = "a,b,c\n9,-500,-1000\n9,1250,500\n9,-1000,1000\n"
     path = with_file(tmp_path, text, centers_columns=["c", "b"], centers_unit="um")

@@ -285,13 +285,16 @@ def test_problem_of_one_value(path, value, fine):
     assert found is None if fine else found and "allowed: " in found
 
 
+def is_kind(value: Any, kind: str) -> bool:
+    kinds = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool}
+    return isinstance(value, kinds[kind]) and (kind == "boolean" or not isinstance(value, bool))
+
+
 def refused_by(node: Any, value: Any, top: Any) -> str | None:
     """Where a schema of the kind that is written refuses a value; None where it does not."""
     if "$ref" in node:
         return refused_by(top["$defs"][node["$ref"].rpartition("/")[2]], value, top)
-    kinds = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool}
-    wrong_kind = not isinstance(value, kinds[node["type"]]) or (isinstance(value, bool) and node["type"] != "boolean")
-    if wrong_kind or value not in node.get("enum", [value]):
+    if not is_kind(value, node["type"]) or value not in node.get("enum", [value]):
         return "kind"
     if node["type"] == "object":
         if missing := set(node.get("required", ())) - value.keys():

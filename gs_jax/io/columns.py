@@ -1,5 +1,6 @@
 """Two columns of numbers, out of tables as other programs and people write them."""
 
+import contextlib
 import csv
 import re
 from collections.abc import Sequence
@@ -47,7 +48,7 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
         If it cannot be read, has no two columns or not the wanted ones, lines of different length, a value of x or y
         that is not a finite number, or too many rows.
     """
-    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+    lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), 1) if line.strip()]
     body = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     if not body:
         raise InputError(f"{path}: found no line, allowed: a header such as x_mm,y_mm, and a line for each lens.")
@@ -72,6 +73,18 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
         cells = zip((values[i] for i in at), names or "xy", strict=True)
         rows.append([finite_number(f"{path}: line {number}, {name}", _point(cell, separator)) for cell, name in cells])
     return Columns(np.array(rows, dtype=float).reshape(-1, 2), names)
+
+
+def _text(path: Path) -> str:
+    """UTF-8, or ASCII and the Greek mu of micrometres as spreadsheets on Windows write it."""
+    try:
+        return read_text(path)
+    except InputError as error:
+        if not isinstance(error.__cause__, UnicodeDecodeError):
+            raise
+        with contextlib.suppress(UnicodeDecodeError):
+            return path.read_bytes().replace(b"\xb5", b"u").decode("ascii")
+        raise
 
 
 def _values(path: Path, number: int, line: str, separator: str) -> list[str]:
