@@ -18,8 +18,8 @@ FRAME = (
     "column (down), both from the sensor's middle; depths z are positive from the plate toward the object, the sensor "
     "distance v is positive from the lenses to the sensor."
 )
-# Of a file with comments: the many centres last.
-_ORDER = ("sensor", "lens", "imaging", "calibration", "array", "provenance")
+# Of a file with comments: the many centres come late.
+_LAST = ("array", "provenance")
 _WIDTH = 110
 
 
@@ -60,9 +60,8 @@ def commented(design: Design) -> str:
     known, data = design_keys(), design.model_dump(exclude_defaults=True)
     lines = [*_comment(f"A microscope for gs-jax. {FRAME}"), "", *_comment(_told(known["name"]))]
     lines.append(as_toml({"name": design.name}).rstrip())
-    for table in _ORDER:
-        if table not in data:
-            continue
+    tables = [table for table in data if table != "name"]
+    for table in sorted(tables, key=lambda table: (table in _LAST, table == _LAST[1])):
         lines += ["", *_comment(f"{_title(table)}."), f"[{table}]"]
         if table == "provenance":
             lines.append(as_toml({table: data[table]}).partition("\n")[2].rstrip())
