@@ -53,6 +53,9 @@ def test_columns_by_name_and_unit_by_key(tmp_path):
     text = "a,b,c\n9,-500,-1000\n9,1250,500\n9,-1000,1000\n"
     path = with_file(tmp_path, text, centers_columns=["c", "b"], centers_unit="um")
     assert read_design(path).array.centers_mm == CENTERS
+    blanks = "n  X (um)  Y (um)  Z (um)\n9 0 -1000 -500\n9 0 500 1250\n9 0 1000 -1000\n"
+    path = with_file(tmp_path, blanks, centers_columns=["Y (um)", "Z (um)"])
+    assert read_design(path).array.centers_mm == CENTERS
     message_of(with_file(tmp_path, text, centers_columns=["c", "d"]), "no one column 'd'", "'a', 'b', 'c'")
     message_of(with_file(tmp_path, "1,2\n", centers_columns=["c", "d"]), "no header", "'c' and 'd'")
 

@@ -199,6 +199,7 @@ CENTERS = {
     "three columns": (b"1,2,3\n", ["3 columns without a header", "`centers_columns`"]),
     "names": (b"n,a,b\n1,2,3\n", ["3 columns: 'n', 'a', 'b'", "`centers_columns`"]),
     "twice": (b"x,x,y\n1,2,3\n", ["3 columns: 'x', 'x', 'y'"]),
+    "half a header": (b"1.0,n/a\n1,2\n", ["first line '1.0,n/a'", "names, or numbers"]),
     "no numbers": (b"# made by hand\n\n", ["no line", "header"]),
     "decimals": (b"x;y\n1,5;1.000,5\n", ["line 2", "'1.000,5'"]),
 }

@@ -64,6 +64,8 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
         header = remark if len(remark) == len(first) else None
     at = _places(path, header, len(first), wanted)
     names = (header[at[0]], header[at[1]]) if header else None
+    if names and any(_is_number(name, separator) for name in names):
+        raise InputError(f"{path}: found the first line {short_repr(','.join(first))}, allowed: names, or numbers.")
     rows = []
     for number, line in body:
         values = _values(path, number, line, separator)
@@ -113,10 +115,11 @@ def _places(path: Path, header: list[str] | None, count: int, wanted: Sequence[s
     if wanted is not None:
         if header is None:
             raise InputError(f"{path}: found no header, allowed: one that names {' and '.join(map(repr, wanted))}.")
-        if missing := [name for name in wanted if header.count(name.strip()) != 1]:
+        plain, asked = (["".join(name.split()) for name in names] for names in (header, wanted))
+        if missing := [name for name, bare in zip(wanted, asked, strict=True) if plain.count(bare) != 1]:
             found = ", ".join(map(repr, header))
             raise InputError(f"{path}: found no one column {short_repr(missing[0])}, allowed: {found:.200}.")
-        return header.index(wanted[0].strip()), header.index(wanted[1].strip())
+        return plain.index(asked[0]), plain.index(asked[1])
     called = [[i for i, name in enumerate(header or ()) if _is_called(name, which)] for which in _CALLED]
     if len(called[0]) == len(called[1]) == 1:
         return called[0][0], called[1][0]
