@@ -28,6 +28,7 @@ SLIPS = [
     # What is usual alone, and does not go together.
     ("imaging.sensor_distance_mm", 58.0, "imaging.sensor_distance_mm = 58: is it meant? Lenses of f = 4.651 mm image"),
     ("imaging.working_distance_mm", [3.0, 30.0], "Nearer than the focal length, 4.651 mm, no real image forms."),
+    ("array.substrate_thickness_mm", 0.05, "which alone are 0.268 mm high."),
     ("imaging.field_radius_mm", 80.0, "imaging.field_radius_mm = 80: is it meant?"),
     ("array.centers_mm", [[0.001, 0.0], [0.0, 0.0], [0.0, 0.002]], "are 0.00"),
 ]

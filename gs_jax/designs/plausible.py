@@ -29,6 +29,8 @@ _ENDLESS = 1e30
 _OFF = 3.0
 # Beyond this multiple of the depth the field is not seen by any lens: 63 degrees.
 _WIDEST = 2.0
+# Lenses that are nearer than this part of their diameter are lenses of another unit, as metres that are read as mm.
+_CLOSEST = 50.0
 
 
 def slips(data: Mapping[str, Any]) -> list[str]:
@@ -123,16 +125,19 @@ def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
         yield f"imaging.field_radius_mm = {field:g}: is it meant? A lens sees so far beside its axis at {depths}."
     if (diameter := lens["aperture_diameter_mm"]) > 2 * (plate_size := max(array["size_mm"])):
         yield f"lens.aperture_diameter_mm = {diameter:g}: is it meant? The whole plate is {plate_size:g} mm."
-    yield from _crowded(np.array(array["centers_mm"], float), diameter)
-
-
-def _crowded(centers: np.ndarray, diameter: float) -> Iterator[str]:
-    """Many lenses a tiny part of their diameter apart, as of metres that are read as millimetres."""
-    if len(centers) < 3:
-        return
-    pitch = float(KDTree(centers).query(centers, k=2)[0][:, 1].mean())
-    if pitch < diameter / 50:
+    pitch = _pitch(np.array(array["centers_mm"], float))
+    if pitch < diameter / _CLOSEST:
         yield (
             f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; did you mean "
             f"{pitch * 1000:.3g} mm, a list in another unit?"
         )
+    radius, half = lens["radius_of_curvature_mm"], min(diameter, pitch) / 2
+    height = radius - math.sqrt(radius**2 - half**2)
+    if 0 < (thickness := array["substrate_thickness_mm"]) < height and not lens.get("focal_length_mm"):
+        said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
+        yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
+
+
+def _pitch(centers: np.ndarray) -> float:
+    """Mean distance of nearest lenses; infinite where they are too few to tell."""
+    return float(KDTree(centers).query(centers, k=2)[0][:, 1].mean()) if len(centers) > 2 else math.inf

@@ -66,6 +66,8 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
     names = (header[at[0]], header[at[1]]) if header else None
     if names and any(_is_number(name, separator) for name in names):
         raise InputError(f"{path}: found the first line {short_repr(','.join(first))}, allowed: names, or numbers.")
+    if (plain := _plain_numbers(body, len(first), separator)) is not None:
+        return Columns(plain[:, at], names)
     rows = []
     for number, line in body:
         values = _values(path, number, line, separator)
@@ -75,6 +77,18 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
         cells = zip((values[i] for i in at), names or "xy", strict=True)
         rows.append([finite_number(f"{path}: line {number}, {name}", _point(cell, separator)) for cell, name in cells])
     return Columns(np.array(rows, dtype=float).reshape(-1, 2), names)
+
+
+def _plain_numbers(body: Sequence[tuple[int, str]], count: int, separator: str) -> np.ndarray | None:
+    """Two columns of nothing but plain numbers, read fast; None if they are others, or a line is to be refused."""
+    if not body or count != 2:
+        return None
+    with contextlib.suppress(ValueError):
+        delimiter = None if separator == " " else separator
+        table = np.loadtxt((line for _, line in body), delimiter=delimiter, comments=None, ndmin=2)
+        if table.shape[1] == 2 and np.isfinite(table).all():
+            return table
+    return None
 
 
 def _text(path: Path) -> str:
