@@ -5,26 +5,29 @@ each with one line and no traceback; 1 otherwise.
 """
 
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 
 import click
 
 from ._version import __version__
-from .base.errors import InputError
+from .base.errors import InputError, InputWarning
 from .base.progress import QUIET, VERBOSE, shown
 from .cli.files import ARGUMENTS
 from .cli.interrupt import end, ending_soon, kept, message, status_of
 
 # Of a message; what is at its end is the least.
 _LONGEST = 380
-# Each is `gs_jax/cli/NAME.py`, imported when it is asked for: some need seconds for what others do not.
+# Each is `gs_jax/cli/NAME.py` (`_` for `-`), imported when it is asked for: some need seconds for what others do not.
 COMMANDS = (
     "reconstruct",
     "calibrate",
     "simulate",
     "deconvolve",
     "metrics",
+    "new-design",
     "layout",
     "optimize",
     "pareto",
@@ -81,7 +84,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = import_module(f".cli.{cmd_name}", __package__).command
+        command = import_module(f".cli.{cmd_name.replace('-', '_')}", __package__).command
         if not any(param.name == "quiet" for param in command.params):
             command.params += _LEVELS
         return command
@@ -102,11 +105,31 @@ _LEVELS = [
 ]
 
 
+@contextmanager
+def _questions_in_one_line() -> Iterator[None]:
+    """Each `InputWarning` is said once."""
+    said = set()
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+        warnings.simplefilter("always", InputWarning)
+
+        def show(message, category, *place, **more):
+            if not issubclass(category, InputWarning):
+                usual(message, category, *place, **more)
+            elif str(message) not in said:
+                said.add(str(message))
+                click.echo(f"gs-jax: {' '.join(str(message).split())}", err=True)
+
+        warnings.showwarning = show
+        yield
+
+
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
 @click.version_option(__version__, prog_name="gs-jax")
 def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
     context = click.get_current_context()
+    context.with_resource(_questions_in_one_line())
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
 

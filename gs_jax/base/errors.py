@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake raises."""
+"""The one exception that a user's mistake raises, and the warning of what looks like one."""
 
 import contextlib
 import re
@@ -23,6 +23,10 @@ class InputError(ValueError):
 
     def __init__(self, message: str):
         super().__init__(_CONTROLS.sub(" ", message).strip())
+
+
+class InputWarning(UserWarning):
+    """Input that is possible but hardly meant: a question in one line. The command line prints it once and goes on."""
 
 
 @contextlib.contextmanager

@@ -7,26 +7,24 @@ import math
 import os
 import re
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tomli_w
-from jaxtyping import Float
 from pydantic import Field, ValidationError, model_validator
-from scipy.spatial import KDTree
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, InputWarning
 from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
-from ..io.disk import read_table, read_text, write_text
-from ..io.provenance import Provenance, write_sidecar
+from ..io.disk import read_text, write_text
 from ..io.tables import Table, one_line
+from .centers import MAX_LENSES, CentersTable, inline_centers
+from .checks import check_whole
+from .plausible import doubts, slips
 
-CENTERS_HEADER = "x_mm,y_mm"
-MAX_LENSES = 100_000
-MIN_SPACING_MM = 1e-3
-
-# Every description is what the error message says is allowed.
+# Every description is what the error message says is allowed, every title what the key means: comments in files, the
+# schema for editors and the page of keys are made of both.
 Length = Annotated[float, Field(ge=1e-6, le=1e4, description="a number of mm from 1e-6 to 1e4")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Pixels = Annotated[int, Field(ge=2, le=65536)]
@@ -56,34 +54,61 @@ Centers = Annotated[
 class SensorTable(Table):
     """`[sensor]`: the camera."""
 
-    pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="a number of micrometres from 1e-3 to 1e4")
-    shape: Shape
+    pixel_pitch_um: float = Field(
+        ge=1e-3,
+        le=1e4,
+        title="distance of neighbouring pixels' centres; pixels are square",
+        description="a number of micrometres from 1e-3 to 1e4",
+    )
+    shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
 
 
 class LensTable(Table):
     """`[lens]`: one plano-convex microlens. `focal_length_mm` overrides the radius, for a thin-lens study."""
 
-    radius_of_curvature_mm: Length
-    refractive_index: float = Field(gt=1, le=5, description="a number above 1, up to 5")
-    aperture_diameter_mm: Length
-    focal_length_mm: Length | None = None
+    radius_of_curvature_mm: Length = Field(
+        title="R of the spherical side, positive; a focal length f in air is R = f (n - 1)"
+    )
+    refractive_index: float = Field(
+        gt=1,
+        le=5,
+        title="n of lenses and plate at the wavelength: PDMS 1.43, fused silica 1.46, acrylic 1.49, BK7 1.52",
+        description="a number above 1, up to 5",
+    )
+    aperture_diameter_mm: Length = Field(title="D of each lens, before neighbours clip it; at most 2 R")
+    focal_length_mm: Length | None = Field(
+        default=None,
+        title="f of an ideal thin lens, in place of the sphere that the radius describes; leave it out for real lenses",
+        description="a number of mm from 1e-6 to 1e4",
+    )
 
 
 class ArrayTable(Table):
     """`[array]`: the plate and where its lenses are. `centers_file` is replaced by its content on reading."""
 
-    size_mm: Size
-    substrate_thickness_mm: float = Field(ge=0, le=1e4, description="a number of mm from 0 to 1e4")
-    centers_mm: Centers
+    size_mm: Size = Field(title="width (x) and height (y) of the plate, with its middle at [0, 0]")
+    substrate_thickness_mm: float = Field(
+        ge=0,
+        le=1e4,
+        title="t of the plate, from its plano front, toward the object, to the lens vertices",
+        description="a number of mm from 0 to 1e4",
+    )
+    centers_mm: Centers = Field(
+        title="lens vertices from the plate's middle: +x right (increasing column), +y down (increasing row)"
+    )
 
 
 class ImagingTable(Table):
     """`[imaging]`: where the sensor and the object are."""
 
-    sensor_distance_mm: Length
-    working_distance_mm: Range
-    wavelength_nm: Wavelength
-    field_radius_mm: Length
+    sensor_distance_mm: Length = Field(title="v from the lens vertices to the sensor, positive")
+    working_distance_mm: Range = Field(
+        title="nearest and farthest object: depths z from the plate's plano front, positive away from the sensor"
+    )
+    wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
+    field_radius_mm: Length = Field(
+        title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
+    )
 
 
 class CalibrationTable(Table):
@@ -92,26 +117,41 @@ class CalibrationTable(Table):
     The tilt is by how much the array's plane rises toward the object along +x and +y.
     """
 
-    rotation_deg: float = Field(default=0.0, ge=-360, le=360, description="a number of degrees from -360 to 360")
-    shift_mm: Point = (0.0, 0.0)
-    tilt_deg: Tilt = (0.0, 0.0)
+    rotation_deg: float = Field(
+        default=0.0,
+        ge=-360,
+        le=360,
+        title="turn of the array about its middle, from +x toward +y: clockwise in the image as it is shown",
+        description="a number of degrees from -360 to 360",
+    )
+    shift_mm: Point = Field(
+        default=(0.0, 0.0), title="where the array's middle is, from the sensor's, once it is turned"
+    )
+    tilt_deg: Tilt = Field(
+        default=(0.0, 0.0), title="by how much the array's plane rises toward the object along +x and +y"
+    )
 
 
 class Design(Table):
     """A microscope, with the tables and keys of its file."""
 
-    name: str = Field(description="a string")
-    sensor: SensorTable = Field(description="a table")
-    lens: LensTable = Field(description="a table")
-    array: ArrayTable = Field(description="a table")
-    imaging: ImagingTable = Field(description="a table")
-    calibration: CalibrationTable = Field(default=CalibrationTable(), description="a table")
-    provenance: dict[str, Any] = Field(default={}, description="a table")
+    name: str = Field(title="what reports call it", description="a string")
+    sensor: SensorTable = Field(title="the camera", description="a table")
+    lens: LensTable = Field(title="one plano-convex microlens; all are alike", description="a table")
+    array: ArrayTable = Field(title="the plate, and where its lenses are", description="a table")
+    imaging: ImagingTable = Field(title="where the sensor and the object are, and the light", description="a table")
+    calibration: CalibrationTable = Field(
+        default=CalibrationTable(),
+        title="the array as found on the sensor; `gs-jax calibrate` writes it",
+        description="a table",
+    )
+    provenance: dict[str, Any] = Field(
+        default={}, title="where the file comes from; anything may stand here", description="a table"
+    )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Design":
-        for check in (_check_numbers, _check_plate, _check_spacing, _check_reach):
-            check(self)
+        check_whole(self)
         return self
 
     def __repr__(self) -> str:
@@ -166,17 +206,33 @@ def read_design(path: str | os.PathLike[str]) -> Design:
     InputError
         If the file, or its centres' file, cannot be read, or a key is missing, extra, of the wrong type or out
         of its range, or the whole makes no microscope.
+
+    Warns
+    -----
+    InputWarning
+        For each number that is possible but hardly meant, such as a sensor distance of 5800 mm.
     """
     text = read_text(path)
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
-    _inline_centers(Path(path), data)
+    inline_centers(Path(path), data)
+    return checked_design(path, data)
+
+
+def checked_design(path: str | os.PathLike[str], data: dict[str, Any]) -> Design:
+    """The design of the tables that the file `path` has, or will have; it raises and warns as `read_design`."""
     try:
-        return Design.model_validate(data)
+        design = Design.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error, Design, {'array': ['centers_file']})}.") from error
+        # A slip of a unit is why lenses are beside the sensor, and comes first.
+        problems = [*slips(data), one_line(error, Design, {"array": list(CentersTable.model_fields)})]
+        end = "" if problems[-1].endswith("?") else "."
+        raise InputError(f"{path}: {' '.join(problems)}{end}") from error
+    for question in doubts(data):
+        warnings.warn(f"{path}: {question}", InputWarning, stacklevel=3)
+    return design
 
 
 def write_design(path: str | os.PathLike[str], design: Design) -> None:
@@ -192,98 +248,13 @@ def write_design(path: str | os.PathLike[str], design: Design) -> None:
 
 def design_text(design: Design) -> str:
     """A design as TOML, its centres inside."""
-    return _PAIR.sub(r"[\1, \2]", tomli_w.dumps(design.model_dump(exclude_defaults=True)))
+    return as_toml(design.model_dump(exclude_defaults=True))
 
 
-def write_centers(
-    path: str | os.PathLike[str], centers: Float[np.ndarray, "lens 2"], provenance: Provenance | None = None
-) -> None:
-    """Writes lens centres, mm, as the CSV file that the key `array.centers_file` names.
-
-    Raises
-    ------
-    InputError
-        As `check_output`, for `.csv`.
-    """
-    rows = [",".join(map(str, row)) for row in centers.tolist()]
-    write_text(path, "\n".join([CENTERS_HEADER, *rows]) + "\n", [".csv"])
-    write_sidecar(path, provenance)
+def as_toml(data: dict[str, Any]) -> str:
+    """TOML, points in a line each."""
+    return _PAIR.sub(r"[\1, \2]", tomli_w.dumps(data))
 
 
 # An array of two numbers on one line, as people write it. `tomli_w` has no line end within a string.
 _PAIR = re.compile(r"""\[\n\s+([^\[\],\n"']+),\n\s+([^\[\],\n"']+),\n\s*\]""")
-
-
-def _inline_centers(path: Path, data: dict[str, Any]) -> None:
-    array = data.get("array")
-    if not isinstance(array, dict) or "centers_file" not in array:
-        return
-    name = array.pop("centers_file")
-    if "centers_mm" in array:
-        raise InputError(f"{path}: found both `array.centers_file` and `array.centers_mm`, allowed: one of them.")
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{path}: `array.centers_file`: found {short_repr(name)}, allowed: the name of a CSV file.")
-    try:
-        rows = read_table(path.parent / name, CENTERS_HEADER, MAX_LENSES)
-    except InputError as error:
-        raise InputError(f"{path}: `array.centers_file`: {error}") from error
-    array["centers_mm"] = rows.tolist()
-
-
-# What only the whole design shows. One problem at a time; each message names its key.
-
-
-def _check_numbers(design: Design) -> None:
-    near, far = design.imaging.working_distance_mm
-    if not near < far:
-        raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
-    aperture, sphere = design.lens.aperture_diameter_mm, 2 * design.lens.radius_of_curvature_mm
-    if aperture > sphere:
-        limit = f"at most {sphere} mm, twice `lens.radius_of_curvature_mm`"
-        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: {limit}")
-
-
-def _check_plate(design: Design) -> None:
-    centers = np.array(design.array.centers_mm)
-    half = np.array(design.array.size_mm) / 2
-    outside = (np.abs(centers) > half + 1e-9).any(axis=1)
-    if outside.any():
-        allowed = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
-        raise ValueError(f"{_lens(design, int(np.argmax(outside)))}, allowed: {allowed}")
-
-
-def _check_spacing(design: Design) -> None:
-    if pair := _close_pair(np.array(design.array.centers_mm)):
-        found = f"{_lens(design, pair[0])} and lens {pair[1] + 1} less than {MIN_SPACING_MM} mm from it"
-        raise ValueError(f"{found}, allowed: lenses at least that far apart")
-
-
-def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
-    # Two in one cell of half the spacing are too close. Without them a tree of any input is quick to search.
-    _, cells = np.unique(np.floor(centers / (MIN_SPACING_MM / 2)), axis=0, return_inverse=True)
-    order = np.argsort(cells.ravel(), kind="stable")
-    together = np.flatnonzero(np.diff(cells.ravel()[order]) == 0)
-    if together.size:
-        return int(order[together[0]]), int(order[together[0] + 1])
-    pairs = KDTree(centers).query_pairs(MIN_SPACING_MM * (1 - 1e-9))
-    return min(pairs, default=None)
-
-
-def _check_reach(design: Design) -> None:
-    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth."""
-    imaging, calibration = design.imaging, design.calibration
-    angle = math.radians(calibration.rotation_deg)
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
-    half = np.array(design.sensor.shape)[::-1] * design.sensor.pixel_pitch_um / 2000
-    distance = np.hypot(*np.maximum(np.abs(centers) - half, 0).T)
-    plate = design.array.substrate_thickness_mm / design.lens.refractive_index
-    radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
-    if (distance > radius).any():
-        index = int(np.argmax(distance > radius))
-        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
-        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
-
-
-def _lens(design: Design, index: int) -> str:
-    return f"`array.centers_mm`: found lens {index + 1} at {list(design.array.centers_mm[index])} mm"

@@ -289,10 +289,11 @@ def _plain_table(text: str, header: str, max_rows: int) -> np.ndarray | None:
 def _numbers(place: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:
     if len(cells) != len(names):
         raise InputError(f"{place}: found {len(cells)} values, allowed: {len(names)} ({','.join(names)}).")
-    return [_number(f"{place}, {name}", cell) for name, cell in zip(names, cells, strict=True)]
+    return [finite_number(f"{place}, {name}", cell) for name, cell in zip(names, cells, strict=True)]
 
 
-def _number(place: str, cell: str) -> float:
+def finite_number(place: str, cell: str) -> float:
+    """The number that a cell of a table is; `InputError`, which names the place, if it is none."""
     try:
         value = float(cell)
     except ValueError:

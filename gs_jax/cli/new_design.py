@@ -1,0 +1,304 @@
+"""`gs-jax new-design`: a design file of one's own."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..base.errors import InputError, errors_name_file
+from ..io.disk import check_output
+from .files import check_may_write, force_option, provenance_of
+
+# Options that are keys of the file, by the place of the key. In the order in which they are asked for.
+_PLACES = {
+    "pixel_pitch_um": "sensor",
+    "shape": "sensor",
+    "refractive_index": "lens",
+    "radius_of_curvature_mm": "lens",
+    "size_mm": "array",
+    "aperture_diameter_mm": "lens",
+    "substrate_thickness_mm": "array",
+    "working_distance_mm": "imaging",
+    "sensor_distance_mm": "imaging",
+    "wavelength_nm": "imaging",
+    "field_radius_mm": "imaging",
+}
+# What a terminal offers where there is no default: the paper's.
+_OFFERED = {"pixel_pitch_um": 4.5, "shape": (5120, 5120), "working_distance_mm": (18.0, 30.0)}
+_FOCAL_LENGTH_MM, _COUNT = 4.65, 200
+
+
+def at_terminal() -> bool:
+    """Whether somebody is there to answer."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _print_schema(context: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        from ..designs.keys import schema
+
+        click.echo(json.dumps(schema(), indent=2))
+        context.exit()
+
+
+@click.command(
+    "new-design",
+    epilog="Example: gs-jax new-design --pixel-pitch-um 3.45 --shape 3000 4096 --focal-length-mm 4.6 "
+    "--centers vendor.csv --working-distance-mm 18 23 -o my.toml",
+)
+@click.option("--pixel-pitch-um", type=float, help="Distance of the camera's pixels.")
+@click.option("--shape", type=int, nargs=2, help="Rows and columns of the camera's image.")
+@click.option("--focal-length-mm", "--focal-length", type=float, help="Of one lens, in air; R = f (n - 1) is written.")
+@click.option("--radius-of-curvature-mm", type=float, help="R of one lens, in place of its focal length.")
+@click.option("--refractive-index", type=float, help="Of lenses and plate.  [default: 1.43, PDMS]")
+@click.option("--aperture-diameter-mm", type=float, help="Of one lens.  [default: mean distance of nearest lenses]")
+@click.option("--centers", type=Path, help="Lens centres: a table of text, x and y in a line, with any header.")
+@click.option("--centers-unit", type=click.Choice(["mm", "um", "px"]), help="[default: the header's, or else mm]")
+@click.option("--centers-columns", nargs=2, help="The header's names of x and y, where they are not clear.")
+@click.option(
+    "--centers-origin",
+    type=click.Choice(["center", "corner"]),
+    help="Where they are counted from: the plate's middle or its corner; px: the sensor's first pixel is the corner.",
+)
+@click.option("--mirror", is_flag=True, help="Take x for -x: the list shows the plate from its other side.")
+@click.option("--rotation-deg", type=float, help="About how the array is turned, from +x toward +y.  [default: 0]")
+@click.option("--crop", is_flag=True, help="Leave out lenses beyond the sensor's reach, where the array is larger.")
+@click.option(
+    "--count", type=click.IntRange(1, 100_000), help="Make a random layout of so many lenses, without a list."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random layout.")
+@click.option("--size-mm", type=float, nargs=2, help="X Y of the plate.  [default: around the lenses, or the sensor's]")
+@click.option("--substrate-thickness-mm", type=float, help="Of the plate, lenses included.  [default: 1]")
+@click.option("--working-distance-mm", type=float, nargs=2, help="NEAR FAR of the object, from the plate's front.")
+@click.option("--sensor-distance-mm", type=float, help="From lenses to sensor.  [default: in focus, of a thin lens]")
+@click.option("--wavelength-nm", type=float, help="Of the light.  [default: 520]")
+@click.option(
+    "--field-radius-mm",
+    type=float,
+    help="How far beside its axis a lens sees.  [default: 14 lenses see a point, at most a quarter of NEAR]",
+)
+@click.option("--name", help="What reports call it.  [default: the file's]")
+@click.option("-o", "--output", type=Path, required=True, help="MY.toml, with a comment for each key.")
+@click.option(
+    "--schema",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_schema,
+    help=("Print the JSON schema of design files, for editors, and exit."),
+)
+@force_option
+def command(output: Path, centers: Path | None, name: str | None, force: bool, **given: Any):
+    """Write the design file of your own microlens array and camera.
+
+    At a terminal it asks for what the options do not say. Elsewhere nothing is asked: what has no default must be
+    given. Lens centres are read from a file (--centers) or made (--count).
+    """
+    from ..designs.design import checked_design
+    from ..designs.keys import commented
+    from ..io.disk import write_text
+
+    check_output(output, [".toml"])
+    check_may_write(output, inputs=(centers,), force=force)
+    known = {key: value for key, value in given.items() if value is not None}
+    asking = at_terminal()
+    _check_together(known, centers, asking)
+    said = set(known)
+    _lenses(known, asking)
+    _centers(known, centers, asking)
+    for key in list(_PLACES)[list(_PLACES).index("aperture_diameter_mm") :]:
+        _fill(known, key, asking)
+    left_out = _crop(known, asking)
+    tables: dict[str, Any] = {"name": name or output.stem, "sensor": {}, "lens": {}, "array": {}, "imaging": {}}
+    for key, table in _PLACES.items():
+        tables[table][key] = list(known[key]) if isinstance(known[key], tuple) else known[key]
+    tables["array"]["centers_mm"] = known["centers"].round(6).tolist()
+    if "rotation_deg" in known:
+        tables["calibration"] = {"rotation_deg": known["rotation_deg"]}
+    tables["provenance"] = provenance_of(known.get("file"))
+    design = checked_design(output, tables)
+    write_text(output, commented(design), [".toml"])
+    taken = [f"{key} = {_shown(known[key])}" for key in _PLACES if key not in said | {"radius_of_curvature_mm"}]
+    if taken and not asking:
+        click.echo(f"by default: {', '.join(taken)}")
+    if left_out:
+        click.echo(f"left out: {left_out} lenses beyond the sensor's reach; the plate is {_shown(known['size_mm'])} mm")
+    f = design.lens.radius_of_curvature_mm / (design.lens.refractive_index - 1)
+    click.echo(
+        f"{output}: {len(design.array.centers_mm)} lenses of f = {f:.4g} mm (R = "
+        f"{design.lens.radius_of_curvature_mm:.4g} mm), sensor at {design.imaging.sensor_distance_mm:g} mm; "
+        f"see gs-jax metrics {output}"
+    )
+
+
+def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -> None:
+    """Options that exclude each other, and those that nobody is there to be asked for."""
+    if {"focal_length_mm", "radius_of_curvature_mm"} <= known.keys():
+        raise InputError("--radius-of-curvature-mm: found --focal-length-mm too, allowed: one of them.")
+    if centers and "count" in known:
+        raise InputError("--count: found --centers too, allowed: one of them.")
+    about = [key for key in ("centers_unit", "centers_columns", "centers_origin", "mirror") if known.get(key)]
+    if about and not centers and not (asking and "count" not in known):
+        raise InputError(f"{_option(about[0])}: found no --centers, allowed: with it alone.")
+    if asking:
+        return
+    missing = [_option(key) for key in ("pixel_pitch_um", "shape") if key not in known]
+    if not {"focal_length_mm", "radius_of_curvature_mm"} & known.keys():
+        missing.append("--focal-length-mm (or --radius-of-curvature-mm)")
+    if not centers and "count" not in known:
+        missing.append("--centers (or --count)")
+    if "working_distance_mm" not in known:
+        missing.append("--working-distance-mm")
+    if missing:
+        raise InputError(
+            f"found no {', '.join(missing)}, allowed: all of them, or a terminal, where they are asked for."
+        )
+
+
+def _lenses(known: dict[str, Any], asking: bool) -> None:
+    """Camera and lens."""
+    from ..designs.start import radius_of
+
+    for key in ("pixel_pitch_um", "shape", "refractive_index"):
+        _fill(known, key, asking)
+    if "radius_of_curvature_mm" in known:
+        return
+    if "focal_length_mm" not in known:
+        kinds = click.Choice(["focal-length", "radius"])
+        if (
+            click.prompt("what is known of a lens: its focal length or its radius", "focal-length", type=kinds)
+            == "radius"
+        ):
+            return _fill(known, "radius_of_curvature_mm", asking)
+        known["focal_length_mm"] = _ask(
+            known, "lens.focal_length_mm", _FOCAL_LENGTH_MM, "focal length of a lens, in air"
+        )
+    known["radius_of_curvature_mm"] = radius_of(known["focal_length_mm"], known["refractive_index"])
+
+
+def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
+    """Lens centres and the plate's size: of a file, or made."""
+    from ..designs.start import generated_centers
+
+    while asking and file is None and "count" not in known:
+        answer = click.prompt("file of lens centres (empty: make a random layout)", "", show_default=False).strip()
+        if not answer:
+            known["count"] = click.prompt("number of lenses", _COUNT, type=click.IntRange(1, 100_000))
+        else:
+            file = Path(answer)
+            try:
+                _read(known, file, asking)
+            except InputError as error:
+                click.echo(f"Error: {error}")
+                file = None
+    if file is None:
+        _fill(known, "size_mm", asking)
+        known["centers"] = generated_centers(known["count"], tuple(known["size_mm"]), known["seed"])
+        return
+    if "centers" not in known:
+        _read(known, file, asking)
+    _fill(known, "size_mm", asking)
+
+
+def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
+    """The file's centres, once it is known how it is meant."""
+    from ..designs.centers import read_centers, unit_of_file
+    from ..designs.start import check_origin_said, check_unit_said
+
+    columns, unit, origin = (known.get(f"centers_{key}") for key in ("columns", "unit", "origin"))
+    size = tuple(known["size_mm"]) if "size_mm" in known else None
+    shape, pitch = tuple(map(float, known["shape"])), known["pixel_pitch_um"] / 1000
+    found = unit_of_file(file, columns)
+    if unit is None and found is None and asking:
+        unit = click.prompt("unit of the file's numbers", "mm", type=click.Choice(["mm", "um", "px"]))
+    place = {"columns": columns, "unit": unit, "size": size, "shape": shape, "pixel_pitch": pitch}
+    plain = read_centers(file, origin="center", **place)
+    with errors_name_file(file):
+        if (unit or found) is None:
+            check_unit_said(plain)
+        if origin is None and (unit or found) != "px":
+            try:
+                check_origin_said(plain)
+            except InputError:
+                if not asking:
+                    raise
+                kinds = click.Choice(["center", "corner"])
+                origin = click.prompt("no x or y is below 0: what are they counted from", "corner", type=kinds)
+    known["centers"] = read_centers(file, origin=origin, mirror=known["mirror"], **place)
+    known["file"] = file
+
+
+def _crop(known: dict[str, Any], asking: bool) -> int:
+    """Leaves out lenses without an image on the sensor, if that is wanted, and the plate about them; how many."""
+    from ..designs.start import plate_of, within_reach
+
+    kept = within_reach(known)
+    beyond = len(kept) - int(kept.sum())
+    if not beyond:
+        return 0
+    found = f"{beyond} of {len(kept)} lenses are beyond the sensor's reach"
+    if not kept.any() or not (known["crop"] or (asking and click.confirm(f"{found}: leave them out?", default=True))):
+        raise InputError(
+            f"{known.get('file', 'layout')}: found that {found}, allowed: none, or --crop to leave them out."
+        )
+    known["centers"] = known["centers"][kept]
+    known["size_mm"] = tuple(map(min, known["size_mm"], plate_of(known["centers"])))
+    return beyond
+
+
+def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
+    """Adds what is not known yet: asked for, or the default."""
+    from ..designs.start import DEFAULTS
+
+    if key in known:
+        return
+    default = DEFAULTS[key](known) if key in DEFAULTS else None
+    if asking:
+        known[key] = _ask(known, f"{_PLACES[key]}.{key}", default or _OFFERED.get(key))
+    elif default is None:
+        raise InputError(f"{_option(key)}: found nothing, and nothing follows from the others, allowed: a value.")
+    else:
+        known[key] = default
+
+
+def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> Any:
+    """An answer that is allowed; what looks like a slip of a unit is asked about."""
+    from ..designs.keys import design_keys, problem
+    from ..designs.plausible import USUAL, meant, slip
+    from ..designs.start import clash
+
+    key = design_keys()[path]
+    hint = f"usually {key.usual}" if key.usual else key.allowed
+    text = f"{meaning or key.meaning} ({hint})"
+    while True:
+        answer = click.prompt(text, None if default is None else _shown(default))
+        value = _number(answer, whole=path == "sensor.shape", pair=key.allowed.startswith("["))
+        if path in USUAL and (question := slip(path, value)):
+            other = meant(path, value)
+            if click.confirm(question, default=other is not None):
+                value = value if other is None else other
+            elif other is None:
+                continue
+        if not (wrong := problem(path, value) or clash(path.partition(".")[2], value, known)):
+            return tuple(value) if isinstance(value, list) else value
+        click.echo(f"Error: {wrong}")
+
+
+def _number(answer: str, *, whole: bool, pair: bool) -> Any:
+    """What an answer says: a number, or two of them; of what is none, the text itself, which is then refused."""
+    try:
+        numbers = [int(part) if whole else float(part) for part in re.split(r"[\s,x]+", answer.strip("[] "))]
+    except ValueError:
+        return answer
+    return numbers if pair else numbers[0] if len(numbers) == 1 else answer
+
+
+def _shown(value: Any) -> str:
+    return " ".join(f"{each:g}" for each in value) if isinstance(value, list | tuple) else f"{value:g}"
+
+
+def _option(key: str) -> str:
+    return f"--{key.replace('_', '-')}"

@@ -1,0 +1,84 @@
+"""What is wrong with a design that only the whole of it shows: its parts do not fit together.
+
+One problem at a time; each message names its key. What is checked here is a `design.Design` that is being made.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from .centers import other_reading
+
+MIN_SPACING_MM = 1e-3
+
+
+def check_whole(design) -> None:
+    """Raises `ValueError` unless the numbers, the plate, the lenses and the sensor of a design fit together."""
+    for check in (_check_numbers, _check_plate, _check_spacing, _check_reach):
+        check(design)
+
+
+def _check_numbers(design) -> None:
+    near, far = design.imaging.working_distance_mm
+    if not near < far:
+        raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
+    aperture, sphere = design.lens.aperture_diameter_mm, 2 * design.lens.radius_of_curvature_mm
+    if aperture > sphere:
+        limit = f"at most {sphere} mm, twice `lens.radius_of_curvature_mm`"
+        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: {limit}")
+
+
+def _check_plate(design) -> None:
+    centers = np.array(design.array.centers_mm)
+    half = np.array(design.array.size_mm) / 2
+    outside = (np.abs(centers) > half + 1e-9).any(axis=1)
+    if outside.any():
+        allowed = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
+        lens = _lens(design, int(np.argmax(outside)))
+        raise ValueError(f"{lens}, allowed: {allowed}{other_reading(centers, half)}")
+
+
+def _check_spacing(design) -> None:
+    if pair := _close_pair(np.array(design.array.centers_mm)):
+        found = f"{_lens(design, pair[0])} and lens {pair[1] + 1} less than {MIN_SPACING_MM} mm from it"
+        raise ValueError(f"{found}, allowed: lenses at least that far apart")
+
+
+def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
+    # Two in one cell of half the spacing are too close. Without them a tree of any input is quick to search.
+    _, cells = np.unique(np.floor(centers / (MIN_SPACING_MM / 2)), axis=0, return_inverse=True)
+    order = np.argsort(cells.ravel(), kind="stable")
+    together = np.flatnonzero(np.diff(cells.ravel()[order]) == 0)
+    if together.size:
+        return int(order[together[0]]), int(order[together[0] + 1])
+    pairs = KDTree(centers).query_pairs(MIN_SPACING_MM * (1 - 1e-9))
+    return min(pairs, default=None)
+
+
+def _check_reach(design) -> None:
+    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth."""
+    imaging, calibration = design.imaging, design.calibration
+    angle = math.radians(calibration.rotation_deg)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
+    distance = beside_sensor(centers, design.sensor.shape, design.sensor.pixel_pitch_um)
+    plate = design.array.substrate_thickness_mm / design.lens.refractive_index
+    radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
+    if (distance > radius).any():
+        index = int(np.argmax(distance > radius))
+        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
+        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
+
+
+def beside_sensor(
+    centers: Float[np.ndarray, "lens 2"], shape: tuple[int, int], pixel_pitch_um: float
+) -> Float[np.ndarray, " lens"]:
+    """How far from a sensor each lens is, mm; 0 above it."""
+    half = np.array(shape)[::-1] * pixel_pitch_um / 2000
+    return np.hypot(*np.maximum(np.abs(centers) - half, 0).T)
+
+
+def _lens(design, index: int) -> str:
+    return f"`array.centers_mm`: found lens {index + 1} at {list(design.array.centers_mm[index])} mm"

@@ -1,0 +1,134 @@
+"""What each key of a design file is: of one source comments in files, the schema for editors and the page of keys.
+
+All is read from the fields of the tables: a title is what a key means, a description what is allowed.
+"""
+
+import textwrap
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ValidationError
+
+from .centers import CentersTable
+from .design import Design, as_toml
+from .plausible import USUAL, unit_of
+
+FRAME = (
+    "Lengths have the unit that their key ends in. +x is along a row of the image as it is shown (right), +y along a "
+    "column (down), both from the sensor's middle; depths z are positive from the plate toward the object, the sensor "
+    "distance v is positive from the lenses to the sensor."
+)
+# Of a file with comments: the many centres come late.
+_LAST = ("array", "provenance")
+_WIDTH = 110
+
+
+class Key(NamedTuple):
+    """A key of a design file; `table` is empty at the top, `usual` is empty where nothing is."""
+
+    table: str
+    name: str
+    unit: str
+    meaning: str
+    allowed: str
+    usual: str
+    required: bool
+
+    @property
+    def path(self) -> str:
+        return f"{self.table}.{self.name}".removeprefix(".")
+
+
+def design_keys() -> dict[str, Key]:
+    """All keys of design files by their path, such as `sensor.shape`, in the order of the tables."""
+    return {key.path: key for key in _all_keys()}
+
+
+def problem(path: str, value: Any) -> str | None:
+    """What is wrong with a value of the key at `path` alone, as a line; None if it is allowed."""
+    table, _, name = path.partition(".")
+    try:
+        Design.model_validate({table: {name: value}})
+    except ValidationError as error:  # as all others are missing
+        if any(found["loc"][:2] == (table, name) for found in error.errors()):
+            return f"found {value}, allowed: {design_keys()[path].allowed}."
+    return None
+
+
+def commented(design: Design) -> str:
+    """A design as TOML, each key with what it means and what is allowed; what is read back is equal."""
+    known, data = design_keys(), design.model_dump(exclude_defaults=True)
+    lines = [*_comment(f"A microscope for gs-jax. {FRAME}"), "", *_comment(_told(known["name"]))]
+    lines.append(as_toml({"name": design.name}).rstrip())
+    tables = [table for table in data if table != "name"]
+    for table in sorted(tables, key=lambda table: (table in _LAST, table == _LAST[1])):
+        lines += ["", *_comment(f"{_title(table)}."), f"[{table}]"]
+        if table == "provenance":
+            lines.append(as_toml({table: data[table]}).partition("\n")[2].rstrip())
+            continue
+        for name, value in data[table].items():
+            lines += [*_comment(_told(known[f"{table}.{name}"])), as_toml({name: value}).rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+def schema() -> dict[str, Any]:
+    """The JSON schema of design files, for editors."""
+    made = Design.model_json_schema()
+    array, more = made["$defs"]["ArrayTable"], CentersTable.model_json_schema()
+    array["properties"] |= more["properties"]
+    array["required"].remove("centers_mm")
+    array["oneOf"] = [{"required": [name]} for name in ("centers_mm", "centers_file")]
+    for table, model in _models().items():
+        where = made["$defs"][model.__name__] if table else made
+        for name, field in where["properties"].items():
+            key = design_keys()[f"{table}.{name}".removeprefix(".")]
+            field.pop("title", None)
+            field["description"] = _told(key)
+    return {"$schema": "http://json-schema.org/draft-07/schema#"} | _for_toml(made) | {"title": "A design of gs-jax"}
+
+
+def _models() -> dict[str, type[BaseModel]]:
+    tables = {name: field.annotation for name, field in Design.model_fields.items()}
+    inner = {name: model for name, model in tables.items() if isinstance(model, type) and issubclass(model, BaseModel)}
+    return {"": Design} | inner
+
+
+def _all_keys() -> Iterator[Key]:
+    for table, model in _models().items():
+        fields = model.model_fields | (CentersTable.model_fields if table == "array" else {})
+        for name, field in fields.items():
+            path = f"{table}.{name}".removeprefix(".")
+            unit = unit_of(name)
+            low, high = USUAL.get(path, (None, None))
+            usual = f"{low:g} to {high:g} {unit}".rstrip() if low is not None else ""
+            yield Key(table, name, unit, field.title or "", field.description or "", usual, field.is_required())
+
+
+def _told(key: Key) -> str:
+    """In one line."""
+    allowed = f"; {key.allowed}" if key.allowed != "a table" else ""
+    return f"{key.meaning}{allowed}{f'; usually {key.usual}' if key.usual else ''}"
+
+
+def _title(table: str) -> str:
+    title = Design.model_fields[table].title or ""
+    return title[:1].upper() + title[1:]
+
+
+def _comment(text: str) -> list[str]:
+    return [f"# {line}" for line in textwrap.wrap(text, _WIDTH, break_on_hyphens=False)]
+
+
+def _for_toml(node: Any) -> Any:
+    """Without what TOML has not (null) and what not all editors know (`prefixItems`, of draft 2020-12)."""
+    if isinstance(node, list):
+        return [_for_toml(each) for each in node]
+    if not isinstance(node, dict):
+        return node
+    node = {key: _for_toml(value) for key, value in node.items() if not (key == "default" and value is None)}
+    choices = [each for each in node.get("anyOf", ()) if each != {"type": "null"}]
+    if len(choices) == 1:
+        node = {key: value for key, value in node.items() if key != "anyOf"} | choices[0]
+    if items := node.pop("prefixItems", None):
+        node["items"] = items[0]
+    return node

@@ -1,0 +1,105 @@
+"""Lens centres as vendors, programs and people write them."""
+
+import numpy as np
+import pytest
+
+from gs_jax.base.errors import InputError
+from gs_jax.designs.design import read_design
+
+from .test_designs import MISSING, message_of, written
+
+# Of three lenses, mm.
+CENTERS = ((-1.0, -0.5), (0.5, 1.25), (1.0, -1.0))
+FORMS = {
+    "ours": "x_mm,y_mm\n-1,-0.5\n0.5,1.25\n1,-1\n",
+    "no header": "-1,-0.5\n0.5,1.25\n1,-1\n",
+    "spaced": " x_mm , y_mm \n -1, -0.5\n0.5 ,1.25 \n\n  1 , -1  \n",
+    "semicolons": "x_mm;y_mm\n-1;-0.5\n0.5;1.25\n1;-1\n",
+    "decimal commas": "x;y\n-1,0;-0,5\n0,5;1,25\n1;-1\n",
+    "tabs": "x\ty\n-1\t-0.5\n0.5\t1.25\n1\t-1\n",
+    "blanks": "x (mm)  y (mm)\n-1.0   -0.5\n 0.5    1.25\n 1.0   -1.0\n",
+    "blanks alone": "-1 -0.5\r\n0.5 1.25\r\n1 -1\r\n",
+    "numpy's": "# X [mm] Y [mm]\n-1.000e+00 -5.000e-01\n5.0e-01 1.25e+00\n1 -1\n",
+    "remarks": "# array 12 of July\n\nx,y\n# first\n-1,-0.5\n0.5,1.25\n1,-1\n",
+    "micrometres": "x_um,y_um\n-1000,-500\n500,1250\n1000,-1000\n",
+    "a vendor's": '"Lens #","Pos X (µm)","Pos Y (µm)","Sag"\n1,-1000,-500,ok\n2,500,1250,ok\n3,1000,-1000,bad\n',
+    "another letter": "no;X [μm];Y [μm]\nA;-1000;-500\nB;500;1250\nC;1000;-1000\n",
+    "in words": "center x micron,center y micron\n-1000,-500\n500,1250\n1000,-1000\n",
+    "y first": "Y,X\n-0.5,-1\n1.25,0.5\n-1,1\n",
+    "Fiji's": " ,Area,X,Y,XM\n1,7,-1,-0.5,0\n2,7,0.5,1.25,0\n3,7,1,-1,0\n",
+}
+
+
+def with_file(folder, text, **keys):
+    (folder / "c.csv").write_text(text, encoding="utf-8", newline="")
+    changes = {"array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    return written(folder, changes | {f"array.{key}": value for key, value in keys.items()})
+
+
+@pytest.mark.parametrize("text", FORMS.values(), ids=FORMS)
+def test_forms(tmp_path, text):
+    assert read_design(with_file(tmp_path, text)).array.centers_mm == CENTERS
+
+
+def test_a_spreadsheets_micrometres(tmp_path):
+    """Of Windows: one byte for the Greek letter, a line end of its own, decimal commas."""
+    path = with_file(tmp_path, "")
+    text = "Nr.;X [µm];Y [µm]\r\n1;-1000,0;-500,0\r\n2;500,0;1250,0\r\n3;1000,0;-1000,0\r\n"
+    (tmp_path / "c.csv").write_bytes(text.encode("cp1252"))
+    assert read_design(path).array.centers_mm == CENTERS
+
+
+def test_columns_by_name_and_unit_by_key(tmp_path):
+    text = "a,b,c\n9,-500,-1000\n9,1250,500\n9,-1000,1000\n"
+    path = with_file(tmp_path, text, centers_columns=["c", "b"], centers_unit="um")
+    assert read_design(path).array.centers_mm == CENTERS
+    blanks = "n  X (um)  Y (um)  Z (um)\n9 0 -1000 -500\n9 0 500 1250\n9 0 1000 -1000\n"
+    path = with_file(tmp_path, blanks, centers_columns=["Y (um)", "Z (um)"])
+    assert read_design(path).array.centers_mm == CENTERS
+    message_of(with_file(tmp_path, text, centers_columns=["c", "d"]), "no one column 'd'", "'a', 'b', 'c'")
+    message_of(with_file(tmp_path, "1,2\n", centers_columns=["c", "d"]), "no header", "'c' and 'd'")
+
+
+def test_pixels_are_those_of_a_capture(tmp_path):
+    """As the contract has it: x = (column - (columns - 1) / 2) pitch; the sensor has 400 rows of 300 pixels."""
+    middle, pitch = np.array([299, 399]) / 2, 0.0045
+    for first, origin in ((middle, {}), (0 * middle, {"centers_origin": "center"})):
+        rows = "".join(f"{x!r},{y!r}\n" for x, y in (np.array(CENTERS) / pitch + first).tolist())
+        path = with_file(tmp_path, f"x_px,y_px\n{rows}", **origin)
+        np.testing.assert_allclose(read_design(path).array.centers_mm, CENTERS, atol=1e-12)
+
+
+def test_from_a_corner(tmp_path):
+    """Of the plate, 3 x 4 mm."""
+    path = with_file(tmp_path, "x_um,y_um\n500,1500\n2000,3250\n2500,1000\n", centers_origin="corner")
+    np.testing.assert_allclose(read_design(path).array.centers_mm, CENTERS, atol=1e-12)
+
+
+def test_mirror_is_x_against_minus_x(tmp_path):
+    expected = tuple((-x, y) for x, y in CENTERS)
+    path = with_file(tmp_path, FORMS["ours"], mirror=True)
+    assert read_design(path).array.centers_mm == expected
+    assert read_design(written(tmp_path, {"array.mirror": True})).array.centers_mm == expected
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"centers_unit": "inch"}, ["`array.centers_unit`", "'inch'", '"mm", "um" or "px"']),
+        ({"centers_unit": "um"}, ["x_mm,y_mm", "unit um", "one unit"]),
+        ({"centers_origin": "left"}, ["`array.centers_origin`", "'left'", '"corner"']),
+        ({"centers_columns": "x"}, ["`array.centers_columns`", "'x'", "as in the header"]),
+        ({"mirror": "yes"}, ["`array.mirror`", "'yes'", "true or false"]),
+        ({"centers_units": "um"}, ["`array.centers_units`", "`centers_unit`"]),
+    ],
+)
+def test_wrong_keys(tmp_path, keys, words):
+    message_of(with_file(tmp_path, FORMS["ours"], **keys), *words)
+
+
+def test_keys_of_a_file_without_one(tmp_path):
+    message_of(written(tmp_path, {"array.centers_unit": "um"}), "`array.centers_unit`", "no `array.centers_file`")
+    for wrong in (3, [3], [["x", 1.0]], [[]]):
+        changes = {"array.centers_mm": wrong, "array.mirror": True}
+        with pytest.raises(InputError, match="array.centers_mm"):
+            read_design(written(tmp_path, changes))

@@ -1,0 +1,74 @@
+"""Pages for people: of all keys, and for the lab."""
+
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+from experiments.calibration_errors import run
+from gs_jax.__main__ import COMMANDS, commands
+from gs_jax.designs.keys import design_keys
+
+ROOT = Path(__file__).parents[1]
+DESIGN = ROOT / "design"
+
+
+def script():
+    spec = importlib.util.spec_from_file_location("keys_page", DESIGN / "keys.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_keys_is_what_the_fields_say():
+    """`python design/keys.py` writes it anew."""
+    text = (DESIGN / "KEYS.md").read_text(encoding="utf-8")
+    assert text == script().page()
+    for key in design_keys().values():
+        assert f"`{key.name}`" in text or f"[{key.name}]" in text, key.path
+
+
+def test_the_drawing_is_drawn_and_small(tmp_path, monkeypatch):
+    module = script()
+    monkeypatch.setattr(module, "DRAWING", tmp_path / "geometry.svg")
+    monkeypatch.setattr(module, "PAGE", tmp_path / "KEYS.md")
+    module.main()
+    for path in (tmp_path / "geometry.svg", DESIGN / "geometry.svg"):
+        assert 10_000 < path.stat().st_size < 200_000
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", DESIGN / "README.md", DESIGN / "KEYS.md", DESIGN / "LAB.md"])
+def test_links_lead_somewhere(path):
+    for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text(encoding="utf-8")):
+        assert (path.parent / link).exists(), link
+
+
+def test_the_readme_leads_to_both():
+    text = (ROOT / "README.md").read_text()
+    assert "design/KEYS.md" in text and "design/LAB.md" in text
+
+
+def test_the_commands_of_the_lab_page_exist():
+    """Each with options that it has."""
+    text = (DESIGN / "LAB.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = [line for block in re.findall(r"```\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    said = [shlex.split(line, comments=True) for line in lines if line.startswith("gs-jax ")]
+    assert {words[1] for words in said} >= {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"}
+    for _, name, *rest in said:
+        assert name in COMMANDS
+        command = commands.get_command(click.Context(commands), name)
+        assert command is not None
+        known = {option for param in command.params for option in param.opts}
+        assert {word for word in rest if word.startswith("-")} <= known, (name, rest)
+
+
+def test_what_mistakes_of_calibration_leave():
+    """As the page for the lab has it, in pixels RMS."""
+    left = {name: rms for name, rms, _ in run()}
+    said = {"nothing": 0.0, "each centre, 3 um": 1.2, "tilt, 0.5 degrees": 1.2, "all centres, 0.2 %": 0.8}
+    said |= {"one place, 20 um sideways": 0.5, "one depth, 50 um": 0.3, "all depths, 200 um": 0.2}
+    assert {name: round(left[name], 1) for name in said} == said and left["two captures swapped"] > 40
