@@ -52,10 +52,14 @@ Centers = Annotated[
 
 
 class SensorTable(Table):
-    """`[sensor]`: the camera."""
+    """`[sensor]`: the camera. With `origin_mm` it is a region of a larger one, whose centre is the frame's origin.
+
+    The key is the region's middle. Lenses need not reach a region, but one of them.
+    """
 
     pixel_pitch_um: float = Field(ge=1e-3, le=1e4, description="a number of micrometres from 1e-3 to 1e4")
     shape: Shape
+    origin_mm: Point | None = None
 
 
 class LensTable(Table):
@@ -142,7 +146,7 @@ class Design(Table):
         )
         return Imager(
             array,
-            Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000),
+            Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
             sensor_distance=imaging.sensor_distance_mm,
             field_radius=imaging.field_radius_mm,
             wavelength=imaging.wavelength_nm * 1e-6,
@@ -263,17 +267,22 @@ def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
 
 
 def _check_reach(design: Design) -> None:
-    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth."""
+    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth.
+
+    On a region of a larger sensor one lens has.
+    """
     imaging, calibration = design.imaging, design.calibration
     angle = math.radians(calibration.rotation_deg)
     rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
     half = np.array(design.sensor.shape)[::-1] * design.sensor.pixel_pitch_um / 2000
-    distance = np.hypot(*np.maximum(np.abs(centers) - half, 0).T)
+    middle = design.sensor.origin_mm or (0.0, 0.0)
+    distance = np.hypot(*np.maximum(np.abs(centers - middle) - half, 0).T)
     plate = design.array.substrate_thickness_mm / design.lens.refractive_index
     radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
-    if (distance > radius).any():
-        index = int(np.argmax(distance > radius))
+    beyond = distance > radius
+    if beyond.all() or (beyond.any() and design.sensor.origin_mm is None):
+        index = int(np.argmax(beyond))
         allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
         raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
 
