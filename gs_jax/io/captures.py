@@ -27,7 +27,7 @@ from .tiff import declared_mosaic, decode_plane, decode_png, page_count
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
 
 MAX_PIXELS = 10**9
-_DTYPES = ("uint8", "uint16", "float32")
+DTYPES = ("uint8", "uint16", "float32")
 _RGB, _MOSAIC = "colour (RGB)", 32803
 _COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
 _PHOTOMETRIC = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
@@ -73,13 +73,16 @@ def read_capture(
         If the file cannot be read, is none of these, is damaged, of another size than `shape` or over 1e9 pixels, of
         another type, holds a NaN or an infinity, or is in colour or has several pages and it is not said which to take.
     """
-    images = frames(path, shape, page=page, channel=channel, bayer=bayer)
-    if page != "mean":
-        return next(images)
-    total, count = next(images).astype(np.float64), 1
+    image = averaged(frames(path, shape, page=page, channel=channel, bayer=bayer))
+    return channel_of(image, bayer, channel) if bayer else image
+
+
+def averaged(images: Iterator[Shaped[np.ndarray, "row column"]]) -> Shaped[np.ndarray, "row column"]:
+    """The mean of images, float32; a single one as it is."""
+    total, count = next(images), 1
     for image in images:
-        total, count = total + image, count + 1
-    return (total / count).astype(np.float32)
+        total, count = np.add(total, image, dtype=np.float64), count + 1
+    return total if count == 1 else (total / count).astype(np.float32)
 
 
 def frames(
@@ -89,9 +92,12 @@ def frames(
     page: int | str | None = None,
     channel: str | None = None,
     bayer: str | None = None,
-    dtypes: tuple[str, ...] = _DTYPES,
+    dtypes: tuple[str, ...] = DTYPES,
 ) -> Iterator[Shaped[np.ndarray, "row column"]]:
-    """The pages of a capture that `page` names, one after the other; parameters and errors as for `read_capture`."""
+    """The pages of a capture that `page` names, one after the other; of a mosaic, all of its pixels.
+
+    Parameters and errors are those of `read_capture`.
+    """
     path = check_input(path)
     form = _FORMATS.get(path.suffix.lower())
     if form is None:
@@ -135,8 +141,8 @@ def write_capture(
     """
     path = check_output(path, CAPTURE_SUFFIXES)
     pixels = np.asarray(image)
-    if pixels.dtype.name not in _DTYPES:
-        raise ValueError(f"`image` must be one of {', '.join(_DTYPES)}, got {pixels.dtype.name}.")
+    if pixels.dtype.name not in DTYPES:
+        raise ValueError(f"`image` must be one of {', '.join(DTYPES)}, got {pixels.dtype.name}.")
     form = _FORMATS[path.suffix.lower()]
     if pixels.dtype.name not in form.dtypes:
         allowed = f"{', '.join(form.dtypes)} in {path.suffix}; use .tif or .npy"
@@ -192,8 +198,6 @@ def _check_colour(path: Path, colour: str | None, wanted: _Wanted) -> None:
 
 def _taken(pixels: np.ndarray, wanted: _Wanted, colours_first: bool = False) -> np.ndarray:
     """The image that is wanted of what a page holds."""
-    if wanted.bayer:
-        return channel_of(pixels, wanted.bayer, wanted.channel)
     if pixels.ndim == 2:
         return pixels
     return np.moveaxis(pixels, 0 if colours_first else -1, 0)[CHANNELS.index(wanted.channel or "")]
@@ -277,7 +281,7 @@ class _Format(NamedTuple):
 
     read: Callable[[Path, _Wanted], Iterator[np.ndarray]]
     write: Callable[[BinaryIO, np.ndarray, Provenance | None], None]
-    dtypes: tuple[str, ...] = _DTYPES
+    dtypes: tuple[str, ...] = DTYPES
 
 
 _FORMATS = {

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Shaped
 
 from ..base.errors import InputError, short_repr
 from ..geometry import Sensor
@@ -74,7 +74,8 @@ class Readout(NamedTuple):
         """What was read out, a line each."""
         said = []
         if self.channel:
-            said.append(f"{self.channel} of {f'an {self.bayer} mosaic, cells of 2 x 2' if self.bayer else 'colour'}")
+            mosaic = f"the mosaic {self.bayer}, an image of its cells of 2 x 2 pixels"
+            said.append(f"{self.channel} of {mosaic if self.bayer else 'a colour image'}")
         if self.roi:
             row, column, rows, columns = self.roi
             said.append(f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1} of the sensor")
@@ -112,7 +113,7 @@ def sites(bayer: str, channel: str | None) -> list[tuple[int, int]]:
     return [divmod(place, 2) for place, colour in enumerate(bayer) if colour == channel[0].upper()]
 
 
-def channel_of(mosaic: Num[np.ndarray, "row column"], bayer: str, channel: str | None) -> Num[np.ndarray, "y x"]:
+def channel_of(mosaic: Shaped[np.ndarray, "row column"], bayer: str, channel: str | None) -> Shaped[np.ndarray, "y x"]:
     """The image of a mosaic's cells in one colour: see `Readout`. Green is float32; errors as `sites`."""
     rows, columns = (n // 2 * 2 for n in mosaic.shape)
     parts = [mosaic[row:rows:2, column:columns:2] for row, column in sites(bayer, channel)]
