@@ -1,5 +1,7 @@
 """What a camera does to light, undone: dark frame, flat field, bad pixels; and what is said of it."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ GAIN = 1.2 - 0.9 * ((ROW - 30) ** 2 + (COLUMN - 35) ** 2) / (30**2 + 35**2)
 DARK = 16 + 3 * (COLUMN % 2)
 
 
-def saved(path, pixels, dtype=np.float32):
+def saved(path, pixels, dtype: Any = np.float32):
     tifffile.imwrite(path, np.asarray(pixels, dtype), photometric="minisblack")
     return path
 

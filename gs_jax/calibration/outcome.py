@@ -75,7 +75,7 @@ def picture(found: Calibration) -> Figure:
     scale = max(float(distance.max()), 1e-12) / (_LONGEST * 2 * half.max())
     colours = found.spots.captures
     arrows.quiver(*places.T, *found.residuals.T, colours, angles="xy", scale_units="xy", scale=scale)
-    arrows.set(xlim=(-half[0], half[0]), ylim=(half[1], -half[1]), aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    arrows.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
     arrows.set_title(f"residuals, longest {distance.max():.2f} pixels; colour: capture", fontsize=9)
     counts.hist(distance, bins=30)
     counts.set(xlabel="distance, pixels", ylabel="spots")
