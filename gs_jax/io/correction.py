@@ -20,7 +20,7 @@ _SHARP = 2
 # Full scale of converters of these bits, as such or in the upper bits of 16.
 _BITS = (8, 10, 12, 14, 16)
 # So many pixels at the maximum, and more than twice those of the hundredth or the few counts below it, were cut off.
-_PILE, _FEW_COUNTS = 10, 5
+_PILE, _FEW_COUNTS, _LEVELS = 10, 5, 32
 MASK_DTYPES = (*DTYPES, "bool")
 # So much of a mask may be bad: more is one that marks what is good.
 _MOST_BAD = 0.5
@@ -165,19 +165,19 @@ def saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:
     """
     if image.dtype.kind != "u":
         return None
-    top = int(image.max())
-    count = int((image == top).sum())
+    found = np.bincount(image.ravel())
+    top, levels = len(found) - 1, np.count_nonzero(found)
+    count = int(found[top])
     full = {2**bits - 1 for bits in _BITS} | {2**16 - 2 ** (16 - bits) for bits in _BITS}
-    # Rounded noise piles up as well, within a few counts.
-    below = int((image >= top - max(top // 100, _FEW_COUNTS)).sum()) - count if top > _FEW_COUNTS else image.size
-    piled = _PILE <= count < image.size / 2 and count > 2 * below
+    # Rounded noise piles up as well, within a few counts; a drawing has few values.
+    below = int(found[max(top - max(top // 100, _FEW_COUNTS), 0) : top].sum())
+    piled = count >= max(_PILE, 2 * below + 1) and levels >= _LEVELS
     return (count, top) if piled or (top in full and count > 1) else None
 
 
 def _read(path, shape, page, readout) -> tuple[np.ndarray, list[str], list[str]]:
     """An image, or the mean of several; what was done; and what is to be said of it."""
     cut: list[tuple[int, int] | None] = []
-
     size = 0
 
     def looked_at():
