@@ -1,7 +1,7 @@
 """Lenses, sensor and object grid, and where a lens images a point (Eqs. 1, 3).
 
 Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
-`[row, column]`, volumes are `[depth, row, column]`. The lateral frame is the sensor's: origin at its
+`[row, column]`, volumes are `[depth, row, column]`. The lateral frame is the whole sensor's: origin at its
 centre, +x along increasing column, +y along increasing row. A depth `z > 0` is measured from the front
 (plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
@@ -20,9 +20,9 @@ def as_float(x) -> Array:
     return jnp.asarray(x, dtype=float)
 
 
-def _as_size(x) -> tuple[float, float]:
-    width, height = map(float, x)
-    return width, height
+def _as_pair(x) -> tuple[float, float]:
+    first, second = map(float, x)
+    return first, second
 
 
 def _as_shape(x) -> tuple[int, int]:
@@ -94,40 +94,46 @@ class Sensor(eqx.Module):
         `(rows, columns)`, two pixels each way at least: interpolation needs neighbours.
     pixel_pitch
         Distance of pixel centres, mm. It is a plain number, not an array: a camera is given, not optimised.
+    origin
+        `(x, y)` of the middle of these pixels, mm: of a region of the whole sensor, whose centre is the frame's origin.
 
     Raises
     ------
     ValueError
-        If there are fewer than 2 x 2 pixels, or the pitch is not positive.
+        If there are fewer than 2 x 2 pixels, the pitch is not positive, or the origin is not finite.
     """
 
     shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
     pixel_pitch: float = eqx.field(static=True, converter=float)
+    origin: tuple[float, float] = eqx.field(static=True, converter=_as_pair, default=(0.0, 0.0))
 
     def __check_init__(self):
         if min(self.shape) < 2:
             raise ValueError(f"`shape` must be two numbers of pixels, each 2 or more, got {self.shape}.")
         if not self.pixel_pitch > 0:
             raise ValueError(f"`pixel_pitch` must be positive, got {self.pixel_pitch}.")
+        if not all(map(math.isfinite, self.origin)):
+            raise ValueError(f"`origin` must be two finite numbers, got {self.origin}.")
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Edges of an image of this sensor for `imshow`, `(left, right, bottom, top)`, mm; row 0 is at the top."""
-        y, x = (n * self.pixel_pitch / 2 for n in self.shape)
-        return -x, x, y, -y
+        (x, y), (rows, columns) = self.origin, self.shape
+        across, along = columns * self.pixel_pitch / 2, rows * self.pixel_pitch / 2
+        return x - across, x + across, y + along, y - along
 
     def to_pixels(self, points: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Fractional `(row, column)` of points `(x, y)`; pixel centres have whole numbers."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
-        row = points[..., 1] / self.pixel_pitch + middle_row
-        column = points[..., 0] / self.pixel_pitch + middle_column
+        row = (points[..., 1] - self.origin[1]) / self.pixel_pitch + middle_row
+        column = (points[..., 0] - self.origin[0]) / self.pixel_pitch + middle_column
         return jnp.stack([row, column], axis=-1)
 
     def to_mm(self, pixels: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
-        x = (pixels[..., 1] - middle_column) * self.pixel_pitch
-        y = (pixels[..., 0] - middle_row) * self.pixel_pitch
+        x = (pixels[..., 1] - middle_column) * self.pixel_pitch + self.origin[0]
+        y = (pixels[..., 0] - middle_row) * self.pixel_pitch + self.origin[1]
         return jnp.stack([x, y], axis=-1)
 
 
@@ -158,7 +164,7 @@ class MicrolensArray(eqx.Module):
     aperture_diameter: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=_as_float_or_none, default=None)
-    size: tuple[float, float] = eqx.field(static=True, converter=_as_size, default=(math.inf, math.inf))
+    size: tuple[float, float] = eqx.field(static=True, converter=_as_pair, default=(math.inf, math.inf))
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
@@ -185,7 +191,7 @@ class Imager(eqx.Module):
         `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
         of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
     rotation
-        Of the array about the sensor's centre, radians, from +x toward +y.
+        Of the array about the frame's origin, radians, from +x toward +y.
     shift
         `(x, y)` of the array after the rotation, mm.
     wavelength
@@ -316,13 +322,14 @@ class Grid(eqx.Module):
     def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
         """The grid that covers as much of the object as the sensor is large (the paper's field of view).
 
-        Its numbers of rows and columns are odd: there is a voxel on the axis. `depths` and `pitch` are mm.
+        Its numbers of rows and columns are odd: there is a voxel at the sensor's origin, by default on the axis.
+        `depths` and `pitch` are mm.
         """
         if not pitch > 0:
             raise ValueError(f"`pitch` must be positive, got {pitch}.")
         rows, columns = (2 * round((n * sensor.pixel_pitch / pitch - 1) / 2) + 1 for n in sensor.shape)
         rows, columns = max(rows, 1), max(columns, 1)
-        return cls(depths, (rows, columns), pitch)
+        return cls(depths, (rows, columns), pitch, sensor.origin)
 
     def at(self, depths) -> "Grid":
         """The same voxels at other depths `(depth,)`, or at a single one, mm."""

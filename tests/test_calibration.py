@@ -16,10 +16,11 @@ from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import Calibration, calibrate
 from gs_jax.calibration.matching import match, match_shift
-from gs_jax.calibration.outcome import picture, scales
+from gs_jax.calibration.outcome import calibrated, picture, scales
 from gs_jax.calibration.scene import calibrate_by_scene
+from gs_jax.calibration.sources import Sources, Spots
 from gs_jax.calibration.spots import core_offsets, find_spots
-from gs_jax.calibration.unknowns import FITTABLE, FITTED
+from gs_jax.calibration.unknowns import FITTABLE, FITTED, offsets_of
 from gs_jax.designs.builtin import geomscope
 from gs_jax.io.positions import read_positions
 from gs_jax.io.provenance import read_provenance
@@ -100,6 +101,19 @@ def test_an_ideal_lens_puts_its_core_on_the_chief_ray():
     ideal = dataclasses.replace(imager, array=dataclasses.replace(imager.array, thin_lens_focal_length=4.65))
     focused = eqx.tree_at(lambda i: i.sensor_distance, ideal, jnp.asarray(1 / (1 / 4.65 - 1 / (20 + 1 / 1.43))))
     np.testing.assert_allclose(core_offsets(focused, np.array([20.0]), np.linspace(0, 2, 3)), 0, atol=1e-4)
+
+
+def test_lenses_beside_the_sensor_are_left_out():
+    """A plate that is larger than the sensor, mounted to one side."""
+    design = geomscope()
+    imager = eqx.tree_at(lambda i: i.shift, design.imager(), jnp.array([4.0, 0.0]))
+    nothing = Spots(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    sources = Sources(POINTS, np.arange(3))
+    found = Calibration(imager, False, {}, {}, sources, nothing, np.zeros((0, 2)), offsets_of(imager, POINTS[:1, 2]))
+    new = calibrated(design, found._replace(residuals=np.ones((1, 2))))
+    left, all_of_them = len(new.array.centers_mm), len(design.array.centers_mm)
+    assert 0.5 * all_of_them < left < all_of_them
+    assert new.provenance["lenses_beside_the_sensor"] == all_of_them - left
 
 
 @pytest.mark.parametrize("seed", range(6))

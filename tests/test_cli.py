@@ -293,10 +293,10 @@ def test_wrong_files_give_one_line_and_status_2(folder, monkeypatch, capsys, nam
 
 
 def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
-    def fault(*_):
+    def fault(*_, **__):
         raise ValueError("not the user's")
 
-    monkeypatch.setattr("gs_jax.io.captures.read_capture", fault)
+    monkeypatch.setattr("gs_jax.io.correction.read_corrected", fault)
     monkeypatch.setattr(sys, "argv", ["gs-jax", *RECONSTRUCT, "-o", "v.tif"])
     with pytest.raises(ValueError, match="not the user's"):
         main()

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from ..base.errors import InputError
+from ..designs.checks import reach
 from ..designs.design import CalibrationTable, Design
 from ..io.provenance import Provenance
 from ..io.tables import one_line
@@ -19,7 +20,10 @@ _LONGEST = 0.08
 
 
 def calibrated(design: Design, found: Calibration, provenance: Provenance | None = None) -> Design:
-    """The design with what was found, which it says in its provenance, too; `InputError` if it is none."""
+    """The design with what was found, which it says in its provenance, too; `InputError` if it is none.
+
+    Lenses whose images fall beside the sensor, now that it is known where they are, are left out.
+    """
     imager = found.imager
     one = lambda value: float(f"{float(value):.9g}")
 
@@ -53,6 +57,11 @@ def calibrated(design: Design, found: Calibration, provenance: Provenance | None
             "provenance": {**design.provenance, **said},
         }
     )
+    distance, radius = reach(new)
+    if new.sensor.origin_mm is None and (distance > radius).any():
+        on = tuple(pair for pair, off in zip(pairs, distance > radius, strict=True) if not off)
+        new = new.model_copy(update={"array": array.model_copy(update={"centers_mm": on})})
+        new.provenance["lenses_beside_the_sensor"] = len(pairs) - len(on)
     try:
         return Design.model_validate(new.model_dump())
     except ValidationError as error:
@@ -104,7 +113,7 @@ def picture(found: Calibration) -> Figure:
     scale = max(float(distance.max()), 1e-12) / (_LONGEST * 2 * half.max())
     colours = found.sources.captures[found.spots.sources]
     arrows.quiver(*places.T, *found.residuals.T, colours, angles="xy", scale_units="xy", scale=scale)
-    arrows.set(xlim=(-half[0], half[0]), ylim=(half[1], -half[1]), aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    arrows.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
     arrows.set_title(f"residuals, longest {distance.max():.2f} pixels; colour: capture", fontsize=9)
     counts.hist(distance, bins=30)
     counts.set(xlabel="distance, pixels", ylabel="spots")

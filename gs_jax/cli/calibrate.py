@@ -7,6 +7,7 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output
+from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN
 
@@ -45,6 +46,7 @@ class _Names(click.ParamType):
     "--from-scene", is_flag=True, help="One capture of any sparse scene, without positions: finds rotation and tilt."
 )
 @click.option("-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of residuals beside it.")
+@capture_options
 @force_option
 def command(
     design: Path,
@@ -56,6 +58,7 @@ def command(
     from_scene: bool,
     output: Path,
     force: bool,
+    camera: CaptureOptions,
 ):
     """Find the geometry of a real microscope, from CAPTURES of point sources: a pinhole or a bead at known places.
 
@@ -71,7 +74,6 @@ def command(
     from ..calibration.sources import Sources
     from ..calibration.unknowns import FITTED
     from ..designs.design import read_design, write_design
-    from ..io.captures import read_capture
     from ..io.figures import write_figure
     from ..io.positions import read_positions
     from ..reconstruction.pipeline import voxel_grid
@@ -82,15 +84,15 @@ def command(
         raise InputError(f"--positions, --from-scene: found {found}, allowed: {allowed}.")
     check_output(output, [".toml"])
     drawing = check_output(output.with_suffix(".png"), [".png"])
-    inputs = (design, *captures, *([positions] if positions else []))
+    inputs = (design, *captures, *([positions] if positions else []), *camera.files)
     check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
-    imager = microscope.imager()
+    imager = camera.imager(microscope.imager())
     names = [name for name in (*(OF_SCENES if from_scene else FITTED), *fit) if name not in hold]
     with Progress() as progress:
         if positions is None:
             capture = next(iter(captures))
-            image = read_capture(capture, imager.sensor.shape)
+            image = camera.read(capture)
             grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
             with errors_name_file(capture):
                 found = calibrate_by_scene(image, imager, grid, fit=names, progress=progress)
@@ -100,13 +102,14 @@ def command(
             with errors_name_file(positions):
                 sources.check(len(captures))
                 sources.check_fit(names)
-            images = [read_capture(path, imager.sensor.shape) for path in progress.track(captures, "Reading captures")]
+            images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             found = calibrate(
                 images, points, imager, captures=of, fit=names, find_lenses=find_lenses, progress=progress
             )
-    new = calibrated(microscope, found, provenance_of(*inputs))
+    new = calibrated(microscope, found, camera.recorded(provenance_of(*inputs)))
     write_design(output, new)
     write_figure(drawing, picture(found))
+    camera.say()
     Console().print(table(microscope, found))
     mirrored = ", the array mirrored (y against -y) and turned" if found.mirrored else ""
     lenses = f", {len(found.imager.array.centers)} lenses found" if find_lenses else ""

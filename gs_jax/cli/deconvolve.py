@@ -7,6 +7,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output
+from .captures import CaptureOptions, picture_options
 from .files import check_may_write, provenance_of
 from .options import Number
 
@@ -20,19 +21,21 @@ from .options import Number
     "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation.  [default: 1e-3 of admm]"
 )
 @click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
-def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path):
+@picture_options
+def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path, camera: CaptureOptions):
     """Reconstruct the plane that CAPTURE shows, through a diffuser or another mask whose PSF is the file PSF.
 
-    PSF is the image of a point on the axis, of any size; both may be grey TIFF, PNG or .npy.
+    PSF is the image of a point on the axis, of any size, the mean of its pages; both may be TIFF, PNG or .npy, and are
+    read and corrected in the same way.
     """
-    from ..io.captures import read_capture, write_capture
+    from ..io.captures import write_capture
     from ..reconstruction.deconvolution import deconvolve
     from ..solvers.convolution_admm import ConvolutionADMM
     from ..solvers.fista import FISTA
     from ..solvers.richardson_lucy import RichardsonLucy
 
     check_output(output, [".tif", ".tiff", ".npy"])
-    check_may_write(output, inputs=(capture, psf))
+    check_may_write(output, inputs=(capture, psf, *camera.files))
     if tv is not None and method == "fista":
         raise InputError("--tv: found --method fista, allowed: admm, richardson-lucy.")
     solver = {
@@ -40,10 +43,11 @@ def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None,
         "fista": lambda: FISTA(steps),
         "richardson-lucy": lambda: RichardsonLucy(steps, accelerate=True, tv=tv or 0.0),
     }[method]()
-    image, spot = read_capture(capture), read_capture(psf)
+    image, spot = camera.read(capture), camera.read(psf, is_spot=True)
     with Progress() as progress:
         scene = deconvolve(image, spot, solver, progress=progress)
         with progress.step("Writing"):
-            write_capture(output, scene, provenance_of(capture, psf))
+            write_capture(output, scene, camera.recorded(provenance_of(capture, psf, *camera.files)))
+    camera.say()
     size = " x ".join(map(str, scene.shape))
     click.echo(f"{output}: {size} pixels, {method}, {steps} steps")

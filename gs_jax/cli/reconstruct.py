@@ -10,6 +10,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.disk import check_output
+from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
 
@@ -67,6 +68,7 @@ from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
 )
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+@capture_options
 @force_option
 def command(
     capture: Path,
@@ -84,20 +86,26 @@ def command(
     output: Path,
     points: Path | None,
     force: bool,
+    camera: CaptureOptions,
 ):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
 
-    CAPTURE is a grey TIFF, PNG or .npy of the sensor's size; the volume is written to scale, for Fiji and napari.
+    CAPTURE is a grey TIFF, PNG or .npy of the sensor's size, or what --page, --channel, --bayer, --roi, --binning say
+    of it; --dark, --flat, --bad-pixels and --offset correct it. The volume is written to scale, for Fiji and napari.
+
+    \b
+    A part of the sensor, binned, with a dark frame and a flat field:
+    gs-jax reconstruct part.tif my.toml --roi 1024,512,2048,2048 --binning 2
+      --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..designs.design import design_text, read_design
-    from ..io.captures import read_capture
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
-    check_may_write(output, points, inputs=(capture, design, weights), force=force)
+    check_may_write(output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
     if suppress != "none" and method != "backproject":
@@ -112,10 +120,10 @@ def command(
     inversion = _inversion(method, steps, weights, tv=tv, sparsity=sparsity)
     cleaned = _network(weights) if suppress == "unet" else None
     microscope = read_design(design)
-    imager = microscope.imager()
+    imager = camera.imager(microscope.imager())
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
-    image = read_capture(capture, imager.sensor.shape)
+    image = camera.read(capture)
     found = evidence = warning = None
     with Progress() as progress:
         if suppress == "points" or (points and suppress != "clusters"):
@@ -141,12 +149,13 @@ def command(
 
             check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
         with progress.step("Writing"):
-            provenance = provenance_of(capture, weights, design=design_text(microscope))
+            provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=design_text(microscope)))
             write_volume(output, volume, grid, provenance)
             if points and found is not None:
                 from ..io.points import write_points
 
                 write_points(points, found, evidence, provenance=provenance)
+    camera.say()
     z, y, x = volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")

@@ -197,7 +197,7 @@ def reconstruction_loss(
         `(rows, columns)` of the part of the sensor that is computed. By default the whole sensor, and the grid on the
         axis; for a smaller part, the grid's middle is uniform over `field`.
     field
-        `(x, y)` of the rectangle of these places, its middle on the axis, mm.
+        `(x, y)` of the rectangle of these places, its middle the sensor's, mm.
 
     Returns
     -------
@@ -220,6 +220,7 @@ def reconstruction_loss(
     def one(key):
         scene_key, noise_key, place_key = jax.random.split(key, 3)
         place = jax.random.uniform(place_key, (2,), dtype, -0.5, 0.5) * jnp.asarray(field, dtype)
+        place = place + jnp.asarray(imager.sensor.origin, dtype)
         local, lit = (imager, None) if window is None else subfield(imager, place, window)
         truth = random_scene(scene_key, grid, density=density, width=width)
         image = noisy(noise_key, electrons * forward(truth, local, grid, images), read_noise)

@@ -137,8 +137,11 @@ def _draw_layout(axes: Axes, design: Design) -> None:
     discs = [Circle(center, radius) for center in design.array.centers_mm]
     axes.add_collection(PatchCollection(discs, facecolor="C0", alpha=0.35, edgecolor="C0", linewidth=0.5))
     sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
-    for size, color, name in ((design.array.size_mm, "k", "plate"), (sensor, "C3", "sensor")):
-        corner = (-size[0] / 2, -size[1] / 2)
+    for size, middle, color, name in (
+        (design.array.size_mm, (0.0, 0.0), "k", "plate"),
+        (sensor, design.sensor.origin_mm or (0.0, 0.0), "C3", "sensor"),
+    ):
+        corner = (middle[0] - size[0] / 2, middle[1] - size[1] / 2)
         axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=color, label=name))
     reach = 0.55 * max(*design.array.size_mm, *sensor)
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel="x, mm", ylabel="y, mm")

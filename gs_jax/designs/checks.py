@@ -58,18 +58,29 @@ def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
 
 
 def _check_reach(design) -> None:
-    """Each lens has a sub-image on the sensor: the disc `v/z' field_radius` about its vertex, at the nearest depth."""
+    """Each lens has a sub-image on the sensor; on a region of a larger sensor one lens has."""
+    distance, radius = reach(design)
+    beyond = distance > radius
+    if beyond.all() or (beyond.any() and design.sensor.origin_mm is None):
+        index = int(np.argmax(beyond))
+        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
+        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
+
+
+def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
+    """How far beside the sensor each lens is, and how far its image of the field goes at the nearest depth, mm.
+
+    That image is the disc `v/z' field_radius` about its vertex.
+    """
     imaging, calibration = design.imaging, design.calibration
     angle = math.radians(calibration.rotation_deg)
     rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
-    distance = beside_sensor(centers, design.sensor.shape, design.sensor.pixel_pitch_um)
+    middle = np.array(design.sensor.origin_mm or (0.0, 0.0))
+    distance = beside_sensor(centers - middle, design.sensor.shape, design.sensor.pixel_pitch_um)
     plate = design.array.substrate_thickness_mm / design.lens.refractive_index
     radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
-    if (distance > radius).any():
-        index = int(np.argmax(distance > radius))
-        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
-        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
+    return distance, radius
 
 
 def beside_sensor(

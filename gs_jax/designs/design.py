@@ -52,7 +52,10 @@ Centers = Annotated[
 
 
 class SensorTable(Table):
-    """`[sensor]`: the camera."""
+    """`[sensor]`: the camera. With `origin_mm` it is a region of a larger one, whose centre is the frame's origin.
+
+    The key is the region's middle. Lenses need not reach a region, but one of them.
+    """
 
     pixel_pitch_um: float = Field(
         ge=1e-3,
@@ -61,6 +64,9 @@ class SensorTable(Table):
         description="a number of micrometres from 1e-3 to 1e4",
     )
     shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
+    origin_mm: Point | None = Field(
+        default=None, title="middle of a region of a larger sensor, whose centre stays the frame's origin"
+    )
 
 
 class LensTable(Table):
@@ -188,7 +194,7 @@ class Design(Table):
         )
         return Imager(
             array,
-            Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000),
+            Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
             sensor_distance=imaging.sensor_distance_mm,
             field_radius=imaging.field_radius_mm,
             wavelength=imaging.wavelength_nm * 1e-6,

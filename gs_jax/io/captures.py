@@ -1,4 +1,4 @@
-"""Captures on disk: 2-D greyscale TIFF, PNG or .npy of uint8, uint16 or float32.
+"""Captures on disk: greyscale TIFF, PNG or .npy of uint8, uint16 or float32, or a page or a colour of one.
 
 Their size and type are checked on the file's own declaration, before a pixel is decoded. To add a format, add its
 suffix to `_FORMATS` with a function that reads it and one that writes it.
@@ -8,7 +8,7 @@ import contextlib
 import json
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -21,17 +21,36 @@ from PIL.PngImagePlugin import PngInfo
 from ..base.errors import InputError, short_repr
 from .disk import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance, write_sidecar
-from .tiff import decode_page
+from .readout import CHANNELS, channel_of, sites
+from .tiff import declared_mosaic, decode_plane, decode_png, page_count
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
 
 MAX_PIXELS = 10**9
-_DTYPES = ("uint8", "uint16", "float32")
-_COLOURS = {2: "colour (RGB)", 3: "a colour palette", 4: "grey with transparency", 6: "colour with transparency"}
-_PHOTOMETRIC = {0: "grey with 0 as white", 2: "colour (RGB)", 3: "a colour palette", 32803: "a colour filter mosaic"}
+DTYPES = ("uint8", "uint16", "float32")
+_RGB, _MOSAIC = "colour (RGB)", 32803
+_COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
+_PHOTOMETRIC = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
 
 
-def read_capture(path: str | os.PathLike[str], shape: tuple[int, int] | None = None) -> Capture:
+class _Wanted(NamedTuple):
+    """What of a file is asked for: as `read_capture`, and types of pixels."""
+
+    shape: tuple[int, ...] | None
+    page: int | str | None
+    channel: str | None
+    bayer: str | None
+    dtypes: tuple[str, ...]
+
+
+def read_capture(
+    path: str | os.PathLike[str],
+    shape: tuple[int, int] | None = None,
+    *,
+    page: int | str | None = None,
+    channel: str | None = None,
+    bayer: str | None = None,
+) -> Capture:
     """A capture `(row, column)` in the file's own type: uint8, uint16 or float32.
 
     Parameters
@@ -39,24 +58,66 @@ def read_capture(path: str | os.PathLike[str], shape: tuple[int, int] | None = N
     path
         A `.tif`, `.tiff`, `.png` or `.npy` file.
     shape
-        `(rows, columns)` that the image must have: the sensor's.
+        `(rows, columns)` that the image in the file must have: the sensor's.
+    page
+        Of a file of several, which count from 1 in the file's order; or "mean", of all, float32.
+    channel
+        "red", "green" or "blue" of a colour image, or of the mosaic that `bayer` says it is.
+    bayer
+        Colours of the first pixels of a mosaic, row by row, such as "RGGB"; the capture is then of its cells of 2 x 2
+        pixels, as `gs_jax.io.readout.Readout` says, and its pixels are where `Readout.sensor` says.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is none of these, is damaged, in colour, multi-page, of another size than
-        `shape` or over 1e9 pixels, of another type, or holds a NaN or an infinity.
+        If the file cannot be read, is none of these, is damaged, of another size than `shape` or over 1e9 pixels, of
+        another type, holds a NaN or an infinity, or is in colour or has several pages and it is not said which to take.
+    """
+    image = averaged(frames(path, shape, page=page, channel=channel, bayer=bayer))
+    return channel_of(image, bayer, channel) if bayer else image
+
+
+def averaged(images: Iterator[Shaped[np.ndarray, "row column"]]) -> Shaped[np.ndarray, "row column"]:
+    """The mean of images, float32; a single one as it is."""
+    total, count = next(images), 1
+    for image in images:
+        total, count = np.add(total, image, dtype=np.float64), count + 1
+    return total if count == 1 else (total / count).astype(np.float32)
+
+
+def frames(
+    path: str | os.PathLike[str],
+    shape: tuple[int, int] | None = None,
+    *,
+    page: int | str | None = None,
+    channel: str | None = None,
+    bayer: str | None = None,
+    dtypes: tuple[str, ...] = DTYPES,
+) -> Iterator[Shaped[np.ndarray, "row column"]]:
+    """The pages of a capture that `page` names, one after the other; of a mosaic, all of its pixels.
+
+    Parameters and errors are those of `read_capture`.
     """
     path = check_input(path)
     form = _FORMATS.get(path.suffix.lower())
     if form is None:
         raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(CAPTURE_SUFFIXES)}.")
-    pixels = form.read(path, shape)
-    pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
-    if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
-        row, column = np.argwhere(~np.isfinite(pixels))[0].tolist()
-        raise InputError(f"{path}: found {pixels[row, column]} at pixel ({row}, {column}), allowed: finite numbers.")
-    return pixels
+    if bayer:
+        sites(bayer, channel)
+    wanted = _Wanted(shape and tuple(shape), page, channel, bayer, dtypes)
+    size = None
+    for pixels in form.read(path, wanted):
+        size = size or pixels.shape
+        if pixels.shape != size:
+            found = " and ".join(" x ".join(map(str, each)) for each in (size, pixels.shape))
+            raise InputError(f"{path}: found pages of {found} pixels for --page mean, allowed: all of one size.")
+        pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
+        if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
+            row, column = np.argwhere(~np.isfinite(pixels))[0].tolist()
+            raise InputError(
+                f"{path}: found {pixels[row, column]} at pixel ({row}, {column}), allowed: finite numbers."
+            )
+        yield pixels
 
 
 def write_capture(
@@ -80,8 +141,8 @@ def write_capture(
     """
     path = check_output(path, CAPTURE_SUFFIXES)
     pixels = np.asarray(image)
-    if pixels.dtype.name not in _DTYPES:
-        raise ValueError(f"`image` must be one of {', '.join(_DTYPES)}, got {pixels.dtype.name}.")
+    if pixels.dtype.name not in DTYPES:
+        raise ValueError(f"`image` must be one of {', '.join(DTYPES)}, got {pixels.dtype.name}.")
     form = _FORMATS[path.suffix.lower()]
     if pixels.dtype.name not in form.dtypes:
         allowed = f"{', '.join(form.dtypes)} in {path.suffix}; use .tif or .npy"
@@ -92,61 +153,112 @@ def write_capture(
         write_sidecar(path, provenance)
 
 
-def _check_declared(path: Path, size: tuple[int, ...], dtype: str, shape: tuple[int, int] | None) -> None:
-    found = " x ".join(str(n) for n in size)
+def _check_declared(path: Path, size: tuple[int, ...], dtype: str, wanted: _Wanted) -> None:
+    found, shape = " x ".join(str(n) for n in size), wanted.shape
     if len(size) != 2 or min(size) < 1:
         raise InputError(f"{path}: found an image of {found or 'no'} pixels, allowed: 2-D greyscale, rows x columns.")
-    if shape is not None and size != tuple(shape):
-        allowed = f"{shape[0]} x {shape[1]}, the sensor of the design"
+    if shape is not None and size != shape:
+        allowed = f"{shape[0]} x {shape[1]}, the sensor of the design, or what --roi and --binning leave of it"
         raise InputError(f"{path}: found {found} pixels (rows x columns), allowed: {allowed}.")
     if size[0] * size[1] > MAX_PIXELS:
         raise InputError(f"{path}: found {found} pixels (rows x columns), allowed: at most {MAX_PIXELS} in all.")
-    if dtype not in _DTYPES:
+    if dtype not in wanted.dtypes:
         advice = "convert it without rescaling, e.g. in Fiji by Image > Type > 32-bit"
-        raise InputError(f"{path}: found pixels of type {dtype}, allowed: {', '.join(_DTYPES)}; {advice}.")
+        raise InputError(f"{path}: found pixels of type {dtype}, allowed: {', '.join(wanted.dtypes)}; {advice}.")
 
 
-def _read_tiff(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
+def _pages(path: Path, count: int, page: int | str | None) -> range:
+    """The pages to read, counted from 0."""
+    if page == "mean":
+        return range(count)
+    if page is None and count == 1:
+        return range(1)
+    if page is None:
+        choice = f"choose by --page 1 to {count}, or average repeated frames by --page mean"
+        raise InputError(f"{path}: found {count} pages, allowed: one; {choice}.")
+    if not isinstance(page, int) or not 1 <= page <= count:
+        raise InputError(f"{path}: found --page {page} for {count} pages, allowed: 1 to {count}, or mean.")
+    return range(page - 1, page)
+
+
+def _check_colour(path: Path, colour: str | None, wanted: _Wanted) -> None:
+    """`colour` is what the file says of itself, None if it is grey."""
+    if colour and colour != _RGB:
+        raise InputError(f"{path}: found {colour}, allowed: greyscale, one sample a pixel, 0 as black.")
+    if colour and wanted.bayer:
+        raise InputError(f"{path}: found colour for --bayer {wanted.bayer}, allowed: a grey image of the mosaic.")
+    if colour and not wanted.channel:
+        raise InputError(f"{path}: found {colour}, allowed: greyscale, or --channel {', '.join(CHANNELS)} of it.")
+    if not colour and wanted.channel and not wanted.bayer:
+        allowed = "colour, or --bayer with it for a mosaic"
+        raise InputError(f"{path}: found greyscale for --channel {wanted.channel}, allowed: {allowed}.")
+    if wanted.channel and wanted.channel not in CHANNELS:
+        raise InputError(f"{path}: found --channel {wanted.channel}, allowed: {', '.join(CHANNELS)}.")
+
+
+def _taken(pixels: np.ndarray, wanted: _Wanted, colours_first: bool = False) -> np.ndarray:
+    """The image that is wanted of what a page holds."""
+    if pixels.ndim == 2:
+        return pixels
+    return np.moveaxis(pixels, 0 if colours_first else -1, 0)[CHANNELS.index(wanted.channel or "")]
+
+
+def _read_tiff(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
     with contextlib.ExitStack() as stack:
         with decoding(path, "TIFF"):
             # Without OME: a set of files is not a capture, and no other file is to be opened.
             tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
-            page = tiff.pages.first
-            planes = max(len(tiff.pages), tiff.series[0].size // max(page.size, 1))
-            photometric, samples = int(page.photometric), page.samplesperpixel
-            size, dtype = tuple(page.shape), str(page.dtype)
-        if planes != 1:
-            raise InputError(f"{path}: found {planes} pages, allowed: one; save the one wanted as its own file.")
-        if photometric != 1 or samples != 1:
-            found = _PHOTOMETRIC.get(photometric, f"{samples} samples a pixel, photometric {photometric}")
-            raise InputError(f"{path}: found {found}, allowed: greyscale, one sample a pixel, 0 as black.")
-        _check_declared(path, size, dtype, shape)
-        return decode_page(path, page)
+            count = page_count(tiff)
+        for index in _pages(path, count, wanted.page):
+            with decoding(path, "TIFF"):
+                page = tiff.pages[min(index, len(tiff.pages) - 1)].aspage()
+                photometric, samples = int(page.photometric), page.samplesperpixel
+                size, dtype = tuple(page.shape), str(page.dtype)
+                planar, declared = int(page.planarconfig) == 2, declared_mosaic(page)
+            colour = _PHOTOMETRIC.get(photometric, f"{samples} samples a pixel, photometric {photometric}")
+            if photometric == 2 and samples >= 3 and len(size) == 3:
+                size = size[1:] if planar else size[:2]
+            elif samples != 1:
+                colour = f"{samples} samples a pixel, photometric {photometric}"
+            _check_mosaic(path, declared, wanted) if photometric == _MOSAIC else _check_colour(path, colour, wanted)
+            _check_declared(path, size, dtype, wanted)
+            yield _taken(decode_plane(path, tiff, index), wanted, planar)
 
 
-def _read_png(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
+def _check_mosaic(path: Path, declared: str | None, wanted: _Wanted) -> None:
+    if not wanted.bayer:
+        allowed = f"greyscale, or --bayer {declared or 'RGGB (or another)'} with --channel {', '.join(CHANNELS)}"
+        raise InputError(f"{path}: found a colour filter mosaic, allowed: {allowed}.")
+    if declared and declared != wanted.bayer:
+        raise InputError(f"{path}: found --bayer {wanted.bayer}, allowed: {declared}, as the file says.")
+
+
+def _read_png(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
     with path.open("rb") as file:
         header = file.read(26)
     if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
         raise InputError(f"{path}: not a whole and valid PNG: found another beginning.")
     columns, rows, bits, colour = struct.unpack(">IIBB", header[16:])
-    if colour != 0:
-        raise InputError(f"{path}: found {_COLOURS.get(colour, 'an unknown type of pixels')}, allowed: greyscale.")
+    _check_colour(path, _COLOURS.get(colour, "an unknown type of pixels"), wanted)
     dtype = {8: "uint8", 16: "uint16"}.get(bits, f"{bits}-bit")
-    _check_declared(path, (rows, columns), dtype, shape)
+    _check_declared(path, (rows, columns), dtype, wanted)
     with decoding(path, "PNG"), Image.open(path, formats=["PNG"]) as image:
-        frames = getattr(image, "n_frames", 1)
-        pixels = np.array(image)
-    if frames != 1:
-        raise InputError(f"{path}: found {frames} pages, allowed: one.")
-    return pixels.astype(dtype)
+        count = getattr(image, "n_frames", 1)
+        pixels = decode_png(path, image, bits)
+    if count != 1:
+        raise InputError(f"{path}: found {count} pages, allowed: one in a PNG.")
+    _pages(path, 1, wanted.page)
+    yield _taken(pixels.astype(dtype), wanted)
 
 
-def _read_npy(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
+def _read_npy(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
     with decoding(path, ".npy of numbers"):
         pixels = np.lib.format.open_memmap(path, mode="r")
-    _check_declared(path, pixels.shape, pixels.dtype.name, shape)
-    return np.array(pixels)
+    pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
+    _check_colour(path, None, wanted)
+    for index in _pages(path, len(pages), wanted.page):
+        _check_declared(path, pages[index].shape, pixels.dtype.name, wanted)
+        yield _taken(np.array(pages[index]), wanted)
 
 
 def _write_tiff(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
@@ -165,11 +277,11 @@ def _write_npy(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None
 
 
 class _Format(NamedTuple):
-    """How files of one suffix are read, given the size that they must have, and written, and what they can hold."""
+    """How files of one suffix are read, page by page, and written, and what they can hold."""
 
-    read: Callable[[Path, tuple[int, int] | None], np.ndarray]
+    read: Callable[[Path, _Wanted], Iterator[np.ndarray]]
     write: Callable[[BinaryIO, np.ndarray, Provenance | None], None]
-    dtypes: tuple[str, ...] = _DTYPES
+    dtypes: tuple[str, ...] = DTYPES
 
 
 _FORMATS = {

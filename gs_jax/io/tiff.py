@@ -1,16 +1,60 @@
-"""TIFF: one page decoded or refused in words, and a second description of a file."""
+"""TIFF and PNG: pages decoded or refused in words, and a second description of a file."""
 
+import contextlib
 import math
 from pathlib import Path
 
 import numpy as np
 import tifffile
+from PIL import Image, ImageFile
 
 from ..base.errors import InputError
 from .disk import decoding
 
 # TIFF's number of a description, and of the tag after it, whose place a second one takes.
 _DESCRIPTION, _AFTER = 270, 271
+# Of TIFF/EP: the colours of a mosaic's cell, 2 x 2 of them, and how they are numbered.
+_CELL, _PATTERN, _COLOURS = 33421, 33422, "RGB"
+
+
+def page_count(tiff: tifffile.TiffFile) -> int:
+    """Pages of a file: those of its list, or of a stack that has one entry for all, as ImageJ writes large ones."""
+    first = tiff.pages.first
+    return max(len(tiff.pages), tiff.series[0].size // max(first.size, 1))
+
+
+def declared_mosaic(page: tifffile.TiffPage) -> str | None:
+    """The colours of a mosaic's first pixels, as `Readout.bayer`, if the file says them."""
+    cell, pattern = (page.tags.get(code) for code in (_CELL, _PATTERN))
+    if cell is None or pattern is None or tuple(cell.value) != (2, 2):
+        return None
+    return "".join(_COLOURS[number] for number in bytes(pattern.value))
+
+
+def decode_plane(path: Path, tiff: tifffile.TiffFile, index: int) -> np.ndarray:
+    """The pixels of a page, counted from 0, of those of `page_count`; its declared size has been checked."""
+    if index < len(tiff.pages):
+        return decode_page(path, tiff.pages[index].aspage())
+    first = tiff.pages.first
+    _check_segments(path, first)
+    with decoding(path, "TIFF"):
+        kind = np.dtype(first.dtype).newbyteorder(tiff.byteorder)
+        return np.array(np.memmap(path, kind, "r", first.dataoffsets[0] + index * first.nbytes, first.shape))
+
+
+def decode_png(path: Path, image: ImageFile.ImageFile, bits: int) -> np.ndarray:
+    """The pixels of a PNG `(row, column)`, or `(row, column, colour)`, of 8 or 16 bits.
+
+    Pillow keeps 8 of 16 bits in colour: it is asked twice, for either half.
+    """
+    if bits != 16 or len(image.getbands()) == 1:
+        return np.array(image)
+    (tile,), halves = image.tile, []
+    for order in "BL":
+        with Image.open(path, formats=["PNG"]) as half:
+            half.tile = [tile._replace(args=f"{half.mode};16{order}")]
+            halves.append(np.array(half).astype(np.uint16))
+    return halves[0] << 8 | halves[1]
 
 
 def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
@@ -30,8 +74,21 @@ def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
         if "imagecodecs" not in str(error):
             raise
         found = getattr(page.compression, "name", page.compression)
+        if (pixels := _by_pillow(path, page)) is not None:
+            return pixels
         advice = "save it uncompressed or with Deflate (ZIP), or `pip install imagecodecs`"
-        raise InputError(f"{path}: found {found} compression, whose decoder is not installed; {advice}.") from error
+        found = f"{found} compression" if page.bitspersample % 8 == 0 else f"packed pixels of {page.bitspersample} bits"
+        raise InputError(f"{path}: found {found}, whose decoder is not installed; {advice}.") from error
+
+
+def _by_pillow(path: Path, page: tifffile.TiffPage) -> np.ndarray | None:
+    """The pixels as Pillow and its libtiff read them (LZW, packed 12 bits), unless it changes their type."""
+    with contextlib.suppress(InputError), decoding(path, "TIFF"), Image.open(path, formats=["TIFF"]) as image:
+        image.seek(page.index)
+        pixels = np.array(image)
+        if pixels.shape == page.shape and pixels.dtype.newbyteorder("=") == page.dtype:
+            return pixels
+    return None
 
 
 def _check_segments(path: Path, page: tifffile.TiffPage) -> None:

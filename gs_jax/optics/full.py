@@ -148,7 +148,7 @@ def _tables(wanted):
 
 def halo_nodes(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> HaloGrid:
     """The halo's nodes for a range of depths and an object's extent, mm; by default the sensor's."""
-    extent = extent or max(imager.sensor.shape) * imager.sensor.pixel_pitch
+    extent = extent or 2 * max(map(abs, imager.sensor.extent))
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
     return halo_grid(imager, depths, math.sqrt(2) * farthest)
 

@@ -18,7 +18,7 @@ def with_margin(imager: Imager, size: int) -> Imager:
     that land there share their light with the next.
     """
     rows, columns = imager.sensor.shape
-    wide = Sensor((rows + size + 1, columns + size + 1), imager.sensor.pixel_pitch)
+    wide = Sensor((rows + size + 1, columns + size + 1), imager.sensor.pixel_pitch, imager.sensor.origin)
     return eqx.tree_at(lambda i: i.sensor, imager, wide)
 
 

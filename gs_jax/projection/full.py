@@ -39,11 +39,11 @@ def full_image(
 def halved(imager: Imager) -> Imager:
     """The imager with pixels twice as large: the first covers the first two each way, the last of an odd number one."""
     sensor = imager.sensor
-    large = Sensor([-(-n // 2) for n in sensor.shape], 2 * sensor.pixel_pitch)
     # A pixel too many moves the middle.
-    moved = [(2 * a - n) * sensor.pixel_pitch / 2 for n, a in zip(sensor.shape, large.shape, strict=True)][::-1]
-    moved = jnp.asarray(moved, imager.shift.dtype)
-    return eqx.tree_at(lambda i: (i.sensor, i.shift), imager, (large, imager.shift - moved))
+    columns, rows = (n % 2 * sensor.pixel_pitch / 2 for n in sensor.shape[::-1])
+    middle = sensor.origin[0] + columns, sensor.origin[1] + rows
+    large = Sensor([-(-n // 2) for n in sensor.shape], 2 * sensor.pixel_pitch, middle)
+    return eqx.tree_at(lambda i: i.sensor, imager, large)
 
 
 def _cores_image(volume, imager, grid, optics):
@@ -116,7 +116,7 @@ def halo_image(
         half_turn = (jnp.arange(halo.angles // 2 + 1) % 2 == 1)[None, :, None]
         polar = jnp.fft.irfft(jnp.where(half_turn, -spots, spots), halo.angles, axis=1).reshape(-1, len(centers))
         spots = apply(spread, polar).T.reshape(-1, outer, outer)
-        start, fraction = _place(centers, jnp.zeros(2, dtype), pixel, image.shape, outer)
+        start, fraction = _place(centers, jnp.asarray(imager.sensor.origin, dtype), pixel, image.shape, outer)
         return _add_windows(image, spots, start, fraction), None
 
     # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.

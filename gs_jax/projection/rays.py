@@ -91,13 +91,14 @@ def trace(
     reach = field_limit(imager.field_radius) if limit is None else limit
     x, y = imager.centers[order].T
 
-    def axis(center, origin, voxels, pixels):
+    def axis(center, origin, voxels, pixels, middle):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
         first = jnp.ceil((center - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
         index = (start[:, None] + jnp.arange(size, dtype=jnp.int32)[None, :]).astype(center.dtype) - (voxels - 1) / 2
+        from_grid, center = center - origin, center - middle
         pixel, fraction, offset = _project(
-            center, center - origin, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
+            center, from_grid, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
@@ -106,8 +107,8 @@ def trace(
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
     return Rays(
-        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0]),
-        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1]),
+        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1]),
+        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0]),
         spacing=jax.lax.stop_gradient(
             jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
         ),
@@ -118,8 +119,8 @@ def trace(
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
     """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the axis.
 
-    `from_origin` is the lens's centre as seen from the grid's origin; voxels are counted from there. `magnification` is
-    `(lens, depth)`.
+    `center` is the lens's as seen from the middle of the sensor's pixels, `from_origin` as seen from the grid's origin,
+    where voxels are counted from. `magnification` is `(lens, depth)`.
     """
     # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
     # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.

@@ -36,9 +36,10 @@ def subfield(
     sensor = imager.sensor
     # Where the first pixel comes to lie on the whole sensor.
     whole = jnp.array(sensor.shape, place.dtype)
-    middle = place[::-1] / sensor.pixel_pitch + (whole - jnp.array(shape, place.dtype)) / 2
+    origin = jnp.array(sensor.origin, place.dtype)
+    middle = (place - origin)[::-1] / sensor.pixel_pitch + (whole - jnp.array(shape, place.dtype)) / 2
     corner = lax.stop_gradient(jnp.round(middle))
-    moved = (corner - (whole - jnp.array(shape, place.dtype)) / 2)[::-1] * sensor.pixel_pitch
+    moved = origin + (corner - (whole - jnp.array(shape, place.dtype)) / 2)[::-1] * sensor.pixel_pitch
     rows, columns = (
         (first + jnp.arange(size) >= 0) & (first + jnp.arange(size) < total)
         for first, size, total in zip(corner.astype(int), shape, sensor.shape, strict=True)

@@ -227,7 +227,8 @@ def _binned(light, imager, grid):
     side = max((n for n in range(1, math.ceil(wanted) + 1) if fits(n)), default=1)
     rows, columns = (n // side for n in sensor.shape)
     light = light.reshape(rows, side, columns, side).sum((1, 3))
-    return light, eqx.tree_at(lambda i: i.sensor, imager, Sensor((rows, columns), side * sensor.pixel_pitch))
+    coarse = Sensor((rows, columns), side * sensor.pixel_pitch, sensor.origin)
+    return light, eqx.tree_at(lambda i: i.sensor, imager, coarse)
 
 
 def _back_projected(image, imager, grid, method, progress):

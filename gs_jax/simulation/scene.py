@@ -165,7 +165,7 @@ def simulate_points(
     depths = np.unique(points[:, 2])
     if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
         depths = np.linspace(near, far, count)
-    sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS)
+    sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
     # Each point between two depths of its slab, the last of which is the first of the next slab.
     between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))

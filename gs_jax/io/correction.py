@@ -1,0 +1,227 @@
+"""Captures corrected for their camera: the one way from a file to light, of every command that reads captures."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Num
+
+from ..base.errors import InputError, errors_name_file
+from ..geometry import Sensor
+from .bad_pixels import hot_in_capture, hot_in_dark, repaired
+from .captures import DTYPES, averaged, frames
+from .readout import Readout, channel_of
+
+# A pixel with less than this share of the flat field's median has no light to speak of.
+_LEAST_GAIN = 0.05
+# Binned more than so, pixels hold whole spots of a well corrected lens.
+_SHARP = 2
+# Full scale of converters of these bits, as such or in the upper bits of 16.
+_BITS = (8, 10, 12, 14, 16)
+# So many pixels at the maximum, and more than twice those of the hundredth or the few counts below it, were cut off.
+_PILE, _FEW_COUNTS, _LEVELS = 10, 5, 32
+MASK_DTYPES = (*DTYPES, "bool")
+# So much of a mask may be bad: more is one that marks what is good.
+_MOST_BAD = 0.5
+
+
+class Correction(NamedTuple):
+    """What is known of a camera.
+
+    Parameters
+    ----------
+    dark
+        A file of the same exposure without light, taken off; its pages are averaged, its hot pixels are bad.
+    flat
+        A file of the sensor evenly lit, without the array, divided out; its pages are averaged, and what is off the
+        dark frame or the offset is off it, too. Pixels with less than 5 % of its median are bad.
+    bad_pixels
+        A file in which every pixel but 0 is bad; "auto" finds single hot pixels in a capture for which there is no dark
+        frame, and whose pixels have their neighbours beside them (no mosaic, binned by 2 at most); "none"
+        repairs none but those of `dark` and `flat`.
+    offset
+        Counts of a pixel without light, where there is no dark frame.
+    """
+
+    dark: Path | None = None
+    flat: Path | None = None
+    bad_pixels: Path | str = "auto"
+    offset: float = 0.0
+
+
+class Corrected(NamedTuple):
+    """A capture, what was done to it, a line each, and what is to be said of it."""
+
+    image: Num[np.ndarray, "row column"]
+    done: list[str]
+    warnings: list[str]
+
+
+def read_corrected(
+    path: str | os.PathLike[str],
+    sensor: Sensor | None = None,
+    *,
+    page: int | str | None = None,
+    readout: Readout = Readout(),
+    correction: Correction = Correction(),
+) -> Corrected:
+    """A capture of a part of a sensor, corrected: an image for `readout.sensor(sensor)`.
+
+    Where nothing is to be done it has the file's own type, otherwise float32. Dark frame, flat field and mask are read
+    as the capture is: the same region, binning and channel.
+
+    Parameters
+    ----------
+    path
+        As for `read_capture`.
+    sensor
+        The whole, of the design. None: captures of any size, and no region.
+    page
+        As for `read_capture`, of the capture alone.
+    readout, correction
+        How the camera delivered all files, and what is known of it.
+
+    Raises
+    ------
+    InputError
+        As `read_capture` and `Readout`, for each of the files under its own name; if there are both a dark frame and an
+        offset, the flat field is dark, or more than half of the pixels are masked.
+
+    Examples
+    --------
+    >>> image, done, warnings = read_corrected("a.tif", scope.sensor, correction=Correction(dark=Path("dark.tif")))
+    """
+    if correction.dark and correction.offset:
+        raise InputError(
+            f"--offset: found --dark {correction.dark}, allowed: one of them; the dark frame has the offset."
+        )
+    shape = readout.region(sensor).shape if sensor else None
+    image, done, warnings = _read(path, shape, page, readout)
+    done += readout.words()
+    light, bad, counted = image, np.zeros(image.shape, bool), []
+    dark, gain = correction.offset, None
+    if correction.dark:
+        dark, said = _read_like(correction.dark, image, shape, readout)
+        warnings += said
+        bad |= _counted(hot_in_dark(dark), f"hot in {correction.dark.name}", counted)
+        done.append(f"dark frame {correction.dark.name} taken off, median {np.median(dark):g}")
+    elif correction.offset:
+        done.append(f"offset {correction.offset:g} taken off")
+    if correction.flat:
+        flat, said = _read_like(correction.flat, image, shape, readout)
+        warnings += said
+        with errors_name_file(correction.flat):
+            gain, unlit = gain_of(flat, dark)
+        bad |= _counted(unlit, f"unlit in {correction.flat.name}", counted)
+        done.append(f"flat field {correction.flat.name} divided out, {gain.min():.3g} to {gain.max():.3g}")
+    if isinstance(correction.bad_pixels, Path):
+        where = f"in {correction.bad_pixels.name}"
+        bad |= _counted(_mask(correction.bad_pixels, image, shape, readout), where, counted)
+    elif correction.bad_pixels == "auto" and not (correction.dark or readout.bayer) and readout.binning <= _SHARP:
+        bad |= _counted(hot_in_capture(image), "hot in the capture", counted)
+    if correction.dark or correction.offset or gain is not None:
+        light = correct(image, dark, gain)
+    if bad.any():
+        light = repaired(light, bad)
+        count = int(bad.sum())
+        done.append(f"{count} bad pixel{'s' * (count > 1)} filled from neighbours: {', '.join(counted)}")
+    return Corrected(light, done, warnings)
+
+
+def correct(
+    image: Num[np.ndarray, "row column"],
+    dark: Num[np.ndarray, "row column"] | float = 0.0,
+    gain: Float[np.ndarray, "row column"] | None = None,
+) -> Float32[np.ndarray, "row column"]:
+    """`(image - dark) / gain`: light, where a camera says `gain * light + dark`."""
+    light = np.asarray(image, np.float32) - np.asarray(dark, np.float32)
+    return light if gain is None else light / np.asarray(gain, np.float32)
+
+
+def gain_of(
+    flat: Num[np.ndarray, "row column"], dark: Num[np.ndarray, "row column"] | float = 0.0
+) -> tuple[Float32[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
+    """What each pixel makes of even light, 1 in the mean, and which pixels are too dark to say; these have 1.
+
+    Raises
+    ------
+    InputError
+        If the flat field's median is no brighter than the dark.
+    """
+    light = correct(flat, dark)
+    middle = float(np.median(light))
+    if not middle > 0:
+        raise InputError(f"found a median of {middle:g} above the dark, allowed: a flat field of even light.")
+    unlit = light < _LEAST_GAIN * middle
+    return np.where(unlit, 1, light / light[~unlit].mean(dtype=np.float64)).astype(np.float32), unlit
+
+
+def saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:
+    """How many pixels were cut off, and the value at which; None if none were, or the type is no camera's.
+
+    That is the brightest value, if it is the full scale of 8 to 16 bits, or if many more pixels have it than what is
+    just below.
+    """
+    if image.dtype.kind != "u":
+        return None
+    found = np.bincount(image.ravel())
+    top, levels = len(found) - 1, np.count_nonzero(found)
+    count = int(found[top])
+    full = {2**bits - 1 for bits in _BITS} | {2**16 - 2 ** (16 - bits) for bits in _BITS}
+    # Rounded noise piles up as well, within a few counts; a drawing has few values.
+    below = int(found[max(top - max(top // 100, _FEW_COUNTS), 0) : top].sum())
+    piled = count >= max(_PILE, 2 * below + 1) and levels >= _LEVELS
+    return (count, top) if piled or (top in full and count > 1) else None
+
+
+def _read(path, shape, page, readout) -> tuple[np.ndarray, list[str], list[str]]:
+    """An image, or the mean of several; what was done; and what is to be said of it."""
+    cut: list[tuple[int, int] | None] = []
+    size = 0
+
+    def looked_at():
+        nonlocal size
+        for frame in frames(path, shape, page=page, channel=readout.channel, bayer=readout.bayer):
+            size = frame.size
+            cut.append(saturated(frame))
+            yield frame
+
+    image = averaged(looked_at())
+    image = channel_of(image, readout.bayer, readout.channel) if readout.bayer else image
+    done = [f"mean of {len(cut)} pages"] if len(cut) > 1 else []
+    found = [each for each in cut if each]
+    if not found:
+        return image, done, []
+    count, value = sum(count for count, _ in found), max(value for _, value in found)
+    share = f"{count} pixels ({count / (len(cut) * size):.2g} of all) at {value}"
+    return image, done, [f"{path}: found {share}, where the camera cuts off: how much light they saw is unknown"]
+
+
+def _read_like(path, image, shape, readout) -> tuple[np.ndarray, list[str]]:
+    """A file as the capture is read, and what is to be said of it."""
+    found, _, warnings = _read(path, shape, "mean", readout)
+    _check_like(path, found, image)
+    return found, warnings
+
+
+def _check_like(path, found, image):
+    if found.shape != image.shape:
+        size, allowed = (" x ".join(map(str, each.shape)) for each in (found, image))
+        raise InputError(f"{path}: found {size} pixels (rows x columns), allowed: {allowed}, as the capture has.")
+
+
+def _mask(path, image, shape, readout) -> Bool[np.ndarray, "row column"]:
+    found = averaged(frames(path, shape, channel=readout.channel, bayer=readout.bayer, dtypes=MASK_DTYPES))
+    bad = (channel_of(found, readout.bayer, readout.channel) if readout.bayer else found) != 0
+    _check_like(path, bad, image)
+    if bad.mean() > _MOST_BAD:
+        raise InputError(f"{path}: found {bad.mean():.0%} of the pixels marked as bad, allowed: up to half; 0 is good.")
+    return bad
+
+
+def _counted(bad, where, counted):
+    """Bad pixels, whose number is added to a list, with where they were found."""
+    if count := int(bad.sum()):
+        counted.append(f"{count} {where}")
+    return bad

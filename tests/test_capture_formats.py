@@ -1,0 +1,169 @@
+"""Captures as cameras and their programs deliver them, and what is said of those that need a choice."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from gs_jax import read_capture
+from gs_jax.base.errors import InputError
+
+RNG = np.random.default_rng(0)
+GREY = RNG.integers(0, 65536, (37, 41)).astype(np.uint16)
+STACK = RNG.integers(0, 4096, (5, 37, 41)).astype(np.uint16)
+COLOUR = RNG.integers(0, 65536, (37, 41, 3)).astype(np.uint16)
+# How grey images of any type are saved.
+GREYS = {
+    "plain": dict(photometric="minisblack"),
+    "big-endian": dict(byteorder=">"),
+    "tiles": dict(tile=(16, 16), compression="zlib"),
+    "deflate": dict(compression="zlib"),
+    "ome": dict(ome=True),
+    "imagej": dict(imagej=True),
+}
+# How several pages are.
+STACKS = {
+    "pages.tif": dict(photometric="minisblack"),
+    "imagej.tif": dict(imagej=True),
+    "one_entry.tif": dict(imagej=True, truncate=True),
+    "deflate.tif": dict(photometric="minisblack", compression="zlib", rowsperstrip=5),
+    "channels.ome.tif": dict(photometric="minisblack", metadata={"axes": "CYX"}),
+}
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("name", GREYS)
+def test_grey_tiff(tmp_path, name, dtype):
+    pixels = (GREY >> 8).astype(dtype)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, **GREYS[name])
+    found = read_capture(tmp_path / "a.tif", (37, 41))
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, pixels)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("differences", [False, True])
+def test_lzw(tmp_path, dtype, differences):
+    """Which tifffile alone does not read; with differences of neighbours (of floats, of their bytes) and without."""
+    pixels = (GREY >> 8).astype(dtype)
+    predictor = {317: 3 if dtype == "float32" else 2} if differences else {}
+    Image.fromarray(pixels).save(tmp_path / "a.tif", compression="tiff_lzw", tiffinfo=predictor)
+    found = read_capture(tmp_path / "a.tif")
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, pixels)
+
+
+def packed(pixels, bits):
+    """A TIFF of one strip whose pixels lie bit to bit, rows from a whole byte on."""
+    kept = np.unpackbits(pixels.astype(">u2").view(np.uint8)).reshape(*pixels.shape, 16)[..., -bits:]
+    data = np.packbits(kept.reshape(len(pixels), -1), axis=1).tobytes()
+    rows, columns = pixels.shape
+    tags = {256: columns, 257: rows, 258: bits, 259: 1, 262: 1, 273: 0, 277: 1, 278: rows, 279: len(data)}
+    tags[273] = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4) + data
+
+
+@pytest.mark.parametrize("columns", [40, 41])
+def test_packed_12_bits(tmp_path, columns):
+    pixels = GREY[:, :columns] >> 4
+    (tmp_path / "a.tif").write_bytes(packed(pixels, 12))
+    np.testing.assert_array_equal(read_capture(tmp_path / "a.tif"), pixels)
+
+
+@pytest.mark.parametrize("name", [*STACKS, "lzw.tif", "stack.npy"])
+def test_a_page_is_chosen(tmp_path, name):
+    path = tmp_path / name
+    if name in STACKS:
+        tifffile.imwrite(path, STACK, **STACKS[name])
+    elif name == "lzw.tif":
+        first, *others = map(Image.fromarray, STACK)
+        first.save(path, compression="tiff_lzw", save_all=True, append_images=others)
+    else:
+        np.save(path, STACK)
+    for page in (1, 4, 5):
+        np.testing.assert_array_equal(read_capture(path, (37, 41), page=page), STACK[page - 1])
+    mean = read_capture(path, page="mean")
+    assert mean.dtype == np.float32
+    np.testing.assert_allclose(mean, STACK.mean(0), rtol=1e-6)
+    refused(path, ["5 pages", "--page 1 to 5", "mean"])
+    for page in (0, 6):
+        refused(path, [f"--page {page}", "5 pages", "1 to 5"], page=page)
+
+
+def test_pages_of_several_sizes(tmp_path):
+    """A preview beside the capture."""
+    tifffile.imwrite(tmp_path / "a.tif", GREY, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "a.tif", GREY[::4, ::4], photometric="minisblack", append=True, metadata=None)
+    np.testing.assert_array_equal(read_capture(tmp_path / "a.tif", (37, 41), page=1), GREY)
+    refused(tmp_path / "a.tif", ["10 x 11", "37 x 41"], page="mean", shape=(37, 41))
+    refused(tmp_path / "a.tif", ["10 x 11", "37 x 41"], page="mean")
+
+
+def png(pixels):
+    """A PNG of 16 bits a colour, which Pillow does not write."""
+    rows, columns, colours = pixels.shape
+    header = struct.pack(">IIBBBBB", columns, rows, 16, {3: 2, 4: 6}[colours], 0, 0, 0)
+    body = zlib.compress(b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels))
+    chunks = [(b"IHDR", header), (b"IDAT", body), (b"IEND", b"")]
+    whole = [
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(whole)
+
+
+@pytest.mark.parametrize(
+    "name", ["contig.tif", "separate.tif", "lzw8.tif", "16.png", "16alpha.png", "8.png", "8alpha.png"]
+)
+def test_a_colour_is_chosen(tmp_path, name):
+    path, pixels = tmp_path / name, COLOUR
+    if name.startswith(("8", "lzw")):
+        pixels = (COLOUR >> 8).astype(np.uint8)
+    with_alpha = np.dstack([pixels, pixels[..., :1]]) if "alpha" in name else pixels
+    if name.startswith("16"):
+        path.write_bytes(png(with_alpha))
+    elif name == "separate.tif":
+        tifffile.imwrite(path, np.moveaxis(pixels, -1, 0), photometric="rgb", planarconfig="separate")
+    elif name == "contig.tif":
+        tifffile.imwrite(path, pixels, photometric="rgb")
+    else:
+        Image.fromarray(with_alpha).save(path, **(dict(compression="tiff_lzw") if path.suffix == ".tif" else {}))
+    for number, channel in enumerate(("red", "green", "blue")):
+        found = read_capture(path, (37, 41), channel=channel)
+        assert found.dtype == pixels.dtype
+        np.testing.assert_array_equal(found, pixels[..., number])
+    refused(path, ["colour (RGB)", "--channel red, green, blue"])
+    refused(path, ["pink", "red, green, blue"], channel="pink")
+    refused(path, ["colour", "--bayer RGGB"], channel="red", bayer="RGGB")
+
+
+def test_a_mosaic_is_split(tmp_path):
+    np.save(tmp_path / "a.npy", GREY)
+    read = lambda channel: read_capture(tmp_path / "a.npy", (37, 41), bayer="GBRG", channel=channel)
+    np.testing.assert_array_equal(read("red"), GREY[1:36:2, 0:40:2])
+    np.testing.assert_array_equal(read("blue"), GREY[0:36:2, 1:40:2])
+    np.testing.assert_array_equal(read("green"), (GREY[0:36:2, 0:40:2] + GREY[1:36:2, 1:40:2].astype(float)) / 2)
+    refused(tmp_path / "a.npy", ["greyscale for --channel red", "--bayer"], channel="red")
+
+
+@pytest.mark.parametrize("declares", [True, False])
+def test_a_declared_mosaic(tmp_path, declares):
+    tags = [(33421, 3, 2, (2, 2), True), (33422, 1, 4, bytes([0, 1, 1, 2]), True)] if declares else []
+    tifffile.imwrite(tmp_path / "a.tif", GREY, photometric=32803, extratags=tags)
+    refused(tmp_path / "a.tif", ["colour filter mosaic", "--bayer RGGB", "--channel"])
+    found = read_capture(tmp_path / "a.tif", bayer="RGGB", channel="blue")
+    np.testing.assert_array_equal(found, GREY[1:36:2, 1:40:2])
+    if declares:
+        refused(tmp_path / "a.tif", ["--bayer BGGR", "RGGB"], bayer="BGGR", channel="blue")
+
+
+def refused(path, words, shape=None, **options):
+    with pytest.raises(InputError) as caught:
+        read_capture(path, shape, **options)
+    message = str(caught.value)
+    assert message.isprintable() and len(message) < 400
+    for word in (path.name, *words):
+        assert word in message, f"{word!r} is not in {message!r}"
