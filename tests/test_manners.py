@@ -46,6 +46,18 @@ def test_help_imports_nothing_heavy(name):
     assert done.returncode == 0 and "Usage: gs-jax" in done.stdout, done.stderr
 
 
+def test_reconstruct_by_default_needs_no_scipy(folder):
+    """Its imports took as long as the back-projection of a full sensor."""
+    code = (
+        f"import sys; sys.argv = ['gs-jax', *{RECONSTRUCT!r}, '-o', 'volume.ome.tif']\n"
+        "from gs_jax.__main__ import main\n"
+        "try:\n    main()\n"
+        "finally:\n    assert not {'scipy', 'skimage', 'matplotlib', 'zarr', 'optax'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
 def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
     os.link(folder / "capture.tif", folder / "linked.tif")
     (folder / "pointer.tif").symlink_to("capture.tif")

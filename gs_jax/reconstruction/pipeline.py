@@ -25,7 +25,7 @@ from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unmatched import Unmatched
 from ..solvers.unrolled import Unrolled
-from ..suppression.consistency import local_levels
+from ..suppression.background import local_levels
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 
