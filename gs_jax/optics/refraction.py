@@ -86,7 +86,8 @@ def refracted_ideally(imager: Imager, depth: Number, point: Coordinates, field: 
     array, v, xp = imager.array, imager.sensor_distance, _arrays(point)
     air = array.substrate_thickness / array.refractive_index
     reduced = depth + air
-    vergence = 1 / array.thin_lens_focal_length - 1 / reduced
+    focal_length: Number = array.thin_lens_focal_length
+    vergence = 1 / focal_length - 1 / reduced
     slope = (point - field) / reduced
     tangent = -field / reduced - vergence * point
     landing = chief_ray(xp.zeros_like(point), field, v / reduced) + point * (1 - v * vergence)
