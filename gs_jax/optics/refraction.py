@@ -13,8 +13,8 @@ import numpy as np
 
 from ..geometry import Imager, chief_ray
 
-# Of either library, as all of a call are; `Coordinates` are (2, ...).
-Number = Any
+# Of either library, as all of a call are; `Coordinates` are `(2, ...)`.
+Scalars = Any
 Coordinates = Any
 
 # Newton's steps for the height of refraction at the plane. Each squares an error that starts at 1e-3.
@@ -31,11 +31,11 @@ class Refraction(NamedTuple):
     """
 
     point: Coordinates
-    sag: Number
-    air: Number
+    sag: Scalars
+    air: Scalars
     slope: Coordinates
     glass: Coordinates
-    cosine: Number
+    cosine: Scalars
     tangent: Coordinates
     landing: Coordinates
     valid: Any
@@ -46,17 +46,17 @@ def on_host(imager: Imager) -> Imager:
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), imager)
 
 
-def dot(a: Coordinates, b: Coordinates) -> Number:
+def dot(a: Coordinates, b: Coordinates) -> Scalars:
     """Scalar product of coordinates."""
     return a[0] * b[0] + a[1] * b[1]
 
 
-def secant(slope: Coordinates) -> Number:
+def secant(slope: Coordinates) -> Scalars:
     """Of a ray's angle with the axis."""
     return _arrays(slope).sqrt(1 + dot(slope, slope))
 
 
-def refracted(imager: Imager, depth: Number, point: Coordinates, field: Coordinates) -> Refraction:
+def refracted(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> Refraction:
     """The ray from a field to where it leaves the lens, and on to the sensor: plane, plate, sphere."""
     array, xp = imager.array, _arrays(point)
     n, t, radius = array.refractive_index, array.substrate_thickness, array.radius_of_curvature
@@ -81,12 +81,12 @@ def refracted(imager: Imager, depth: Number, point: Coordinates, field: Coordina
     return Refraction(point, sag, air, slope, glass, cosine, tangent, landing, valid)
 
 
-def refracted_ideally(imager: Imager, depth: Number, point: Coordinates, field: Coordinates) -> Refraction:
+def refracted_ideally(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> Refraction:
     """The same of an ideal lens: the slope behind it is `(image - point) / v'`, written with `1/v'`, may be zero."""
     array, v, xp = imager.array, imager.sensor_distance, _arrays(point)
     air = array.substrate_thickness / array.refractive_index
     reduced = depth + air
-    focal_length: Number = array.thin_lens_focal_length
+    focal_length: Scalars = array.thin_lens_focal_length
     vergence = 1 / focal_length - 1 / reduced
     slope = (point - field) / reduced
     tangent = -field / reduced - vergence * point
@@ -95,7 +95,7 @@ def refracted_ideally(imager: Imager, depth: Number, point: Coordinates, field: 
     return Refraction(point, zero, zero + air, slope, slope, zero + 1, tangent, landing, zero == 0)
 
 
-def solid_angle(imager: Imager, depth: Number, ray: Refraction) -> Number:
+def solid_angle(imager: Imager, depth: Scalars, ray: Refraction) -> Scalars:
     """Of an object point's light, per area of the lens where it leaves, 1/mm^2.
 
     The Jacobian of the slope `q = a / h` by the point, times `(1 + q^2)^(-3/2)`. With `a` the way sideways and `h` the
@@ -117,7 +117,7 @@ def solid_angle(imager: Imager, depth: Number, ray: Refraction) -> Number:
     return abs(1 - along / h) * tilt
 
 
-def passed(imager: Imager, ray: Refraction) -> Number:
+def passed(imager: Imager, ray: Refraction) -> Scalars:
     """Share of the light that both faces let through: Fresnel's equations, unpolarised. An ideal lens passes all."""
     if imager.array.thin_lens_focal_length is not None:
         return ray.cosine
@@ -132,7 +132,7 @@ def _through(n_in, cos_in, n_out, cos_out):
     return 1 - (across**2 + along**2) / 2
 
 
-def as_air(n: Number, thickness: Number, depth: Number, across: Coordinates) -> Number:
+def as_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coordinates) -> Scalars:
     """The layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
     square, xp = dot(across, across), _arrays(across)
     g = thickness / n
@@ -144,7 +144,7 @@ def as_air(n: Number, thickness: Number, depth: Number, across: Coordinates) -> 
     return g
 
 
-def slope_in_glass(n: Number, slope: Coordinates) -> Coordinates:
+def slope_in_glass(n: Scalars, slope: Coordinates) -> Coordinates:
     """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
     return slope / _arrays(slope).sqrt(n**2 + (n**2 - 1) * dot(slope, slope))
 
