@@ -45,7 +45,7 @@ def write(records: Records, left_out: Records, folder: Path, provenance: Provena
     write_records(folder / "benchmark.json", records, provenance)
     notes = {"machine": describe(), "slopes": slopes(records), "left_out": left_out}
     write_json(folder / "benchmark-notes.json", notes)
-    with atomic_write(folder / "benchmark.csv") as path, path.open("w", newline="") as file:
+    with atomic_write(folder / "benchmark.csv") as path, path.open("w", encoding="utf-8", newline="") as file:
         columns: list[str] = list(COLUMNS)
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
