@@ -75,7 +75,7 @@ def calibrate(
     *,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Finds a microscope's geometry in captures of a point source, from a design that is roughly right.
+    """Finds a microscope's geometry in captures of a point source, from a design that is about right.
 
     The spots of each capture are matched to the lenses at any rotation, mirrored or not, with a sensor distance within
     a quarter of the design's. Then sensor distance, rotation and shift are fitted by Levenberg-Marquardt to the spots
