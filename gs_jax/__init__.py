@@ -13,7 +13,7 @@ The microscope:
     write_design         Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal
     geomscope            The paper's microscope (Table 1), with a random layout of our own of the same statistics
     random_layout        A random layout with a wanted pitch and no hole between the lenses
-    datasheet            The metrics of a design as numbers for a JSON file, with units in the names
+    calibrate            Finds a microscope's geometry in captures of point sources, from a design that is about right
 
 From a capture to a volume:
 
@@ -25,6 +25,7 @@ From a capture to a volume:
     FISTA                FISTA: least squares with sparsity, not negative, for any operator
     Unrolled             Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package
     ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator
+    deconvolve           The scene that an image shows, seen through a system that is everywhere alike
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
     write_volume         Writes a volume, never rescaled or clipped, whole or not at all
     read_volume          A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths
@@ -33,7 +34,6 @@ Without the background:
 
     suppress             What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero
     find_points          Finds the points that a capture shows: those that nearly all of their lenses see
-    find_clusters        Points by the paper's particle clustering, from the volume alone
     write_points         Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal
     read_points          Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`
 

@@ -1,11 +1,11 @@
 from ._version import __version__ as __version__
 from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
+from .calibration.fit import calibrate as calibrate
 from .codesign.search import optimize as optimize
 from .codesign.study import read_study as read_study
 from .designs.builtin import geomscope as geomscope
 from .designs.design import Design as Design, read_design as read_design, write_design as write_design
-from .designs.sheet import datasheet as datasheet
 from .geometry import Grid as Grid, Imager as Imager, MicrolensArray as MicrolensArray, Sensor as Sensor
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.points import read_points as read_points, write_points as write_points
@@ -18,6 +18,7 @@ from .projection.backprojection import backproject as backproject, backproject_a
 from .projection.forward_model import forward as forward
 from .projection.levels import optics_of as optics_of
 from .projection.operators import forward_operator as forward_operator
+from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.reprojection import reproject as reproject
@@ -29,7 +30,6 @@ from .solvers.fista import FISTA as FISTA
 from .solvers.iteration import solve as solve
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.unrolled import Unrolled as Unrolled
-from .suppression.clustering import find_clusters as find_clusters
 from .suppression.locate import find_points as find_points
 from .suppression.unet import suppress as suppress
 

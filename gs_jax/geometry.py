@@ -17,7 +17,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 
 def as_float(x) -> Array:
-    return jnp.asarray(x, dtype=float)
+    # What is no array yet becomes one on the host: JAX would compile a conversion for each shape.
+    return jnp.asarray(x if isinstance(x, Array) else np.asarray(x, float), dtype=float)
 
 
 def _as_pair(x) -> tuple[float, float]:
@@ -218,7 +219,7 @@ class Imager(eqx.Module):
     def __check_init__(self):
         if not self.field_radius > 0:
             raise ValueError(f"`field_radius` must be positive, got {self.field_radius}.")
-        if not isinstance(self.wavelength, Tracer) and not SHORTEST <= self.wavelength <= LONGEST:
+        if not isinstance(self.wavelength, Tracer) and not SHORTEST <= float(self.wavelength) <= LONGEST:
             allowed = f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)"
             raise ValueError(f"`wavelength` must be {allowed}, got {self.wavelength:g}.")
 

@@ -42,7 +42,7 @@ def test_records_and_files(found, tmp_path):
     assert all(set(record) == KEYS for record in records)
     assert {r["pairs"] for r in records} == {16.0**4}
     report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
-    assert json.loads((tmp_path / "benchmark.json").read_text()) == records
+    assert json.loads((tmp_path / "benchmark.json").read_text()) == {"records": records}
     with (tmp_path / "benchmark.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(records)
     text = (tmp_path / "benchmark.md").read_text()
@@ -98,8 +98,11 @@ def test_what_is_too_large_or_too_slow_is_left_out_in_words():
 
 def test_command(found, tmp_path, monkeypatch):
     from gs_jax.cli.benchmark import command
+    from gs_jax.cli.info import command as info
 
     monkeypatch.setattr("gs_jax.benchmark.compare.run", lambda each, progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
     assert result.exit_code == 0 and "benchmark.json" in result.output
-    assert len(json.loads((tmp_path / "new" / "benchmark.json").read_text())) == len(found[0])
+    written = tmp_path / "new" / "benchmark.json"
+    assert len(json.loads(written.read_text())["records"]) == len(found[0])
+    assert CliRunner().invoke(info, [str(written)]).output.splitlines()[1].split()[:2] == ["command", "gs-jax"]

@@ -1,9 +1,15 @@
 """What speaks for points, and designs of which none is to be trusted."""
 
+import dataclasses
+
 import numpy as np
 
-from gs_jax import Grid, geomscope
+from gs_jax import Grid, Sensor, geomscope
+from gs_jax.optics.cores import apparent_depths
+from gs_jax.suppression import evidence
+from gs_jax.suppression.consistency import signal
 from gs_jax.suppression.evidence import LEAST_SHARP, point_evidence, sharpness
+from gs_jax.suppression.locate import searched_voxels
 
 from .test_locate import capture_of, find, many, small
 
@@ -14,6 +20,20 @@ def test_sharpness_tells_the_design_in_focus_from_the_printed_one():
     """By our tracer's cores: a fifth to a half of the light, and a hundredth."""
     assert 0.15 < sharpness(geomscope(sensor_distance_mm=5.8).imager(), DEPTHS) < 0.5
     assert sharpness(geomscope(sensor_distance_mm=4.0).imager(), DEPTHS) < 0.02 < LEAST_SHARP
+
+
+def test_places_are_counted_where_cores_are_looked_for(monkeypatch):
+    """As many as `find_points` searches, between the apparent depths; and a signal is not smoothed again."""
+    imager = dataclasses.replace(geomscope().imager(), sensor=Sensor((64, 64), 0.05))
+    grid, count, seen = Grid([18.0, 22.0], (5, 5), 0.04), evidence.count_of, []
+    monkeypatch.setattr(evidence, "count_of", lambda voxels: seen.append(voxels) or count(voxels))
+    monkeypatch.setattr(evidence, "signal", None)
+    light = signal(np.random.default_rng(0).normal(size=(64, 64)))
+    point_evidence(np.array([[0.1, 0.2, 20.0, 1.0]]), light, imager, grid)
+    (voxels,) = seen
+    searched = searched_voxels(imager, grid.at(apparent_depths(imager, grid.depths)))
+    np.testing.assert_allclose(voxels.depths, searched.depths, rtol=1e-6)
+    assert abs(float(voxels.depths[1] - searched_voxels(imager, grid).depths[1])) > 0.01
 
 
 def test_evidence_of_points_that_are_there():

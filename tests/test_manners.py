@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from gs_jax.__main__ import COMMANDS, commands
-from gs_jax.cli import options
+from gs_jax.cli import deconvolve, options
 from gs_jax.cli.interrupt import RESUMABLE, message
 from gs_jax.io.captures import read_capture
 from gs_jax.io.disk import atomic_write
 from gs_jax.optics.window import PSFS
 from gs_jax.projection.levels import LEVELS
+from gs_jax.reconstruction.deconvolution import TV
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.simulation.scene import OPTICS
 
@@ -31,6 +32,8 @@ __all__ = ["folder"]
 
 def test_names_are_those_of_the_library():
     assert options.METHODS == tuple(METHODS) and options.LEVELS == LEVELS
+    (tv,) = (option for option in deconvolve.command.params if option.name == "tv")
+    assert isinstance(tv, click.Option) and f"[default: {TV:g} of admm]" in (tv.help or "")
     assert options.SIMULATED == OPTICS and options.PSFS == tuple(PSFS)
 
 
@@ -44,6 +47,18 @@ def test_help_imports_nothing_heavy(name):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0 and "Usage: gs-jax" in done.stdout, done.stderr
+
+
+def test_reconstruct_by_default_needs_no_scipy(folder):
+    """Its imports took as long as the back-projection of a full sensor."""
+    code = (
+        f"import sys; sys.argv = ['gs-jax', *{RECONSTRUCT!r}, '-o', 'volume.ome.tif']\n"
+        "from gs_jax.__main__ import main\n"
+        "try:\n    main()\n"
+        "finally:\n    assert not {'scipy', 'skimage', 'matplotlib', 'zarr', 'optax'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
 
 
 def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):

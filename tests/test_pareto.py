@@ -1,14 +1,20 @@
 import json
+import shlex
 
 import numpy as np
 import pytest
+import tomli_w
+from click.testing import CliRunner
 
+from gs_jax.__main__ import commands
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import stages
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
 from gs_jax.codesign.search import optimize
-from gs_jax.codesign.study import Study
+from gs_jax.codesign.study import Study, read_study
 from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import write_design
+from gs_jax.io.provenance import read_provenance
 
 STUDY = {
     "depths_mm": (18.0, 23.0),
@@ -124,6 +130,25 @@ def test_every_stage_compiles_once(monkeypatch):
 def test_a_study_without_limits_that_move():
     with pytest.raises(InputError, match="`pareto`: found nothing, allowed: one or two tables"):
         trade_off(geomscope(), Study.model_validate(STUDY | {"pareto": []}))
+
+
+def test_the_command_reads_its_study_once_and_signs_its_numbers(tmp_path, monkeypatch):
+    """The command, the study and the design with their hashes, and the design's text; from the first point on."""
+    read, counted = [], lambda path: read.append(path) or read_study(path)
+    monkeypatch.setattr("gs_jax.codesign.study.read_study", counted)
+    monkeypatch.setattr("gs_jax.codesign.search.read_study", counted)
+    write_design(tmp_path / "start.toml", geomscope())
+    limit = {"name": "depth_of_field_mm", "at_least": [3.0]}
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(STUDY | {"design": "start.toml", "pareto": [limit]}))
+    arguments = ["pareto", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(commands, arguments)
+    assert done.exit_code == 0, done.output
+    assert len(read) == 1
+    found = read_provenance(tmp_path / "out" / "pareto.json")
+    assert found["command"] == shlex.join(["gs-jax", *arguments]) and "[lens]" in found["design"]
+    assert all(found[f"input {name}"].startswith("sha256 ") for name in ("study.toml", "start.toml"))
+    shown = CliRunner().invoke(commands, ["info", str(tmp_path / "out" / "pareto.json")])
+    assert found["command"] in shown.output and found["software"] in shown.output
 
 
 def test_numbers_and_picture(front, tmp_path):

@@ -1,9 +1,17 @@
 """How far long work is, on a terminal and in a pipe."""
 
+import re
+import subprocess
+import sys
+
 import pytest
 
 from gs_jax.base import progress as module
 from gs_jax.base.progress import QUIET, VERBOSE, Progress, shown
+
+from .test_cli import RECONSTRUCT, folder
+
+__all__ = ["folder"]
 
 
 @pytest.fixture
@@ -53,7 +61,36 @@ def test_how_much_is_shown(clock, capsys):
         assert capsys.readouterr().err == said
 
 
-def test_work_over_a_minute_is_announced(clock, capsys):
+def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
+    monkeypatch.setattr(module, "most_memory", lambda: 2.9 * 2**30)
+    for count, quarter, said in ((20, "", "80 s in all"), (600, "--voxel-um 80", "40 min in all")):
+        with Progress() as progress:
+            list(progress.track(range(count), "Iterating", quarter=quarter))
+        wanted = f"gs-jax: Iterating: about {said}, 2.9 GiB of memory" + (
+            f"; {quarter}: about 10 min" if quarter else ""
+        )
+        assert capsys.readouterr().err.splitlines()[0] == wanted
+
+
+def test_the_terminal_announces_it_too(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(module, "_LONG", 0.0)
     with Progress() as progress:
-        list(progress.track(range(20), "Iterating"))
-    assert capsys.readouterr().err.splitlines()[0] == "gs-jax: Iterating: about 1 min in all"
+        list(progress.track(range(3), "Imaging"))
+    assert "Imaging: about" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("method", ["list-rl", "admm"])
+def test_the_memory_that_is_announced_is_what_is_taken(folder, method):
+    """By the kernel's count at the end, within a factor of two; and the voxels named are twice as wide."""
+    arguments = ["gs-jax", *RECONSTRUCT, "--method", method, "--steps", "4", "--voxel-um", "50", "-o", "v.ome.tif"]
+    code = (
+        "import sys; from gs_jax.base import progress, memory; from gs_jax.__main__ import main\n"
+        f"progress._LONG = 0; sys.argv = {arguments!r}\n"
+        "try:\n    main()\nfinally:\n    print(memory.most_memory() / 2**30)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    line = next(line for line in done.stderr.splitlines() if "Iterating: about" in line)
+    announced = float(re.findall(r"([\d.]+) GiB of memory; --voxel-um 100: about", line)[0])
+    taken = float(done.stdout.splitlines()[-1])
+    assert taken / 2 <= announced <= 2 * taken and taken > 0.1

@@ -47,7 +47,7 @@ class Log(Progress):
         self.parts, self.most = [], most
 
     @contextmanager
-    def counter(self, description, total):
+    def counter(self, description, total, *, quarter=""):
         def advance():
             self.parts.append((description, total))
             if len(self.parts) == self.most:

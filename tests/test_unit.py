@@ -7,6 +7,7 @@ from scipy.optimize import fminbound
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray
+from gs_jax.optics import refraction
 from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
 
 WAVELENGTH = 520e-6
@@ -58,6 +59,28 @@ def test_fermat_and_snell(field, depth, thickness):
     np.testing.assert_allclose(slope, 0, atol=1e-12)
     # Paths of 30 mm in float64.
     np.testing.assert_allclose(rays.path, total - total[0], atol=1e-13)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+def test_rays_without_a_compiler_are_the_same(field, lens):
+    """Beyond the sphere too; and the solid angle is what the Jacobian of the slope by the point says."""
+    imager, points = unit(**lens), 2.2 * some_points()
+    trace = refraction.refracted_ideally if lens else refraction.refracted
+    wanted, (x, y) = unit_rays(imager, 20.0, points, field), field
+    host = trace(refraction.on_host(imager), 20.0, points.T, np.array([[x], [y]]))
+    assert all(isinstance(part, np.ndarray) for part in host) and host.valid.any()
+    np.testing.assert_array_equal(host.valid, wanted.valid)
+    for found, ours in ((host.landing, wanted.landing), (host.tangent, wanted.tangent)):
+        np.testing.assert_allclose(found.T, ours, rtol=1e-12, atol=1e-14)
+
+    def slope(point):
+        return trace(imager, jnp.asarray(20.0), point, jnp.asarray(field)).slope
+
+    angle = refraction.solid_angle(refraction.on_host(imager), 20.0, host)
+    jacobian = jnp.linalg.det(jax.vmap(jax.jacfwd(slope))(jnp.asarray(points)))
+    expected = jnp.abs(jacobian) * (1 + jnp.sum(jax.vmap(slope)(jnp.asarray(points)) ** 2, -1)) ** -1.5
+    np.testing.assert_allclose(angle[host.valid], expected[host.valid], rtol=1e-9)
 
 
 def test_paraxial_rays_follow_the_shared_geometry():

@@ -17,6 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from .memory import most_memory
+
 # Seconds between two lines; what takes longer than a minute is announced.
 _EVERY, _LONG = 10.0, 60.0
 # How much is shown: QUIET is nothing, VERBOSE a line after every piece of work.
@@ -49,9 +51,9 @@ class Progress:
             self._bars.stop()
         self._lines = False
 
-    def track(self, items: Iterable, description: str) -> Iterator:
+    def track(self, items: Iterable, description: str, *, quarter: str = "") -> Iterator:
         """The items, one by one, as the parts of a counter."""
-        with self.counter(description, len(items) if isinstance(items, Sized) else None) as done:
+        with self.counter(description, len(items) if isinstance(items, Sized) else None, quarter=quarter) as done:
             for item in items:
                 yield item
                 done()
@@ -64,10 +66,16 @@ class Progress:
             done()
 
     @contextmanager
-    def counter(self, description: str, total: int | None) -> Iterator[Callable[[], None]]:
-        """Work of `total` parts; what it yields is called after each."""
+    def counter(self, description: str, total: int | None, *, quarter: str = "") -> Iterator[Callable[[], None]]:
+        """Work of `total` parts; what it yields is called after each. `quarter`: what would take a fourth of the time.
+
+        After the second part, work of more than a minute is announced: its time, the memory, and the quarter.
+        """
         if bars := self._bars:
-            task, forecast = bars.add_task(description, total=total), _Forecast(description, total, bars.console.print)
+            task = bars.add_task(description, total=total)
+            forecast = _Forecast(
+                description, total, partial(bars.console.print, highlight=False, soft_wrap=True), quarter
+            )
 
             def advance():
                 bars.advance(task)
@@ -77,7 +85,7 @@ class Progress:
             if total is None:
                 bars.update(task, total=bars.tasks[task].completed)
         elif self._lines:
-            yield (lines := _Lines(description, total))
+            yield (lines := _Lines(description, total, quarter))
             if shown.get() == VERBOSE:
                 lines.say(time.monotonic())
         else:
@@ -85,10 +93,14 @@ class Progress:
 
 
 class _Forecast:
-    """Called after each part; after the second, without what the first compiled, it says how long all will take."""
+    """Called after each part; after the second, without what the first compiled, it says how long all will take.
 
-    def __init__(self, description: str, total: int | None, say: Callable[[str], object]):
-        self.description, self.total, self.say, self.done, self.first = description, total, say, 0, 0.0
+    And how much memory: the most that was taken, as further parts take no more.
+    """
+
+    def __init__(self, description: str, total: int | None, say: Callable[[str], object], quarter: str):
+        self.description, self.total, self.say, self.quarter = description, total, say, quarter
+        self.done, self.first = 0, 0.0
 
     def __call__(self, now: float) -> None:
         self.done += 1
@@ -97,16 +109,22 @@ class _Forecast:
         if self.done == 1:
             self.first = now
         elif (whole := (now - self.first) * self.total) > _LONG:
-            self.say(f"gs-jax: {self.description}: about {whole / 60:.0f} min in all")
+            sooner = f"; {self.quarter}: about {_in_words(whole / 4)}" if self.quarter else ""
+            memory = f"{most_memory() / 2**30:.2g} GiB of memory"
+            self.say(f"gs-jax: {self.description}: about {_in_words(whole)} in all, {memory}{sooner}")
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 1.5 * _LONG else f"{seconds:.0f} s"
 
 
 class _Lines:
     """Called after each part, it prints a line where the last is old."""
 
-    def __init__(self, description: str, total: int | None):
+    def __init__(self, description: str, total: int | None, quarter: str):
         self.description, self.total, self.done = description, total, 0
         self.began = self.last = time.monotonic()
-        self.forecast = _Forecast(description, total, partial(print, file=sys.stderr, flush=True))
+        self.forecast = _Forecast(description, total, partial(print, file=sys.stderr, flush=True), quarter)
 
     def __call__(self) -> None:
         self.done += 1

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..base.memory import status_mib
+
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
     """Seconds that a call took, and what it returned."""
@@ -31,9 +33,3 @@ def peak_mib(call: Callable[[], Any]) -> tuple[float, Any]:
     before = status_mib("VmRSS")
     result = call()
     return status_mib("VmHWM") - before, result
-
-
-def status_mib(key: str) -> float:
-    """A line of `/proc/self/status`, MiB: `VmRSS` is resident now, `VmHWM` at most."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key))

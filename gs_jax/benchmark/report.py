@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from ..base.info import describe
 from ..io.disk import atomic_write, write_json, write_text
 from ..io.figures import write_figure
+from ..io.provenance import KEY, Provenance
 from .compare import slopes
 
 COLUMNS = ("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed")
@@ -28,7 +29,12 @@ _PANELS = {
 Records = Sequence[dict[str, Any]]
 
 
-def write(records: Records, left_out: Records, folder: Path) -> None:
+def write_records(path: Path, records: Records, provenance: Provenance | None = None) -> None:
+    """The records as JSON, and where they come from; `InputError` if it cannot be written."""
+    write_json(path, ({KEY: dict(provenance)} if provenance else {}) | {"records": records})
+
+
+def write(records: Records, left_out: Records, folder: Path, provenance: Provenance | None = None) -> None:
     """The records as `benchmark.json`, `.csv`, `.md` and `.png`; the rest in `benchmark-notes.json`.
 
     Raises
@@ -36,10 +42,10 @@ def write(records: Records, left_out: Records, folder: Path) -> None:
     InputError
         If the folder cannot be written to.
     """
-    write_json(folder / "benchmark.json", records)
+    write_records(folder / "benchmark.json", records, provenance)
     notes = {"machine": describe(), "slopes": slopes(records), "left_out": left_out}
     write_json(folder / "benchmark-notes.json", notes)
-    with atomic_write(folder / "benchmark.csv") as path, path.open("w", newline="") as file:
+    with atomic_write(folder / "benchmark.csv") as path, path.open("w", encoding="utf-8", newline="") as file:
         columns: list[str] = list(COLUMNS)
         writer = csv.DictWriter(file, columns)
         writer.writeheader()

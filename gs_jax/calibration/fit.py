@@ -90,7 +90,7 @@ def calibrate(
     find_lenses: bool = False,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Finds a microscope's geometry in captures of point sources, from a design that is roughly right.
+    """Finds a microscope's geometry in captures of point sources, from a design that is about right.
 
     The spots of each capture are matched to the lenses at any rotation, mirrored or not, with a sensor distance within
     a quarter of the design's. Then what `fit` names is fitted by Levenberg-Marquardt to the spots within the field

@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..io.disk import make_folder, write_json
+from ..io.disk import make_folder
+from .files import provenance_of
 from .interrupt import PARTIAL, kept
 
 
@@ -14,18 +15,18 @@ from .interrupt import PARTIAL, kept
 def command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
     from ..benchmark.compare import run
-    from ..benchmark.report import write
+    from ..benchmark.report import write, write_records
 
     folder = make_folder(out)
-    numbers = folder / "benchmark.json"
+    numbers, provenance = folder / "benchmark.json", provenance_of()
 
     def each(records):
-        write_json(numbers, records)
+        write_records(numbers, records, provenance)
         kept[numbers] = PARTIAL
 
     with Progress() as progress:
         records, left_out = run(each=each, progress=progress)
-    write(records, left_out, folder)
+    write(records, left_out, folder, provenance)
     for missing in left_out:
         click.echo(f"left out: {missing['method']} at {missing['pairs']:.1e} pairs: {missing['reason']}")
     click.echo(f"{folder}: benchmark.json, .csv, .md and .png")

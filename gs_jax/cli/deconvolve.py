@@ -18,7 +18,7 @@ from .options import Number
 @click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True)
 @click.option(
-    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation.  [default: 1e-3 of admm]"
+    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation.  [default: 0.001 of admm]"
 )
 @click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
 @picture_options
@@ -29,7 +29,7 @@ def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None,
     read and corrected in the same way.
     """
     from ..io.captures import write_capture
-    from ..reconstruction.deconvolution import deconvolve
+    from ..reconstruction.deconvolution import TV, deconvolve
     from ..solvers.convolution_admm import ConvolutionADMM
     from ..solvers.fista import FISTA
     from ..solvers.richardson_lucy import RichardsonLucy
@@ -39,7 +39,7 @@ def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None,
     if tv is not None and method == "fista":
         raise InputError("--tv: found --method fista, allowed: admm, richardson-lucy.")
     solver = {
-        "admm": lambda: ConvolutionADMM(steps, sparsity=0.0, tv=1e-3 if tv is None else tv),
+        "admm": lambda: ConvolutionADMM(steps, sparsity=0.0, tv=TV if tv is None else tv),
         "fista": lambda: FISTA(steps),
         "richardson-lucy": lambda: RichardsonLucy(steps, accelerate=True, tv=tv or 0.0),
     }[method]()

@@ -6,7 +6,7 @@ import click
 
 from ..base.progress import Progress
 from ..io.disk import check_output, make_folder, write_json
-from .files import check_may_write
+from .files import check_may_write, provenance_of
 from .interrupt import PARTIAL, kept
 
 
@@ -22,26 +22,31 @@ def command(study: Path, out: Path):
     from rich.console import Console
     from rich.table import Table
 
+    from ..base.errors import errors_name_file
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
-    from ..codesign.search import opened
     from ..codesign.study import parent_path, read_study
+    from ..designs.design import design_text, read_design
     from ..io.figures import write_figure
+    from ..io.provenance import KEY
 
     # Searches end within a billionth of the minimum; single precision stops far from it.
     jax.config.update("jax_enable_x64", True)
-    design = parent_path(study, read_study(study))
-    with opened(design, study) as (parent, question):
+    question = read_study(study)
+    start = parent_path(study, question)
+    parent = read_design(start)
+    with errors_name_file(study):
         sweep_of(parent, question)
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
-    check_may_write(numbers, drawing, inputs=(study,))
+    check_may_write(numbers, drawing, inputs=(study, start))
+    provenance = provenance_of(study, start, design=design_text(parent))
 
     def each(front):
-        write_json(numbers, as_json(front))
+        write_json(numbers, {KEY: provenance} | as_json(front))
         kept[numbers] = PARTIAL
 
-    with Progress() as progress:
-        front = trade_off(design, study, each=each, progress=progress)
+    with Progress() as progress, errors_name_file(study):
+        front = trade_off(parent, question, each=each, progress=progress)
     write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):

@@ -186,15 +186,17 @@ def _points(image, imager, grid, progress):
     """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
     import numpy as np
 
+    from ..suppression.consistency import signal
     from ..suppression.evidence import LEAST_SHARP, point_evidence, sharpness
     from ..suppression.locate import find_points
 
-    points, warning = find_points(image, imager, grid, progress=progress), None
+    light = signal(image)
+    points, warning = find_points(light, imager, grid, progress=progress), None
     sharp = sharpness(imager, grid)
     if sharp < LEAST_SHARP:
         share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
         warning = f"out of focus at these depths: {share}; no point is to be trusted"
-    columns = point_evidence(points, image, imager, grid)._asdict()
+    columns = point_evidence(points, light, imager, grid)._asdict()
     return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
 
 

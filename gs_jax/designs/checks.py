@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from .centers import other_reading
 
@@ -47,13 +46,19 @@ def _check_spacing(design) -> None:
 
 
 def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
-    # Two in one cell of half the spacing are too close. Without them a tree of any input is quick to search.
+    # Two in one cell of half the spacing are too close. Without them few are close to any along x.
     _, cells = np.unique(np.floor(centers / (MIN_SPACING_MM / 2)), axis=0, return_inverse=True)
     order = np.argsort(cells.ravel(), kind="stable")
     together = np.flatnonzero(np.diff(cells.ravel()[order]) == 0)
     if together.size:
         return int(order[together[0]]), int(order[together[0] + 1])
-    pairs = KDTree(centers).query_pairs(MIN_SPACING_MM * (1 - 1e-9))
+    along, least, pairs = np.argsort(centers[:, 0], kind="stable"), MIN_SPACING_MM * (1 - 1e-9), []
+    for step in range(1, len(centers)):
+        apart = centers[along[step:]] - centers[along[:-step]]
+        if apart[:, 0].min() > least:
+            break
+        near = np.flatnonzero(np.hypot(*apart.T) <= least)
+        pairs += [tuple(sorted(map(int, pair))) for pair in zip(along[near], along[near + step], strict=True)]
     return min(pairs, default=None)
 
 

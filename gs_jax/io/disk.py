@@ -14,13 +14,15 @@ import time
 import uuid
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
 from ..base.errors import InputError, short_repr
+
+AnyPath = TypeVar("AnyPath", bound=PurePath)
 
 MAX_TEXT_BYTES = 2**26
 # To remove a folder, and the seconds between them.
@@ -164,7 +166,7 @@ def remove_temporaries() -> None:
         _remove(temporary)
 
 
-def _temporary_beside(path: Path) -> Path:
+def _temporary_beside(path: AnyPath) -> AnyPath:
     # Not `tempfile`, whose files nobody else may read: the user's umask is to decide that.
     return path.with_name(f".gs-jax-{uuid.uuid4().hex[:12]}{path.suffix}")
 

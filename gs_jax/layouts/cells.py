@@ -16,7 +16,7 @@ from scipy.spatial import Delaunay, KDTree, Voronoi
 
 from ..base.errors import InputError
 
-Real = float | int
+Number = float | int
 
 
 def nearest_neighbour_distances(centers: Float[np.ndarray, "lens 2"]) -> Float[np.ndarray, " lens"]:
@@ -27,7 +27,7 @@ def nearest_neighbour_distances(centers: Float[np.ndarray, "lens 2"]) -> Float[n
     return KDTree(centers).query(centers, k=2)[0][:, 1]
 
 
-def coverage(centers: Float[np.ndarray, "lens 2"], size: Sequence[Real], *, diameter: Real) -> float:
+def coverage(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number], *, diameter: Number) -> float:
     """The fraction of the plate's area that lies in a disc of this diameter (mm) about a centre; exact.
 
     The sum over the lenses of the area that a disc and its lens's Voronoi cell share.
@@ -50,7 +50,7 @@ def coverage(centers: Float[np.ndarray, "lens 2"], size: Sequence[Real], *, diam
     return min(1.0, float(area.sum() / math.prod(size)))
 
 
-def largest_hole(centers: Float[np.ndarray, "lens 2"], size: Sequence[Real]) -> float:
+def largest_hole(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number]) -> float:
     """The largest distance of a point of the plate from the nearest centre, mm; exact.
 
     Discs of this radius about the centres just cover the plate. The farthest point is a vertex of a Voronoi

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from .cells import (
-    Real,
+    Number,
     cell_edges,
     check_positive,
     cross,
@@ -40,11 +40,11 @@ NOISE, NOISY_PART = 0.02, 0.6
 
 def random_layout(
     count: int,
-    size: Sequence[Real],
+    size: Sequence[Number],
     *,
-    pitch: Real | None = None,
-    pitch_sd: Real | None = None,
-    diameter: Real | None = 2.0,
+    pitch: Number | None = None,
+    pitch_sd: Number | None = None,
+    diameter: Number | None = 2.0,
     seed: int = 0,
 ) -> Float[np.ndarray, "lens 2"]:
     """A random layout with a wanted pitch and no hole between the lenses.
@@ -101,7 +101,7 @@ def random_layout(
     return _matched(start, size, pitch, pitch_sd, diameter, rng)
 
 
-def poisson_disc_layout(size: Sequence[Real], *, min_distance: Real, seed: int = 0) -> Float[np.ndarray, "lens 2"]:
+def poisson_disc_layout(size: Sequence[Number], *, min_distance: Number, seed: int = 0) -> Float[np.ndarray, "lens 2"]:
     """Random centres that keep a distance, as many as fit: there is no room for another one.
 
     Uniform random points, without those too close to an earlier one; then random points where there still is
@@ -136,7 +136,7 @@ def poisson_disc_layout(size: Sequence[Real], *, min_distance: Real, seed: int =
     return centers
 
 
-def hexagonal_layout(size: Sequence[Real], *, pitch: Real) -> Float[np.ndarray, "lens 2"]:
+def hexagonal_layout(size: Sequence[Number], *, pitch: Number) -> Float[np.ndarray, "lens 2"]:
     """The centres of a hexagonal lattice on a plate `(x, y)`, one of them in the middle, rows along x, mm.
 
     Raises
@@ -147,7 +147,7 @@ def hexagonal_layout(size: Sequence[Real], *, pitch: Real) -> Float[np.ndarray, 
     return _lattice(size, pitch, [[1, 0], [0.5, math.sqrt(0.75)]])
 
 
-def square_layout(size: Sequence[Real], *, pitch: Real) -> Float[np.ndarray, "lens 2"]:
+def square_layout(size: Sequence[Number], *, pitch: Number) -> Float[np.ndarray, "lens 2"]:
     """The centres of a square lattice on a plate `(x, y)`, one of them in the middle, mm.
 
     Raises
@@ -159,7 +159,7 @@ def square_layout(size: Sequence[Real], *, pitch: Real) -> Float[np.ndarray, "le
 
 
 def lloyd_relaxed(
-    centers: Float[np.ndarray, "lens 2"], size: Sequence[Real], *, iterations: int
+    centers: Float[np.ndarray, "lens 2"], size: Sequence[Number], *, iterations: int
 ) -> Float[np.ndarray, "lens 2"]:
     """Centres moved to the centroids of their Voronoi cells within the plate, several times (Lloyd, 1982).
 

@@ -15,7 +15,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from .cores import RINGS, Cores, core_tables, drawn
 from .halo import HaloGrid, halo_grid, halo_table
-from .light import zones
+from .light import clear_area, zones
 
 # Reach of a core's kernel, in the halo's pixels: what is wider is smooth enough for them.
 CORE_REACH = 5
@@ -162,10 +162,15 @@ def halo_of(
     progress: Progress | None = None,
 ) -> Halo:
     """What the cores leave of the light at each depth, theirs being those of rings with these ends, in field radii."""
-    aperture, dtype = zones(imager.array), imager.sensor_distance.dtype
+    aperture = zones(imager.array)
     each = zip((progress or Progress()).track(depths, "Tracing halos"), map(Cores, *cores), strict=True)
     table = np.stack([halo_table(imager, depth, aperture, grid, core, ends) for depth, core in each])
-    return Halo(jnp.asarray(table, dtype), jnp.asarray(aperture.area, dtype), imager.sensor_distance, grid)
+    return Halo(
+        jnp.asarray(table, imager.sensor_distance.dtype),
+        jnp.mean(clear_area(imager.array)),
+        imager.sensor_distance,
+        grid,
+    )
 
 
 def kernel_size(imager: Imager, halo: Halo) -> int:

@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.safe import safe_sqrt
-from ..geometry import Imager, chief_ray
+from ..geometry import Imager
+from .refraction import Refraction, as_air, dot, refracted, refracted_ideally, secant, slope_in_glass
 
 Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]]
 
-# Newton's steps for the height of refraction at the plane. Each squares an error that starts at 1e-3.
+# Newton's steps to the best focus. The first is right to 1e-3, and each squares its error.
 _STEPS = 3
 
 
@@ -65,9 +66,8 @@ def unit_rays(
     dtype = imager.sensor_distance.dtype
     depth, field = jnp.asarray(depth, dtype), jnp.asarray(field, dtype)
     points = jnp.asarray(pupil_points, dtype)
-    one = _thick_ray if imager.array.thin_lens_focal_length is None else _thin_ray
     # Points last: the processor works along the last axis, and two are too few.
-    over_points = jax.vmap(lambda point: tuple(one(imager, depth, point, field)), 1, (1, 1, 0, 0))
+    over_points = jax.vmap(lambda point: tuple(_ray(imager, depth, point, field)), 1, (1, 1, 0, 0))
     landing, tangent, path, valid = over_points(points.reshape(-1, 2).T)
     landing, tangent = landing.T.reshape(points.shape), tangent.T.reshape(points.shape)
     return UnitRay(landing, tangent, path.reshape(points.shape[:-1]), valid.reshape(points.shape[:-1]))
@@ -199,75 +199,32 @@ def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch
     return tangent / jnp.sqrt(1 + jnp.sum(tangent**2, -1, keepdims=True))
 
 
-def _thin_ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
-    """An ideal lens: the slope behind it is `(image - point) / v'`, written with `1/v'`, which may be zero."""
+def _ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
+    """Quantities with `_chief` are those of the ray through the vertex."""
+    if imager.array.thin_lens_focal_length is None:
+        ray = refracted(imager, depth, point, field)
+        return UnitRay(ray.landing, ray.tangent, _thick_path(imager, depth, ray, field), ray.valid)
+    ray = refracted_ideally(imager, depth, point, field)
     v, reduced = imager.sensor_distance, imager.reduced_depth(depth)
-    vergence = 1 / imager.array.focal_length - 1 / reduced
-    tilt = -field / reduced
-    tangent = tilt - vergence * point
-    s, s_chief = _secant(tangent), _secant(tilt)
+    vergence, tilt = 1 / imager.array.focal_length - 1 / reduced, -field / reduced
     # |point - image| - |image| = v' (s - s_chief), from the object on; then v (s - s_chief) along the ray.
-    longer = jnp.sum(vergence * point**2 - 2 * point * tilt) / (s + s_chief)
-    landing = chief_ray(jnp.zeros(2, v.dtype), field, v / reduced) + point * (1 - v * vergence)
-    return UnitRay(landing, tangent, longer * (v * vergence - 1), jnp.asarray(True))
+    longer = (vergence * dot(point, point) - 2 * dot(point, tilt)) / (secant(ray.tangent) + secant(tilt))
+    return UnitRay(ray.landing, ray.tangent, longer * (v * vergence - 1), ray.valid)
 
 
-def _thick_ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
-    """Plane, plate, sphere. Quantities with `_chief` are those of the ray through the vertex."""
-    array, v = imager.array, imager.sensor_distance
-    n, t, radius = array.refractive_index, array.substrate_thickness, array.radius_of_curvature
-    r2 = jnp.sum(point**2)
-    on_sphere = r2 < radius**2
-    point, r2 = jnp.where(on_sphere, point, 0), jnp.where(on_sphere, r2, 0)
-    depth_of_center = jnp.sqrt(radius**2 - r2)
-    sag = r2 / (radius + depth_of_center)
-
-    # Slope in front q = (point - field) / (depth + air), with the glass as so much air.
-    air, air_chief = as_air(n, t - sag, depth, point - field), as_air(n, t, depth, -field)
-    h, h_chief = depth + air, depth + air_chief
-    q, q_chief = (point - field) / h, -field / h_chief
-    change = point / h + field * (air - air_chief) / (h * h_chief)
-    glass, glass_chief = slope_in_glass(n, q), slope_in_glass(n, q_chief)
-    s_chief, s_glass, s_glass_chief = _secant(q_chief), _secant(glass), _secant(glass_chief)
-    squares = jnp.sum(change * (q + q_chief))
-    path = depth * squares / (_secant(q) + s_chief)
+def _thick_path(imager: Imager, depth: Array, ray: Refraction, field: Array) -> Array:
+    n, t, v = imager.array.refractive_index, imager.array.substrate_thickness, imager.sensor_distance
+    air_chief = as_air(n, t, depth, -field)
+    h, h_chief = depth + ray.air, depth + air_chief
+    q, q_chief = ray.slope, -field / h_chief
+    change = ray.point / h + field * (ray.air - air_chief) / (h * h_chief)
+    s_chief, s_glass, s_glass_chief = secant(q_chief), secant(ray.glass), secant(slope_in_glass(n, q_chief))
+    squares = dot(change, q + q_chief)
+    path = depth * squares / (secant(q) + s_chief)
     # Snell's law for the square of the slope in glass; see `slope_in_glass`.
-    flat, flat_chief = n**2 + (n**2 - 1) * jnp.sum(q**2), n**2 + (n**2 - 1) * jnp.sum(q_chief**2)
+    flat, flat_chief = n**2 + (n**2 - 1) * dot(q, q), n**2 + (n**2 - 1) * dot(q_chief, q_chief)
     glass_squares = n**2 * squares / (flat * flat_chief)
-    path = path + n * (t * glass_squares / (s_glass + s_glass_chief) - sag * s_glass)
-
-    # Lateral and axial parts of the ray and of the sphere's normal.
-    ray, ray_z = glass / s_glass, 1 / s_glass
-    normal, normal_z = point / radius, depth_of_center / radius
-    cosine = jnp.sum(ray * normal) + ray_z * normal_z
-    behind2 = 1 - n**2 * (1 - cosine**2)
-    valid = on_sphere & (behind2 > 0)
-    bend = jnp.sqrt(jnp.where(behind2 > 0, behind2, 1)) - n * cosine
-    tangent = jnp.where(valid, n * ray + bend * normal, 0) / jnp.where(valid, n * ray_z + bend * normal_z, 1)
-    landing = point + (v + sag) * tangent
+    path = path + n * (t * glass_squares / (s_glass + s_glass_chief) - ray.sag * s_glass)
     # At the vertex the sphere is parallel to the plane: the chief ray leaves as it came.
-    s = _secant(tangent)
-    path = path + sag * s + v * jnp.sum((tangent - q_chief) * (tangent + q_chief)) / (s + s_chief)
-    return UnitRay(landing, tangent, path, valid)
-
-
-def as_air(n: Array, thickness: Array, depth: Array, across: Array) -> Array:
-    """The layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
-    square = jnp.sum(across**2)
-    g = thickness / n
-    for _ in range(_STEPS):
-        h = depth + g
-        flat = n**2 + (n**2 - 1) * square / h**2
-        g = g - (g - thickness / jnp.sqrt(flat)) / (
-            1 - thickness * (n**2 - 1) * square / (h**3 * flat * jnp.sqrt(flat))
-        )
-    return g
-
-
-def slope_in_glass(n: Array, slope: Array) -> Array:
-    """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
-    return slope / jnp.sqrt(n**2 + (n**2 - 1) * jnp.sum(slope**2))
-
-
-def _secant(slope: Array) -> Array:
-    return jnp.sqrt(1 + jnp.sum(slope**2))
+    s = secant(ray.tangent)
+    return path + ray.sag * s + v * dot(ray.tangent - q_chief, ray.tangent + q_chief) / (s + s_chief)

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
-from scipy.fft import next_fast_len
 
 from ..geometry import Imager, Sensor
 from ..optics.exit_pupil import phasor
@@ -24,6 +23,8 @@ def with_margin(imager: Imager, size: int) -> Imager:
 
 def padded_shape(sensor: Sensor, size: int) -> tuple[int, int]:
     """Of the transforms, even. What wraps round falls on the first `size - 1` lines, which are beyond the sensor."""
+    from scipy.fft import next_fast_len  # here, so that back-projection, which transforms nothing, does without SciPy
+
     rows, columns = (2 * int(next_fast_len(-(-(n + size - 1) // 2), real=True) or 0) for n in sensor.shape)
     return rows, columns
 

@@ -12,13 +12,16 @@ from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from .pipeline import above_offset, iterated
 
+# Default weight of ADMM's total variation.
+TV = 1e-3
+
 Deconvolver = ConvolutionADMM | FISTA | RichardsonLucy
 
 
 def deconvolve(
     image: Num[Array | np.ndarray, "row column"],
     psf: Num[Array | np.ndarray, "high wide"],
-    solver: Deconvolver = ConvolutionADMM(steps=100, tv=1e-3),
+    solver: Deconvolver = ConvolutionADMM(steps=100, tv=TV),
     *,
     progress: Progress | None = None,
 ) -> Float32[np.ndarray, "row column"]:

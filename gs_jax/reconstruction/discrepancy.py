@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
-from scipy.ndimage import uniform_filter
 
 # Side of the squares that have one noise each, pixels.
 _SQUARE = 32
@@ -41,6 +40,8 @@ def misfit_of_noise(
     counts
         If true, of the Kullback-Leibler divergence, `sum(variance / (2 mean))`; else of half the squares.
     """
+    from scipy.ndimage import uniform_filter  # here, so that back-projection, which asks no noise, does without SciPy
+
     side = image.shape[0] // light.shape[0]
     variance = noise_variance(image)
     squares = (np.arange(n) * side // _SQUARE for n in light.shape)

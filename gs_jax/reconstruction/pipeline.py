@@ -25,7 +25,7 @@ from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unmatched import Unmatched
 from ..solvers.unrolled import Unrolled
-from ..suppression.consistency import local_levels
+from ..suppression.background import local_levels
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 
@@ -237,10 +237,15 @@ def _back_projected(image, imager, grid, method, progress):
         return np.asarray(backproject(image, imager, grid, **options), np.float32)
     image, depths = jnp.asarray(image), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
-    for first in progress.track(range(0, depths.size, _PLANES), "Back-projecting"):
+    for first in progress.track(range(0, depths.size, _PLANES), "Back-projecting", quarter=_wider(grid)):
         some = slice(first, first + _PLANES)
         volume[some] = backproject(image, imager, grid.at(depths[some]), **options)
     return volume
+
+
+def _wider(grid):
+    """Voxels that there are a fourth of: so are the pixels that iterative methods look at, and the time."""
+    return f"--voxel-um {2000 * grid.pitch:.4g}"
 
 
 def iterated(solver, progress, light, system, enough=0.0):
@@ -248,7 +253,8 @@ def iterated(solver, progress, light, system, enough=0.0):
     # How many steps and until when is decided here: other numbers need no other code.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, system)
-    with progress.counter("Iterating", solver.steps) as advance:
+    quarter = _wider(system.grid) if isinstance(system, System) else ""
+    with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):
             state, cost, residual = _step(state, compiled, light, system)
             # To read the numbers waits for the step: what is shown has been done, and Ctrl-C ends it here.

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
 from ..geometry import as_float
-from ..layouts.cells import Real
+from ..layouts.cells import Number
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
 EXPANDED = 16.0
@@ -64,7 +64,7 @@ def expose(
     camera: Camera,
     key: PRNGKeyArray,
     *,
-    peak_electrons: Real | Float[Array, ""],
+    peak_electrons: Number | Float[Array, ""],
 ) -> UInt8[Array, "row column"] | UInt16[Array, "row column"]:
     """The counts of one exposure.
 

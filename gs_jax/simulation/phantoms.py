@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ..base.errors import InputError, short_repr
 from ..geometry import Grid
-from ..layouts.cells import Real, check_positive, half_size
+from ..layouts.cells import Number, check_positive, half_size
 
 Emitters = Float[np.ndarray, "emitter 4"]
 
@@ -32,7 +32,7 @@ _ARM = np.array([(0, 1), *((x, x + length * side) for x, length in ((0.45, 0.27)
 _LEAST_ROWS = 600
 
 
-def random_points(count: int, size: Sequence[Real], depth_range: Sequence[Real], *, seed: int = 0) -> Emitters:
+def random_points(count: int, size: Sequence[Number], depth_range: Sequence[Number], *, seed: int = 0) -> Emitters:
     """Points of intensity 1, uniform in a box.
 
     Parameters
@@ -51,7 +51,13 @@ def random_points(count: int, size: Sequence[Real], depth_range: Sequence[Real],
 
 
 def beads(
-    count: int, size: Sequence[Real], depth_range: Sequence[Real], *, diameter: Real = 0.005, pitch: Real, seed: int = 0
+    count: int,
+    size: Sequence[Number],
+    depth_range: Sequence[Number],
+    *,
+    diameter: Number = 0.005,
+    pitch: Number,
+    seed: int = 0,
 ) -> Emitters:
     """Glowing balls at random in a slab, as those in PDMS of Fig. 7 (5 um, in 2.5 mm); there they clump, here not.
 
@@ -107,7 +113,7 @@ def usaf_bars(groups: Sequence[int] = (2, 3)) -> Float[np.ndarray, "bar 4"]:
     return bars - np.repeat(middle, 2)
 
 
-def usaf_1951(groups: Sequence[int] = (2, 3), *, depth: Real, pitch: Real) -> Emitters:
+def usaf_1951(groups: Sequence[int] = (2, 3), *, depth: Number, pitch: Number) -> Emitters:
     """The bars of `usaf_bars`, glowing, in the plane `depth` (Fig. 6).
 
     Parameters
@@ -127,7 +133,12 @@ def usaf_1951(groups: Sequence[int] = (2, 3), *, depth: Real, pitch: Real) -> Em
 
 
 def snowflake(
-    depth_range: Sequence[Real] = (20.0, 25.0), size: Real = 20.0, tilt: Real = 0.0, *, width: Real = 0.7, pitch: Real
+    depth_range: Sequence[Number] = (20.0, 25.0),
+    size: Number = 20.0,
+    tilt: Number = 0.0,
+    *,
+    width: Number = 0.7,
+    pitch: Number,
 ) -> Emitters:
     """A flat six-armed snowflake, inclined so that it just spans a range of depths, as that of Fig. 8.
 
@@ -164,7 +175,7 @@ def snowflake(
     return _emitters([lateral.real, lateral.imag, (near + far) / 2 + sine * slope], np.tile(area, 6))
 
 
-def letters(text: str, *, depth: Real, height: Real, pitch: Real) -> Emitters:
+def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitters:
     """Glowing text in Pillow's own font, upright in an image with row 0 at the top; its middle is on the axis.
 
     Parameters

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.fft import next_fast_len
 
 
 class Convolution(eqx.Module):
@@ -39,6 +38,8 @@ class Convolution(eqx.Module):
         """
         if psf.ndim != 3 or min(psf.shape) < 1:
             raise ValueError(f"`psf` must be (depth, row, column) with a pixel at least, got {psf.shape}.")
+        from scipy.fft import next_fast_len  # here, so that solvers that transform nothing do without SciPy
+
         size = [int(next_fast_len(n + k - 1, real=True) or 0) for n, k in zip(image_shape, psf.shape[1:], strict=True)]
         padded = jnp.pad(jnp.asarray(psf), [(0, 0), *((0, n - k) for n, k in zip(size, psf.shape[1:], strict=True))])
         centred = jnp.roll(padded, [-(k // 2) for k in psf.shape[1:]], (1, 2))

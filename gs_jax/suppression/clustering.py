@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Float64
 from skimage.measure import label, regionprops
 
 from ..geometry import Grid
-from ..layouts.cells import Real
+from ..layouts.cells import Number
 
 # Standard deviation of a normal distribution over its median deviation from the median.
 _DEVIATION = 1.4826
@@ -20,8 +20,8 @@ def find_clusters(
     volume: Float[Array | np.ndarray, "depth y x"],
     grid: Grid,
     *,
-    thresholds: Sequence[Real] = (0.05, 0.1, 0.15, 0.2),
-    noise_floor: Real = 5.0,
+    thresholds: Sequence[Number] = (0.05, 0.1, 0.15, 0.2),
+    noise_floor: Number = 5.0,
 ) -> Float64[np.ndarray, "point 4"]:
     """Points by the paper's particle clustering, from the volume alone.
 

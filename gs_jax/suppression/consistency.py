@@ -8,7 +8,6 @@ noise, so that offset and gain of the camera do not matter.
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
@@ -17,11 +16,10 @@ from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from ..geometry import Imager, chief_ray
+from .background import local_levels
 
 # Of the Gaussian that evens out where in a pixel a spot is, pixels: most that keeps spots 2.5 pixels apart apart.
 _SMOOTHING = 0.7
-# Side of the squares that have one background and one noise, pixels: wider than a spot, narrower than haze.
-_SQUARE = 32
 # The noise is taken to be this part of the brightest spot at least: images without noise, and camera steps.
 _DYNAMIC_RANGE = 1000
 # How far the light of a spot is followed, pixels.
@@ -44,26 +42,6 @@ def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
     light = smooth - background
     least = max(float(np.median(noise)), float(light.max()) / _DYNAMIC_RANGE)
     return Signal(light, np.maximum(noise, least))
-
-
-def local_levels(
-    image: Shaped[Array | np.ndarray, "row column"],
-) -> tuple[Float32[np.ndarray, "row column"], Float32[np.ndarray, "row column"]]:
-    """Background and noise: of each square of 32 pixels, then linear between the squares' middles.
-
-    The background is the median; the noise is the root mean square of what is darker, which no spot adds to.
-    """
-    image = np.asarray(image, np.float32)
-    rows, columns = image.shape
-    padded = np.pad(image, ((0, -rows % _SQUARE), (0, -columns % _SQUARE)), mode="edge")
-    squares = padded.reshape(padded.shape[0] // _SQUARE, _SQUARE, -1, _SQUARE).swapaxes(1, 2)
-    # A third of the pixels says the same.
-    squares = squares.reshape(*squares.shape[:2], -1)[..., ::3]
-    median = np.median(squares, axis=-1)
-    darker = np.minimum(squares - median[..., None], 0)
-    noise = np.sqrt(2 * np.mean(darker**2, axis=-1))
-    wide = lambda part: np.asarray(jax.image.resize(jnp.asarray(part), padded.shape, "linear"))[:rows, :columns]
-    return wide(median), wide(noise)
 
 
 class Readings(NamedTuple):

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Float64, Int, Shaped
 
 from ..geometry import Grid, Imager
 from ..optics.cores import apparent_depths, core_shares
-from .consistency import agreed_level, log_false_alarms, readings, signal, survival
+from .consistency import Signal, agreed_level, log_false_alarms, readings, signal, survival
 from .locate import APERTURE, FIELDS, LIT, SHARE, count_of, searched_voxels
 
 # Least part of a spot's light, of lenses within the field radius, that must fall into its core. The paper's microscope
@@ -38,16 +38,21 @@ class Evidence(NamedTuple):
 
 
 def point_evidence(
-    points: Float[np.ndarray, "point 4"], image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid
+    points: Float[np.ndarray, "point 4"],
+    image: Shaped[Array | np.ndarray, "row column"] | Signal,
+    imager: Imager,
+    grid: Grid,
 ) -> Evidence:
     """What speaks for the points that `find_points` found in an image, with the same arguments."""
-    light, places = signal(image), np.array(points[:, :3], np.float64)
-    if len(points):
-        places[:, 2] = apparent_depths(imager, points[:, 2])
+    light, places = image if isinstance(image, Signal) else signal(image), np.array(points[:, :3], np.float64)
+    # Cores lie, and are looked for, where chief rays of other depths land.
+    ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
+    apparent = np.asarray(apparent_depths(imager, np.concatenate([ends, points[:, 2]])), np.float64)
+    places[:, 2] = apparent[2:]
     seen = readings(places, light, imager)
     lenses, noise = seen.seen.sum(1), seen.noise.max(1, initial=0)
     level = agreed_level(seen.light, seen.seen, SHARE)
-    tests = count_of(searched_voxels(imager, grid))
+    tests = count_of(searched_voxels(imager, grid.at(apparent[:2])))
     log = log_false_alarms(level, lenses, SHARE, survival(light.light), tests) / math.log(10)
     lit = (seen.seen & (seen.light > LIT * seen.noise)).sum(1)
     signal_to_noise = np.divide(level, noise, out=np.zeros_like(level), where=noise > 0)

@@ -61,7 +61,11 @@ _SEARCHES = 2
 
 
 def find_points(
-    image: Shaped[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, *, progress: Progress | None = None
+    image: Shaped[Array | np.ndarray, "row column"] | Signal,
+    imager: Imager,
+    grid: Grid,
+    *,
+    progress: Progress | None = None,
 ) -> Points:
     """Finds the points that a capture shows: those that nearly all of their lenses see.
 
@@ -80,7 +84,7 @@ def find_points(
     Parameters
     ----------
     image
-        `sensor.shape`, linear, in any unit, on any offset.
+        `sensor.shape`, linear, in any unit, on any offset; or what `consistency.signal` made of it.
     imager
         What took it.
     grid
@@ -100,12 +104,13 @@ def find_points(
         If the image is not `sensor.shape`.
     """
     progress = progress or Progress()
-    if image.shape != imager.sensor.shape:
-        raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    seen = image if isinstance(image, Signal) else signal(image)
+    if seen.light.shape != imager.sensor.shape:
+        raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {seen.light.shape}.")
     depths = _around(grid)
     apparent = np.asarray(apparent_depths(imager, depths), np.float64)
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
-    seen, voxels = signal(image), searched_voxels(imager, searched)
+    voxels = searched_voxels(imager, searched)
     rest, candidates = seen, np.zeros((0, 3))
     points, spots, own = _consistent(candidates, seen, imager, voxels)
     for _ in range(_SEARCHES):
