@@ -310,6 +310,8 @@ def test_the_command(tmp_path):
     np.testing.assert_allclose(new.centers, actual.centers, atol=2e-3)
     assert float(new.sensor_distance) == pytest.approx(float(actual.sensor_distance), abs=5e-3)
     assert "standard_deviations" in read_provenance(tmp_path / "new.toml") and (tmp_path / "new.png").exists()
+    shown = CliRunner().invoke(commands, ["metrics", str(tmp_path / "new.toml")], catch_exceptions=False).stdout
+    assert "calibrated by" in shown and "sensor_distance_mm +- " in shown
     assert new.tilt is not None and "calibrated_values" in read_provenance(tmp_path / "new.toml")
     (tmp_path / "p.csv").write_text("x_mm,y_mm,z_mm\n0,0,20\n")
     for more, message in (
