@@ -152,7 +152,7 @@ def reconstruct(
 
 def explainable(
     image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, optics: Optics | str, progress: Progress
-) -> tuple[Float[np.ndarray, "row column"], Imager, Float[np.ndarray, "row column"] | float, Optics]:
+) -> tuple[Float[np.ndarray, "y x"], Imager, Float[np.ndarray, "y x"] | float, Optics]:
     """What iterative methods are to explain: light above the offset, its microscope, background in it, and the optics.
 
     With optics by name, pixels are as wide as voxels, and what optics other than "full" do not hold is background.
