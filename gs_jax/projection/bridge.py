@@ -31,7 +31,7 @@ _COUNT, _ITEMS = 2, 4  # of its arguments and results
 _ERROR_DESTROY, _SCHEDULE, _THREADS = 8, 17, 18  # of the API
 _METADATA, _TABLE = 1, 77  # types of extensions: XLA's, and our own, by which the handler learns where the table is
 # Places in the table: addresses of functions, the kernels last.
-_TASK, _ALLOCATE, _FREE, _YIELD, _MINOR, _FIRST_KERNEL = range(6)
+_TASK, _ALLOCATE, _FREE, _YIELD, _ADVISE, _MINOR, _FIRST_KERNEL = range(7)
 # Places in a job; its parts and buffers are known to the kernels.
 _REFERENCES, _NEXT, _DONE, _KERNEL, _FREE_ME, _SCRATCH, _LENGTH = 0, 1, 2, 4, 5, 240, 256
 
@@ -64,15 +64,15 @@ def _add(_, address, number):
 
 
 @intrinsic
-def _call(_, function, first, second):
+def _call(_, function, first, second, third):
     """Call a C function by its address; one that takes less ignores the rest."""
 
     def code(context, builder, signature, arguments):
         number = ir.IntType(64)
-        kind = ir.FunctionType(number, [number, number]).as_pointer()
+        kind = ir.FunctionType(number, [number, number, number]).as_pointer()
         return builder.call(builder.inttoptr(arguments[0], kind), arguments[1:])
 
-    return types.int64(function, types.int64, types.int64), code
+    return types.int64(function, types.int64, types.int64, types.int64), code
 
 
 @inline
@@ -88,14 +88,14 @@ def _work(address):
         part = _add(address + 8 * _NEXT, 1)
         if part >= job[PARTS]:
             return
-        _call(job[_KERNEL], address, part)
+        _call(job[_KERNEL], address, part, 0)
         _add(address + 8 * _DONE, 1)
 
 
 @inline
 def _release(address):
     if _add(address + 8 * _REFERENCES, -1) == 1:
-        _call(_at(address, _LENGTH)[_FREE_ME], address, 0)
+        _call(_at(address, _LENGTH)[_FREE_ME], address, 0, 0)
 
 
 def task(address, _):
@@ -117,6 +117,16 @@ def _list(job, first, items):
     return first + items[_COUNT]
 
 
+@inline
+def _use_large_pages(job, place, advise):
+    """For the first result: to map 100 MB in small ones takes as long as half of a kernel."""
+    page = 2**21
+    first = (job[place] + page - 1) // page * page
+    pages = (job[place] + 4 * job[place + 2] * job[place + 3] * job[place + 4] - first) // page
+    if advise != 0 and pages > 1:
+        _call(advise, first, pages * page, 14)  # MADV_HUGEPAGE
+
+
 def handle(frame_address, _):
     """XLA's handler."""
     frame = _at(frame_address, 21)
@@ -130,7 +140,7 @@ def handle(frame_address, _):
             _at(_global(), 1)[0] = extension[3]
             return 0
     table = _at(_at(_global(), 1)[0], 16)
-    address = _call(table[_ALLOCATE], 8 * _LENGTH, 0)
+    address = _call(table[_ALLOCATE], 8 * _LENGTH, 0, 0)
     job = _at(address, _LENGTH)
     attributes = _at(frame[_ATTRIBUTES], 2)
     which, parts = _at(_at(attributes[0], 2)[1], 1)[0], _at(_at(attributes[1], 2)[1], 1)[0]
@@ -138,25 +148,26 @@ def handle(frame_address, _):
     job[_KERNEL], job[_FREE_ME] = table[_FIRST_KERNEL + which], table[_FREE]
     listed = _list(job, 0, frame[_ARGUMENTS : _ARGUMENTS + 5])
     _list(job, listed, frame[_RESULTS : _RESULTS + 5])
+    _use_large_pages(job, BUFFERS + PER_BUFFER * listed, table[_ADVISE])
     # XLA reads and writes the structures of its functions here.
     api, scratch, at_scratch = _at(frame[_API], 19), job[_SCRATCH:], address + 8 * _SCRATCH
     threads = address + 8 * (_SCRATCH + 8)
     scratch[0], scratch[1], scratch[2], scratch[3], scratch[8] = 32, 0, frame[_CONTEXT], threads, 1
-    error = _call(api[_THREADS], at_scratch, 0)
+    error = _call(api[_THREADS], at_scratch, 0, 0)
     for _ in range(min(scratch[8], parts) - 1):
         if error != 0:
             break
         _add(address + 8 * _REFERENCES, 1)
         scratch[0], scratch[1], scratch[2], scratch[3], scratch[4] = 40, 0, frame[_CONTEXT], table[_TASK], address
-        error = _call(api[_SCHEDULE], at_scratch, 0)
+        error = _call(api[_SCHEDULE], at_scratch, 0, 0)
         if error != 0:
             _add(address + 8 * _REFERENCES, -1)
     if error != 0:  # no threads: all is done here
         scratch[0], scratch[1], scratch[2] = 24, 0, error
-        _call(api[_ERROR_DESTROY], at_scratch, 0)
+        _call(api[_ERROR_DESTROY], at_scratch, 0, 0)
     _work(address)
     while _add(address + 8 * _DONE, 0) < parts:
-        _call(table[_YIELD], 0, 0)
+        _call(table[_YIELD], 0, 0, 0)
     _release(address)
     return 0
 
@@ -188,6 +199,8 @@ def _register():
     functions = (ctypes.pythonapi.PyMem_RawMalloc, ctypes.pythonapi.PyMem_RawFree, idle)
     for place, function in zip((_ALLOCATE, _FREE, _YIELD), functions, strict=True):
         _table[place] = ctypes.cast(function, ctypes.c_void_p).value or 0
+    if sys.platform == "linux":
+        _table[_ADVISE] = ctypes.cast(ctypes.CDLL(None).madvise, ctypes.c_void_p).value or 0
     _table[_MINOR], _table[_TASK] = minor, _compile(task, types.int64, 1)
     handler = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(_compile(handle, types.int64, 1))
     extension, frame = np.array([32, _TABLE, 0, _table.ctypes.data], np.int64), np.zeros(21, np.int64)

@@ -73,6 +73,7 @@ def gather(job_address, part, _):
                         v.store(at_edge, value)
                         for rest in range(columns - x_start - c):
                             volume[d, y_start + k, x_start + c + rest] += edge[rest]
+    r.keep((blended, edge, right, x2, pairs))
 
 
 def scatter(job_address, part, _):
@@ -89,7 +90,8 @@ def scatter(job_address, part, _):
     image[top:bottom] = ZERO
     # Neighbouring voxels that reach the same pixels would wait for each other: they go to lines of their own.
     length = 4 * r.padded(wide + WIDTH)
-    lines, edge = np.zeros(length, np.float32), np.zeros(WIDTH, np.float32)
+    lines, edge, spare = np.zeros(length, np.float32), np.zeros(WIDTH, np.float32), np.zeros(length, np.float32)
+    at_spare = np.int64(spare.ctypes.data)
     low, target = np.zeros(nx, np.int64), np.zeros(nx, np.int64)
     right = np.zeros(r.padded(nx), np.float32)
     x2_padded = np.full(r.padded(nx), FAR, np.float32)
@@ -132,18 +134,20 @@ def scatter(job_address, part, _):
                 i, down = r.pixel_and_fraction(
                     np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
                 )
+                # What is another part's goes to a line that nobody reads.
                 at_upper = r.address(job, FIRST + 1) + 4 * i * wide
-                at_lower = at_upper + 4 * wide
+                at_lower = at_upper + 4 * wide if i + 1 < bottom else at_spare
+                at_upper = at_upper if i >= top else at_spare
                 for block in range(low[end - 1] // WIDTH, (low[begin] + 1) // WIDTH + 1):
                     j = 4 * min(WIDTH * block, wide - WIDTH)
-                    spread = v.zeros()
-                    for line in range(many):
+                    spread = v.load(at_lines + j)
+                    v.store(at_lines + j, v.zeros())
+                    for line in range(1, many):
                         spread = spread + v.load(at_lines + line * length + j)
                         v.store(at_lines + line * length + j, v.zeros())
-                    if i >= top:
-                        v.store(at_upper + j, v.load(at_upper + j) + (ONE - down) * spread)
-                    if i + 1 < bottom:
-                        v.store(at_lower + j, v.load(at_lower + j) + down * spread)
+                    v.store(at_upper + j, v.load(at_upper + j) + (ONE - down) * spread)
+                    v.store(at_lower + j, v.load(at_lower + j) + down * spread)
+    r.keep((lines, edge, spare, right, x2, pairs))
 
 
 def rays_bar(job_address, part, _):
@@ -220,3 +224,4 @@ def rays_bar(job_address, part, _):
                 x_fraction_bar[lens, d, c], x_distance2_bar[lens, d, c] = x_bars[c], x_bars[r.padded(nx) + c]
             for number in range(many):
                 parameters_bar[lens, d, number] = bars[number].sum()
+    r.keep((lines, edge, right, x2, pairs))

@@ -214,3 +214,10 @@ def first_below(pixel, limit):
         else:
             low = middle + 1
     return low
+
+
+@inline
+def keep(arrays):
+    """Numba frees an array after its last use, and to use its address is none: this is."""
+    for array in arrays:
+        array[0] = ZERO
