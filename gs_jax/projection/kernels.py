@@ -216,9 +216,10 @@ def rays_bar(job_address, part, _):
                     weighted = voxels * r.weight(tables, d, distance2)
                     by_distance2 = sample * r.weight_slope(tables, d, distance2)
                     by_y, by_y2 = by_y + weighted * along_y, by_y2 + by_distance2
+                    # Before the other stores, after which LLVM would compute the weight again.
+                    r.add_parameters_bar(tables, d, distance2, sample, at_bars)
                     v.store(at_x_bar + 4 * c, v.load(at_x_bar + 4 * c) + weighted * along_x)
                     v.store(at_x2_bar + 4 * c, v.load(at_x2_bar + 4 * c) + by_distance2)
-                    r.add_parameters_bar(tables, d, distance2, sample, at_bars)
                 y_fraction_bar[lens, d, k], y_distance2_bar[lens, d, k] = v.total(by_y), v.total(by_y2)
             for c in range(nx):
                 x_fraction_bar[lens, d, c], x_distance2_bar[lens, d, c] = x_bars[c], x_bars[r.padded(nx) + c]
