@@ -1,6 +1,7 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points."""
 
 import dataclasses
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,7 @@ def command(
     """
     from ..designs.design import design_text, read_design
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
+    from ..projection.native import once
     from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
 
     check_output(output, VOLUME_SUFFIXES)
@@ -131,9 +133,11 @@ def command(
         if suppress == "points":
             volume = _volume_of_points(found, grid)
         else:
-            volume = volume_of(
-                image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
-            )
+            # The paper's method is a single pass. All others, and points, are many.
+            with once() if method == "backproject" and not points else nullcontext():
+                volume = volume_of(
+                    image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
+                )
         if suppress == "clusters":
             from ..suppression.clustering import find_clusters
 

@@ -1,6 +1,8 @@
 """The bilinear form on a processor, by compiled kernels where these are at hand; by XLA everywhere else."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache, partial, wraps
 from threading import Lock
 
@@ -17,6 +19,17 @@ _PARTS = 32
 # As which XLA knows the handler.
 TARGET = "gs_jax_native"
 _lock = Lock()
+_once = ContextVar("once", default=False)
+
+
+@contextmanager
+def once() -> Iterator[None]:
+    """Around a program that back-projects a single time: XLA is done with it before Numba is loaded."""
+    token = _once.set(True)
+    try:
+        yield
+    finally:
+        _once.reset(token)
 
 
 def native_on_cpu(native: Callable) -> Callable[[Callable], Callable]:
@@ -65,7 +78,7 @@ def rays_bar(shapes, rays: Rays, image, volume) -> Rays:
 def _suits(shapes, rays: Rays, arrays) -> bool:
     # Float64 is for those who compare. Sixteen pixels are read at once.
     single = rays.parameters.dtype == jnp.float32 and all(a is None or a.dtype != jnp.float64 for a in arrays)
-    return jax.default_backend() == "cpu" and single and shapes.image[1] >= 16
+    return jax.default_backend() == "cpu" and single and shapes.image[1] >= 16 and not _once.get()
 
 
 def kernel_number(name: str) -> int | None:
