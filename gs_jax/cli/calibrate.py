@@ -38,7 +38,10 @@ class _Names(click.ParamType):
     "file name), of several sources. Empty cells are not known and are fitted.",
 )
 @click.option(
-    "--fit", type=_Names(), default=(), help=f"Fit these, too: {', '.join(_NAMES[4:])}. Always fitted: the others."
+    "--fit",
+    type=_Names(),
+    default=(),
+    help=f"Fit these, too: {', '.join(_NAMES[4:])}. {', '.join(_NAMES[:4])} are anyway.",
 )
 @click.option("--hold", type=_Names(), default=(), help="Take these from the design.")
 @click.option("--find-lenses", is_flag=True, help="Find the lenses, whatever centres DESIGN lists; needs positions.")
