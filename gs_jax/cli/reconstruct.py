@@ -1,9 +1,6 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points."""
 
-import dataclasses
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -13,6 +10,7 @@ from ..io.disk import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
+from .recording import check_recording, reconstruct_recording, recording_options
 
 
 @click.command(
@@ -68,6 +66,7 @@ from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
 )
 @click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
 @click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+@recording_options
 @capture_options
 @force_option
 def command(
@@ -86,6 +85,8 @@ def command(
     output: Path,
     points: Path | None,
     force: bool,
+    frame_interval: float | None,
+    resume: bool,
     camera: CaptureOptions,
 ):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
@@ -99,13 +100,15 @@ def command(
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..designs.design import design_text, read_design
+    from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
-    from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
+    from ..reconstruction.pipeline import COARSE, voxel_grid
+    from .inversion import maker, method_of
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
-    check_may_write(output, points, inputs=(capture, design, weights, *camera.files), force=force)
+    check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
     if suppress != "none" and method != "backproject":
@@ -117,34 +120,35 @@ def command(
         raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
     if stop_at_noise and method in ("backproject", "unrolled"):
         raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
-    inversion = _inversion(method, steps, weights, tv=tv, sparsity=sparsity)
-    cleaned = _network(weights) if suppress == "unet" else None
+    inversion = method_of(method, steps, weights, tv=tv, sparsity=sparsity)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
-    image = camera.read(capture)
-    found = evidence = warning = None
-    with Progress() as progress:
-        if suppress == "points" or (points and suppress != "clusters"):
-            found, evidence, warning = _points(image, imager, grid, progress)
-        if suppress == "points":
-            volume = _volume_of_points(found, grid)
-        else:
-            volume = volume_of(
-                image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
+    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points}
+    with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
+        check_recording(capture, recording, output, resume=resume, interval=frame_interval, force=force)
+        if recording:
+            return reconstruct_recording(
+                recording,
+                design_text(microscope),
+                imager,
+                grid,
+                maker(imager, grid, inversion, progress, **options, weights=weights),
+                output,
+                name=capture.name,
+                camera=camera,
+                progress=progress,
+                points=points,
+                weights=weights,
+                interval=frame_interval,
+                resume=resume,
             )
-        if suppress == "clusters":
-            from ..suppression.clustering import find_clusters
-
-            with progress.step("Clustering"):
-                found = find_clusters(volume, grid)
-                volume = _volume_of_points(found, grid)
-        if cleaned:
-            with progress.step("Suppressing the background"):
-                volume = cleaned(volume)
+        image = camera.read(capture)
+        made = maker(imager, grid, inversion, progress, **options, weights=weights)
+        volume, found, evidence, warning = made(image, progress)
         check = None
-        if method == "unrolled" or cleaned:
+        if method == "unrolled" or suppress == "unet":
             from ..reconstruction.reprojection import reproject
 
             check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
@@ -166,50 +170,3 @@ def command(
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
     if warning:
         click.echo(f"gs-jax: warning: {warning}", err=True)
-
-
-def _inversion(name: str, steps: int, weights: Path | None, **options) -> Any:
-    """The method of this name, with the options that were given, if it has them."""
-    from ..reconstruction.methods import METHODS as BY_NAME
-    from ..solvers.unrolled import read_unrolled
-
-    method: Any = read_unrolled(weights) if weights and name == "unrolled" else BY_NAME[name](steps)
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given:
-        if not hasattr(method, option):
-            has = [other for other, make in BY_NAME.items() if hasattr(make(1), option)]
-            raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
-    return dataclasses.replace(method, **given)
-
-
-def _points(image, imager, grid, progress):
-    """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
-    import numpy as np
-
-    from ..suppression.consistency import signal
-    from ..suppression.evidence import LEAST_SHARP, point_evidence, sharpness
-    from ..suppression.locate import find_points
-
-    light = signal(image)
-    points, warning = find_points(light, imager, grid, progress=progress), None
-    sharp = sharpness(imager, grid)
-    if sharp < LEAST_SHARP:
-        share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
-        warning = f"out of focus at these depths: {share}; no point is to be trusted"
-    columns = point_evidence(points, light, imager, grid)._asdict()
-    return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
-
-
-def _network(weights: Path | None):
-    """What cleans a volume: our network, or that of a file."""
-    from ..suppression.unet import read_weights, suppress
-
-    return partial(suppress, network=read_weights(weights) if weights else None)
-
-
-def _volume_of_points(points, grid):
-    import numpy as np
-
-    from ..simulation.phantoms import rasterize
-
-    return np.asarray(rasterize(points, grid), np.float32)
