@@ -230,7 +230,7 @@ def run(
     found["slopes"] = {
         axis: {name: slope(axis, results, name) for name in IN_STUDY} for axis, results in found["study"].items()
     }
-    found["bars"] = bars(found["jobs"][0])
+    found["bars"] = [bar for job in found["jobs"] for bar in bars(job)]
     return found
 
 
@@ -254,10 +254,10 @@ def bars(result: dict) -> list[dict]:
     image_mib = result["pixels"] ** 2 * 4 / 2**20
     rows = [
         ("time of the paper's loop in numba, in ours", ratio("numba, the paper's loop"), ">=", 5),
-        ("our time, in that of numba lens patches", 1 / ratio("numba, lens patches"), "<=", 2.5),
+        ("our time, in that of numba lens patches", 1 / ratio("numba, lens patches"), "<=", 1.05),
         ("the paper's 18 s, in ours", PAPER_S / of("gs_jax", "median_s"), ">=", 100),
-        ("adjoint, in back-projections", ratio("gs_jax, adjoint"), "<=", 3),
-        ("gradient by centres and v, in back-projections", ratio("gs_jax, gradient"), "<=", 4),
+        ("adjoint, in back-projections", ratio("gs_jax, adjoint"), "<=", 1.5),
+        ("value and gradient by centres and v, in back-projections", ratio("gs_jax, value and gradient"), "<=", 3),
         (
             "memory with the image, MiB",
             image_mib + of("gs_jax", "extra_mib"),
@@ -267,6 +267,7 @@ def bars(result: dict) -> list[dict]:
     ]
     return [
         {
+            "job": result["job"],
             "what": what,
             "found": found,
             "sign": sign,
@@ -274,6 +275,7 @@ def bars(result: dict) -> list[dict]:
             "met": bool(found >= bar if sign == ">=" else found <= bar),
         }
         for what, found, sign, bar in rows
+        if not np.isnan(found)  # memory is measured for the first
     ]
 
 
@@ -297,7 +299,10 @@ def job_rows(result: dict) -> list[list[str]]:
 
 
 def bar_rows(found: dict) -> list[list[str]]:
-    return [[b["what"], f"{b['found']:.3g}", f"{b['sign']} {b['bar']:.3g}", "yes" if b["met"] else "NO"] for b in found]
+    return [
+        [b["job"], b["what"], f"{b['found']:.3g}", f"{b['sign']} {b['bar']:.3g}", "yes" if b["met"] else "NO"]
+        for b in found
+    ]
 
 
 def tables(found: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
@@ -306,7 +311,7 @@ def tables(found: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
     slopes = [[axis, *(f"{s[name]:.2f}" for name in IN_STUDY)] for axis, s in found["slopes"].items()]
     return [
         *jobs,
-        ("Against the bars", ("", "found", "bar", "met"), bar_rows(found["bars"])),
+        ("Against the bars", ("", "", "found", "bar", "met"), bar_rows(found["bars"])),
         ("Exponent of the cost between the two largest sizes", ("in", *IN_STUDY), slopes),
     ]
 

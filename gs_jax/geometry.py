@@ -276,6 +276,12 @@ class Imager(eqx.Module):
         v = self.sensor_distance
         return magnification * (v + height) / (v - height * magnification)
 
+    def lean(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "depth 2"]:
+        """How far beside its vertex a lens's axis is at a depth, mm: it is normal to the array's plane."""
+        depth = self.reduced_depth(depth)[:, None]
+        tilt = jnp.zeros(2, depth.dtype) if self.tilt is None else self.tilt
+        return -depth * tilt[None]
+
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v) / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)

@@ -173,6 +173,20 @@ def test_several_sources_in_a_capture_and_some_places_unknown():
     assert np.abs(found.sources.points - MANY)[:, :2].max() < 5e-3 and len(found.residuals) > 60
 
 
+def test_two_sources_of_one_depth_are_told_apart():
+    """Both unknown in the plane, in one capture; a known one is in another."""
+    actual, design, _ = device(5)
+    given, of = np.array([MANY[4], MANY[0], MANY[1]]), [0, 1, 1]
+    true = given.copy()
+    given[1:, :2] = np.nan
+    found = calibrate(captures(actual, true, of), given, design, captures=np.array(of))
+    check(found, actual)
+    # Which is which nobody said.
+    places = found.sources.points[1:]
+    places = places if abs(places[0, 0] - true[1, 0]) < 0.5 else places[::-1]
+    np.testing.assert_allclose(places, true[1:], atol=5e-3)
+
+
 def test_places_unknown_in_the_plane():
     """The shift is the design's: any other shows the same spots, from sources that are displaced."""
     actual, design, _ = device(6)
@@ -310,6 +324,8 @@ def test_the_command(tmp_path):
     np.testing.assert_allclose(new.centers, actual.centers, atol=2e-3)
     assert float(new.sensor_distance) == pytest.approx(float(actual.sensor_distance), abs=5e-3)
     assert "standard_deviations" in read_provenance(tmp_path / "new.toml") and (tmp_path / "new.png").exists()
+    shown = CliRunner().invoke(commands, ["metrics", str(tmp_path / "new.toml")], catch_exceptions=False).stdout
+    assert "calibrated by" in shown and "sensor_distance_mm +- " in shown
     assert new.tilt is not None and "calibrated_values" in read_provenance(tmp_path / "new.toml")
     (tmp_path / "p.csv").write_text("x_mm,y_mm,z_mm\n0,0,20\n")
     for more, message in (

@@ -15,7 +15,7 @@ from .test_calibration import POINTS, captures
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_region_calibrates_the_whole(binning):
     actual, design, _ = device(0)
-    row, column, rows, columns = 100, 50, 800, 900
+    row, column, rows, columns = 100, 50, 1200, 1400
     region = Readout(roi=(row, column, rows, columns), binning=binning).sensor(design.sensor)
     images = [
         image[row : row + rows, column : column + columns]

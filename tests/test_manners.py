@@ -55,7 +55,7 @@ def test_reconstruct_by_default_needs_no_scipy(folder):
         f"import sys; sys.argv = ['gs-jax', *{RECONSTRUCT!r}, '-o', 'volume.ome.tif']\n"
         "from gs_jax.__main__ import main\n"
         "try:\n    main()\n"
-        "finally:\n    assert not {'scipy', 'skimage', 'matplotlib', 'zarr', 'optax'} & set(sys.modules)"
+        "finally:\n    assert not {'scipy', 'skimage', 'matplotlib', 'zarr', 'optax', 'numba'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
     assert done.returncode == 0, done.stderr

@@ -44,6 +44,20 @@ def test_chief_rays_are_straight_lines_through_the_vertices():
     np.testing.assert_allclose(imager.project(point)[:, 0], landing, atol=1e-12)
 
 
+def test_light_is_brightest_on_the_axis_that_leans():
+    """By the angle between the ray and the plane's normal, in three dimensions."""
+    imager = tilted()
+    normal = np.array([-TILT[0], -TILT[1], 1.0]) / np.sqrt(1 + TILT @ TILT)
+    reduced = float(imager.reduced_depth(20.0))
+    lean = np.asarray(imager.lean(jnp.array([20.0])))[0]
+    np.testing.assert_allclose(np.cross([*lean, reduced], normal), 0, atol=1e-12)
+    alone = eqx.tree_at(lambda i: i.array.centers, dataclasses.replace(imager, field_radius=1.0), jnp.zeros((1, 2)))
+    image = np.asarray(backproject(np.ones((700, 720)), alone, Grid([20.0], (161, 161), 0.02)))[0]
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    center = np.asarray(alone.centers)[0]
+    assert np.abs((np.array([column, row]) - 80) * 0.02 - center - lean).max() < 0.02
+
+
 def test_no_tilt_and_a_tilt_of_zero_are_the_same():
     grid, volume = Grid([18.0, 21.0], (61, 67), 0.1), np.random.default_rng(1).random((2, 61, 67))
     image = [forward(volume, imager, grid) for imager in (tilted(None), tilted((0.0, 0.0)))]

@@ -1,6 +1,8 @@
 """The geometry of a microscope from captures of point sources whose places are known, at least in part."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -39,6 +41,8 @@ _SPOTS = 60
 _WITHIN = (0.06, 0.03, 0.015)
 # Standard deviation that lenses of a printed array may have from their places, mm, and lenses of no list.
 _PRINTED, _ANYWHERE = 0.01, 1.0
+# Captures that are looked at side by side, each with several times its memory.
+_THREADS = 2
 # Steps of the solver at most.
 _MOST_STEPS = 300
 # Spots in an array of them: a multiple, so that few shapes are compiled.
@@ -126,10 +130,11 @@ def calibrate(
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
     sources.check(len(images))
     sources.check_fit(fit)
-    found = [
-        spots_in(image, imager, int((sources.captures == number).sum()))
-        for number, image in enumerate(progress.track(images, "Finding spots"))
-    ]
+    many = [int((sources.captures == number).sum()) for number in range(len(images))]
+    # Filters of SciPy, which run beside each other.
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:
+        spots = threads.map(spots_in, images, [imager] * len(images), many)
+        found = [each for each, _ in zip(spots, progress.track(images, "Finding spots"), strict=True)]
     with progress.step("Matching lenses"):
         start = begin_without_lenses(found, sources, imager) if find_lenses else begin(found, sources, imager)
     if find_lenses:

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..geometry import Imager, MicrolensArray
+from ..geometry import Imager, MicrolensArray, chief_ray
 from .matching import Similarity, match, match_shift, meeting_lenses
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of
@@ -106,20 +107,37 @@ def _mirrored(array: MicrolensArray) -> MicrolensArray:
 
 def _placed(found, sources: Sources, imager: Imager) -> Sources:
     """Sources with coordinates that nobody gave, from where the pattern of the lenses is in their captures."""
-    points, centers = sources.points.copy(), np.asarray(imager.centers, np.float64)
-    for source in np.flatnonzero(np.isnan(points).any(1)):
-        spots = found[int(sources.captures[source])]
-        depth = points[source, 2]
-        if np.isnan(depth):
-            near = match(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
-            magnification = abs(near.factor) - 1
-            reduced = float(imager.sensor_distance) / max(magnification, 1e-3)
-            depth = reduced - float(imager.reduced_depth(0.0))
-        magnification = float(imager.magnification(depth))
-        shift, _ = match_shift(spots, (1 + magnification) * centers)
-        place = [*(-shift / magnification), max(depth, 1e-3)]
-        points[source] = np.where(np.isnan(points[source]), place, points[source])
+    points, left = sources.points.copy(), [np.asarray(spots) for spots in found]
+    # Spots of the sources that are known are not those of the others.
+    for source in np.argsort(np.isnan(points).any(1), kind="stable"):
+        capture = int(sources.captures[source])
+        missing = np.isnan(points[source])
+        if missing.any():
+            points[source] = np.where(missing, _place(left[capture], points[source, 2], imager), points[source])
+        left[capture] = _without(left[capture], points[source], imager)
     return sources._replace(points=points)
+
+
+def _place(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
+    """Where the source is that most of the spots are of, at a depth, or at any if that is NaN."""
+    if np.isnan(depth):
+        near = match(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
+        magnification = max(abs(near.factor) - 1, 1e-3)
+        depth = max(float(imager.sensor_distance) / magnification - float(imager.reduced_depth(0.0)), 1e-3)
+    magnification = float(imager.magnification(depth))
+    shift, _ = match_shift(spots, (1 + magnification) * np.asarray(imager.centers, np.float64))
+    x, y = -shift / magnification
+    return float(x), float(y), depth
+
+
+def _without(spots, point, imager: Imager):
+    """The spots that are not of a source."""
+    centers, magnification = np.asarray(imager.centers, np.float64), float(imager.magnification(point[2]))
+    seen = np.linalg.norm(centers - point[:2], axis=1) < imager.field_radius
+    if not len(spots) or not seen.any():
+        return spots
+    wanted = chief_ray(centers[seen], point[:2], magnification)
+    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > _NEAR]
 
 
 def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:

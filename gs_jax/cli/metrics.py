@@ -34,6 +34,7 @@ def command(design: Path, output: Path | None, depths: list[float] | None, confu
     if output:
         write_json(output, sheet)
     click.echo(summary(microscope, sheet))
+    click.echo(_calibration(microscope.provenance))
     console = Console()
     for table in tables(sheet):
         console.print()
@@ -41,3 +42,13 @@ def command(design: Path, output: Path | None, depths: list[float] | None, confu
     click.echo()
     for sentence in findings(microscope, sheet, confusion=confusion):
         click.echo(f"- {sentence}")
+
+
+def _calibration(provenance) -> str:
+    """What `gs-jax calibrate` wrote into the file."""
+    if "calibrated_spots" not in provenance:
+        return "  not calibrated: the geometry is that of the design"
+    spots, captures = provenance["calibrated_spots"], provenance["calibrated_captures"]
+    rms, deviations = provenance["calibrated_rms_pixels"], provenance["standard_deviations"]
+    known = ", ".join(f"{name} +- {deviation:g}" for name, deviation in deviations.items())
+    return f"  calibrated by {spots} spots of {captures} captures, {rms:.3f} pixels RMS: {known}"

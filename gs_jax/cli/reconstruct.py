@@ -1,5 +1,6 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -102,6 +103,7 @@ def command(
     from ..designs.design import design_text, read_design
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
+    from ..projection.native import once
     from ..reconstruction.pipeline import COARSE, voxel_grid
     from .inversion import maker, method_of
 
@@ -146,7 +148,9 @@ def command(
             )
         image = camera.read(capture)
         made = maker(imager, grid, inversion, progress, **options, weights=weights)
-        volume, found, evidence, warning = made(image, progress)
+        # The paper's method is a single pass. All others, and points, are many.
+        with once() if method == "backproject" and suppress != "points" and not points else nullcontext():
+            volume, found, evidence, warning = made(image, progress)
         check = None
         if method == "unrolled" or suppress == "unet":
             from ..reconstruction.reprojection import reproject

@@ -65,7 +65,9 @@ class SensorTable(Table):
     )
     shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
     origin_mm: Point | None = Field(
-        default=None, title="middle of a region of a larger sensor, whose centre stays the frame's origin"
+        default=None,
+        title="middle of a region of a larger sensor, whose centre stays the frame's origin",
+        description="[x, y] in mm, up to 1e4",
     )
 
 

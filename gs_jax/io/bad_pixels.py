@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Bool, Float32, Num
-from scipy.ndimage import maximum_filter
 
 # A pixel of a dark frame is hot if it is so many standard deviations brighter than the median of its neighbourhood of
 # 5 x 5; a count is rounded by half of one.
@@ -19,8 +18,7 @@ def hot_in_dark(dark: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "row co
     middle = float(np.median(dark))
     deviation = max(1.4826 * float(np.median(np.abs(dark - middle))), _ROUNDING)
     hot = dark > middle + _HOT * deviation
-    places = np.argwhere(hot)
-    for some in np.array_split(places, len(places) // 100_000 + 1):
+    for some in _in_parts(np.argwhere(hot)):
         local = np.median(_around(dark, some, 2), axis=1)
         hot[tuple(some.T)] = dark[tuple(some.T)] > local + _HOT * deviation
     return hot
@@ -39,10 +37,9 @@ def hot_in_capture(image: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "ro
     # Images without noise have bright pixels, too.
     least = (float(image.max()) - level) / 100 if image.dtype.kind == "f" else _BRIGHT * _ROUNDING
     hot = image > level + max(_BRIGHT * noise, least)
-    ring = np.ones((3, 3), bool)
-    ring[1, 1] = False
-    neighbour = maximum_filter(image, footprint=ring, mode="nearest")
-    hot[hot] = neighbour[hot] - level < _NEIGHBOUR * (image[hot] - level)
+    for some in _in_parts(np.argwhere(hot)):
+        brightest = np.delete(_around(image, some, 1), 4, axis=1).max(1)
+        hot[tuple(some.T)] = brightest - level < _NEIGHBOUR * (image[tuple(some.T)] - level)
     return hot
 
 
@@ -67,6 +64,11 @@ def repaired(
         image[filled], bad[filled] = np.nanmedian(near[reached], axis=1), False
         places = places[~reached]
     return image
+
+
+def _in_parts(places):
+    """A few at a time, for the memory of their neighbourhoods."""
+    return np.array_split(places, len(places) // 100_000 + 1)
 
 
 def _around(image, places, reach):

@@ -60,6 +60,10 @@ def _cores_image(volume, imager, grid, optics):
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * stretch[number]
         at = grid.at(imager.sensor_distance / magnification - imager.reduced_depth(0.0))
+        if imager.tilt is not None:
+            # Cores are drawn to the axis of the lens, which leans.
+            drawn = (1 / stretch[number] - 1) * imager.lean(depth[None])[0]
+            at = eqx.tree_at(lambda g: g.origin, at, at.origin + drawn)
         weight = RingLight(*rings[number])
         rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
         return volume_to_image(Shapes(imager.sensor.shape, at.volume_shape, weight), rays, voxels[None])

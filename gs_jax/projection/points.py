@@ -116,7 +116,8 @@ def forward_points(
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
-        pairs = KDTree(some[:, :2]).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
+        beside = some[:, :2] - np.asarray(imager.lean(some[:, 2]), np.float64)
+        pairs = KDTree(beside).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
             spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
@@ -141,14 +142,15 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
 
 
 def _rays(depth, imager, stamps):
-    """Magnification and parameters of the weight, for each point."""
+    """Magnification, how much of it is the core's own, and parameters of the weight, for each point."""
     reduced = depth + float(imager.reduced_depth(0.0))
     magnification = float(imager.sensor_distance) / reduced
     if stamps.ring is None:
-        return magnification, reduced[:, None]
+        return magnification, np.ones_like(reduced), reduced[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
     light = np.stack([between(part) for part in stamps.ring.light.T], -1)
-    return magnification * between(stamps.ring.stretch), light
+    stretch = between(stamps.ring.stretch)
+    return magnification * stretch, stretch, light
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -158,6 +160,7 @@ def _add_spots(
     points: Float[Array | np.ndarray, "spot 4"],
     lenses: Int[Array | np.ndarray, " spot"],
     magnification: Float[Array | np.ndarray, " spot"],
+    stretch: Float[Array | np.ndarray, " spot"],
     parameters: Float[Array | np.ndarray, "spot parameter"],
     imager: Imager,
     depths: Float[Array, " depth"],
@@ -166,14 +169,18 @@ def _add_spots(
 ) -> Float[Array, "tile side side"]:
     """Adds the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
     size, dtype = kernels.shape[-1], imager.sensor_distance.dtype
-    points, magnification, parameters = (jnp.asarray(part, dtype) for part in (points, magnification, parameters))
+    numbers = (points, magnification, stretch, parameters)
+    points, magnification, stretch, parameters = (jnp.asarray(part, dtype) for part in numbers)
     center, point, depth = imager.centers[lenses], points[:, :2], points[:, 2]
-    light = (points[:, 3] * weight(jnp.sum((center - point) ** 2, -1), parameters)).astype(kernels.dtype)
+    lean = imager.lean(depth)
+    light = (points[:, 3] * weight(jnp.sum((center + lean - point) ** 2, -1), parameters)).astype(kernels.dtype)
     between = jnp.interp(depth, depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
     near = between.astype(int)
     far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
 
     magnification = imager.magnification_of(magnification, imager.heights[lenses])
+    # Cores are drawn to the axis of the lens, which leans.
+    point = point + (1 / stretch - 1)[:, None] * lean
     place = imager.sensor.to_pixels(chief_ray(center, point, magnification[:, None]))
     fifths = jnp.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
     (i, j), corner = (fifths % STEPS).T, fifths // STEPS + size // 2

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from inspect import unwrap
 from typing import Any
 
 import jax
@@ -131,11 +132,14 @@ def _jvp(primals, tangents, *, call):
 def _by_constants(static, primals, dots):
     call, moving = static
 
+    # What calls a kernel has no derivative; what it is wrapped around has.
+    plain = replace(call, function=unwrap(call.function))
+
     def move(values):
         arrays = list(primals)
         for i, value in zip(moving, values, strict=True):
             arrays[i] = value
-        return call(*arrays)
+        return plain(*arrays)
 
     return jax.jvp(move, ([primals[i] for i in moving],), (list(dots),))[1]
 

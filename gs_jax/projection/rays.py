@@ -89,11 +89,12 @@ def trace(
     magnification = imager.magnifications(grid.depths)
     magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
-    x, y = imager.centers[order].T
+    (x, y), (x_lean, y_lean) = imager.centers[order].T, imager.lean(grid.depths).T
 
-    def axis(center, origin, voxels, pixels, middle):
+    def axis(center, origin, voxels, pixels, middle, lean):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
-        first = jnp.ceil((center - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
+        # One patch for all depths: that of the mean one.
+        first = jnp.ceil((center + lean.mean() - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
         index = (start[:, None] + jnp.arange(size, dtype=jnp.int32)[None, :]).astype(center.dtype) - (voxels - 1) / 2
         from_grid, center = center - origin, center - middle
@@ -102,13 +103,13 @@ def trace(
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
-        distance2 = jnp.where(on_sensor, (offset**2)[:, None, :], _OUTSIDE)
+        distance2 = jnp.where(on_sensor, (offset[:, None, :] + lean[None, :, None]) ** 2, _OUTSIDE)
         first_coordinate = jax.lax.stop_gradient(coordinate[..., 0])
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
     return Rays(
-        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1]),
-        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0]),
+        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1], y_lean),
+        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0], x_lean),
         spacing=jax.lax.stop_gradient(
             jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
         ),
@@ -117,7 +118,7 @@ def trace(
 
 
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
-    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the axis.
+    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the vertex.
 
     `center` is the lens's as seen from the middle of the sensor's pixels, `from_origin` as seen from the grid's origin,
     where voxels are counted from. `magnification` is `(lens, depth)`.

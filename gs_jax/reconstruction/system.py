@@ -54,7 +54,7 @@ def model_of(imager: Imager, grid: Grid, optics: Optics | str, progress: Progres
 
 def explainable(
     image: Num[Array | np.ndarray, "row column"], model: Model
-) -> tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"] | float]:
+) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
     """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it."""
     rows, columns = model.imager.sensor.shape
     light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))

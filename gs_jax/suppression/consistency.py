@@ -64,13 +64,13 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
         image a point beyond the sensor do not see it.
     """
     centers = np.asarray(imager.centers, np.float64)
-    tree = KDTree(centers)
-    most = max(tree.query_ball_point(points[:, :2], imager.field_radius, return_length=True), default=0)
+    tree, depth = KDTree(centers), jnp.asarray(points[:, 2], imager.sensor_distance.dtype)
+    beside = points[:, :2] - np.asarray(imager.lean(depth), np.float64)
+    most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
     # With two or more there is an axis of lenses.
-    distance, lens = tree.query(points[:, :2], k=max(most, 2), distance_upper_bound=imager.field_radius)
+    distance, lens = tree.query(beside, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
     distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
-    depth = jnp.asarray(points[:, 2], imager.sensor_distance.dtype)
     magnification = np.asarray(imager.magnifications(depth), np.float64)
     of_each = (
         magnification[0][:, None] if len(magnification) == 1 else magnification[lens, np.arange(len(lens))[:, None]]
