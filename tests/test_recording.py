@@ -18,6 +18,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.designs.design import read_design
 from gs_jax.io import ngff, volume_series
 from gs_jax.io.captures import Wanted
+from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import opened_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halved
@@ -119,6 +120,12 @@ def test_what_viewers_are_told(folder, monkeypatch, capsys):
     ]
     whole = volumes()
     np.testing.assert_allclose(levels[1][2, 1, 3, 4], whole[2, 1, 6:8, 8:10].mean(), rtol=1e-6)
+    find = reader("v.zarr")
+    assert find is not None
+    ((layer, options, kind),) = find("v.zarr")
+    assert kind == "image" and options["multiscale"] and [each.shape for each in layer] == [n.shape for n in levels]
+    assert options["scale"] == [0.05, 1000, 50, 50] and options["translate"] == [0, 18000, -950, -800]
+    assert options["axis_labels"] == ("t", "z", "y", "x") and options["units"] == ("s", "um", "um", "um")
     window = attributes["omero"]["channels"][0]["window"]
     assert window["min"] <= window["start"] < window["end"] <= window["max"] == whole[0].max()
 

@@ -1,4 +1,4 @@
-"""`gs-jax reconstruct`: a capture to a volume, or to points."""
+"""`gs-jax reconstruct`: a capture to a volume, or to points; a recording to volumes in time."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -65,8 +65,14 @@ from .recording import check_recording, reconstruct_recording, recording_options
     type=Path,
     help="WEIGHTS.npz of `gs-jax train`, for --method unrolled or --suppress unet.  [default: ours]",
 )
-@click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
-@click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+@click.option(
+    "-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr and for recordings."
+)
+@click.option(
+    "--points",
+    type=Path,
+    help="POINTS.csv: write the points that the capture shows, too; of a recording with their frame, from 0.",
+)
 @recording_options
 @capture_options
 @force_option
@@ -94,6 +100,13 @@ def command(
 
     CAPTURE is a grey TIFF, PNG or .npy of the sensor's size, or what --page, --channel, --bayer, --roi, --binning say
     of it; --dark, --flat, --bad-pixels and --offset correct it. The volume is written to scale, for Fiji and napari.
+
+    CAPTURE may be a recording: a TIFF or .npy of several pages, a folder of captures, a pattern in quotes, or a Zarr
+    array (t, y, x). All frames go to one VOLUME.zarr (t, z, y, x); a bad one is named and left empty (exit status 1).
+
+    \b
+    A recording of 20 frames a second, and on after an interrupt:
+    gs-jax reconstruct "run7/*.tif" my.toml --depths 18:22:0.25 --frame-interval 0.05 -o run7.zarr --resume
 
     \b
     A part of the sensor, binned, with a dark frame and a flat field:

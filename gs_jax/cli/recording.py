@@ -28,7 +28,10 @@ def recording_options(command):
         help="Of a recording: seconds from frame to frame, the scale of its time axis.  [default: unknown]",
     )
     resume = click.option(
-        "--resume", is_flag=True, help="Of a recording: keep the frames that VOLUME.zarr has, and make the others."
+        "--resume",
+        is_flag=True,
+        help="Of a recording: keep the frames that a run left in VOLUME.zarr, if any, and make the others. Without it "
+        "an unfinished VOLUME.zarr is replaced by --force alone.",
     )
     return interval(resume(command))
 

@@ -9,14 +9,14 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError, short_repr
 from ..geometry import Grid
-from .disk import atomic_write
+from .disk import atomic_write, decoding
 from .ngff import CHUNK, chunked, image_attributes, plain_depths
 from .provenance import Provenance
 
@@ -162,6 +162,44 @@ def read_head(path: str | os.PathLike[str]) -> tuple[dict[str, str], int] | None
         return {str(key): str(value) for key, value in head["request"].items()}, int(head["frames"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+class Series(NamedTuple):
+    """Volumes in time, of which nothing has been read.
+
+    Parameters
+    ----------
+    levels
+        Zarr arrays `(t, z, y, x)`, the first of the full size.
+    scale, first
+        Of the first level, the steps `(t, z, y, x)` and the centre of the first voxel: um, and seconds or frames.
+    interval
+        Seconds between frames, if they are known.
+    shown
+        What is black and white.
+    """
+
+    levels: list[Any]
+    scale: list[float]
+    first: list[float]
+    interval: float | None
+    shown: tuple[float, float]
+
+
+def read_series(path: str | os.PathLike[str]) -> Series | None:
+    """What `VolumeSeries` wrote, or None if it is anything else."""
+    if read_head(path) is None:
+        return None
+    import zarr
+
+    with decoding(Path(path), "OME-Zarr"):
+        group = zarr.open_group(path, mode="r")
+        attributes: Any = group.attrs.asdict()
+        (image,), window = attributes["multiscales"], attributes["omero"]["channels"][0]["window"]
+        scale, first = image["datasets"][0]["coordinateTransformations"]
+        interval = scale["scale"][0] if "unit" in image["axes"][0] else None
+        levels = [group[each["path"]] for each in image["datasets"]]
+        return Series(levels, scale["scale"], first["translation"], interval, (window["start"], window["end"]))
 
 
 def check_replaceable(path: Path) -> None:
