@@ -83,7 +83,8 @@ def run(frames: int = 500, pixels: int = 1024, depths: int = 13) -> dict:
         journal, watched = folder / "v.zarr" / JOURNAL, []
         while process.poll() is None:
             done = journal.read_bytes().count(b"\n") - 1 if journal.exists() else 0
-            watched.append((time.monotonic() - began, done, process.memory_info().rss / 2**20))
+            if memory := process.memory_info().rss:  # of a process that is ending it is 0
+                watched.append((time.monotonic() - began, done, memory / 2**20))
             time.sleep(_EVERY)
         said = process.stdout.read().decode() if process.stdout else ""
         alone = parts(folder / "recording.tif", design, places, folder, min(frames, _TIMED))

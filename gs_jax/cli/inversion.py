@@ -89,4 +89,7 @@ def _volume_of_points(points, grid):
 
     from ..simulation.phantoms import rasterize
 
-    return np.asarray(rasterize(points, grid), np.float32)
+    # Points of no light beside them, up to a power of two: other numbers of points need no other program.
+    padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
+    padded[: len(points)] = points
+    return np.asarray(rasterize(padded, grid), np.float32)
