@@ -96,6 +96,11 @@ def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
     assert "dark.tif" in read_provenance("v.zarr")["correction"]
 
 
+def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
+    status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
+    assert (status, err) == (0, "") and out.count("imaged again") == 1 and "v.zarr: frame 0 imaged again is" in out
+
+
 def test_what_viewers_are_told(folder, monkeypatch, capsys):
     """Time first, to scale; planes as chunks; a pyramid where a plane is larger than a chunk."""
     monkeypatch.setattr(ngff, "CHUNK", 16)

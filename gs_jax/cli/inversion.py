@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +26,13 @@ def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress,
     options = {"optics": optics, "stop_at_noise": stop_at_noise, "progress": progress}
     volume_of: Any = None if suppress == "points" else reconstructor(imager, grid, inversion, **options)
 
+    # Of the design and the depths alone.
+    sharp = cache(partial(_sharpness, imager, grid))
+
     def made(image, progress):
         found = evidence = warning = None
         if suppress == "points" or (points and suppress != "clusters"):
-            found, evidence, warning = _points(image, imager, grid, progress)
+            found, evidence, warning = _points(image, imager, grid, sharp(), progress)
         volume = _volume_of_points(found, grid) if suppress == "points" else volume_of(image, progress)
         if suppress == "clusters":
             from ..suppression.clustering import find_clusters
@@ -59,17 +62,22 @@ def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
     return dataclasses.replace(method, **given)
 
 
-def _points(image, imager, grid, progress):
+def _sharpness(imager, grid):
+    from ..suppression.evidence import sharpness
+
+    return sharpness(imager, grid)
+
+
+def _points(image, imager, grid, sharp, progress):
     """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
     import numpy as np
 
     from ..suppression.consistency import signal
-    from ..suppression.evidence import LEAST_SHARP, point_evidence, sharpness
+    from ..suppression.evidence import LEAST_SHARP, point_evidence
     from ..suppression.locate import find_points
 
     light = signal(image)
     points, warning = find_points(light, imager, grid, progress=progress), None
-    sharp = sharpness(imager, grid)
     if sharp < LEAST_SHARP:
         share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
         warning = f"out of focus at these depths: {share}; no point is to be trusted"

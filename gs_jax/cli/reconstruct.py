@@ -11,7 +11,7 @@ from ..io.disk import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
-from .recording import check_recording, reconstruct_recording, recording_options
+from .recording import check_recording, in_words, reconstruct_recording, recording_options
 
 
 @click.command(
@@ -142,6 +142,13 @@ def command(
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
     options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points}
     with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
+        again = None
+        if method == "unrolled" or suppress == "unet":
+            from ..reconstruction.reprojection import reproject
+
+            again = lambda volume, image, progress: reproject(
+                volume, image, imager, grid, optics=optics, progress=progress
+            )
         check_recording(capture, recording, output, resume=resume, interval=frame_interval, force=force)
         if recording:
             return reconstruct_recording(
@@ -158,17 +165,14 @@ def command(
                 weights=weights,
                 interval=frame_interval,
                 resume=resume,
+                again=again,
             )
         image = camera.read(capture)
         made = maker(imager, grid, inversion, progress, **options, weights=weights)
         # The paper's method is a single pass. All others, and points, are many.
         with once() if method == "backproject" and suppress != "points" and not points else nullcontext():
             volume, found, evidence, warning = made(image, progress)
-        check = None
-        if method == "unrolled" or suppress == "unet":
-            from ..reconstruction.reprojection import reproject
-
-            check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
+        check = again(volume, image, progress) if again else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=design_text(microscope)))
             write_volume(output, volume, grid, provenance)
@@ -181,8 +185,7 @@ def command(
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
     if check:
-        error = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
-        click.echo(f"{output}: imaged again it is {error}, {check.regions.max():.0%} where it is farthest")
+        click.echo(f"{output}: imaged again it is {in_words(check)}")
     if found is not None:
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
     if warning:

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,12 @@ def reconstruct_recording(
     weights: Path | None,
     interval: float | None,
     resume: bool,
+    again: Callable | None = None,
 ) -> int:
-    """Makes and writes all frames, says what was made, and returns the exit status: 1 if a frame failed."""
+    """Makes and writes all frames, says what was made, and returns the exit status: 1 if a frame failed.
+
+    `again` images a volume again, and compares it with its image; it does so with the first one.
+    """
     from ..io.ngff import plain_depths
     from ..io.volume_series import VolumeSeries
     from ..reconstruction.recording import reconstruct_frames
@@ -87,11 +92,13 @@ def reconstruct_recording(
     )
     kept[output] = RESUMABLE
     before, began = len(series.finished), time.monotonic()
-    warnings = {}
+    warnings, checks = {}, []
 
     def made(frame):
-        image, done, said = frame
+        number, image, done, said = frame
         found = make(image, Progress())
+        if again and not checks:
+            checks.append(f"frame {number} imaged again is {in_words(again(found.volume, image, Progress()))}")
         note: dict[str, Any] = {name: lines for name, lines in (("done", done), ("warnings", said)) if lines}
         if found.points is not None:
             note["points"] = _columns(found.points, found.evidence)
@@ -114,7 +121,7 @@ def reconstruct_recording(
         while to_say:
             click.echo(to_say.pop(0), err=True)
 
-    reconstruct_frames(series, read, made, failed=failed, progress=progress)
+    reconstruct_frames(series, lambda frame: (frame, *read(frame)), made, failed=failed, progress=progress)
     say()
     seconds, new = time.monotonic() - began, len(series.finished) - before
     if points:
@@ -129,6 +136,8 @@ def reconstruct_recording(
     voxels = f"{size} voxels (t, z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}")
     click.echo(f"{output}: {rate}")
+    for check in checks:
+        click.echo(f"{output}: {check}")
     for warning in warnings:
         click.echo(f"gs-jax: warning: {warning}", err=True)
     if series.failed:
@@ -136,6 +145,12 @@ def reconstruct_recording(
         what = f"{len(series.failed)} of {series.count} frames failed and are empty: {some}"
         click.echo(f"gs-jax: {output}: {what}; --resume tries them again", err=True)
     return int(bool(series.failed))
+
+
+def in_words(check) -> str:
+    """How far a volume that is imaged again is from its capture."""
+    error = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
+    return f"{error}, {check.regions.max():.0%} where it is farthest"
 
 
 def _request(names, provenance) -> dict[str, str]:
