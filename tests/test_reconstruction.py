@@ -47,7 +47,7 @@ class Log(Progress):
         self.parts, self.most = [], most
 
     @contextmanager
-    def counter(self, description, total, *, quarter=""):
+    def counter(self, description, total, *, quarter="", rate=""):
         def advance():
             self.parts.append((description, total))
             if len(self.parts) == self.most:

@@ -10,8 +10,8 @@ from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
 from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
-from gs_jax.reconstruction.pipeline import System
 from gs_jax.reconstruction.reprojection import reproject
+from gs_jax.reconstruction.system import System
 from gs_jax.solvers import unrolled
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
 from gs_jax.training.examples import SCENES, Kind, example

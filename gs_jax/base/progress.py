@@ -40,7 +40,12 @@ class Progress:
         if console.is_terminal and level == NORMAL:
             times = TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()
             self._bars = Bars(
-                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times, console=console
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                *times,
+                TextColumn("{task.fields[rate]}"),
+                console=console,
             )
             self._bars.start()
         self._lines = level == VERBOSE or (level == NORMAL and not console.is_terminal)
@@ -66,26 +71,32 @@ class Progress:
             done()
 
     @contextmanager
-    def counter(self, description: str, total: int | None, *, quarter: str = "") -> Iterator[Callable[[], None]]:
-        """Work of `total` parts; what it yields is called after each. `quarter`: what would take a fourth of the time.
+    def counter(
+        self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
+    ) -> Iterator[Callable[[], None]]:
+        """Work of `total` parts; what it yields is called after each.
 
+        `quarter`: what would take a fourth of the time. `rate`: what the parts are, if so many a second are shown.
         After the second part, work of more than a minute is announced: its time, the memory, and the quarter.
         """
         if bars := self._bars:
-            task = bars.add_task(description, total=total)
+            task = bars.add_task(description, total=total, rate="")
+            began = time.monotonic()
             forecast = _Forecast(
                 description, total, partial(bars.console.print, highlight=False, soft_wrap=True), quarter
             )
 
             def advance():
                 bars.advance(task)
-                forecast(time.monotonic())
+                forecast(now := time.monotonic())
+                if rate and now > began:
+                    bars.update(task, rate=f"{forecast.done / (now - began):.3g} {rate}/s")
 
             yield advance
             if total is None:
                 bars.update(task, total=bars.tasks[task].completed)
         elif self._lines:
-            yield (lines := _Lines(description, total, quarter))
+            yield (lines := _Lines(description, total, quarter, rate))
             if shown.get() == VERBOSE:
                 lines.say(time.monotonic())
         else:
@@ -121,8 +132,8 @@ def _in_words(seconds: float) -> str:
 class _Lines:
     """Called after each part, it prints a line where the last is old."""
 
-    def __init__(self, description: str, total: int | None, quarter: str):
-        self.description, self.total, self.done = description, total, 0
+    def __init__(self, description: str, total: int | None, quarter: str, rate: str = ""):
+        self.description, self.total, self.rate, self.done = description, total, rate, 0
         self.began = self.last = time.monotonic()
         self.forecast = _Forecast(description, total, partial(print, file=sys.stderr, flush=True), quarter)
 
@@ -138,6 +149,6 @@ class _Lines:
         taken, left = self.last - self.began, (self.total or self.done) - self.done
         time_left = f", about {taken / self.done * left:.0f} s left" if left and self.done else ""
         of, digits = f" of {self.total}" if self.total else "", 0 if taken >= _EVERY else 2
-        print(
-            f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{time_left}", file=sys.stderr, flush=True
-        )
+        rate = f", {self.done / taken:.3g} {self.rate}/s" if self.rate and taken > 0 else ""
+        line = f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{rate}{time_left}"
+        print(line, file=sys.stderr, flush=True)

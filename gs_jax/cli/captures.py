@@ -2,6 +2,7 @@
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -89,7 +90,8 @@ class CaptureOptions:
         self.page, self.readout = page, Readout(roi, binning, bayer, channel)
         mask = bad_pixels if bad_pixels in ("auto", "none") else Path(bad_pixels)
         self.correction = Correction(dark, flat, mask, offset)
-        self.sensor, self.done, self.warnings = None, {}, {}
+        self.sensor: Any = None
+        self.done, self.warnings = {}, {}
 
     @property
     def files(self) -> list[Path]:
@@ -120,6 +122,31 @@ class CaptureOptions:
             self.done.setdefault(line, []).append(path)
         self.warnings |= dict.fromkeys(found.warnings)
         return found.image
+
+    def frames(self, recording):
+        """From a frame of a recording to its image, corrected, float32, what was done to it alone, and what is wrong.
+
+        What corrects all frames is read here.
+        """
+        import numpy as np
+
+        from ..io.captures import Wanted
+        from ..io.correction import prepare, read_frame
+
+        shape, readout = self.readout.region(self.sensor).shape, self.readout
+        wanted = Wanted(shape, None, readout.channel, readout.bayer)
+        prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction)
+        self.done = {line: [Path(f"{len(recording.names)} frames")] for line in prepared.done}
+        shared = [*prepared.done, *prepared.warnings]
+        self.warnings |= dict.fromkeys(prepared.warnings)
+
+        def read(frame):
+            found = read_frame(recording.names[frame], recording.images(frame, wanted), prepared, readout)
+            # One type for all frames: nothing is compiled for another.
+            done, warnings = ([line for line in lines if line not in shared] for lines in (found.done, found.warnings))
+            return np.asarray(found.image, np.float32), done, warnings
+
+        return read
 
     def recorded(self, provenance: dict[str, str]) -> dict[str, str]:
         """A provenance that says what was done, too."""

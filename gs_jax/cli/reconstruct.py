@@ -1,10 +1,7 @@
-"""`gs-jax reconstruct`: a capture to a volume, or to points."""
+"""`gs-jax reconstruct`: a capture to a volume, or to points; a recording to volumes in time."""
 
-import dataclasses
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -14,6 +11,7 @@ from ..io.disk import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
+from .recording import check_recording, in_words, reconstruct_recording, recording_options
 
 
 @click.command(
@@ -67,8 +65,15 @@ from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
     type=Path,
     help="WEIGHTS.npz of `gs-jax train`, for --method unrolled or --suppress unet.  [default: ours]",
 )
-@click.option("-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr.")
-@click.option("--points", type=Path, help="POINTS.csv: write the points that the capture shows, too.")
+@click.option(
+    "-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr and for recordings."
+)
+@click.option(
+    "--points",
+    type=Path,
+    help="POINTS.csv: write the points that the capture shows, too; of a recording with their frame, from 0.",
+)
+@recording_options
 @capture_options
 @force_option
 def command(
@@ -87,6 +92,8 @@ def command(
     output: Path,
     points: Path | None,
     force: bool,
+    frame_interval: float | None,
+    resume: bool,
     camera: CaptureOptions,
 ):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
@@ -94,20 +101,29 @@ def command(
     CAPTURE is a grey TIFF, PNG or .npy of the sensor's size, or what --page, --channel, --bayer, --roi, --binning say
     of it; --dark, --flat, --bad-pixels and --offset correct it. The volume is written to scale, for Fiji and napari.
 
+    CAPTURE may be a recording: a TIFF or .npy of several pages, a folder of captures, a pattern in quotes, or a Zarr
+    array (t, y, x). All frames go to one VOLUME.zarr (t, z, y, x); a bad one is named and left empty (exit status 1).
+
+    \b
+    A recording of 20 frames a second, and on after an interrupt:
+    gs-jax reconstruct "run7/*.tif" my.toml --depths 18:22:0.25 --frame-interval 0.05 -o run7.zarr --resume
+
     \b
     A part of the sensor, binned, with a dark frame and a flat field:
     gs-jax reconstruct part.tif my.toml --roi 1024,512,2048,2048 --binning 2
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..designs.design import design_text, read_design
+    from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.native import once
-    from ..reconstruction.pipeline import COARSE, reconstruct as volume_of, voxel_grid
+    from ..reconstruction.pipeline import COARSE, voxel_grid
+    from .inversion import maker, method_of
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
-    check_may_write(output, points, inputs=(capture, design, weights, *camera.files), force=force)
+    check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
     if suppress != "none" and method != "backproject":
@@ -119,39 +135,44 @@ def command(
         raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
     if stop_at_noise and method in ("backproject", "unrolled"):
         raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
-    inversion = _inversion(method, steps, weights, tv=tv, sparsity=sparsity)
-    cleaned = _network(weights) if suppress == "unet" else None
+    inversion = method_of(method, steps, weights, tv=tv, sparsity=sparsity)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
-    image = camera.read(capture)
-    found = evidence = warning = None
-    with Progress() as progress:
-        if suppress == "points" or (points and suppress != "clusters"):
-            found, evidence, warning = _points(image, imager, grid, progress)
-        if suppress == "points":
-            volume = _volume_of_points(found, grid)
-        else:
-            # The paper's method is a single pass. All others, and points, are many.
-            with once() if method == "backproject" and not points else nullcontext():
-                volume = volume_of(
-                    image, imager, grid, inversion, optics=optics, stop_at_noise=stop_at_noise, progress=progress
-                )
-        if suppress == "clusters":
-            from ..suppression.clustering import find_clusters
-
-            with progress.step("Clustering"):
-                found = find_clusters(volume, grid)
-                volume = _volume_of_points(found, grid)
-        if cleaned:
-            with progress.step("Suppressing the background"):
-                volume = cleaned(volume)
-        check = None
-        if method == "unrolled" or cleaned:
+    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points}
+    with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
+        again = None
+        if method == "unrolled" or suppress == "unet":
             from ..reconstruction.reprojection import reproject
 
-            check = reproject(volume, image, imager, grid, optics=optics, progress=progress)
+            again = lambda volume, image, progress: reproject(
+                volume, image, imager, grid, optics=optics, progress=progress
+            )
+        check_recording(capture, recording, output, resume=resume, interval=frame_interval, force=force)
+        if recording:
+            return reconstruct_recording(
+                recording,
+                design_text(microscope),
+                imager,
+                grid,
+                maker(imager, grid, inversion, progress, **options, weights=weights),
+                output,
+                name=capture.name,
+                camera=camera,
+                progress=progress,
+                points=points,
+                weights=weights,
+                interval=frame_interval,
+                resume=resume,
+                again=again,
+            )
+        image = camera.read(capture)
+        made = maker(imager, grid, inversion, progress, **options, weights=weights)
+        # The paper's method is a single pass. All others, and points, are many.
+        with once() if method == "backproject" and suppress != "points" and not points else nullcontext():
+            volume, found, evidence, warning = made(image, progress)
+        check = again(volume, image, progress) if again else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=design_text(microscope)))
             write_volume(output, volume, grid, provenance)
@@ -164,56 +185,8 @@ def command(
     size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
     if check:
-        error = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
-        click.echo(f"{output}: imaged again it is {error}, {check.regions.max():.0%} where it is farthest")
+        click.echo(f"{output}: imaged again it is {in_words(check)}")
     if found is not None:
         click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
     if warning:
         click.echo(f"gs-jax: warning: {warning}", err=True)
-
-
-def _inversion(name: str, steps: int, weights: Path | None, **options) -> Any:
-    """The method of this name, with the options that were given, if it has them."""
-    from ..reconstruction.methods import METHODS as BY_NAME
-    from ..solvers.unrolled import read_unrolled
-
-    method: Any = read_unrolled(weights) if weights and name == "unrolled" else BY_NAME[name](steps)
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given:
-        if not hasattr(method, option):
-            has = [other for other, make in BY_NAME.items() if hasattr(make(1), option)]
-            raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
-    return dataclasses.replace(method, **given)
-
-
-def _points(image, imager, grid, progress):
-    """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
-    import numpy as np
-
-    from ..suppression.consistency import signal
-    from ..suppression.evidence import LEAST_SHARP, point_evidence, sharpness
-    from ..suppression.locate import find_points
-
-    light = signal(image)
-    points, warning = find_points(light, imager, grid, progress=progress), None
-    sharp = sharpness(imager, grid)
-    if sharp < LEAST_SHARP:
-        share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
-        warning = f"out of focus at these depths: {share}; no point is to be trusted"
-    columns = point_evidence(points, light, imager, grid)._asdict()
-    return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
-
-
-def _network(weights: Path | None):
-    """What cleans a volume: our network, or that of a file."""
-    from ..suppression.unet import read_weights, suppress
-
-    return partial(suppress, network=read_weights(weights) if weights else None)
-
-
-def _volume_of_points(points, grid):
-    import numpy as np
-
-    from ..simulation.phantoms import rasterize
-
-    return np.asarray(rasterize(points, grid), np.float32)

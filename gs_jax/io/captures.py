@@ -33,14 +33,14 @@ _COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency"
 _PHOTOMETRIC = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
 
 
-class _Wanted(NamedTuple):
+class Wanted(NamedTuple):
     """What of a file is asked for: as `read_capture`, and types of pixels."""
 
-    shape: tuple[int, ...] | None
-    page: int | str | None
-    channel: str | None
-    bayer: str | None
-    dtypes: tuple[str, ...]
+    shape: tuple[int, ...] | None = None
+    page: int | str | None = None
+    channel: str | None = None
+    bayer: str | None = None
+    dtypes: tuple[str, ...] = DTYPES
 
 
 def read_capture(
@@ -104,9 +104,16 @@ def frames(
         raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(CAPTURE_SUFFIXES)}.")
     if bayer:
         sites(bayer, channel)
-    wanted = _Wanted(shape and tuple(shape), page, channel, bayer, dtypes)
+    wanted = Wanted(shape and tuple(shape), page, channel, bayer, dtypes)
+    yield from checked(path, form.read(path, wanted))
+
+
+def checked(
+    path: str | os.PathLike[str], images: Iterator[Shaped[np.ndarray, "row column"]]
+) -> Iterator[Shaped[np.ndarray, "row column"]]:
+    """Images of a file in the machine's byte order; `InputError` if they are of several sizes or not finite."""
     size = None
-    for pixels in form.read(path, wanted):
+    for pixels in images:
         size = size or pixels.shape
         if pixels.shape != size:
             found = " and ".join(" x ".join(map(str, each)) for each in (size, pixels.shape))
@@ -153,7 +160,8 @@ def write_capture(
         write_sidecar(path, provenance)
 
 
-def _check_declared(path: Path, size: tuple[int, ...], dtype: str, wanted: _Wanted) -> None:
+def check_declared(path: Path, size: tuple[int, ...], dtype: str, wanted: Wanted) -> None:
+    """`InputError` unless the size and the type that a file declares are what is wanted."""
     found, shape = " x ".join(str(n) for n in size), wanted.shape
     if len(size) != 2 or min(size) < 1:
         raise InputError(f"{path}: found an image of {found or 'no'} pixels, allowed: 2-D greyscale, rows x columns.")
@@ -181,8 +189,8 @@ def _pages(path: Path, count: int, page: int | str | None) -> range:
     return range(page - 1, page)
 
 
-def _check_colour(path: Path, colour: str | None, wanted: _Wanted) -> None:
-    """`colour` is what the file says of itself, None if it is grey."""
+def check_colour(path: Path, colour: str | None, wanted: Wanted) -> None:
+    """`InputError` unless the channel that is wanted is there; `colour` is what the file says, None if it is grey."""
     if colour and colour != _RGB:
         raise InputError(f"{path}: found {colour}, allowed: greyscale, one sample a pixel, 0 as black.")
     if colour and wanted.bayer:
@@ -196,36 +204,48 @@ def _check_colour(path: Path, colour: str | None, wanted: _Wanted) -> None:
         raise InputError(f"{path}: found --channel {wanted.channel}, allowed: {', '.join(CHANNELS)}.")
 
 
-def _taken(pixels: np.ndarray, wanted: _Wanted, colours_first: bool = False) -> np.ndarray:
+def _taken(pixels: np.ndarray, wanted: Wanted, colours_first: bool = False) -> np.ndarray:
     """The image that is wanted of what a page holds."""
     if pixels.ndim == 2:
         return pixels
     return np.moveaxis(pixels, 0 if colours_first else -1, 0)[CHANNELS.index(wanted.channel or "")]
 
 
-def _read_tiff(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
+@contextlib.contextmanager
+def opened_tiff(path: Path) -> Iterator[tuple[tifffile.TiffFile, int]]:
+    """A TIFF, and how many pages it has."""
     with contextlib.ExitStack() as stack:
         with decoding(path, "TIFF"):
             # Without OME: a set of files is not a capture, and no other file is to be opened.
             tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
             count = page_count(tiff)
+        yield tiff, count
+
+
+def tiff_page(path: Path, tiff: tifffile.TiffFile, index: int, wanted: Wanted) -> Shaped[np.ndarray, "row column"]:
+    """What is wanted of a page, counted from 0."""
+    with decoding(path, "TIFF"):
+        page = tiff.pages[min(index, len(tiff.pages) - 1)].aspage()
+        photometric, samples = int(page.photometric), page.samplesperpixel
+        size, dtype = tuple(page.shape), str(page.dtype)
+        planar, declared = int(page.planarconfig) == 2, declared_mosaic(page)
+    colour = _PHOTOMETRIC.get(photometric, f"{samples} samples a pixel, photometric {photometric}")
+    if photometric == 2 and samples >= 3 and len(size) == 3:
+        size = size[1:] if planar else size[:2]
+    elif samples != 1:
+        colour = f"{samples} samples a pixel, photometric {photometric}"
+    _check_mosaic(path, declared, wanted) if photometric == _MOSAIC else check_colour(path, colour, wanted)
+    check_declared(path, size, dtype, wanted)
+    return _taken(decode_plane(path, tiff, index), wanted, planar)
+
+
+def _read_tiff(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
+    with opened_tiff(path) as (tiff, count):
         for index in _pages(path, count, wanted.page):
-            with decoding(path, "TIFF"):
-                page = tiff.pages[min(index, len(tiff.pages) - 1)].aspage()
-                photometric, samples = int(page.photometric), page.samplesperpixel
-                size, dtype = tuple(page.shape), str(page.dtype)
-                planar, declared = int(page.planarconfig) == 2, declared_mosaic(page)
-            colour = _PHOTOMETRIC.get(photometric, f"{samples} samples a pixel, photometric {photometric}")
-            if photometric == 2 and samples >= 3 and len(size) == 3:
-                size = size[1:] if planar else size[:2]
-            elif samples != 1:
-                colour = f"{samples} samples a pixel, photometric {photometric}"
-            _check_mosaic(path, declared, wanted) if photometric == _MOSAIC else _check_colour(path, colour, wanted)
-            _check_declared(path, size, dtype, wanted)
-            yield _taken(decode_plane(path, tiff, index), wanted, planar)
+            yield tiff_page(path, tiff, index, wanted)
 
 
-def _check_mosaic(path: Path, declared: str | None, wanted: _Wanted) -> None:
+def _check_mosaic(path: Path, declared: str | None, wanted: Wanted) -> None:
     if not wanted.bayer:
         allowed = f"greyscale, or --bayer {declared or 'RGGB (or another)'} with --channel {', '.join(CHANNELS)}"
         raise InputError(f"{path}: found a colour filter mosaic, allowed: {allowed}.")
@@ -233,15 +253,15 @@ def _check_mosaic(path: Path, declared: str | None, wanted: _Wanted) -> None:
         raise InputError(f"{path}: found --bayer {wanted.bayer}, allowed: {declared}, as the file says.")
 
 
-def _read_png(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
+def _read_png(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
     with path.open("rb") as file:
         header = file.read(26)
     if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
         raise InputError(f"{path}: not a whole and valid PNG: found another beginning.")
     columns, rows, bits, colour = struct.unpack(">IIBB", header[16:])
-    _check_colour(path, _COLOURS.get(colour, "an unknown type of pixels"), wanted)
+    check_colour(path, _COLOURS.get(colour, "an unknown type of pixels"), wanted)
     dtype = {8: "uint8", 16: "uint16"}.get(bits, f"{bits}-bit")
-    _check_declared(path, (rows, columns), dtype, wanted)
+    check_declared(path, (rows, columns), dtype, wanted)
     with decoding(path, "PNG"), Image.open(path, formats=["PNG"]) as image:
         count = getattr(image, "n_frames", 1)
         pixels = decode_png(path, image, bits)
@@ -251,13 +271,13 @@ def _read_png(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
     yield _taken(pixels.astype(dtype), wanted)
 
 
-def _read_npy(path: Path, wanted: _Wanted) -> Iterator[np.ndarray]:
+def _read_npy(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
     with decoding(path, ".npy of numbers"):
         pixels = np.lib.format.open_memmap(path, mode="r")
     pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
-    _check_colour(path, None, wanted)
+    check_colour(path, None, wanted)
     for index in _pages(path, len(pages), wanted.page):
-        _check_declared(path, pages[index].shape, pixels.dtype.name, wanted)
+        check_declared(path, pages[index].shape, pixels.dtype.name, wanted)
         yield _taken(np.array(pages[index]), wanted)
 
 
@@ -279,7 +299,7 @@ def _write_npy(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None
 class _Format(NamedTuple):
     """How files of one suffix are read, page by page, and written, and what they can hold."""
 
-    read: Callable[[Path, _Wanted], Iterator[np.ndarray]]
+    read: Callable[[Path, Wanted], Iterator[np.ndarray]]
     write: Callable[[BinaryIO, np.ndarray, Provenance | None], None]
     dtypes: tuple[str, ...] = DTYPES
 

@@ -1,11 +1,12 @@
 """Captures corrected for their camera: the one way from a file to light, of every command that reads captures."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Num
+from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from ..base.errors import InputError, errors_name_file
 from ..geometry import Sensor
@@ -92,41 +93,100 @@ def read_corrected(
     --------
     >>> image, done, warnings = read_corrected("a.tif", scope.sensor, correction=Correction(dark=Path("dark.tif")))
     """
-    if correction.dark and correction.offset:
-        raise InputError(
-            f"--offset: found --dark {correction.dark}, allowed: one of them; the dark frame has the offset."
-        )
     shape = readout.region(sensor).shape if sensor else None
-    image, done, warnings = _read(path, shape, page, readout)
-    done += readout.words()
-    light, bad, counted = image, np.zeros(image.shape, bool), []
-    dark, gain = correction.offset, None
+    _check(correction)
+    images = frames(path, shape, page=page, channel=readout.channel, bayer=readout.bayer)
+    image, done, warnings = _averaged(path, images, readout)
+    prepared = prepare(image.shape, shape, readout, correction)
+    found = apply(image, prepared)
+    return Corrected(found.image, done + found.done, warnings + found.warnings)
+
+
+class Prepared(NamedTuple):
+    """A correction whose files have been read, for any number of captures.
+
+    Parameters
+    ----------
+    dark, gain
+        What is taken off, and what is divided by; None: nothing is.
+    bad
+        Pixels to fill, and how many were found where.
+    searched
+        Single hot pixels of each capture are bad, too.
+    done, warnings
+        As of `Corrected`.
+    """
+
+    dark: Num[np.ndarray, "row column"] | float | None
+    gain: Float32[np.ndarray, "row column"] | None
+    bad: Bool[np.ndarray, "row column"]
+    counted: list[str]
+    searched: bool
+    done: list[str]
+    warnings: list[str]
+
+
+def prepare(
+    size: tuple[int, int],
+    shape: tuple[int, int] | None = None,
+    readout: Readout = Readout(),
+    correction: Correction = Correction(),
+) -> Prepared:
+    """Reads what a correction needs, once.
+
+    Parameters
+    ----------
+    size
+        Of the images that are to be corrected.
+    shape
+        Of the captures in their files, if it is known.
+    readout, correction
+        As for `read_corrected`, errors too.
+    """
+    _check(correction)
+    bad, counted = np.zeros(size, bool), []
+    done, warnings = readout.words(), []
+    dark, gain = correction.offset or None, None
     if correction.dark:
-        dark, said = _read_like(correction.dark, image, shape, readout)
+        dark, said = _read_like(correction.dark, size, shape, readout)
         warnings += said
         bad |= _counted(hot_in_dark(dark), f"hot in {correction.dark.name}", counted)
         done.append(f"dark frame {correction.dark.name} taken off, median {np.median(dark):g}")
     elif correction.offset:
         done.append(f"offset {correction.offset:g} taken off")
     if correction.flat:
-        flat, said = _read_like(correction.flat, image, shape, readout)
+        flat, said = _read_like(correction.flat, size, shape, readout)
         warnings += said
         with errors_name_file(correction.flat):
-            gain, unlit = gain_of(flat, dark)
+            gain, unlit = gain_of(flat, 0.0 if dark is None else dark)
         bad |= _counted(unlit, f"unlit in {correction.flat.name}", counted)
         done.append(f"flat field {correction.flat.name} divided out, {gain.min():.3g} to {gain.max():.3g}")
     if isinstance(correction.bad_pixels, Path):
         where = f"in {correction.bad_pixels.name}"
-        bad |= _counted(_mask(correction.bad_pixels, image, shape, readout), where, counted)
-    elif correction.bad_pixels == "auto" and not (correction.dark or readout.bayer) and readout.binning <= _SHARP:
-        bad |= _counted(hot_in_capture(image), "hot in the capture", counted)
-    if correction.dark or correction.offset or gain is not None:
-        light = correct(image, dark, gain)
+        bad |= _counted(_mask(correction.bad_pixels, size, shape, readout), where, counted)
+    automatic = correction.bad_pixels == "auto" and not (correction.dark or readout.bayer)
+    return Prepared(dark, gain, bad, counted, automatic and readout.binning <= _SHARP, done, warnings)
+
+
+def apply(image: Num[np.ndarray, "row column"], prepared: Prepared) -> Corrected:
+    """An image corrected; of its own type where nothing is to be done, otherwise float32."""
+    bad, counted, done, light = prepared.bad, list(prepared.counted), list(prepared.done), image
+    if prepared.searched:
+        bad = bad | _counted(hot_in_capture(image), "hot in the capture", counted)
+    if prepared.dark is not None or prepared.gain is not None:
+        light = correct(image, 0.0 if prepared.dark is None else prepared.dark, prepared.gain)
     if bad.any():
         light = repaired(light, bad)
         count = int(bad.sum())
         done.append(f"{count} bad pixel{'s' * (count > 1)} filled from neighbours: {', '.join(counted)}")
-    return Corrected(light, done, warnings)
+    return Corrected(light, done, list(prepared.warnings))
+
+
+def _check(correction):
+    if correction.dark and correction.offset:
+        raise InputError(
+            f"--offset: found --dark {correction.dark}, allowed: one of them; the dark frame has the offset."
+        )
 
 
 def correct(
@@ -175,14 +235,23 @@ def saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:
     return (count, top) if piled or (top in full and count > 1) else None
 
 
-def _read(path, shape, page, readout) -> tuple[np.ndarray, list[str], list[str]]:
+def read_frame(
+    name: str, images: Iterator[Shaped[np.ndarray, "row column"]], prepared: Prepared, readout: Readout = Readout()
+) -> Corrected:
+    """As `read_corrected`, of images that are being read, with a correction that has been; `name` is for messages."""
+    image, done, warnings = _averaged(name, images, readout)
+    found = apply(image, prepared)
+    return Corrected(found.image, done + found.done, warnings + found.warnings)
+
+
+def _averaged(name, images, readout) -> tuple[np.ndarray, list[str], list[str]]:
     """An image, or the mean of several; what was done; and what is to be said of it."""
     cut: list[tuple[int, int] | None] = []
     size = 0
 
     def looked_at():
         nonlocal size
-        for frame in frames(path, shape, page=page, channel=readout.channel, bayer=readout.bayer):
+        for frame in images:
             size = frame.size
             cut.append(saturated(frame))
             yield frame
@@ -195,26 +264,27 @@ def _read(path, shape, page, readout) -> tuple[np.ndarray, list[str], list[str]]
         return image, done, []
     count, value = sum(count for count, _ in found), max(value for _, value in found)
     share = f"{count} pixels ({count / (len(cut) * size):.2g} of all) at {value}"
-    return image, done, [f"{path}: found {share}, where the camera cuts off: how much light they saw is unknown"]
+    return image, done, [f"{name}: found {share}, where the camera cuts off: how much light they saw is unknown"]
 
 
-def _read_like(path, image, shape, readout) -> tuple[np.ndarray, list[str]]:
+def _read_like(path, size, shape, readout) -> tuple[np.ndarray, list[str]]:
     """A file as the capture is read, and what is to be said of it."""
-    found, _, warnings = _read(path, shape, "mean", readout)
-    _check_like(path, found, image)
+    images = frames(path, shape, page="mean", channel=readout.channel, bayer=readout.bayer)
+    found, _, warnings = _averaged(path, images, readout)
+    _check_like(path, found, size)
     return found, warnings
 
 
-def _check_like(path, found, image):
-    if found.shape != image.shape:
-        size, allowed = (" x ".join(map(str, each.shape)) for each in (found, image))
-        raise InputError(f"{path}: found {size} pixels (rows x columns), allowed: {allowed}, as the capture has.")
+def _check_like(path, found, size):
+    if found.shape != size:
+        seen, allowed = (" x ".join(map(str, each)) for each in (found.shape, size))
+        raise InputError(f"{path}: found {seen} pixels (rows x columns), allowed: {allowed}, as the capture has.")
 
 
-def _mask(path, image, shape, readout) -> Bool[np.ndarray, "row column"]:
+def _mask(path, size, shape, readout) -> Bool[np.ndarray, "row column"]:
     found = averaged(frames(path, shape, channel=readout.channel, bayer=readout.bayer, dtypes=MASK_DTYPES))
     bad = (channel_of(found, readout.bayer, readout.channel) if readout.bayer else found) != 0
-    _check_like(path, bad, image)
+    _check_like(path, bad, size)
     if bad.mean() > _MOST_BAD:
         raise InputError(f"{path}: found {bad.mean():.0%} of the pixels marked as bad, allowed: up to half; 0 is good.")
     return bad

@@ -35,6 +35,8 @@ _NUMBER_BYTES, _PLAIN = 32, b"0123456789+-.eE, \t\r\n"
 # What the root of an image in Zarr may hold. A store with anything else in it (labels, a plate, notes) is
 # somebody's work and is not replaced.
 _ZARR_METADATA = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}
+# What we add to volumes in time: `volume_series`.
+_OURS = {"frames.jsonl"}
 
 
 def _reason(error: Exception) -> str:
@@ -130,7 +132,7 @@ def _check_target(path: Path) -> None:
 
 def _holds_only_an_image(folder: Path) -> bool:
     names = set(os.listdir(folder))
-    return bool(names & _ZARR_METADATA) and all(name in _ZARR_METADATA or name.isdecimal() for name in names)
+    return bool(names & _ZARR_METADATA) and all(name in _ZARR_METADATA | _OURS or name.isdecimal() for name in names)
 
 
 @contextlib.contextmanager

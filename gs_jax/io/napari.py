@@ -1,4 +1,4 @@
-"""A reader for napari: volumes and points to scale and in one place, in um; `napari.yaml` names it.
+"""A reader for napari: volumes, in time too, and points to scale and in one place, in um; `napari.yaml` names it.
 
 napari's other readers of OME-TIFF leave out where the first voxel is, and those of CSV know pixels alone.
 """
@@ -12,9 +12,10 @@ import numpy as np
 from ..base.errors import InputError
 from .points import POINTS_HEADER, read_points
 from .viewers import display_range
+from .volume_series import Series, read_series
 from .volumes import VOLUME_SUFFIXES, read_volume
 
-Layer = tuple[np.ndarray, dict[str, Any], str]
+Layer = tuple[Any, dict[str, Any], str]
 
 _UM = 1000.0
 _AXES: dict[str, Any] = {"axis_labels": ("z", "y", "x"), "units": ("um", "um", "um")}
@@ -39,6 +40,8 @@ def _has_points(path: str) -> bool:
 
 
 def _volume(path) -> list[Layer]:
+    if (series := read_series(path)) is not None:
+        return [_in_time(path, series)]
     try:
         voxels, grid = read_volume(path)
     except InputError as error:
@@ -49,6 +52,21 @@ def _volume(path) -> list[Layer]:
     first = _UM * np.array([depths[0], float(grid.y[0]), float(grid.x[0])])
     options = {"scale": scale, "translate": first, "contrast_limits": display_range(voxels), "name": Path(path).name}
     return [(voxels, options | _AXES, "image")]
+
+
+def _in_time(path, series: Series) -> Layer:
+    """Volumes in time, which napari reads where it shows them."""
+    unit = "s" if series.interval else "pixel"
+    options = {
+        "scale": series.scale,
+        "translate": series.first,
+        "contrast_limits": series.shown,
+        "name": Path(path).name,
+        "axis_labels": ("t", *_AXES["axis_labels"]),
+        "units": (unit, *_AXES["units"]),
+        "multiscale": len(series.levels) > 1,
+    }
+    return series.levels if len(series.levels) > 1 else series.levels[0], options, "image"
 
 
 def _points(path) -> list[Layer]:

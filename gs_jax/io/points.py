@@ -1,13 +1,13 @@
 """Points on disk: CSV."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Array, Float, Float64, Shaped
 
 from ..base.errors import InputError, short_repr
-from .disk import check_input, read_table, write_text
+from .disk import atomic_write, check_input, check_output, read_table, write_text
 from .provenance import Provenance, write_sidecar
 
 MAX_POINTS = 1_000_000
@@ -68,4 +68,40 @@ def write_points(
     lines = [",".join([POINTS_HEADER, *more])]
     lines += [",".join(str(value) for value in (*row, *others)) for row, others in zip(rows, further, strict=True)]
     write_text(path, "\n".join(lines) + "\n", [".csv"])
+    write_sidecar(path, provenance)
+
+
+def write_points_in_time(
+    path: str | os.PathLike[str],
+    frames: Iterable[tuple[int, Mapping[str, list]]],
+    *,
+    provenance: Provenance | None = None,
+) -> None:
+    """Writes the points of frames as one CSV, with the column `frame` after those of `write_points`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    frames
+        Of each its number, and the columns of its points by name, the first four those of `read_points`; all frames
+        have the same. One is held at a time.
+    provenance
+        Where they come from, for a file beside this.
+
+    Raises
+    ------
+    InputError
+        As `check_output`, for `.csv`.
+    """
+    path, first = check_output(path, [".csv"]), True
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as to:
+        for frame, columns in frames:
+            if first:
+                to.write(",".join([POINTS_HEADER, "frame", *list(columns)[4:]]) + "\n")
+                first = False
+            for row in zip(*columns.values(), strict=True):
+                to.write(",".join(map(str, (*row[:4], frame, *row[4:]))) + "\n")
+        if first:
+            to.write(f"{POINTS_HEADER},frame\n")
     write_sidecar(path, provenance)

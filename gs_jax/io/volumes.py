@@ -30,12 +30,12 @@ from jaxtyping import Array, Float32, Shaped
 from ..base.errors import InputError, short_repr
 from ..geometry import Grid
 from .disk import atomic_write, check_input, check_output, decoding
-from .provenance import KEY, NAMESPACE, Provenance
+from .ngff import chunked, first_um, image_attributes, plain_depths, um
+from .provenance import NAMESPACE, Provenance
 from .tiff import decode_page, place_for_description, take_place
-from .viewers import display_range, imagej_description, title
+from .viewers import imagej_description, title
 
 MAX_VOXELS = 10**10
-CHUNK = 1024
 
 _MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 _MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
@@ -70,7 +70,7 @@ def write_volume(
     """
     path = check_output(path, VOLUME_SUFFIXES)
     voxels = _as_float32(path, np.asarray(volume))
-    depths = [float(str(depth)) for depth in np.asarray(grid.depths)]  # 18.1, not float32's 18.100000381
+    depths = plain_depths(grid)
     if voxels.shape != grid.volume_shape:
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
@@ -107,19 +107,8 @@ def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth ro
     raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: float32, or values that it holds exactly.")
 
 
-def _um(mm: float) -> float:
-    return float(f"{mm * 1000:.12g}")  # 18100, not 18100.000000000004
-
-
 def _mm(value: float, unit: float) -> float:
     return float(f"{value * unit:.12g}")
-
-
-def _first_um(grid: Grid) -> tuple[float, float]:
-    """The centre of the first voxel of each plane, `(y, x)`, um, from what a float32 origin was meant to be."""
-    x, y = (float(str(at)) for at in np.asarray(grid.origin))
-    rows, columns = grid.shape
-    return _um(y - (rows - 1) / 2 * grid.pitch), _um(x - (columns - 1) / 2 * grid.pitch)
 
 
 def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
@@ -150,25 +139,25 @@ def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitch
 
 
 def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
-    planes, pitch, (first_y, first_x) = len(depths), grid.pitch, _first_um(grid)
-    plane: dict[str, Any] = {"PositionZ": [_um(depth) for depth in depths]}
+    planes, pitch, (first_y, first_x) = len(depths), grid.pitch, first_um(grid)
+    plane: dict[str, Any] = {"PositionZ": [um(depth) for depth in depths]}
     plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
     metadata = {
         "axes": "ZYX",
         "Name": title(path),
-        "PhysicalSizeX": _um(pitch),
-        "PhysicalSizeY": _um(pitch),
+        "PhysicalSizeX": um(pitch),
+        "PhysicalSizeY": um(pitch),
         "Plane": plane,
     }
     # Uneven depths: the mean step is what a viewer that knows one step only can show; the planes keep the truth.
     step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
     if step > 0:
-        metadata["PhysicalSizeZ"] = _um(step)
+        metadata["PhysicalSizeZ"] = um(step)
     metadata |= {f"{name}Unit": "µm" for name in list(metadata) if name.startswith("PhysicalSize")}
     plane |= {f"{name}Unit": ["µm"] * planes for name in list(plane)}
     if provenance:
         metadata["MapAnnotation"] = {"Namespace": NAMESPACE, **provenance}
-    per_um = 1 / _um(pitch)  # the unit is in ImageJ's description: TIFF knows inches and centimetres alone
+    per_um = 1 / um(pitch)  # the unit is in ImageJ's description: TIFF knows inches and centimetres alone
     with atomic_write(path) as temporary:
         tifffile.imwrite(
             temporary,
@@ -178,7 +167,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
             metadata=metadata,
             resolution=(per_um, per_um),
             resolutionunit="NONE",
-            extratags=[place_for_description(imagej_description(voxels, _um(step)))],
+            extratags=[place_for_description(imagej_description(voxels, um(step)))],
         )
         take_place(temporary)
 
@@ -240,37 +229,10 @@ def _length(path: Path, element: ElementTree.Element, name: str, default_unit: s
 def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
     import zarr  # 0.15 s that TIFF does not need
 
-    pitch = grid.pitch
-    # One plane has no step, and the format wants one: the lateral pitch, as of a cube.
-    step = (depths[-1] - depths[0]) / (len(depths) - 1) if len(depths) > 1 else pitch
-    even = np.abs(np.array(depths) - depths[0] - step * np.arange(len(depths))).max() <= 1e-6 * max(depths)
-    if step <= 0 or not even:
-        raise InputError(f"{path}: found uneven or descending depths, allowed in OME-Zarr: even steps; use .ome.tif.")
-    scale = [_um(step), _um(pitch), _um(pitch)]
-    first = [_um(depths[0]), *_first_um(grid)]
-    transforms = [{"type": "scale", "scale": scale}, {"type": "translation", "translation": first}]
-    low, high = display_range(voxels)
-    window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
-    channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
-    multiscale = {
-        "version": "0.4",
-        "name": title(path),
-        "axes": [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"],
-        "datasets": [{"path": "0", "coordinateTransformations": transforms}],
-    }
-    attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
-    if provenance:
-        attributes[KEY] = dict(provenance)
+    attributes = image_attributes(path, depths, grid, [voxels.shape[1:]], voxels, provenance)
     with atomic_write(path) as temporary:
         group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
-        array = group.create_array(
-            "0",
-            shape=voxels.shape,
-            dtype=voxels.dtype,
-            chunks=(1, *(min(n, CHUNK) for n in voxels.shape[1:])),
-            compressors={"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1},
-            chunk_key_encoding={"name": "v2", "separator": "/"},
-        )
+        array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **chunked(voxels.shape))
         array[...] = voxels
 
 

@@ -10,7 +10,8 @@ from ..solvers.convolution import Convolution
 from ..solvers.convolution_admm import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
-from .pipeline import above_offset, iterated
+from .pipeline import iterated
+from .system import above_offset
 
 # Default weight of ADMM's total variation.
 TV = 1e-3

@@ -1,45 +1,38 @@
 """From a capture to a volume, whatever the method."""
 
 import dataclasses
-import math
+from collections.abc import Callable
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float, Float32, Num
+from jaxtyping import Array, Float32, Num
 
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
-from ..geometry import Grid, Imager, Sensor
+from ..geometry import Grid, Imager
 from ..optics.cores import apparent_depths
-from ..optics.full import FullOptics
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
-from ..projection.levels import LEVELS, optics_of
-from ..projection.operators import forward_operator
+from ..projection.levels import LEVELS
 from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
-from ..solvers.unmatched import Unmatched
 from ..solvers.unrolled import Unrolled
-from ..suppression.background import local_levels
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
+from .system import System, explainable, model_of, slow_waves
+
+Image = Num[Array | np.ndarray, "row column"]
+Volume = Float32[np.ndarray, "depth y x"]
 
 # Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16
-# Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
-_DARKEST = 1
-# Half a wave of background is this many of the halo's pixels at least: as wide as the halo of a spot.
-_SLOW = 6.5
 # Of the default voxel of an iterative method, which is as wide as so many pixels.
 COARSE = 4
 # In units of the misfit of noise, which is known to a few percent.
 _ENOUGH = 1.1
-_ROUNDING = 0.02
 
 
 def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:
@@ -77,7 +70,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
 
 
 def reconstruct(
-    image: Num[Array | np.ndarray, "row column"],
+    image: Image,
     imager: Imager,
     grid: Grid,
     method: Method = BackProjection(),
@@ -85,7 +78,7 @@ def reconstruct(
     optics: Optics | str = "full",
     stop_at_noise: bool = False,
     progress: Progress | None = None,
-) -> Float32[np.ndarray, "depth y x"]:
+) -> Volume:
     """The volume that an image shows.
 
     Back-projection takes the image as it is, some planes at a time. The other methods explain the light above the
@@ -123,112 +116,77 @@ def reconstruct(
     --------
     >>> volume = reconstruct(image, imager, grid, RichardsonLucy(steps=20))
     """
-    progress, by_name = progress or Progress(), isinstance(optics, str)
-    if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
-        raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
-    if by_name and optics not in LEVELS:
-        raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
     if image.shape != imager.sensor.shape:
         raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
-    on_cores = by_name and optics != "pinhole"
-    seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
-    if isinstance(method, BackProjection):
-        return _back_projected(image, imager, seen, method, progress)
-    light, imager, background, optics = explainable(image, imager, grid, optics, progress)
-    counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
-    enough = _ENOUGH * misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
-    if isinstance(method, ListRichardsonLucy):
-        return iterated(method.solver(background), progress, light, System(imager, grid, optics, seen), enough)
-    if isinstance(method, RichardsonLucy):
-        method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
-        return iterated(method, progress, light, System(imager, grid, optics), enough)
-    light = light - background
-    if isinstance(method, Unrolled):
-        # Its steps were trained together.
-        return iterated(method, progress, light, System(imager, grid, optics, seen))
-    system = System(imager, grid, optics, slow=_slow_waves(imager, optics) if by_name else 0)
-    return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
+    _check(method, optics)
+    progress = progress or Progress()
+    volume_of = reconstructor(imager, grid, method, optics=optics, stop_at_noise=stop_at_noise, progress=progress)
+    return volume_of(image, progress)
 
 
-def explainable(
-    image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, optics: Optics | str, progress: Progress
-) -> tuple[Float[np.ndarray, "y x"], Imager, Float[np.ndarray, "y x"] | float, Optics]:
-    """What iterative methods are to explain: light above the offset, its microscope, background in it, and the optics.
-
-    With optics by name, pixels are as wide as voxels, and what optics other than "full" do not hold is background.
-    """
-    light = above_offset(np.asarray(image, imager.sensor_distance.dtype))
-    if not isinstance(optics, str):
-        return light, imager, 0.0, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics
-    light, imager = _binned(light, imager, grid)
-    background = 0.0 if optics == "full" else np.maximum(local_levels(light)[0], 0)
-    return light, imager, background, optics_of(imager, grid.depths, optics, progress=progress)
-
-
-def _slow_waves(imager, optics):
-    if not isinstance(optics, FullOptics):
-        return 0
-    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.halo.grid.pixel))
-
-
-def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
-    """An image less its darkest percent, or as it is if that is negative."""
-    return image - np.asarray(max(float(np.percentile(image, _DARKEST)), 0.0), image.dtype)
-
-
-class System(eqx.Module):
-    """What a solver inverts: the microscope, and how.
+def reconstructor(
+    imager: Imager,
+    grid: Grid,
+    method: Method = BackProjection(),
+    *,
+    optics: Optics | str = "full",
+    stop_at_noise: bool = False,
+    progress: Progress | None = None,
+) -> Callable[[Image, Progress], Volume]:
+    """`reconstruct` for many images: what is the same for all is computed here, once.
 
     Parameters
     ----------
-    imager, grid, optics
-        As for `forward`.
-    seen
-        If given, back-projection from these voxels stands for the adjoint.
-    slow
-        So many of the image's longest cosine waves each way are left out of account.
+    imager, grid, method, optics, stop_at_noise, progress
+        As for `reconstruct`.
+
+    Returns
+    -------
+    Callable
+        From an image of `sensor.shape`, and what shows how far it is, to the volume. Images of one type: of another
+        it compiles again.
+
+    Raises
+    ------
+    InputError
+        If `method` is no method, there is no such optics, or a depth is blurred over more than 128 pixels ("near").
     """
-
-    imager: Imager
-    grid: Grid
-    optics: Optics
-    seen: Grid | None = None
-    slow: int = eqx.field(static=True, default=0)
-
-    @property
-    def operator(self) -> lx.AbstractLinearOperator | Unmatched:
-        A = forward_operator(self.imager, self.grid, self.optics)
-        if self.seen is not None:
-            return Unmatched(A, forward_operator(self.imager, self.seen).T)
-        return lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
-
-    def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
-        """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""
-        image = jnp.asarray(image)
-        if not self.slow:
-            return image
-        rows, columns = (_waves(n, self.slow, image.dtype) for n in image.shape)
-        return image - rows @ (rows.T @ image @ columns) @ columns.T
+    by_name = isinstance(optics, str)
+    _check(method, optics)
+    on_cores = by_name and optics != "pinhole"
+    seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
+    if isinstance(method, BackProjection):
+        return lambda image, progress: _back_projected(image, imager, seen, method, progress)
+    model = model_of(imager, grid, optics, progress or Progress())
+    matched = not isinstance(method, ListRichardsonLucy | Unrolled)
+    least_squares = matched and not isinstance(method, RichardsonLucy)
+    slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
+    listed = seen if isinstance(method, ListRichardsonLucy) else None
+    system = System(model.imager, grid, model.optics, listed, slow)
+    return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
 
 
-def _waves(size, count, dtype):
-    """The longest waves of the discrete cosine transform, orthonormal: `(size, count)`."""
-    waves = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
-    return jnp.asarray(waves / np.linalg.norm(waves, axis=0), dtype)
+def _check(method, optics):
+    if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
+        raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
+    if isinstance(optics, str) and optics not in LEVELS:
+        raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
 
 
-def _binned(light, imager, grid):
-    """Pixels summed to squares that are at most as wide as a voxel's image, and divide the sensor."""
-    sensor = imager.sensor
-    wanted = float(imager.magnification(grid.depths).mean()) * grid.pitch / sensor.pixel_pitch
-    common = math.gcd(*sensor.shape)
-    # Two pixels each way must be left.
-    fits = lambda n: common % n == 0 and n <= wanted + _ROUNDING and min(sensor.shape) >= 2 * n
-    side = max((n for n in range(1, math.ceil(wanted) + 1) if fits(n)), default=1)
-    rows, columns = (n // side for n in sensor.shape)
-    light = light.reshape(rows, side, columns, side).sum((1, 3))
-    coarse = Sensor((rows, columns), side * sensor.pixel_pitch, sensor.origin)
-    return light, eqx.tree_at(lambda i: i.sensor, imager, coarse)
+def _explained(image, model, system, method, stop_at_noise, progress):
+    light, background = explainable(image, model)
+    counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
+    enough = _ENOUGH * misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
+    if isinstance(method, ListRichardsonLucy):
+        return iterated(method.solver(background), progress, light, system, enough)
+    if isinstance(method, RichardsonLucy):
+        method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
+        return iterated(method, progress, light, system, enough)
+    light = light - background
+    if isinstance(method, Unrolled):
+        # Its steps were trained together.
+        return iterated(method, progress, light, system)
+    return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
 
 
 def _back_projected(image, imager, grid, method, progress):

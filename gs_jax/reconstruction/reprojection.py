@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Num
 from ..base.progress import Progress
 from ..geometry import Grid, Imager
 from ..projection.forward_model import Optics, forward
-from .pipeline import explainable
+from .system import explainable, model_of
 
 # Squares along a side of the sensor, unless it has fewer pixels.
 REGIONS = 16
@@ -55,9 +55,10 @@ def reproject(
     image, imager, grid, optics, progress
         As for `reconstruct`.
     """
-    light, imager, background, optics = explainable(image, imager, grid, optics, progress or Progress())
-    model = forward(jnp.asarray(volume, light.dtype), imager, grid, optics)
-    return _compared(np.asarray(model, np.float64), np.asarray(light - background, np.float64))
+    model = model_of(imager, grid, optics, progress or Progress())
+    light, background = explainable(image, model)
+    again = forward(jnp.asarray(volume, light.dtype), model.imager, grid, model.optics)
+    return _compared(np.asarray(again, np.float64), np.asarray(light - background, np.float64))
 
 
 def _compared(model, light):

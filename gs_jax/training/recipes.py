@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float32
 
 from ..base.progress import Progress
 from ..optics.cores import apparent_depths
-from ..reconstruction.pipeline import System, above_offset
+from ..reconstruction.system import System, above_offset
 from ..solvers.unrolled import State, Unrolled, untrained
 from ..suppression.unet import UNet, multislice_network, paper_network
 from .examples import SCENES, Kind, example, tables

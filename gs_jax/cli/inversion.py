@@ -1,0 +1,103 @@
+"""What the options of `gs-jax reconstruct` make of an image: a volume, and points."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..base.errors import InputError
+
+
+class Made(NamedTuple):
+    """Of an image: the volume; if points were asked for, these, columns that speak for them, and a warning."""
+
+    volume: Any
+    points: Any = None
+    evidence: Any = None
+    warning: str | None = None
+
+
+def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress, points, weights) -> Callable:
+    """From an image, and what shows how far it is, to what is `Made` of it; the same for all of its images is done."""
+    from ..reconstruction.pipeline import reconstructor
+
+    cleaned = _network(weights) if suppress == "unet" else None
+    options = {"optics": optics, "stop_at_noise": stop_at_noise, "progress": progress}
+    volume_of: Any = None if suppress == "points" else reconstructor(imager, grid, inversion, **options)
+
+    # Of the design and the depths alone.
+    sharp = cache(partial(_sharpness, imager, grid))
+
+    def made(image, progress):
+        found = evidence = warning = None
+        if suppress == "points" or (points and suppress != "clusters"):
+            found, evidence, warning = _points(image, imager, grid, sharp(), progress)
+        volume = _volume_of_points(found, grid) if suppress == "points" else volume_of(image, progress)
+        if suppress == "clusters":
+            from ..suppression.clustering import find_clusters
+
+            with progress.step("Clustering"):
+                found = find_clusters(volume, grid)
+                volume = _volume_of_points(found, grid)
+        if cleaned:
+            with progress.step("Suppressing the background"):
+                volume = cleaned(volume)
+        return Made(volume, found, evidence, warning)
+
+    return made
+
+
+def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
+    """The method of this name, with the options that were given, if it has them."""
+    from ..reconstruction.methods import METHODS as BY_NAME
+    from ..solvers.unrolled import read_unrolled
+
+    method: Any = read_unrolled(weights) if weights and name == "unrolled" else BY_NAME[name](steps)
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        if not hasattr(method, option):
+            has = [other for other, make in BY_NAME.items() if hasattr(make(1), option)]
+            raise InputError(f"--{option}: found --method {name}, allowed: {', '.join(has)}.")
+    return dataclasses.replace(method, **given)
+
+
+def _sharpness(imager, grid):
+    from ..suppression.evidence import sharpness
+
+    return sharpness(imager, grid)
+
+
+def _points(image, imager, grid, sharp, progress):
+    """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
+    import numpy as np
+
+    from ..suppression.consistency import signal
+    from ..suppression.evidence import LEAST_SHARP, point_evidence
+    from ..suppression.locate import find_points
+
+    light = signal(image)
+    points, warning = find_points(light, imager, grid, progress=progress), None
+    if sharp < LEAST_SHARP:
+        share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
+        warning = f"out of focus at these depths: {share}; no point is to be trusted"
+    columns = point_evidence(points, light, imager, grid)._asdict()
+    return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
+
+
+def _network(weights: Path | None):
+    """What cleans a volume: our network, or that of a file."""
+    from ..suppression.unet import read_weights, suppress
+
+    return partial(suppress, network=read_weights(weights) if weights else None)
+
+
+def _volume_of_points(points, grid):
+    import numpy as np
+
+    from ..simulation.phantoms import rasterize
+
+    # Points of no light beside them, up to a power of two: other numbers of points need no other program.
+    padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
+    padded[: len(points)] = points
+    return np.asarray(rasterize(padded, grid), np.float32)

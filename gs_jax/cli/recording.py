@@ -1,0 +1,186 @@
+"""`gs-jax reconstruct` of a recording: its frames to one OME-Zarr."""
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..base.errors import InputError
+from ..base.progress import Progress
+from .captures import CaptureOptions
+from .files import provenance_of
+from .interrupt import RESUMABLE, kept
+from .options import Number, depth_range
+
+# Frames that failed and are named as they do; later ones are counted, and are all in the store.
+_NAMED = 10
+# Options that say where results go and how, not what they are.
+_ELSEWHERE = ("capture", "design", "output", "points", "resume", "force")
+
+
+def recording_options(command):
+    """Of recordings alone."""
+    interval = click.option(
+        "--frame-interval",
+        type=Number(least=1e-9, most=1e9, unit="s"),
+        help="Of a recording: seconds from frame to frame, the scale of its time axis.  [default: unknown]",
+    )
+    resume = click.option(
+        "--resume",
+        is_flag=True,
+        help="Of a recording: keep the frames that a run left in VOLUME.zarr, if any, and make the others. Without it "
+        "an unfinished VOLUME.zarr is replaced by --force alone.",
+    )
+    return interval(resume(command))
+
+
+def check_recording(capture: Path, recording, output: Path, *, resume: bool, interval: float | None, force: bool):
+    """`InputError` where the output cannot hold time, or would be lost; or where there is no time."""
+    from ..io.volume_series import check_replaceable
+
+    if recording is None:
+        if resume or interval:
+            option = "--resume" if resume else "--frame-interval"
+            raise InputError(f"{option}: found a single capture {capture}, allowed: a recording.")
+        return
+    if output.suffix.lower() != ".zarr":
+        count = len(recording.names)
+        if recording.files == [capture]:
+            page = f"choose by --page 1 to {count}, or average repeated frames by --page mean"
+            raise InputError(f"{capture}: found {count} pages, allowed: one ({page}), or for all -o VOLUME.zarr.")
+        raise InputError(f"{output}: found a recording of {count} frames, allowed: VOLUME.zarr, which has a time axis.")
+    if not (resume or force):
+        check_replaceable(output)
+
+
+def reconstruct_recording(
+    recording,
+    design_text: str,
+    imager,
+    grid,
+    make,
+    output: Path,
+    *,
+    name: str,
+    camera: CaptureOptions,
+    progress: Progress,
+    points: Path | None,
+    weights: Path | None,
+    interval: float | None,
+    resume: bool,
+    again: Callable | None = None,
+) -> int:
+    """Makes and writes all frames, says what was made, and returns the exit status: 1 if a frame failed.
+
+    `again` images a volume again, and compares it with its image; it does so with the first one.
+    """
+    from ..io.ngff import plain_depths
+    from ..io.volume_series import VolumeSeries
+    from ..reconstruction.recording import reconstruct_frames
+
+    read = camera.frames(recording)
+    names = recording.names
+    provenance = provenance_of(weights, *camera.files, design=design_text)
+    request = _request(names, provenance)
+    provenance[f"input {name}"] = f"{len(names)} frames, {names[0]} to {names[-1]}"
+    provenance = camera.recorded(provenance)
+    series = VolumeSeries(
+        output, len(names), grid, interval=interval, request=request, provenance=provenance, resume=resume
+    )
+    kept[output] = RESUMABLE
+    before, began = len(series.finished), time.monotonic()
+    warnings, checks = {}, []
+
+    def made(frame):
+        number, image, done, said = frame
+        found = make(image, Progress())
+        if again and not checks:
+            checks.append(f"frame {number} imaged again is {in_words(again(found.volume, image, Progress()))}")
+        note: dict[str, Any] = {name: lines for name, lines in (("done", done), ("warnings", said)) if lines}
+        if found.points is not None:
+            note["points"] = _columns(found.points, found.evidence)
+        if found.warning:
+            warnings[found.warning] = None
+        return found.volume, note
+
+    # Where every frame fails for one reason, that is said once, as the error.
+    to_say, said = [], 0
+
+    def failed(frame, reason):
+        nonlocal said
+        said += 1
+        if said <= _NAMED:
+            to_say.append(f"gs-jax: frame {frame} ({names[frame]}): {reason}")
+        if series.finished:
+            say()
+
+    def say():
+        while to_say:
+            click.echo(to_say.pop(0), err=True)
+
+    reconstruct_frames(series, lambda frame: (frame, *read(frame)), made, failed=failed, progress=progress)
+    say()
+    seconds, new = time.monotonic() - began, len(series.finished) - before
+    if points:
+        from ..io.points import write_points_in_time
+
+        write_points_in_time(points, ((frame, note["points"]) for frame, note in series.notes()), provenance=provenance)
+    camera.say()
+    _say_of_frames(series)
+    size = " x ".join(map(str, (series.count, *grid.volume_shape)))
+    rest = f"; {before} were there" if before else ""
+    rate = f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
+    voxels = f"{size} voxels (t, z, y, x), {grid.pitch * 1000:.4g} um laterally"
+    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}")
+    click.echo(f"{output}: {rate}")
+    for check in checks:
+        click.echo(f"{output}: {check}")
+    for warning in warnings:
+        click.echo(f"gs-jax: warning: {warning}", err=True)
+    if series.failed:
+        some = ", ".join(map(str, sorted(series.failed)[:_NAMED])) + (", ..." if len(series.failed) > _NAMED else "")
+        what = f"{len(series.failed)} of {series.count} frames failed and are empty: {some}"
+        click.echo(f"gs-jax: {output}: {what}; --resume tries them again", err=True)
+    return int(bool(series.failed))
+
+
+def in_words(check) -> str:
+    """How far a volume that is imaged again is from its capture."""
+    error = f"{check.error:.0%} RMS from the capture (correlation {check.correlation:.3f})"
+    return f"{error}, {check.regions.max():.0%} where it is farthest"
+
+
+def _request(names, provenance) -> dict[str, str]:
+    """What volumes depend on: options, the design, and the contents of the files beside the recording."""
+    given = click.get_current_context().params
+    request = {name: str(value) for name, value in given.items() if name not in _ELSEWHERE and value is not None}
+    request |= {name: text for name, text in provenance.items() if name.startswith(("input ", "design"))}
+    request["points"] = str(bool(given.get("points")))
+    request["names of frames"] = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    return request
+
+
+def _columns(points, evidence) -> dict[str, list]:
+    import numpy as np
+
+    named = dict(zip(("x_mm", "y_mm", "z_mm", "intensity"), np.asarray(points).T, strict=True)) | (evidence or {})
+    return {name: np.asarray(values).tolist() for name, values in named.items()}
+
+
+def _say_of_frames(series):
+    """What was done to single frames, and what is wrong with them: their number, and the first."""
+    from ..io.volume_series import JOURNAL
+
+    done, wrong, first = 0, 0, ""
+    for _, note in series.notes():
+        done += bool(note.get("done"))
+        wrong += bool(note.get("warnings"))
+        first = first or next(iter(note.get("warnings", [])), "")
+    if done:
+        where = f"{JOURNAL} in {series.path} says how many"
+        click.echo(f"{done} frame{'s' * (done > 1)}: pixels filled from neighbours; {where}")
+    if wrong:
+        click.echo(f"gs-jax: warning: in {wrong} frame{'s' * (wrong > 1)}, the first: {first}", err=True)

@@ -1,0 +1,128 @@
+"""What iterative methods invert: the microscope in pixels that suit the voxels, and the light that it is to explain."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+from ..base.progress import Progress
+from ..geometry import Grid, Imager, Sensor
+from ..optics.full import FullOptics
+from ..projection.forward_model import Optics
+from ..projection.levels import optics_of
+from ..projection.operators import forward_operator
+from ..solvers.unmatched import Unmatched
+from ..suppression.background import local_levels
+
+# Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
+_DARKEST = 1
+# Half a wave of background is this many of the halo's pixels at least: as wide as the halo of a spot.
+_SLOW = 6.5
+_ROUNDING = 0.02
+
+
+class Model(NamedTuple):
+    """What iterative methods explain an image by.
+
+    Parameters
+    ----------
+    imager, optics
+        With optics by name, pixels are as wide as voxels.
+    side
+        So many of the camera's pixels each way are one of these.
+    hazy
+        The optics does not hold all of the light; what it does not is background.
+    """
+
+    imager: Imager
+    optics: Optics
+    side: int = 1
+    hazy: bool = False
+
+
+def model_of(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> Model:
+    """The model of a microscope for voxels; optics as for `reconstruct`."""
+    if not isinstance(optics, str):
+        return Model(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
+    imager, side = _coarser(imager, grid)
+    return Model(imager, optics_of(imager, grid.depths, optics, progress=progress), side, optics != "full")
+
+
+def explainable(
+    image: Num[Array | np.ndarray, "row column"], model: Model
+) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
+    """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it."""
+    rows, columns = model.imager.sensor.shape
+    light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))
+    light = light.reshape(rows, model.side, columns, model.side).sum((1, 3))
+    return light, np.maximum(local_levels(light)[0], 0) if model.hazy else 0.0
+
+
+def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+    """An image less its darkest percent, or as it is if that is negative."""
+    return image - np.asarray(max(float(np.percentile(image, _DARKEST)), 0.0), image.dtype)
+
+
+class System(eqx.Module):
+    """What a solver inverts: the microscope, and how.
+
+    Parameters
+    ----------
+    imager, grid, optics
+        As for `forward`.
+    seen
+        If given, back-projection from these voxels stands for the adjoint.
+    slow
+        So many of the image's longest cosine waves each way are left out of account.
+    """
+
+    imager: Imager
+    grid: Grid
+    optics: Optics
+    seen: Grid | None = None
+    slow: int = eqx.field(static=True, default=0)
+
+    @property
+    def operator(self) -> lx.AbstractLinearOperator | Unmatched:
+        A = forward_operator(self.imager, self.grid, self.optics)
+        if self.seen is not None:
+            return Unmatched(A, forward_operator(self.imager, self.seen).T)
+        return lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
+
+    def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+        """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""
+        image = jnp.asarray(image)
+        if not self.slow:
+            return image
+        rows, columns = (_waves(n, self.slow, image.dtype) for n in image.shape)
+        return image - rows @ (rows.T @ image @ columns) @ columns.T
+
+
+def _waves(size, count, dtype):
+    """The longest waves of the discrete cosine transform, orthonormal: `(size, count)`."""
+    waves = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
+    return jnp.asarray(waves / np.linalg.norm(waves, axis=0), dtype)
+
+
+def _coarser(imager, grid):
+    """Pixels as squares that are at most as wide as a voxel's image, and divide the sensor; how many each way."""
+    sensor = imager.sensor
+    wanted = float(imager.magnification(grid.depths).mean()) * grid.pitch / sensor.pixel_pitch
+    common = math.gcd(*sensor.shape)
+    # Two pixels each way must be left.
+    fits = lambda n: common % n == 0 and n <= wanted + _ROUNDING and min(sensor.shape) >= 2 * n
+    side = max((n for n in range(1, math.ceil(wanted) + 1) if fits(n)), default=1)
+    rows, columns = (n // side for n in sensor.shape)
+    coarse = Sensor((rows, columns), side * sensor.pixel_pitch, sensor.origin)
+    return eqx.tree_at(lambda i: i.sensor, imager, coarse), side
+
+
+def slow_waves(imager: Imager, optics: Optics) -> int:
+    """Of the image's longest cosine waves each way, those that a background makes which `optics` holds all of."""
+    if not isinstance(optics, FullOptics):
+        return 0
+    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.halo.grid.pixel))

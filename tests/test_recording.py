@@ -1,0 +1,363 @@
+"""Recordings: frames from wherever they lie to one OME-Zarr, which survives whatever ends a run."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import zarr
+
+from gs_jax import Grid
+from gs_jax.base.errors import InputError
+from gs_jax.designs.design import read_design
+from gs_jax.io import ngff, volume_series
+from gs_jax.io.captures import Wanted
+from gs_jax.io.napari import reader
+from gs_jax.io.provenance import read_provenance
+from gs_jax.io.recordings import opened_recording
+from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halved
+from gs_jax.projection.backprojection import backproject
+from gs_jax.reconstruction.pipeline import reconstruct
+from gs_jax.reconstruction.recording import AHEAD, reconstruct_frames
+
+from .test_cli import folder, run
+
+__all__ = ["folder"]
+
+FRAMES = np.random.default_rng(0).integers(100, 3000, (5, 96, 80)).astype(np.uint16)
+OPTIONS = ("--depths", "18:22:1", "--voxel-um", "50")
+
+
+def save(name, frames=FRAMES):
+    """A recording of this name: pages, a folder or a pattern of files, or Zarr."""
+    if name.endswith(".zarr"):
+        zarr.create_array(name, data=frames)
+    elif name.endswith(".tif") and "*" not in name:
+        tifffile.imwrite(name, frames, photometric="minisblack")
+    elif name.endswith(".npy"):
+        np.save(name, frames)
+    else:
+        os.mkdir("frames")
+        for number, frame in enumerate(frames):
+            # The ninth comes before the tenth.
+            tifffile.imwrite(f"frames/f{number + 8}.tif", frame)
+    return name
+
+
+def command(name, *options, output="v.zarr"):
+    return ("reconstruct", name, "design.toml", *OPTIONS, "-o", output, *options)
+
+
+def level(path="v.zarr", name="0") -> Any:
+    """An array of a store, as any reader of Zarr has it."""
+    return zarr.open_group(path, mode="r")[name]
+
+
+def volumes(path="v.zarr") -> np.ndarray:
+    return level(path)[...]
+
+
+def files(path):
+    return {str(each.relative_to(path)): each.read_bytes() for each in sorted(path.rglob("*")) if each.is_file()}
+
+
+def expected(frames=FRAMES, **options):
+    grid = Grid.over(read_design("design.toml").imager().sensor, depths=np.arange(18.0, 22.5), pitch=0.05)
+    imager = read_design("design.toml").imager()
+    return np.stack([reconstruct(frame.astype(np.float32), imager, grid, **options) for frame in frames])
+
+
+@pytest.mark.parametrize("name", ["rec.tif", "rec.npy", "frames", "frames/f*.tif", "rec.zarr"])
+def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name):
+    status, out, err = run(monkeypatch, capsys, *command(save(name)))
+    assert (status, err) == (0, "")
+    assert "5 x 5 x 39 x 33 voxels (t, z, y, x), 50 um laterally, 5 depths from 18 to 22 mm" in out
+    assert "frames/s" in out
+    # Of one type and compiled in one way: float32 rounding is the same.
+    np.testing.assert_allclose(volumes(), expected(), rtol=1e-5)
+    assert read_provenance("v.zarr")[f"input {os.path.basename(name)}"].startswith("5 frames")
+
+
+def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
+    """With a correction, which is read once, and an iterative method."""
+    save("rec.tif")
+    tifffile.imwrite("dark.tif", np.full((96, 80), 90, np.uint16))
+    how = ("--method", "richardson-lucy", "--steps", "2", "--dark", "dark.tif")
+    status, out, _ = run(monkeypatch, capsys, *command("rec.tif", *how))
+    assert status == 0 and "5 frames: dark frame dark.tif taken off, median 90" in out
+    run(monkeypatch, capsys, *command("rec.tif", *how, "--page", "4", output="page.zarr"))
+    np.testing.assert_allclose(volumes()[3], volumes("page.zarr"), rtol=1e-4, atol=1e-4 * volumes().max())
+    assert "dark.tif" in read_provenance("v.zarr")["correction"]
+
+
+def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
+    status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
+    assert (status, err) == (0, "") and out.count("imaged again") == 1 and "v.zarr: frame 0 imaged again is" in out
+
+
+def test_what_viewers_are_told(folder, monkeypatch, capsys):
+    """Time first, to scale; planes as chunks; a pyramid where a plane is larger than a chunk."""
+    monkeypatch.setattr(ngff, "CHUNK", 16)
+    monkeypatch.setattr(volume_series, "CHUNK", 16)
+    run(monkeypatch, capsys, *command(save("rec.tif"), "--frame-interval", "0.05"))
+    attributes = json.loads((folder / "v.zarr" / ".zattrs").read_text())
+    (image,) = attributes["multiscales"]
+    assert image["version"] == "0.4" and image["axes"] == [
+        {"name": "t", "type": "time", "unit": "second"},
+        *({"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"),
+    ]
+    levels = [level(name=each["path"]) for each in image["datasets"]]
+    assert [level.shape for level in levels] == [(5, 5, 39, 33), (5, 5, 20, 17), (5, 5, 10, 9)]
+    assert [level.chunks for level in levels] == [(1, 1, 16, 16), (1, 1, 16, 16), (1, 1, 10, 9)]
+    transforms = [each["coordinateTransformations"] for each in image["datasets"]]
+    assert [scale["scale"] for scale, _ in transforms] == [[0.05, 1000, 50 * n, 50 * n] for n in (1, 2, 4)]
+    # Of wider voxels, the first centre lies further in.
+    assert [place["translation"] for _, place in transforms] == [
+        [0, 18000, -950, -800],
+        [0, 18000, -925, -775],
+        [0, 18000, -875, -725],
+    ]
+    whole = volumes()
+    np.testing.assert_allclose(levels[1][2, 1, 3, 4], whole[2, 1, 6:8, 8:10].mean(), rtol=1e-6)
+    find = reader("v.zarr")
+    assert find is not None
+    ((layer, options, kind),) = find("v.zarr")
+    assert kind == "image" and options["multiscale"] and [each.shape for each in layer] == [n.shape for n in levels]
+    assert options["scale"] == [0.05, 1000, 50, 50] and options["translate"] == [0, 18000, -950, -800]
+    assert options["axis_labels"] == ("t", "z", "y", "x") and options["units"] == ("s", "um", "um", "um")
+    window = attributes["omero"]["channels"][0]["window"]
+    assert window["min"] <= window["start"] < window["end"] <= window["max"] == whole[0].max()
+
+
+def test_without_an_interval_time_has_no_unit(folder, monkeypatch, capsys):
+    run(monkeypatch, capsys, *command(save("rec.tif")))
+    (image,) = json.loads((folder / "v.zarr" / ".zattrs").read_text())["multiscales"]
+    assert image["axes"][0] == {"name": "t", "type": "time"}
+    assert image["datasets"][0]["coordinateTransformations"][0]["scale"][0] == 1
+
+
+def test_odd_ends_are_means_of_what_is_there():
+    volume = np.arange(15, dtype=np.float32).reshape(1, 3, 5)
+    np.testing.assert_allclose(halved(volume), [[[3, 5, 6.5], [10.5, 12.5, 14]]])
+
+
+def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, capsys):
+    frames = np.random.default_rng(1).integers(100, 3000, (60, 96, 80)).astype(np.uint16)
+    save("rec.tif", frames)
+    arguments = [sys.executable, "-m", "gs_jax", *command("rec.tif")]
+    process = subprocess.Popen(arguments, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    journal = folder / "v.zarr" / JOURNAL
+    deadline = time.monotonic() + 100
+    while not (journal.exists() and journal.read_bytes().count(b"\n") > 2) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    whole = expected(frames)
+    before = [json.loads(line)["frame"] for line in journal.read_text().splitlines()[1:]]
+    # It opens, and has what it says that it has.
+    assert len(before) >= 2
+    np.testing.assert_allclose(volumes()[before], whole[before], rtol=1e-5)
+    with journal.open("a") as file:
+        file.write('{"frame": 59, "do')  # cut off within a line
+    status, out, _ = run(monkeypatch, capsys, *command("rec.tif"), "--resume")
+    assert status == 0 and f"; {len(before)} were there" in out
+    run(monkeypatch, capsys, *command("rec.tif", output="w.zarr"))
+    resumed, uninterrupted = files(folder / "v.zarr"), files(folder / "w.zarr")
+    for each in (resumed, uninterrupted):
+        attributes = json.loads(each.pop(".zattrs"))
+        assert attributes["multiscales"][0]["datasets"] and each.pop(JOURNAL).count(b"\n") == 61
+    assert resumed.keys() == uninterrupted.keys()
+    # What was killed computed the geometry in float32, the tests do in float64.
+    np.testing.assert_allclose(volumes(), volumes("w.zarr"), rtol=1e-4)
+
+
+def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, capsys):
+    save("frames")
+    good = (folder / "frames" / "f10.tif").read_bytes()
+    (folder / "frames" / "f10.tif").write_bytes(good[:3000])
+    tifffile.imwrite("frames/f8.tif", FRAMES[0, :50])
+    (folder / "frames" / "notes.txt").touch()
+    status, out, err = run(monkeypatch, capsys, *command("frames"))
+    assert status == 1 and "3 frames in" in out
+    assert "gs-jax: frame 0 (f8.tif): " in err and "found 50 x 80 pixels" in err
+    assert "gs-jax: frame 2 (f10.tif): " in err and "not a whole and valid TIFF" in err
+    assert err.endswith("gs-jax: v.zarr: 2 of 5 frames failed and are empty: 0, 2; --resume tries them again\n")
+    whole = expected()
+    np.testing.assert_allclose(volumes()[[1, 3, 4]], whole[[1, 3, 4]], rtol=1e-5)
+    assert not volumes()[[0, 2]].any()
+    (folder / "frames" / "f10.tif").write_bytes(good)
+    status, out, err = run(monkeypatch, capsys, *command("frames"), "--resume")
+    assert status == 1 and "1 frames in" in out and err.count("frame 0") == 1 and "1 of 5 frames failed" in err
+    tifffile.imwrite("frames/f8.tif", FRAMES[0])
+    assert run(monkeypatch, capsys, *command("frames"), "--resume")[0] == 0
+    np.testing.assert_allclose(volumes(), whole, rtol=1e-5)
+
+
+def test_where_no_frame_is_good_nothing_is_written(folder, monkeypatch, capsys):
+    status, _, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:, :50])))
+    assert status == 2 and "found 50 x 80 pixels" in err and not (folder / "v.zarr").exists()
+
+
+def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
+    save("frames")
+    (folder / "frames" / "f10.tif").write_bytes(b"II*\0")
+    run(monkeypatch, capsys, *command("frames"))
+    before = files(folder / "v.zarr")
+    for options, words in (
+        ((), "found 4 of 5 frames of a recording that was interrupted, allowed: --resume to go on, or --force"),
+        (("--resume", "--optics", "pinhole"), "found optics 'pinhole' for --resume, allowed: 'full', as it was begun"),
+        (("--resume", "--frame-interval", "2"), "found frame_interval '2.0' for --resume, allowed: 'nothing'"),
+    ):
+        status, _, err = run(monkeypatch, capsys, *command("frames"), *options)
+        assert status == 2 and words in err
+    tifffile.imwrite("frames/f99.tif", FRAMES[0])
+    status, _, err = run(monkeypatch, capsys, *command("frames"), "--resume")
+    assert status == 2 and "names of frames" in err
+    assert files(folder / "v.zarr") == before
+    os.unlink("frames/f10.tif")
+    status, _, err = run(monkeypatch, capsys, *command("frames"), "--force")
+    assert (status, err) == (0, "gs-jax: replaced v.zarr\n") and volumes().shape[0] == 5
+    # What is finished is a result as others are.
+    status, _, err = run(monkeypatch, capsys, *command("frames"))
+    assert (status, err) == (0, "gs-jax: replaced v.zarr\n")
+
+
+def test_points_of_all_frames_in_one_table(folder, monkeypatch, capsys):
+    scope = read_design("design.toml").imager()
+    frames = np.full((3, 96, 80), 16, np.uint16)
+    for frame in (0, 2):
+        for row, column in np.asarray(scope.sensor.to_pixels(scope.project(np.array([[0.1 * frame, 0, 20.0]]))))[:, 0]:
+            frames[frame, round(row) - 1 : round(row) + 2, round(column) - 1 : round(column) + 2] = 1000
+    save("rec.tif", frames)
+    how = ("--suppress", "clusters", "--points", "p.csv")
+    assert run(monkeypatch, capsys, *command("rec.tif", *how))[0] == 0
+    header, *rows = (folder / "p.csv").read_text().splitlines()
+    assert header == "x_mm,y_mm,z_mm,intensity,frame"
+    found = np.array([row.split(",") for row in rows], float)
+    assert set(found[:, 4]) == {0, 2}
+    x = [found[found[:, 4] == frame][0, 0] for frame in (0, 2)]
+    assert np.abs(np.array(x) - (0, 0.2)).max() < 0.051
+    assert read_provenance("p.csv")["input rec.tif"].startswith("3 frames")
+    # A frame alone has the same points.
+    run(monkeypatch, capsys, *command("rec.tif", *how[:2], "--page", "3", "--points", "q.csv", output="w.zarr"))
+    alone = np.loadtxt(folder / "q.csv", delimiter=",", skiprows=1, ndmin=2)
+    np.testing.assert_allclose(alone, found[found[:, 4] == 2, :4], rtol=1e-6)
+
+
+def test_it_is_compiled_once(folder, monkeypatch, capsys):
+    """Also where a frame is repaired, and thus of another type."""
+    frames = FRAMES // 100 + 100
+    frames[2, 40, 40] = 65535
+    save("rec.tif", frames)
+    jitted: Any = backproject
+    compiled = jitted._cache_size()
+    status, out, _ = run(monkeypatch, capsys, *command("rec.tif", "--voxel-um", "61"))
+    assert status == 0 and "1 frame: pixels filled from neighbours" in out
+    assert jitted._cache_size() == compiled + 1
+
+
+@pytest.mark.parametrize(
+    "name, options, words",
+    [
+        ("rec.tif", ("-o", "v.ome.tif"), "rec.tif: found 5 pages, allowed: one (choose by --page 1 to 5"),
+        ("frames", ("-o", "v.ome.tif"), "v.ome.tif: found a recording of 5 frames, allowed: VOLUME.zarr"),
+        ("empty", (), "empty: found no captures, allowed: files that end in .tif"),
+        ("no*.tif", (), "no*.tif: found no captures"),
+        ("capture.tif", ("--resume",), "--resume: found a single capture capture.tif, allowed: a recording"),
+        ("capture.tif", ("--frame-interval", "1"), "--frame-interval: found a single capture"),
+        ("flat.zarr", (), "flat.zarr: found an array of 96 x 80, allowed: (t, y, x)"),
+        ("deep.zarr", (), "deep.zarr: found an array of 5 x 3 x 96 x 80, allowed: (t, y, x)"),
+        ("double.zarr", (), "found pixels of type float64"),
+        ("none.zarr", (), "none.zarr"),
+        ("rec.zarr", ("-o", "rec.zarr"), "rec.zarr: cannot be written"),
+    ],
+)
+def test_what_is_no_recording_is_said(folder, monkeypatch, capsys, name, options, words):
+    os.mkdir("empty")
+    for each in ("frames", "rec.tif", "rec.zarr"):
+        save(each)
+    save("flat.zarr", FRAMES[0])
+    save("deep.zarr", np.stack([FRAMES] * 3, 1))
+    save("double.zarr", FRAMES.astype(float))
+    status, _, err = run(monkeypatch, capsys, *command(name, *options))
+    assert status == 2 and words in err and len(err) < 400
+    assert not any((folder / each).exists() for each in ("v.zarr", "v.ome.tif"))
+
+
+def test_ome_zarr_with_channel_and_depth_is_a_recording(tmp_path):
+    attributes = {"multiscales": [{"axes": [{"name": n} for n in "tczyx"], "datasets": [{"path": "full"}]}]}
+    group = zarr.create_group(tmp_path / "a", zarr_format=2, attributes=attributes)
+    group.create_array("full", data=FRAMES[:, None, None])
+    with opened_recording(tmp_path / "a") as recording:
+        assert recording is not None and len(recording.names) == 5
+        np.testing.assert_array_equal(next(recording.images(3, Wanted())), FRAMES[3])
+
+
+def test_memory_is_bounded_and_work_overlaps(tmp_path):
+    """However slow the disk is, few frames are read and none of many volumes waits."""
+    alive, most, lock = 0, 0, threading.Lock()
+
+    def count(by):
+        nonlocal alive, most
+        with lock:
+            alive += by
+            most = max(most, alive)
+
+    class Slow(VolumeSeries):
+        def write(self, frame, volume, note=None):
+            time.sleep(0.01)
+            super().write(frame, volume, note)
+            count(-1)
+
+    def read(frame):
+        count(1)
+        return frame
+
+    grid = Grid([20.0], (4, 4), 0.1)
+    series = Slow(tmp_path / "v.zarr", 30, grid)
+    reconstruct_frames(series, read, lambda frame: (np.full((1, 4, 4), frame + 1, np.float32), {}))
+    assert volumes(tmp_path / "v.zarr")[:, 0, 0, 0].tolist() == list(range(1, 31))
+    # Those being read ahead, one more to be asked for, one made and one being written.
+    assert most <= AHEAD + 3
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
+    grid = Grid([20.0], (4, 4), 0.1)
+
+    def make(frame):
+        if frame == 6:
+            raise error
+        return np.full((1, 4, 4), frame + 1, np.float32), {}
+
+    with pytest.raises(error if isinstance(error, type) else OSError):
+        reconstruct_frames(VolumeSeries(tmp_path / "v.zarr", 9, grid), lambda frame: frame, make)
+    series = VolumeSeries(tmp_path / "v.zarr", 9, grid, resume=True)
+    assert series.finished >= set(range(5)) and series.unfinished[-3:] == [6, 7, 8]
+    with pytest.raises(InputError, match="for --resume, allowed"):
+        VolumeSeries(tmp_path / "v.zarr", 8, grid, resume=True)
+
+
+@pytest.mark.slow
+def test_memory_is_flat(folder):
+    """Peak resident memory of 60 frames beside 10."""
+    code = (
+        "import sys; sys.argv = ['gs-jax', *sys.argv[1:]]\n"
+        "from gs_jax.__main__ import main\n"
+        "from gs_jax.base.memory import most_memory\n"
+        "try:\n    main()\nfinally:\n    print(most_memory())"
+    )
+    peaks = []
+    for count in (10, 60):
+        save(f"{count}.tif", np.tile(FRAMES, (count // 5, 1, 1)))
+        arguments = (*command(f"{count}.tif", "--voxel-um", "10", output=f"{count}.zarr"),)
+        done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+        peaks.append(float(done.stdout.splitlines()[-1]))
+    # 50 more volumes are 6 MiB each.
+    assert peaks[1] - peaks[0] < 60 * 2**20
