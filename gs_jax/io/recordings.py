@@ -104,11 +104,12 @@ def _counted(path: Path) -> list[Any]:
 
 def _of_zarr(path, page):
     import zarr
+    from zarr import open as open_zarr
 
     if page is not None:
         raise InputError(f"--page {page}: found {path}, a recording in Zarr, allowed: no page.")
     with decoding(path, "Zarr store"):
-        store = zarr.open(path, mode="r")
+        store = open_zarr(path, mode="r")
         array = store if isinstance(store, zarr.Array) else _image(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: found no array in Zarr, allowed: an array (t, y, x), or OME-Zarr of one image.")
