@@ -210,7 +210,7 @@ def _register():
 
 
 def header() -> str:
-    return (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
+    return (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text(encoding="utf-8")
 
 
 def version() -> tuple[int, ...]:
