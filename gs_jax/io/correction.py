@@ -1,5 +1,6 @@
 """Captures corrected for their camera: the one way from a file to light, of every command that reads captures."""
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,8 @@ _SHARP = 2
 _BITS = (8, 10, 12, 14, 16)
 # So many pixels at the maximum, and more than twice those of the hundredth or the few counts below it, were cut off.
 _PILE, _FEW_COUNTS, _LEVELS = 10, 5, 32
+# In so many pixels levels are counted.
+_PIXELS = 500_000
 MASK_DTYPES = (*DTYPES, "bool")
 # So much of a mask may be bad: more is one that marks what is good.
 _MOST_BAD = 0.5
@@ -225,12 +228,14 @@ def saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:
     """
     if image.dtype.kind != "u":
         return None
-    found = np.bincount(image.ravel())
-    top, levels = len(found) - 1, np.count_nonzero(found)
-    count = int(found[top])
+    top = int(image.max())
+    count = int(np.count_nonzero(image == top))
     full = {2**bits - 1 for bits in _BITS} | {2**16 - 2 ** (16 - bits) for bits in _BITS}
-    # Rounded noise piles up as well, within a few counts; a drawing has few values.
-    below = int(found[max(top - max(top // 100, _FEW_COUNTS), 0) : top].sum())
+    # Rounded noise piles up as well, within a few counts; a drawing has few values, in a part of its pixels, too.
+    least = max(top - max(top // 100, _FEW_COUNTS), 0)
+    below = int(np.count_nonzero(image >= least)) - count
+    step = math.isqrt(image.size // _PIXELS) + 1
+    levels = np.count_nonzero(np.bincount(image[::step, ::step].ravel()))
     piled = count >= max(_PILE, 2 * below + 1) and levels >= _LEVELS
     return (count, top) if piled or (top in full and count > 1) else None
 

@@ -116,7 +116,9 @@ def forward_points(
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
-        beside = some[:, :2] - np.asarray(imager.lean(some[:, 2]), np.float64)
+        beside = some[:, :2] - np.asarray(
+            imager.lean(jnp.asarray(some[:, 2], imager.sensor_distance.dtype)), np.float64
+        )
         pairs = KDTree(beside).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
