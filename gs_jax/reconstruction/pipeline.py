@@ -161,7 +161,8 @@ def reconstructor(
     matched = not isinstance(method, ListRichardsonLucy | Unrolled)
     least_squares = matched and not isinstance(method, RichardsonLucy)
     slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
-    listed = seen if isinstance(method, ListRichardsonLucy) else None
+    # Back-projection stands for the adjoint.
+    listed = seen if isinstance(method, ListRichardsonLucy | Unrolled) else None
     system = System(model.imager, grid, model.optics, listed, slow)
     return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
 
