@@ -20,7 +20,8 @@ from gs_jax.calibration.outcome import calibrated, picture, scales
 from gs_jax.calibration.scene import calibrate_by_scene
 from gs_jax.calibration.sources import Sources, Spots
 from gs_jax.calibration.spots import core_offsets, find_spots
-from gs_jax.calibration.unknowns import FITTABLE, FITTED, offsets_of
+from gs_jax.calibration.unknowns import FITTABLE, FITTED
+from gs_jax.cli.calibrate import _NAMES
 from gs_jax.designs.builtin import geomscope
 from gs_jax.io.positions import read_positions
 from gs_jax.io.provenance import read_provenance
@@ -109,7 +110,7 @@ def test_lenses_beside_the_sensor_are_left_out():
     imager = eqx.tree_at(lambda i: i.shift, design.imager(), jnp.array([4.0, 0.0]))
     nothing = Spots(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     sources = Sources(POINTS, np.arange(3))
-    found = Calibration(imager, False, {}, {}, sources, nothing, np.zeros((0, 2)), offsets_of(imager, POINTS[:1, 2]))
+    found = Calibration(imager, False, {}, {}, sources, nothing, np.zeros((0, 2)))
     new = calibrated(design, found._replace(residuals=np.ones((1, 2))))
     left, all_of_them = len(new.array.centers_mm), len(design.array.centers_mm)
     assert 0.5 * all_of_them < left < all_of_them
@@ -295,6 +296,10 @@ def test_wrong_positions_are_one_line(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         read_positions(path, ["a.tif", "b.tif"])
+
+
+def test_the_command_knows_what_can_be_fitted():
+    assert tuple(name.replace("-", "_") for name in _NAMES) == FITTABLE
 
 
 def test_the_command(tmp_path):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Float64, Int, Num
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
+from .matching import NEAR
 from .sources import Sources, Spots, assigned
 from .spots import find_spots
 from .start import begin, begin_without_lenses
@@ -38,7 +39,7 @@ from .unknowns import (
 # Spots looked for in a capture, for each of its sources.
 _SPOTS = 60
 # How near a spot must be to where it is due, mm on the sensor: wide, then narrow.
-_WITHIN = (0.06, 0.03, 0.015)
+_WITHIN = (NEAR, 0.03, 0.015)
 # Standard deviation that lenses of a printed array may have from their places, mm, and lenses of no list.
 _PRINTED, _ANYWHERE = 0.01, 1.0
 # Captures that are looked at side by side, each with several times its memory.
@@ -65,8 +66,6 @@ class Calibration(NamedTuple):
         The points with what was found of them, mm, and the capture of each.
     spots, residuals
         The spots, and how far each is from where it should be, `(x, y)`, pixels.
-    offsets
-        How far spots are due from chief rays, by exact rays.
     """
 
     imager: Imager
@@ -76,7 +75,6 @@ class Calibration(NamedTuple):
     sources: Sources
     spots: Spots
     residuals: Float64[np.ndarray, "spot 2"]
-    offsets: Offsets
 
     @property
     def rms(self) -> float:
@@ -191,7 +189,7 @@ def refine(
     deviations = deviations_of(state, known, loose, noise_of(off, state, spots))
     check_known(deviations)
     sources = sources._replace(points=np.asarray(found_points(state, known), np.float64))
-    return Calibration(applied(state, imager), False, values_of(state), deviations, sources, spots, off, known.offsets)
+    return Calibration(applied(state, imager), False, values_of(state), deviations, sources, spots, off)
 
 
 class _Fitted(NamedTuple):

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 # The brightest spots that guesses are made from and tried on, of each source and at most, and lenses that make a pair.
 _FIRST, _TRIED, _MOST, _NEIGHBOURS = 5, 20, 3, 12
 # A spot is on a lens within this, mm on the plate: a twentieth of the pitch of the paper's array.
-_NEAR = 0.06
+NEAR = 0.06
 # Spots that must be on lenses at least, and their share of those tried.
 _FEWEST, _SHARE = 6, 0.5
 _AT_ONCE = 20_000
@@ -78,7 +78,7 @@ def match(
             pair, lens = pairs[start : start + _AT_ONCE].T
             factor = factors[pair, lens]
             shift = p[one[pair]] - factor * lenses[first[lens]]
-            count = (_distance(p, factor, shift, tree, mirrored) < _NEAR).sum(1)
+            count = (_distance(p, factor, shift, tree, mirrored) < NEAR).sum(1)
             top = int(count.argmax())
             if count[top] > best.on_lenses:
                 best = Similarity(complex(factor[top]), complex(shift[top]), mirrored, int(count[top]), len(p), sources)
@@ -99,7 +99,7 @@ def _improved(found: Similarity, p, c, tree) -> Similarity:
     back = (p - found.shift) / found.factor
     back = back.conj() if found.mirrored else back
     distance, lens = tree.query(np.stack([back.real, back.imag], -1))
-    use = distance < _NEAR
+    use = distance < NEAR
     lenses = (c.conj() if found.mirrored else c)[lens[use]]
     system = np.stack([lenses, np.ones_like(lenses)], -1)
     factor, shift = np.linalg.lstsq(system, p[use])[0]
@@ -114,8 +114,8 @@ def match_shift(
         return np.zeros(2), 0
     apart = (spots[:, None] - pattern[None]).reshape(-1, 2)
     tree = KDTree(apart)
-    count = tree.query_ball_point(apart, _NEAR, return_length=True)
-    together = tree.query_ball_point(apart[int(count.argmax())], _NEAR)
+    count = tree.query_ball_point(apart, NEAR, return_length=True)
+    together = tree.query_ball_point(apart[int(count.argmax())], NEAR)
     return np.median(apart[together], axis=0), len(together)
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..geometry import Imager, MicrolensArray, chief_ray
-from .matching import Similarity, match, match_shift, meeting_lenses
+from .matching import NEAR, Similarity, match, match_shift, meeting_lenses
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of
 
@@ -19,8 +19,8 @@ from .unknowns import moved_lenses, offsets_of
 _DISTANCE, _STEPS = 0.25, 51
 # Without a known depth: scale of the pattern, and how far it may be off, relative.
 _SCALE, _SCALE_OFF = 1.3, 0.2
-# How near to where it is due a spot is counted, mm, and guesses that are compared.
-_NEAR, _GUESSES = 0.06, 6
+# Guesses that are compared.
+_GUESSES = 6
 # Share of the spots that must be on lenses which other captures show, too.
 _SHARED = 0.5
 
@@ -63,10 +63,11 @@ def begin(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager:
     # Points that lack a coordinate say less of the geometry.
     clear = [(each, source) for each, source in guesses if each.is_clear]
     clear.sort(key=lambda guess: int(np.isnan(sources.points[guess[1]]).sum()))
-    starts = [_begun(each, source, found, sources, imager) for each, source in clear[:_GUESSES]]
-    if len(starts) == 1 or (sources.captures[:, None] == sources.captures).sum() == len(sources.captures):
-        return starts[0]
-    return max(starts, key=lambda start: _explained(found, start))
+    # Where each capture has one source, the clearest pattern is that source's.
+    alone = len(np.unique(sources.captures)) == len(sources.captures)
+    guesses = clear[: 1 if alone else _GUESSES]
+    starts = [_begun(each, source, found, sources, imager) for each, source in guesses]
+    return starts[0] if len(starts) == 1 else max(starts, key=lambda start: _explained(found, start))
 
 
 def _scale(imager: Imager, depth: float) -> tuple[float, float]:
@@ -79,7 +80,7 @@ def _scale(imager: Imager, depth: float) -> tuple[float, float]:
 
 def _explained(found, start: Start) -> int:
     offsets = offsets_of(start.imager, start.sources.points[:, 2])
-    return len(assigned(found, start.sources, start.imager, offsets, _NEAR).lenses)
+    return len(assigned(found, start.sources, start.imager, offsets, NEAR).lenses)
 
 
 def _begun(best: Similarity, source: int, found, sources: Sources, imager: Imager) -> Start:
@@ -137,7 +138,7 @@ def _without(spots, point, imager: Imager):
     if not len(spots) or not seen.any():
         return spots
     wanted = chief_ray(centers[seen], point[:2], magnification)
-    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > _NEAR]
+    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > NEAR]
 
 
 def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:
@@ -156,9 +157,9 @@ def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: S
     spots = [found[int(k)] for k in sources.captures]
     nominal = np.asarray(imager.magnification(points[:, 2]), np.float64)
     steps = np.linspace(1 - _DISTANCE, 1 + _DISTANCE, _STEPS)
-    met = np.array([meeting_lenses(spots, points[:, :2], step * nominal, _NEAR / 4)[2] for step in steps])
+    met = np.array([meeting_lenses(spots, points[:, :2], step * nominal, NEAR / 4)[2] for step in steps])
     step = float(steps[met == met.max()].mean())
-    centers, count, _ = meeting_lenses(spots, points[:, :2], step * nominal, _NEAR)
+    centers, count, _ = meeting_lenses(spots, points[:, :2], step * nominal, NEAR)
     if not count or count < _SHARED * sum(map(len, spots)):
         text = f"{count} of {sum(map(len, spots))} spots on lenses that several captures show"
         allowed = "half of them; are positions and the sensor's pixels right?"

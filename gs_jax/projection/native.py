@@ -93,7 +93,8 @@ def _load(name):
         from . import bridge
 
         return bridge.number(name)
-    except Exception:  # no numba, one that does not know this Python or XLA, nowhere to keep what it compiled
+    # No numba, one that does not know this Python or XLA, or nowhere to keep what it compiled.
+    except (ImportError, OSError, RuntimeError):
         return None
 
 

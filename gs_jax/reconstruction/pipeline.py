@@ -158,12 +158,11 @@ def reconstructor(
     if isinstance(method, BackProjection):
         return lambda image, progress: _back_projected(image, imager, seen, method, progress)
     model = model_of(imager, grid, optics, progress or Progress())
-    matched = not isinstance(method, ListRichardsonLucy | Unrolled)
-    least_squares = matched and not isinstance(method, RichardsonLucy)
+    # Of these, back-projection stands for the adjoint.
+    unmatched = isinstance(method, ListRichardsonLucy | Unrolled)
+    least_squares = not (unmatched or isinstance(method, RichardsonLucy))
     slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
-    # Back-projection stands for the adjoint.
-    listed = seen if isinstance(method, ListRichardsonLucy | Unrolled) else None
-    system = System(model.imager, grid, model.optics, listed, slow)
+    system = System(model.imager, grid, model.optics, seen if unmatched else None, slow)
     return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
 
 
