@@ -6,11 +6,12 @@ from .codesign.search import optimize as optimize
 from .codesign.study import read_study as read_study
 from .designs.builtin import geomscope as geomscope
 from .designs.design import Design as Design, read_design as read_design, write_design as write_design
-from .geometry import Grid as Grid, Imager as Imager, MicrolensArray as MicrolensArray, Sensor as Sensor
+from .geometry import Imager as Imager, Sensor as Sensor
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.points import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
 from .layouts.patterns import random_layout as random_layout
+from .lenses import MicrolensArray as MicrolensArray
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .pictures import show as show
@@ -32,5 +33,6 @@ from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.unrolled import Unrolled as Unrolled
 from .suppression.locate import find_points as find_points
 from .suppression.unet import suppress as suppress
+from .voxels import Grid as Grid
 
 __all__: list[str]

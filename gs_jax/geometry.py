@@ -1,39 +1,21 @@
-"""Lenses, sensor and object grid, and where a lens images a point (Eqs. 1, 3).
+"""Lenses and sensor, and where a lens images a point (Eqs. 1, 3).
 
 Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
-`[row, column]`, volumes are `[depth, row, column]`. The lateral frame is the whole sensor's: origin at its
+`[row, column]`. The lateral frame is the whole sensor's: origin at its
 centre, +x along increasing column, +y along increasing row. A depth `z > 0` is measured from the front
 (plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
 
 import math
-import operator
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
-
-def as_float(x) -> Array:
-    # What is no array yet becomes one on the host: JAX would compile a conversion for each shape.
-    return jnp.asarray(x if isinstance(x, Array) else np.asarray(x, float), dtype=float)
-
-
-def _as_pair(x) -> tuple[float, float]:
-    first, second = map(float, x)
-    return first, second
-
-
-def _as_shape(x) -> tuple[int, int]:
-    rows, columns = map(operator.index, x)
-    return rows, columns
-
-
-def _as_float_or_none(x) -> Array | None:
-    return None if x is None else as_float(x)
-
+from .base.converters import as_float, as_float_or_none, as_pair, as_shape
+from .lenses import MicrolensArray
 
 # A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
 SHORTEST, LONGEST = 1e-5, 0.1
@@ -104,9 +86,9 @@ class Sensor(eqx.Module):
         If there are fewer than 2 x 2 pixels, the pitch is not positive, or the origin is not finite.
     """
 
-    shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
+    shape: tuple[int, int] = eqx.field(static=True, converter=as_shape)
     pixel_pitch: float = eqx.field(static=True, converter=float)
-    origin: tuple[float, float] = eqx.field(static=True, converter=_as_pair, default=(0.0, 0.0))
+    origin: tuple[float, float] = eqx.field(static=True, converter=as_pair, default=(0.0, 0.0))
 
     def __check_init__(self):
         if min(self.shape) < 2:
@@ -136,47 +118,6 @@ class Sensor(eqx.Module):
         x = (pixels[..., 1] - middle_column) * self.pixel_pitch + self.origin[0]
         y = (pixels[..., 0] - middle_row) * self.pixel_pitch + self.origin[1]
         return jnp.stack([x, y], axis=-1)
-
-
-class MicrolensArray(eqx.Module):
-    """Plano-convex microlenses on one plate, the plano side toward the object.
-
-    Parameters
-    ----------
-    centers
-        Lens vertices `(lens, 2)` in the array's own frame, mm.
-    radius_of_curvature, refractive_index, aperture_diameter, substrate_thickness
-        Of every lens and of the plate that carries them, mm. The aperture is the one before neighbours
-        clip it to its Voronoi cell.
-    thin_lens_focal_length
-        Overrides the focal length that follows from the radius, mm, for a thin-lens study.
-    size
-        `(x, y)` of the plate, centred, mm: where the outer lenses end. By default they are as wide as their discs.
-
-    Raises
-    ------
-    ValueError
-        If `centers` is not `(lens, 2)` or holds no lens.
-    """
-
-    centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
-    radius_of_curvature: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
-    refractive_index: Float[Array, ""] = eqx.field(converter=as_float, default=1.43)
-    aperture_diameter: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
-    substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
-    thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=_as_float_or_none, default=None)
-    size: tuple[float, float] = eqx.field(static=True, converter=_as_pair, default=(math.inf, math.inf))
-
-    def __check_init__(self):
-        if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
-            raise ValueError(f"`centers` must be (lens, 2) with a lens at least, got {self.centers.shape}.")
-
-    @property
-    def focal_length(self) -> Float[Array, ""]:
-        """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm."""
-        if self.thin_lens_focal_length is None:
-            return self.radius_of_curvature / (self.refractive_index - 1)
-        return self.thin_lens_focal_length
 
 
 class Imager(eqx.Module):
@@ -214,7 +155,7 @@ class Imager(eqx.Module):
     rotation: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
     wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
-    tilt: Float[Array, "2"] | None = eqx.field(converter=_as_float_or_none, default=None)
+    tilt: Float[Array, "2"] | None = eqx.field(converter=as_float_or_none, default=None)
 
     def __check_init__(self):
         if not self.field_radius > 0:
@@ -289,86 +230,3 @@ class Imager(eqx.Module):
     def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array, "lens point 2"]:
         """Where each lens images each point `(x, y, z)`, mm on the sensor."""
         return chief_ray(self.centers[:, None, :], points[None, :, :2], self.magnifications(points[:, 2])[..., None])
-
-
-class Grid(eqx.Module):
-    """Voxels of the object space; centred on the axis, unless it has another origin.
-
-    Parameters
-    ----------
-    depths
-        `(depth,)` of the planes, mm, evenly spaced or not. Back-projection and the forward model take any order;
-        what interpolates between planes or writes them to disk says if they must ascend.
-    shape
-        `(rows, columns)` of each plane.
-    pitch
-        Lateral distance of voxel centres, mm. Like the field radius it decides shapes: a plain number.
-    origin
-        `(x, y)` of the middle of each plane, mm: of a region of interest beside the axis.
-
-    Raises
-    ------
-    ValueError
-        If there is no depth, no voxel, or the pitch is not positive.
-    """
-
-    depths: Float[Array, " depth"] = eqx.field(converter=as_float)
-    shape: tuple[int, int] = eqx.field(static=True, converter=_as_shape)
-    pitch: float = eqx.field(static=True, converter=float)
-    origin: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
-
-    def __check_init__(self):
-        if self.depths.ndim != 1 or self.depths.size < 1:
-            raise ValueError(f"`depths` must be (depth,) with a depth at least, got {self.depths.shape}.")
-        if min(self.shape) < 1:
-            raise ValueError(f"`shape` must be two positive numbers of voxels, got {self.shape}.")
-        if not self.pitch > 0:
-            raise ValueError(f"`pitch` must be positive, got {self.pitch}.")
-
-    @classmethod
-    def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
-        """The grid that covers as much of the object as the sensor is large (the paper's field of view).
-
-        Its numbers of rows and columns are odd: there is a voxel at the sensor's origin, by default on the axis.
-        `depths` and `pitch` are mm.
-        """
-        if not pitch > 0:
-            raise ValueError(f"`pitch` must be positive, got {pitch}.")
-        rows, columns = (2 * round((n * sensor.pixel_pitch / pitch - 1) / 2) + 1 for n in sensor.shape)
-        rows, columns = max(rows, 1), max(columns, 1)
-        return cls(depths, (rows, columns), pitch, sensor.origin)
-
-    def at(self, depths) -> "Grid":
-        """The same voxels at other depths `(depth,)`, or at a single one, mm."""
-        return eqx.tree_at(lambda g: g.depths, self, jnp.atleast_1d(jnp.asarray(depths, self.depths.dtype)))
-
-    @property
-    def volume_shape(self) -> tuple[int, int, int]:
-        """`(depths, rows, columns)` of a volume on this grid."""
-        return self.depths.size, *self.shape
-
-    @property
-    def y(self) -> Float[Array, " row"]:
-        """Voxel centres along the rows' axis, mm."""
-        return self.origin[1] + self._offsets(self.shape[0])
-
-    @property
-    def x(self) -> Float[Array, " column"]:
-        """Voxel centres along the columns' axis, mm."""
-        return self.origin[0] + self._offsets(self.shape[1])
-
-    def _offsets(self, count):
-        return (jnp.arange(count, dtype=self.depths.dtype) - (count - 1) / 2) * self.pitch
-
-    def to_mm(self, voxels: Int[Array | np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Points `(x, y, z)` of the voxels `(depth, row, column)`, mm, on the host in float64."""
-        depth, row, column = np.moveaxis(np.asarray(voxels), -1, 0)
-        axes = ((self.x, column), (self.y, row), (self.depths, depth))
-        return np.stack([np.asarray(axis, np.float64)[index] for axis, index in axes], axis=-1)
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Edges of a plane for `imshow`, `(left, right, bottom, top)`, mm; row 0 is at the top."""
-        (x, y), (rows, columns) = map(float, self.origin), self.shape
-        across, along = columns * self.pitch / 2, rows * self.pitch / 2
-        return x - across, x + across, y + along, y - along

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float, Num
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from .geometry import Grid
+from .voxels import Grid
 
 # Darkest and brightest shown, percentiles: back-projection has a pedestal, which is no object, and a few bright voxels.
 _DARKEST, _BRIGHTEST = 50, 99.95

@@ -12,7 +12,9 @@ MODULES = sorted((ROOT / "gs_jax").rglob("*.py"))
 ORDER = [
     "_version",
     "base",
+    "lenses",
     "geometry",
+    "voxels",
     "metrics",
     "pictures",
     "optics",

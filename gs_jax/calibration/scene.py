@@ -10,8 +10,9 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..suppression.locate import find_points
+from ..voxels import Grid
 from .fit import Calibration, refine, spots_in
 from .sources import Sources
 

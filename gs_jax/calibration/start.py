@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..geometry import Imager, MicrolensArray, chief_ray
+from ..geometry import Imager, chief_ray
+from ..lenses import MicrolensArray
 from .matching import NEAR, Similarity, match, match_shift, meeting_lenses
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry import Imager, MicrolensArray, chief_ray
+from ..geometry import Imager, chief_ray
+from ..lenses import MicrolensArray
 from .spots import core_offsets
 
 # Fields at which exact rays are traced, the degree of what is laid through them, and depths at most.

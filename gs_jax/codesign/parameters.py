@@ -17,12 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from pydantic import ValidationError
 
+from ..base.converters import as_float
 from ..base.errors import InputError
 from ..designs.design import Design
 from ..designs.microscope import Microscope
-from ..geometry import Imager, MicrolensArray, as_float
+from ..geometry import Imager
 from ..io.tables import one_line
 from ..layouts.cells import cell_edges
+from ..lenses import MicrolensArray
 from ..optics.aperture import aperture_area, pitch, wedge
 
 Values = dict[str, Float[Array, "..."]]

@@ -17,7 +17,6 @@ from ..designs.builtin import geomscope
 from ..designs.design import Design, write_design
 from ..designs.problems import findings
 from ..designs.sheet import datasheet
-from ..geometry import Grid
 from ..io.captures import write_capture
 from ..io.disk import make_folder, write_json, write_text
 from ..io.figures import write_figure
@@ -32,6 +31,7 @@ from ..simulation.scene import simulate
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
+from ..voxels import Grid
 from .report import Views, points_picture, report_text, template, views_picture
 from .scene import WORDS, words
 

@@ -16,9 +16,10 @@ import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
-from ..geometry import LONGEST, SHORTEST, Imager, MicrolensArray, Sensor
+from ..geometry import LONGEST, SHORTEST, Imager, Sensor
 from ..io.disk import read_text, write_text
 from ..io.tables import Table, one_line
+from ..lenses import MicrolensArray
 from .centers import MAX_LENSES, CentersTable, inline_centers
 from .checks import check_whole
 from .plausible import doubts, slips

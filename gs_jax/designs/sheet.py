@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
+from ..base.converters import as_float
 from ..base.errors import InputError, short_repr
-from ..geometry import as_float
 from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
 from ..optics import aberrations
 from .design import Design

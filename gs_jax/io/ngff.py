@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError
-from ..geometry import Grid
+from ..voxels import Grid
 from .provenance import KEY, Provenance
 from .viewers import display_range, title
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError, short_repr
-from ..geometry import Grid
+from ..voxels import Grid
 from .disk import atomic_write, decoding
 from .ngff import CHUNK, chunked, image_attributes, plain_depths
 from .provenance import Provenance

@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, KDTree
 
 from ..base.progress import Progress
-from ..geometry import MicrolensArray
 from ..layouts.cells import cross
+from ..lenses import MicrolensArray
 from .outlines import Plan, draw_plan
 
 # How often facets that are too large are split. One or two rounds are enough; more would mean that none is.

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..designs.design import Design
-from ..geometry import MicrolensArray
 from ..layouts.cells import cell_edges, coverage, largest_hole, nearest_neighbour_distances
+from ..lenses import MicrolensArray
 from .caps import COARSEST, MAX_FACETS, cap_sag, estimated_facets
 from .mesh_files import Mesh
 from .solids import STEEPEST, MoldShape, engravings, mold_block, plate_thickness, widest_aperture

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..geometry import MicrolensArray
 from ..io.disk import atomic_write, check_output
 from ..io.provenance import Provenance, write_sidecar
+from ..lenses import MicrolensArray
 from .solids import MoldShape, mark_plans, mold_block
 
 Ring = Float[np.ndarray, "corner 2"]

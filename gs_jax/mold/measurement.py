@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from ..geometry import Imager, MicrolensArray
+from ..geometry import Imager
+from ..lenses import MicrolensArray
 from .caps import cap_sag
 from .mesh_files import Mesh
 from .solids import plate_thickness

@@ -14,8 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..geometry import MicrolensArray
 from ..layouts.cells import cell_edges, half_size
+from ..lenses import MicrolensArray
 
 # Points of the plan that are closer than this are one point: ten times what float32 can tell apart on a 20 mm plate,
 # and a fiftieth of the finest facet that is worth printing.

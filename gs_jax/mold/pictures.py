@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from ..geometry import MicrolensArray
+from ..lenses import MicrolensArray
 from .caps import COARSEST, cap_height, cap_sag
 from .solids import MoldShape, array_solid, mold_solid
 

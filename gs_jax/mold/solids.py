@@ -19,8 +19,8 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
 from ..base.progress import Progress
-from ..geometry import MicrolensArray
 from ..layouts.cells import nearest_neighbour_distances
+from ..lenses import MicrolensArray
 from .caps import Surface, cap_sag, facet_surface
 
 # How far a tool that cuts reaches beyond what it cuts: no two faces coincide.

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_quotient, safe_sqrt
-from ..geometry import MicrolensArray
+from ..lenses import MicrolensArray
 from .theory import Real, Result
 
 

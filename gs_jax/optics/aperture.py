@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_sqrt
-from ..geometry import MicrolensArray
+from ..lenses import MicrolensArray
 
 # Lenses that are handled at once.
 _LENSES = 16

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
-from ..geometry import Imager, MicrolensArray
+from ..geometry import Imager
+from ..lenses import MicrolensArray
 from .aperture import aperture_area
 from .psf import GOLDEN_ANGLE
 from .refraction import on_host, passed, refracted, refracted_ideally, solid_angle

@@ -8,7 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..geometry import Grid, Imager
+from ..geometry import Imager
+from ..voxels import Grid
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .rays import Envelope, Rays, trace
 

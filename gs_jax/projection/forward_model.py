@@ -6,8 +6,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..optics.full import FullOptics
+from ..voxels import Grid
 from .backprojection import as_volume, backproject_adjoint
 from .convolve import add_spectrum, image_of, padded_shape, with_margin
 from .full import full_image

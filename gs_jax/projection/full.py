@@ -10,10 +10,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Grid, Imager, Sensor
+from ..geometry import Imager, Sensor
 from ..optics.cores import ring_edges
 from ..optics.full import FullOptics, Halo
 from ..optics.light import clear_area
+from ..voxels import Grid
 from .bilinear import Shapes, volume_to_image
 from .convolve import add_halved, add_symmetric_spectrum, image_of, padded_shape, with_margin
 from .polar import apply, splat_table, spread_table

@@ -3,7 +3,8 @@
 import jax
 import lineax as lx
 
-from ..geometry import Grid, Imager
+from ..geometry import Imager
+from ..voxels import Grid
 from .forward_model import Optics, forward
 
 

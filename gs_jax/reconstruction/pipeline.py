@@ -12,7 +12,7 @@ from jaxtyping import Array, Float32, Num
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..optics.cores import apparent_depths
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
@@ -20,6 +20,7 @@ from ..projection.levels import LEVELS
 from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
+from ..voxels import Grid
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 from .system import System, explainable, model_of, slow_waves

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..base.progress import Progress
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..projection.forward_model import Optics, forward
+from ..voxels import Grid
 from .system import explainable, model_of
 
 # Squares along a side of the sensor, unless it has fewer pixels.

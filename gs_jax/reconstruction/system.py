@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..base.progress import Progress
-from ..geometry import Grid, Imager, Sensor
+from ..geometry import Imager, Sensor
 from ..optics.full import FullOptics
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import forward_operator
 from ..solvers.unmatched import Unmatched
 from ..suppression.background import local_levels
+from ..voxels import Grid
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARKEST = 1

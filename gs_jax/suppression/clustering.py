@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 from skimage.measure import label, regionprops
 
-from ..geometry import Grid
 from ..layouts.cells import Number
+from ..voxels import Grid
 
 # Standard deviation of a normal distribution over its median deviation from the median.
 _DEVIATION = 1.4826

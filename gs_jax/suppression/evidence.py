@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Shaped
 
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
+from ..voxels import Grid
 from .consistency import Signal, agreed_level, log_false_alarms, readings, signal, survival
 from .locate import APERTURE, FIELDS, LIT, SHARE, count_of, searched_voxels
 

@@ -15,9 +15,10 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from ..base.progress import Progress
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
 from ..projection.backprojection import backproject
+from ..voxels import Grid
 from .consistency import (
     REACH,
     Readings,

@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.precision import in_float32
-from ..geometry import Grid, Imager, MicrolensArray, Sensor
+from ..geometry import Imager, Sensor
 from ..layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout
+from ..lenses import MicrolensArray
 from ..optics.full import FullOptics, full_optics, halo_nodes
 from ..optics.halo import HaloGrid
 from ..projection.forward_model import forward
 from ..simulation.camera import Camera, electrons, expose
+from ..voxels import Grid
 from .scenes import PLANES as SCENE_PLANES, random_scene, shared_out
 
 # Scenes that one microscope images: its tables take longer than an image.

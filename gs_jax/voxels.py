@@ -1,0 +1,92 @@
+"""The voxels of the object space. Volumes are `[depth, row, column]`; lengths are in millimetres."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .base.converters import as_float, as_shape
+from .geometry import Sensor
+
+
+class Grid(eqx.Module):
+    """Voxels of the object space; centred on the axis, unless it has another origin.
+
+    Parameters
+    ----------
+    depths
+        `(depth,)` of the planes, mm, evenly spaced or not. Back-projection and the forward model take any order;
+        what interpolates between planes or writes them to disk says if they must ascend.
+    shape
+        `(rows, columns)` of each plane.
+    pitch
+        Lateral distance of voxel centres, mm. Like the field radius it decides shapes: a plain number.
+    origin
+        `(x, y)` of the middle of each plane, mm: of a region of interest beside the axis.
+
+    Raises
+    ------
+    ValueError
+        If there is no depth, no voxel, or the pitch is not positive.
+    """
+
+    depths: Float[Array, " depth"] = eqx.field(converter=as_float)
+    shape: tuple[int, int] = eqx.field(static=True, converter=as_shape)
+    pitch: float = eqx.field(static=True, converter=float)
+    origin: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
+
+    def __check_init__(self):
+        if self.depths.ndim != 1 or self.depths.size < 1:
+            raise ValueError(f"`depths` must be (depth,) with a depth at least, got {self.depths.shape}.")
+        if min(self.shape) < 1:
+            raise ValueError(f"`shape` must be two positive numbers of voxels, got {self.shape}.")
+        if not self.pitch > 0:
+            raise ValueError(f"`pitch` must be positive, got {self.pitch}.")
+
+    @classmethod
+    def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":
+        """The grid that covers as much of the object as the sensor is large (the paper's field of view).
+
+        Its numbers of rows and columns are odd: there is a voxel at the sensor's origin, by default on the axis.
+        `depths` and `pitch` are mm.
+        """
+        if not pitch > 0:
+            raise ValueError(f"`pitch` must be positive, got {pitch}.")
+        rows, columns = (2 * round((n * sensor.pixel_pitch / pitch - 1) / 2) + 1 for n in sensor.shape)
+        rows, columns = max(rows, 1), max(columns, 1)
+        return cls(depths, (rows, columns), pitch, sensor.origin)
+
+    def at(self, depths) -> "Grid":
+        """The same voxels at other depths `(depth,)`, or at a single one, mm."""
+        return eqx.tree_at(lambda g: g.depths, self, jnp.atleast_1d(jnp.asarray(depths, self.depths.dtype)))
+
+    @property
+    def volume_shape(self) -> tuple[int, int, int]:
+        """`(depths, rows, columns)` of a volume on this grid."""
+        return self.depths.size, *self.shape
+
+    @property
+    def y(self) -> Float[Array, " row"]:
+        """Voxel centres along the rows' axis, mm."""
+        return self.origin[1] + self._offsets(self.shape[0])
+
+    @property
+    def x(self) -> Float[Array, " column"]:
+        """Voxel centres along the columns' axis, mm."""
+        return self.origin[0] + self._offsets(self.shape[1])
+
+    def _offsets(self, count):
+        return (jnp.arange(count, dtype=self.depths.dtype) - (count - 1) / 2) * self.pitch
+
+    def to_mm(self, voxels: Int[Array | np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points `(x, y, z)` of the voxels `(depth, row, column)`, mm, on the host in float64."""
+        depth, row, column = np.moveaxis(np.asarray(voxels), -1, 0)
+        axes = ((self.x, column), (self.y, row), (self.depths, depth))
+        return np.stack([np.asarray(axis, np.float64)[index] for axis, index in axes], axis=-1)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Edges of a plane for `imshow`, `(left, right, bottom, top)`, mm; row 0 is at the top."""
+        (x, y), (rows, columns) = map(float, self.origin), self.shape
+        across, along = columns * self.pitch / 2, rows * self.pitch / 2
+        return x - across, x + across, y + along, y - along
