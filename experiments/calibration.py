@@ -1,7 +1,8 @@
 """Calibration: geometry found in captures of single points, on another group's tracer and on random devices.
 
-- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm beside it): what is fitted, and how far spots
-  are from where a geometry that was fitted to other depths puts them. Then `find_points` on 120 points, with it.
+- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm beside it): what is fitted, by default and of
+  everything that can be, and how far spots are from where a geometry that was fitted to other depths puts them. Then
+  `find_points` on 120 points, with it and with the design; and their capture alone, from a design that is turned.
 - Random devices, simulated with all of the light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of
   up to 2 mm, a tilt up to 1 degree each way, a sensor distance up to 20 % off; three captures each. Deviations from
   what is true, in the standard deviations that the calibration gives.
@@ -13,6 +14,7 @@ DATA holds `P1.toml` and `P1_i_*.tif`; without it there are only the random devi
 """
 
 import json
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -27,6 +29,8 @@ from gs_jax.base.progress import Progress
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.calibration.fit import Calibration, calibrate, residuals_of
 from gs_jax.calibration.outcome import picture
+from gs_jax.calibration.scene import calibrate_by_scene
+from gs_jax.calibration.unknowns import FITTABLE
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
@@ -37,6 +41,8 @@ NAMES = ("sensor_distance_mm", "rotation_deg", "shift_x_mm", "shift_y_mm", "tilt
 DEPTHS = (18.0, 20.0, 22.0)
 # Of a random device: lenses on a plate, mm, and a sensor that sees about a third of them.
 LENSES, PLATE, PIXELS, PIXEL, FIELD = 60, 11.0, 1536, 0.006, 2.5
+# By how much the design of the self-check is turned, and where its scene is, mm.
+TURN, SCENE = np.radians(2.0), [17.5, 22.5]
 
 
 def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
@@ -45,7 +51,10 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*.tif"))
     points = np.array([points_of(data, name)[0, :3] for name in names])
     images = [read_capture(data / f"P1_{name}.tif", imager.sensor.shape) for name in names]
+    begun = time.monotonic()
     whole = calibrate(images, points, imager, progress=progress)
+    seconds = time.monotonic() - begun
+    every = calibrate(images, points, imager, fit=FITTABLE, progress=progress)
     held_out = {}
     for depth in DEPTHS:
         others, these = np.flatnonzero(points[:, 2] != depth), np.flatnonzero(points[:, 2] == depth)
@@ -53,17 +62,31 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
         away = residuals_of(fitted, [images[k] for k in these], points[these])
         held_out[f"{depth:g} mm"] = float(np.sqrt((away**2).sum(1).mean()))
     scene, truth = read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
-    found = find_points(scene, whole.imager, voxel_grid(whole.imager, [17.5, 22.5]), progress=progress)
-    score = localization(found, truth, axial=0.6)
+    scores = {}
+    for name, geometry in (("calibrated", whole.imager), ("design", imager)):
+        found = find_points(scene, geometry, voxel_grid(geometry, SCENE), progress=progress)
+        score = localization(found, truth, axial=0.6)
+        scores[name] = {"f1": score.f1, "axial_um": 1000 * score.axial_rmse}
+    turned = eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + TURN)
+    alone = calibrate_by_scene(scene, turned, voxel_grid(turned, SCENE), progress=progress)
     return {
-        "values": whole.values,
-        "deviations": whole.deviations,
-        "rms_pixels": whole.rms,
-        "spots": len(whole.residuals),
+        **_said(whole),
+        "seconds": seconds,
+        "everything_fitted": _said(every),
         "held_out_rms_pixels": held_out,
-        "points_f1": score.f1,
-        "points_axial_um": 1000 * score.axial_rmse,
+        "points": scores,
+        "from_scene": _said(alone),
     }, whole
+
+
+def _said(found: Calibration) -> dict:
+    return {
+        "values": found.values,
+        "deviations": found.deviations,
+        "rms_pixels": found.rms,
+        "spots": len(found.residuals),
+        "sources": len(found.sources.points),
+    }
 
 
 def device(seed: int) -> tuple[Imager, Imager, bool]:
@@ -116,7 +139,7 @@ def report(data: Path | None, devices: int, progress: Progress) -> Report:
     found, whole = run(data, devices, progress=progress)
     columns = ("", "median deviation", "largest", "within 3 SD", "SD of the deviations, in SD")
     rows = []
-    for name in NAMES:
+    for name in NAMES if devices else ():
         off = np.abs([each["off"][name] for each in found["devices"].values()])
         in_sd = np.array([each["in_sd"][name] for each in found["devices"].values()])
         within = f"{np.mean(np.abs(in_sd) < 3):.0%}"

@@ -2,8 +2,9 @@
 
 Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
 `[row, column]`. The lateral frame is the whole sensor's: origin at its
-centre, +x along increasing column, +y along increasing row. A depth `z > 0` is measured from the front
-(plano) surface of the array's plate. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
+centre, +x along increasing column, +y along increasing row. A depth `z > 0` is measured from the array's front, the
+plate's plano face or, with the curved side in front, the lens vertices; the sensor's distance `v` is measured from
+the array's back, the other of these two. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
 
 import math
@@ -15,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from .base.converters import as_float, as_float_or_none, as_pair, as_shape
-from .lenses import MicrolensArray
+from .lenses import MicrolensArray, Scalar
 
 # A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
 SHORTEST, LONGEST = 1e-5, 0.1
@@ -128,7 +129,7 @@ class Imager(eqx.Module):
     array, sensor
         What is imaged with.
     sensor_distance
-        `v`, from the lens vertices to the sensor, mm.
+        `v`, from the array's back to the sensor, mm: from the lens vertices, or from the plano face if that is behind.
     field_radius
         `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
         of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
@@ -199,22 +200,30 @@ class Imager(eqx.Module):
         return 1 / jnp.sqrt(1 + jnp.sum(self.tilt**2))
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
-        """`z' = z + t/n`: what the optics sees of a depth `z`, mm (the plate counts as `t/n` of air)."""
-        return jnp.asarray(depth) + self.array.substrate_thickness / self.array.refractive_index
+        """`z'`: from the object to the lens vertices as the optics sees it, mm.
+
+        `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front.
+        """
+        return jnp.asarray(depth) + self.array.air_in_front
+
+    @property
+    def reduced_sensor_distance(self) -> Scalar:
+        """`v'`: from the lens vertices to the sensor as the optics sees it, `v`, or `v + t/n` with the plate behind."""
+        return self.sensor_distance + self.array.air_behind
 
     def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
-        """Lateral magnification `M_z = v / z'` (Eq. 3)."""
-        return self.sensor_distance / self.reduced_depth(depth)
+        """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
+        return self.reduced_sensor_distance / self.reduced_depth(depth)
 
     def magnifications(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "lens depth"]:
-        """Of each lens: `(v + h) / (z' - h)` at the height `h`. One row for all lenses unless the array is tilted."""
+        """Of each lens: `(v' + h) / (z' - h)` at the height `h`. One row for all lenses unless the array is tilted."""
         if self.tilt is None:
             return self.magnification(depth)[None]
         return self.magnification_of(self.magnification(depth)[None], self.heights[:, None])
 
     def magnification_of(self, magnification, height):
-        """What `M = v/z'` becomes for a lens at a height, mm: `(v + h) / (z' - h)`; they broadcast."""
-        v = self.sensor_distance
+        """What `M = v'/z'` becomes for a lens at a height, mm: `(v' + h) / (z' - h)`; they broadcast."""
+        v = self.reduced_sensor_distance
         return magnification * (v + height) / (v - height * magnification)
 
     def lean(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "depth 2"]:
@@ -224,7 +233,7 @@ class Imager(eqx.Module):
         return -depth * tilt[None]
 
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
-        """Scale of the array's pattern on the sensor, `s_z = (z' + v) / z'` (Eq. 1)."""
+        """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)
 
     def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array, "lens point 2"]:

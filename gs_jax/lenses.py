@@ -1,15 +1,26 @@
 """The lenses on their plate, and the shape of their surface. Lengths are in millimetres."""
 
 import math
+from typing import Any, Literal
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from .base.arrays import library_of
 from .base.converters import as_float, as_float_or_none, as_pair
+
+# Side of the lenses that faces the object.
+Orientation = Literal["plano", "curved"]
+# Of JAX or of NumPy, as the array's own numbers are; `Scalars` are several.
+Scalar = Any
+Scalars = Any
 
 
 class MicrolensArray(eqx.Module):
-    """Plano-convex microlenses on one plate, the plano side toward the object.
+    """Plano-convex microlenses on one plate, all alike.
+
+    A surface is a conic with even polynomial terms: it falls `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A_4 r^4 + ...`
+    below its vertex, `c = 1/R` (ISO 10110-12).
 
     Parameters
     ----------
@@ -22,11 +33,17 @@ class MicrolensArray(eqx.Module):
         Overrides the focal length that follows from the radius, mm, for a thin-lens study.
     size
         `(x, y)` of the plate, centred, mm: where the outer lenses end. By default they are as wide as their discs.
+    orientation
+        The side of the lenses that faces the object, `"plano"` or `"curved"`.
+    conic_constant
+        `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid.
+    aspheric_terms
+        `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
 
     Raises
     ------
     ValueError
-        If `centers` is not `(lens, 2)` or holds no lens.
+        If `centers` is not `(lens, 2)` or holds no lens, or there is no such orientation.
     """
 
     centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
@@ -36,10 +53,15 @@ class MicrolensArray(eqx.Module):
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     size: tuple[float, float] = eqx.field(static=True, converter=as_pair, default=(math.inf, math.inf))
+    orientation: Orientation = eqx.field(static=True, default="plano")
+    conic_constant: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
+    aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
             raise ValueError(f"`centers` must be (lens, 2) with a lens at least, got {self.centers.shape}.")
+        if self.orientation not in ("plano", "curved"):
+            raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
 
     @property
     def focal_length(self) -> Float[Array, ""]:
@@ -47,3 +69,42 @@ class MicrolensArray(eqx.Module):
         if self.thin_lens_focal_length is None:
             return self.radius_of_curvature / (self.refractive_index - 1)
         return self.thin_lens_focal_length
+
+    @property
+    def air_in_front(self) -> Scalar:
+        """The glass between the object and the vertices as so much air, `t/n`: none if the curved side is in front."""
+        reduced = self.substrate_thickness / self.refractive_index
+        return reduced if self.orientation == "plano" else 0 * reduced
+
+    @property
+    def air_behind(self) -> Scalar:
+        """The glass between the vertices and the sensor as so much air, mm."""
+        return self.substrate_thickness / self.refractive_index - self.air_in_front
+
+    @property
+    def departure(self) -> Scalar:
+        """By how much `r^4` the surface falls more than the sphere, `k / (8 R^3) + A_4`, 1/mm^3."""
+        departure = self.conic_constant / (8 * self.radius_of_curvature**3)
+        return departure + self.aspheric_terms[0] if self.aspheric_terms.size else departure
+
+    def reaches(self, squared_radius: Scalars) -> Scalars:
+        """Whether there is a surface at a squared distance from the axis, mm^2: a conic may end."""
+        return (1 + self.conic_constant) * squared_radius < self.radius_of_curvature**2
+
+    def sag(self, squared_radius: Scalars) -> Scalars:
+        """How far the surface is below its vertex, mm, where it `reaches`."""
+        sag = squared_radius / (self.radius_of_curvature + self._root(squared_radius))
+        for order, term in enumerate(self.aspheric_terms, 2):
+            sag = sag + term * squared_radius**order
+        return sag
+
+    def steepness(self, squared_radius: Scalars) -> Scalars:
+        """Slope of the surface over the radius, `s'(r) / r`, 1/mm: that has no division by zero on the axis."""
+        steepness = 1 / self._root(squared_radius)
+        for order, term in enumerate(self.aspheric_terms, 2):
+            steepness = steepness + 2 * order * term * squared_radius ** (order - 1)
+        return steepness
+
+    def _root(self, squared_radius):
+        root2 = self.radius_of_curvature**2 - (1 + self.conic_constant) * squared_radius
+        return library_of(squared_radius).sqrt(root2)

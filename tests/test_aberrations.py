@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.optics.aberrations import (
     Wavefront,
     balanced_rms,
@@ -13,13 +14,21 @@ from gs_jax.optics.aberrations import (
     linear_field_radius,
     linear_rms,
     log_strehl,
+    of_array,
     seidel,
     strehl,
 )
 from gs_jax.optics.theory import focus_distance
+from gs_jax.optics.unit import wavefront
 
-F, N, DEPTH, WAVELENGTH = 2 / 0.43, 1.43, 20.7, 520e-6
+R, F, N, DEPTH, WAVELENGTH = 2.0, 2 / 0.43, 1.43, 20.7, 520e-6
 ORIENTATIONS = pytest.mark.parametrize("plano", [True, False])
+
+
+def lens(plano, **parts):
+    """Of the same curvature, with a plate that counts for nothing."""
+    parts = {"radius_of_curvature": R, "refractive_index": N} | parts
+    return MicrolensArray([[0.0, 0.0]], orientation="plano" if plano else "curved", **parts)
 
 
 def refract(direction, normal, n, n_):
@@ -189,7 +198,7 @@ def test_strehl_ratio_against_a_diffraction_integral():
 @pytest.mark.parametrize("pupil", [0.2, 0.8])
 def test_the_strehl_ratio_halves_at_the_field_radius(plano, v, pupil):
     """In logarithms: at 0.8 mm the ratio itself underflows."""
-    height = linear_field_radius(F, N, pupil, DEPTH, v, WAVELENGTH, plano_to_object=plano)
+    height = linear_field_radius(lens(plano), pupil, DEPTH, v, WAVELENGTH)
     at = lambda h: log_strehl(linear_rms(seidel(F, N, pupil, DEPTH, h, v, plano_to_object=plano)), WAVELENGTH)
     # Logarithms of up to 7000 in float64, and their difference.
     np.testing.assert_allclose(at(height) - at(0.0), -np.log(2), rtol=1e-9)
@@ -202,7 +211,7 @@ def test_a_lens_without_coma_has_no_limit_by_the_printed_sum():
     for _ in range(200):
         middle = (low + high) / 2
         low, high = (middle, high) if coma(low) * coma(middle) > 0 else (low, middle)
-    radius = lambda z: linear_field_radius(F, N, 0.2, z, 5.0, WAVELENGTH, plano_to_object=False)
+    radius = lambda z: linear_field_radius(lens(False), 0.2, z, 5.0, WAVELENGTH)
     assert radius(low) > 1e3
     assert jnp.isfinite(jax.grad(lambda z: 1 / radius(z))(jnp.array(low * 1.01)))
 
@@ -224,10 +233,28 @@ def test_gradients(plano):
 @ORIENTATIONS
 @pytest.mark.parametrize("v", [5.5, 6.3])
 def test_gradients_of_the_field_radius(plano, v):
-    arguments = tuple(jnp.array(x) for x in (F, N, 0.7, DEPTH, v))
+    arguments = tuple(jnp.array(x) for x in (0.7, DEPTH, v))
     # The wavelength is the smallest of the lengths: micrometres.
-    radius = lambda um, f, n, a, z, v: linear_field_radius(f, n, a, z, v, um / 1000, plano_to_object=plano)
-    check_grads(jax.jit(radius), (jnp.array(0.52), *arguments), order=1, eps=1e-6, atol=1e-6, rtol=1e-6)
+    radius = lambda um, array, a, z, v: linear_field_radius(array, a, z, v, um / 1000)
+    check_grads(jax.jit(radius), (jnp.array(0.52), lens(plano), *arguments), order=1, eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
+@ORIENTATIONS
+@pytest.mark.parametrize("shape", [{"conic_constant": -1.3}, {"aspheric_terms": (0.02, 0.01)}], ids=str)
+def test_a_surface_that_is_no_sphere_changes_spherical_aberration_alone(plano, shape):
+    """The difference to the sphere of exact wavefronts, along a radius of a small pupil."""
+    radii = jnp.linspace(0.02, 0.06, 20)[:, None] * jnp.array([[0.0, 1.0]])
+    parts = {"thin": lens(plano, substrate_thickness=0.0), "shaped": lens(plano, substrate_thickness=0.0, **shape)}
+    errors, thirds = {}, {}
+    for name, array in parts.items():
+        imager = Imager(array, Sensor((8, 8), 0.005), 5.0, 3.0)
+        errors[name] = -wavefront(imager, DEPTH, radii, (0.2, 0.0))
+        thirds[name] = of_array(array, 1.0, DEPTH, 0.2, 5.0)
+    fourth = (errors["shaped"] - errors["thin"]) / radii[:, 1] ** 4
+    change = jax.tree.map(lambda a, b: a - b, thirds["shaped"], thirds["thin"])
+    # The next order is the sixth, (r / R)^2 = 1e-3 of the fourth with factors of a few.
+    np.testing.assert_allclose(fourth, change.spherical, rtol=0.01)
+    assert change.coma == change.astigmatism == change.field_curvature == change.defocus == 0
 
 
 def test_gradients_where_an_error_is_zero():

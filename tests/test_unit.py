@@ -12,6 +12,12 @@ from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront, wav
 
 WAVELENGTH = 520e-6
 FIELDS = [(0.0, 0.0), (1.0, -0.4), (0.0, 3.0)]
+SHAPES: list[dict] = [
+    {},
+    {"conic_constant": -2.0},
+    {"orientation": "curved"},
+    {"orientation": "curved", "conic_constant": -0.7, "aspheric_terms": (0.01, -0.002)},
+]
 
 
 def unit(v=5.8, dtype=jnp.float64, **lens):
@@ -26,19 +32,23 @@ def some_points(radius=0.9, count=40):
 
 
 @pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("lens", SHAPES, ids=str)
 @pytest.mark.parametrize(("depth", "thickness"), [(20.0, 1.0), (3.0, 2.5)])
-def test_fermat_and_snell(field, depth, thickness):
-    """The path through a point of the lens is least over the plane, and has Snell's slopes at the sphere."""
-    imager = unit(substrate_thickness=thickness)
-    n, radius, v = 1.43, 2.0, 5.8
-    sphere = lambda p: jnp.sqrt(radius**2 - jnp.sum(p**2)) - radius
+def test_fermat_and_snell(field, lens, depth, thickness):
+    """The path through a point of the lens is least over the plane, and has Snell's slopes at the curved side."""
+    imager = unit(substrate_thickness=thickness, **lens)
+    n, v, flipped = 1.43, 5.8, lens.get("orientation") == "curved"
     leg = lambda a, b: jnp.sqrt(jnp.sum((a - b) ** 2))
     at = lambda p, z: jnp.append(p, z)
 
-    def path(entry, point, end):
-        surface = at(point, sphere(point))
-        start, plane = at(jnp.array(field), -thickness - depth), at(entry, -thickness)
-        return leg(start, plane) + n * leg(plane, surface) + leg(surface, at(end, v))
+    def path(on_plane, point, end):
+        """From the object to the sensor; z from the vertex."""
+        sag = falls(jnp.sum(point**2), **lens)
+        surface, plane = at(point, sag if flipped else -sag), at(on_plane, thickness if flipped else -thickness)
+        first, second = (surface, plane) if flipped else (plane, surface)
+        start = at(jnp.array(field), -depth if flipped else -thickness - depth)
+        last = at(end, thickness + v if flipped else v)
+        return leg(start, first) + n * leg(first, second) + leg(second, last)
 
     def least(point, end):
         """Newton's steps on Fermat's principle at the plane."""
@@ -48,34 +58,40 @@ def test_fermat_and_snell(field, depth, thickness):
     @jax.jit
     @jax.vmap
     def total_and_slope(point, end):
-        entry = least(point, end)
-        return path(entry, point, end), jax.grad(path, 1)(entry, point, end)
+        on_plane = least(point, end)
+        return path(on_plane, point, end), jax.grad(path, 1)(on_plane, point, end)
 
     points = jnp.asarray(np.vstack([[0, 0], some_points()]))
     rays = unit_rays(imager, depth, points, field)
     total, slope = total_and_slope(points, rays.landing)
     assert jnp.all(rays.valid)
-    # Fermat at the sphere: the path does not change when the point moves on it.
+    # Fermat at the curved side: the path does not change when the point moves on it.
     np.testing.assert_allclose(slope, 0, atol=1e-12)
     # Paths of 30 mm in float64.
     np.testing.assert_allclose(rays.path, total - total[0], atol=1e-13)
 
 
+def falls(squared, orientation="plano", conic_constant=0.0, aspheric_terms=()):
+    """The surface below its vertex, as ISO 10110-12 has it; R is 2 mm."""
+    c, r = 0.5, jnp.sqrt(squared + 1e-300)
+    conic = c * r**2 / (1 + jnp.sqrt(1 - (1 + conic_constant) * c**2 * r**2))
+    return conic + sum(term * r ** (4 + 2 * k) for k, term in enumerate(aspheric_terms))
+
+
 @pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+@pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 def test_rays_without_a_compiler_are_the_same(field, lens):
-    """Beyond the sphere too; and the solid angle is what the Jacobian of the slope by the point says."""
+    """Beyond the surface too; and the solid angle is what the Jacobian of the slope by the point says."""
     imager, points = unit(**lens), 2.2 * some_points()
-    trace = refraction.refracted_ideally if lens else refraction.refracted
     wanted, (x, y) = unit_rays(imager, 20.0, points, field), field
-    host = trace(refraction.on_host(imager), 20.0, points.T, np.array([[x], [y]]))
-    assert all(isinstance(part, np.ndarray) for part in host) and host.valid.any()
+    host = refraction.refracted(refraction.on_host(imager), 20.0, points.T, np.array([[x], [y]]))
+    assert all(isinstance(part, np.ndarray) for part in jax.tree.leaves(host)) and host.valid.any()
     np.testing.assert_array_equal(host.valid, wanted.valid)
     for found, ours in ((host.landing, wanted.landing), (host.tangent, wanted.tangent)):
         np.testing.assert_allclose(found.T, ours, rtol=1e-12, atol=1e-14)
 
     def slope(point):
-        return trace(imager, jnp.asarray(20.0), point, jnp.asarray(field)).slope
+        return refraction.refracted(imager, jnp.asarray(20.0), point, jnp.asarray(field)).slope
 
     angle = refraction.solid_angle(refraction.on_host(imager), 20.0, host)
     jacobian = jnp.linalg.det(jax.vmap(jax.jacfwd(slope))(jnp.asarray(points)))
@@ -83,19 +99,30 @@ def test_rays_without_a_compiler_are_the_same(field, lens):
     np.testing.assert_allclose(angle[host.valid], expected[host.valid], rtol=1e-9)
 
 
-def test_paraxial_rays_follow_the_shared_geometry():
-    imager = unit()
+def test_light_is_counted_on_either_side():
+    """On the axis both faces pass `1 - ((n - 1) / (n + 1))^2`, and a piece of the lens takes `dA / (4 pi z'^2)`."""
+    for orientation, reduced in (("plano", 20 + 1 / 1.43), ("curved", 20.0)):
+        imager = refraction.on_host(unit(orientation=orientation))
+        ray = refraction.refracted(imager, 20.0, np.zeros((2, 1)), np.zeros((2, 1)))
+        np.testing.assert_allclose(refraction.passed(imager, ray), (1 - (0.43 / 2.43) ** 2) ** 2, rtol=1e-12)
+        np.testing.assert_allclose(refraction.solid_angle(imager, 20.0, ray), reduced**-2.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("lens", SHAPES, ids=str)
+def test_paraxial_rays_follow_the_shared_geometry(lens):
+    imager = unit(**lens)
     field, points = 1e-4 * jnp.array([3.0, -2.0]), 1e-4 * some_points()
     landing = unit_rays(imager, 20.0, points, field).landing
     reduced = imager.reduced_depth(20.0)
     vergence = 1 / imager.array.focal_length - 1 / reduced
-    expected = chief_ray(jnp.zeros((1, 2)), field[None], 5.8 / reduced) + points * (1 - 5.8 * vergence)
+    v = 5.8 + (1 / 1.43 if lens.get("orientation") == "curved" else 0)
+    expected = chief_ray(jnp.zeros((1, 2)), field[None], v / reduced) + points * (1 - v * vergence)
     # What is left out is of the third order in the slopes: 1e-12.
     np.testing.assert_allclose(landing, expected, atol=1e-11)
 
 
 @pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+@pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 def test_the_paths_slope_is_the_rays(field, lens):
     """Hamilton: moving the sensor and its point changes the path by the direction cosines."""
     point = np.array([0.3, -0.5])
@@ -139,10 +166,11 @@ def test_an_ideal_lens_collimates_from_its_focus():
 
 @pytest.mark.parametrize("v", [4.0, 5.8])
 @pytest.mark.parametrize("field", FIELDS)
-def test_float32_keeps_a_wavefront_of_30_waves_to_a_thousandth(v, field):
+@pytest.mark.parametrize("lens", SHAPES, ids=str)
+def test_float32_keeps_a_wavefront_of_30_waves_to_a_thousandth(v, field, lens):
     points = some_points(0.65)
-    exact = wavefront(unit(v), 20.0, points, field)
-    low = wavefront(unit(v, jnp.float32), 20.0, points, field)
+    exact = wavefront(unit(v, **lens), 20.0, points, field)
+    low = wavefront(unit(v, jnp.float32, **lens), 20.0, points, field)
     assert low.dtype == jnp.float32
     # Differences of paths, not paths: 25 mm in float32 alone would be wrong by 2e-3 waves in each of its sums.
     np.testing.assert_allclose(low, exact, rtol=0, atol=5e-4 * WAVELENGTH)
@@ -154,11 +182,12 @@ def test_best_focus_of_a_thin_lens_is_the_image():
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_best_focus_is_the_least_wavefront_error(field):
-    error = jax.jit(lambda v: wavefront_rms(unit(v), 20.0, field=field, radius=0.65))
-    least = fminbound(lambda v: float(error(v)), 4.5, 6.5, xtol=1e-9)
+@pytest.mark.parametrize("lens", SHAPES, ids=str)
+def test_best_focus_is_the_least_wavefront_error(field, lens):
+    error = jax.jit(lambda v: wavefront_rms(unit(v, **lens), 20.0, field=field, radius=0.65))
+    least = fminbound(lambda v: float(error(v)), 3.5, 6.5, xtol=1e-9)
     # A minimum is flat: half the digits. With the error off the axis, the Gauss-Newton steps end at 1e-5.
-    np.testing.assert_allclose(best_focus(unit(4.0), 20.0, field=field, radius=0.65), least, rtol=1e-5)
+    np.testing.assert_allclose(best_focus(unit(4.0, **lens), 20.0, field=field, radius=0.65), least, rtol=1e-5)
 
 
 def test_disc_averages():
@@ -188,7 +217,7 @@ def test_a_perfect_wavefront_has_a_gradient():
     assert value < 1e-12 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 
-@pytest.mark.parametrize("lens", [{}, {"thin_lens_focal_length": 4.65}])
+@pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients(lens, modes):
     points = jnp.asarray(some_points(0.8, 3)).at[0].set(0)

@@ -94,7 +94,8 @@ def _seen(found: Similarity, point, imager: Imager) -> Imager:
     scale, (x, y, z) = abs(found.factor), point
     magnification = scale - 1
     array = _mirrored(imager.array) if found.mirrored else imager.array
-    distance = imager.sensor_distance if np.isnan(z) else magnification * float(imager.reduced_depth(z))
+    reduced = imager.reduced_sensor_distance if np.isnan(z) else magnification * float(imager.reduced_depth(z))
+    distance = reduced - imager.array.air_behind
     shift = (found.shift + magnification * complex(x, y)) / scale
     shift = imager.shift if np.isnan(shift) else (shift.real, shift.imag)
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
@@ -125,7 +126,7 @@ def _place(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
     if np.isnan(depth):
         near = match(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
         magnification = max(abs(near.factor) - 1, 1e-3)
-        depth = max(float(imager.sensor_distance) / magnification - float(imager.reduced_depth(0.0)), 1e-3)
+        depth = max(float(imager.reduced_sensor_distance) / magnification - float(imager.reduced_depth(0.0)), 1e-3)
     magnification = float(imager.magnification(depth))
     shift, _ = match_shift(spots, (1 + magnification) * np.asarray(imager.centers, np.float64))
     x, y = -shift / magnification
@@ -167,5 +168,6 @@ def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: S
         raise InputError(f"captures: found {text}, allowed: {allowed}")
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
     zero = jnp.zeros((), imager.sensor_distance.dtype)
-    new = (moved_lenses(imager.array, centers), imager.sensor_distance * step, zero, jnp.zeros(2, zero.dtype))
+    distance = imager.reduced_sensor_distance * step - imager.array.air_behind
+    new = (moved_lenses(imager.array, centers), distance, zero, jnp.zeros(2, zero.dtype))
     return Start(eqx.tree_at(where, imager, new), False, sources)

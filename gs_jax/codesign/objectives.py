@@ -48,7 +48,7 @@ def focus_offset(c: Microscope) -> Float[Array, ""]:
     In vergence, where focus at infinity and beyond is nothing special.
     """
     f, near, far = c.imager.array.focal_length, c.reduced[0], c.reduced[-1]
-    in_focus = 1 / f - 1 / c.imager.sensor_distance
+    in_focus = 1 / f - 1 / c.imager.reduced_sensor_distance
     return jnp.abs(2 * in_focus - 1 / near - 1 / far) / (1 / near - 1 / far)
 
 

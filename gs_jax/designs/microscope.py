@@ -147,21 +147,21 @@ class Microscope(eqx.Module):
 
     def wavefront(self, heights: Float[Array, " field"]) -> Wavefront:
         """Third-order errors at heights beside a lens's axis, sensor where it is: `(depth, field)`, or broadcast."""
-        array, v = self.imager.array, self.imager.sensor_distance
+        array, v = self.imager.array, self.imager.reduced_sensor_distance
         return aberrations.of_array(array, self.clear_diameter / 2, self.reduced[:, None], heights[None], v)
 
     @property
     def focus_distance(self) -> Float[Array, " depth"]:
-        """Where a thin lens images the depth; infinite if it does not."""
-        return theory.focus_distance(self.focal_length, self.reduced)
+        """The sensor's distance `v` at which a thin lens images the depth; infinite if it does not."""
+        return theory.focus_distance(self.focal_length, self.reduced) - self.imager.array.air_behind
 
     @property
     def blur(self) -> Float[Array, " depth"]:
         """Diameter of the thin lens's patch on the sensor where it is."""
-        return theory.blur(self.focal_length, self.clear_diameter, self.reduced, self.imager.sensor_distance)
+        return theory.blur(self.focal_length, self.clear_diameter, self.reduced, self.imager.reduced_sensor_distance)
 
     @property
     def object_blur(self) -> Float[Array, " depth"]:
         """The same as seen in the object."""
-        v = self.imager.sensor_distance
+        v = self.imager.reduced_sensor_distance
         return theory.object_blur(self.focal_length, self.clear_diameter, self.reduced, v)

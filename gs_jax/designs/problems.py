@@ -101,9 +101,9 @@ def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
 
 def _sharp_range(design: Design, m: Microscope) -> str:
     v, f = design.imaging.sensor_distance_mm, float(m.focal_length)
-    if v <= f:
+    if m.imager.reduced_sensor_distance <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
-    in_focus = theory.depth_in_focus(f, v) - m.imager.reduced_depth(0.0)
+    in_focus = theory.depth_in_focus(f, float(m.imager.reduced_sensor_distance)) - m.imager.reduced_depth(0.0)
     focused = dataclasses.replace(m, depths=in_focus[None])
     near, far = max(float(focused.near_limit[0]), 0), float(focused.far_limit[0])
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
@@ -114,12 +114,12 @@ def _sharp_range(design: Design, m: Microscope) -> str:
 
 def _strehl(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
     wavelength, pupil = float(m.imager.wavelength), float(m.clear_diameter) / 2
-    lens = (m.focal_length, m.imager.array.refractive_index, pupil, m.reduced, m.imager.sensor_distance)
     error = m.wavefront(jnp.zeros(1))
     waves = np.asarray(aberrations.linear_rms(error))[:, 0] / wavelength
     if waves.max() <= _STREHL_DOMAIN:
         return []
-    half = np.asarray(aberrations.linear_field_radius(*lens, wavelength)) * 1000
+    array, v = m.imager.array, m.imager.reduced_sensor_distance
+    half = np.asarray(aberrations.linear_field_radius(array, pupil, m.reduced, v, wavelength)) * 1000
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
         "the Strehl ratios only say that the image is far from diffraction-limited.",
@@ -132,10 +132,11 @@ def _strehl(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
     )
     paraxial = sheet["focus_distance_mm"]
     if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:
-        sharpest = 1 / (1 / paraxial[0] + 2 * float(error.spherical[0, 0]) / pupil**2)
+        image = paraxial[0] + float(array.air_behind)
+        sharpest = 1 / (1 / image + 2 * float(error.spherical[0, 0]) / pupil**2)
         found.append(
             "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "
-            f"{sheet['depth_mm'][0]:g} mm toward the lens, by up to {_length(paraxial[0] - sharpest)}."
+            f"{sheet['depth_mm'][0]:g} mm toward the lens, by up to {_length(image - sharpest)}."
         )
     return found
 

@@ -25,7 +25,7 @@ def psf_width(c: Microscope) -> Float[Array, " depth"]:
     landing, weight, lit = _spots(c)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
-    airy = theory.airy_deviation(c.imager.wavelength, c.imager.sensor_distance, c.clear_diameter)
+    airy = theory.airy_deviation(c.imager.wavelength, c.imager.reduced_sensor_distance, c.clear_diameter)
     total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
     return theory.FWHM * jnp.sqrt(total) / c.magnification
 

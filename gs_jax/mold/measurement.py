@@ -191,7 +191,7 @@ def quality(found: Verification, imager: Imager) -> dict[str, Any]:
     imager
         The design's.
     """
-    array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.sensor_distance)
+    array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.reduced_sensor_distance)
     bend = float(array.refractive_index) - 1
     shift = np.linalg.norm(found.center - np.asarray(array.centers, float), axis=1)
     larger = found.radius / float(array.radius_of_curvature) - 1

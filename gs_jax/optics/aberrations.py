@@ -10,9 +10,11 @@ over both surfaces (Welford, Aberrations of Optical Systems, ch. 8) become, plan
     S_III = a^2 b^2 K
     S_IV  = a^2 b^2 K / n
 
-A lens turned round is the same lens with the light reversed: `s` becomes `K - s`, and `S_II` changes its sign. The
-wavefront error against a sphere about the Gaussian image is `W040 r^4 + W131 r^3 cos + W222 r^2 cos^2 + W220 r^2` for
-the pupil radius `r` from 0 to 1 and the angle from the direction of the image, with `W040 = S_I/8`, `W131 = S_II/2`,
+A lens turned round is the same lens with the light reversed: `s` becomes `K - s`, and `S_II` changes its sign. A
+surface that falls `d r^4` more than the sphere, `d = k / (8 R^3) + A_4`, adds `8 (n - 1) d a^4` to `S_I`, and nothing
+to the others, as the stop is there (ch. 8.5). The wavefront error against a sphere about the Gaussian image is
+`W040 r^4 + W131 r^3 cos + W222 r^2 cos^2 + W220 r^2` for the pupil radius `r` from 0 to 1 and the angle from the
+direction of the image, with `W040 = S_I/8`, `W131 = S_II/2`,
 `W222 = S_III/2`, `W220 = (S_III + S_IV)/4`. Positive means that the wavefront is ahead of the sphere: positive `W040`
 focuses marginal rays short. The plate adds its own spherical aberration, `t (n^2 - 1) / (8 n^3) (a/z')^4`, for the
 paper's lens 2e-4 waves at 20 mm; it is left out.
@@ -63,6 +65,7 @@ def seidel(
     sensor_distance: Real,
     *,
     plano_to_object: bool = True,
+    departure: Real = 0.0,
 ) -> Wavefront:
     """Wavefront error of a plano-convex lens for a point beside its axis.
 
@@ -79,13 +82,15 @@ def seidel(
         two spheres; with the sensor at the Gaussian image it is zero.
     plano_to_object
         The side toward the object: plano as the paper's array is built, else convex.
+    departure
+        `d` of the surface from a sphere, 1/mm^3.
     """
     n, a = jnp.asarray(refractive_index), jnp.asarray(pupil_radius)
     power, toward = 1 / jnp.asarray(focal_length), 1 / jnp.asarray(reduced_depth)
     angle = field_height * toward
     s = toward if plano_to_object else power - toward
     c, g = power / (n - 1), (n**2 - 1) / n**2
-    s1 = a**4 * (g * s**3 + (n * c - s) ** 2 * (power - g * s))
+    s1 = a**4 * (g * s**3 + (n * c - s) ** 2 * (power - g * s) + 8 * (n - 1) * departure)
     s2 = a**3 * angle * (s * (power + n * g * c) - n * c * power)
     s3 = a**2 * angle**2 * power
     s4 = s3 / n
@@ -96,9 +101,13 @@ def seidel(
 def of_array(
     array: MicrolensArray, pupil_radius: Real, reduced_depth: Real, field_height: Real, sensor_distance: Real
 ) -> Wavefront:
-    """`seidel` of an array's lens, its plano side to the object; of an ideal thin lens nothing but the defocus."""
+    """`seidel` of an array's lens; of an ideal thin lens nothing but the defocus.
+
+    The sensor's distance is the reduced one, `v'`.
+    """
     lens = array.focal_length, array.refractive_index, pupil_radius, reduced_depth
-    error = seidel(*lens, field_height, sensor_distance)
+    plano, departure = array.orientation == "plano", array.departure
+    error = seidel(*lens, field_height, sensor_distance, plano_to_object=plano, departure=departure)
     if array.thin_lens_focal_length is None:
         return error
     nothing = jnp.zeros_like(error.coma)
@@ -153,22 +162,15 @@ def strehl(rms: Real, wavelength: Real) -> Result:
 
 
 def linear_field_radius(
-    focal_length: Real,
-    refractive_index: Real,
-    pupil_radius: Real,
-    reduced_depth: Real,
-    sensor_distance: Real,
-    wavelength: Real,
-    *,
-    plano_to_object: bool = True,
+    array: MicrolensArray, pupil_radius: Real, reduced_depth: Real, sensor_distance: Real, wavelength: Real
 ) -> Result:
     """Field height where the Strehl ratio is half of that on the axis (paper, "Field of view"), by Eqs. 9 and 10, mm.
 
     Coma alone grows with the field there, `dw(h) = dw(0) + k h`. With `L = ln 2 (lambda / 2 pi)^2` the height solves
-    `dw(h)^2 = dw(0)^2 + L`. Parameters as in `seidel`; see `strehl` for where this means something.
+    `dw(h)^2 = dw(0)^2 + L`. Parameters as in `of_array`; see `strehl` for where this means something. Without coma, as
+    of an ideal lens, it is infinite.
     """
-    lens = (focal_length, refractive_index, pupil_radius, reduced_depth)
-    error = seidel(*lens, 1.0, sensor_distance, plano_to_object=plano_to_object)
+    error = of_array(array, pupil_radius, reduced_depth, 1.0, sensor_distance)
     slope = balanced_rms(error).coma
     axis = linear_rms(error) - slope
     drop = math.log(2) * (jnp.asarray(wavelength) / (2 * math.pi)) ** 2

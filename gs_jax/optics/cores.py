@@ -132,7 +132,9 @@ def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float
     Whoever follows chief rays at the apparent depth of a plane (back-projection, say) meets the cores of that plane.
     The authors' lenses, focused on 20 mm, show 18 mm 0.16 mm too near, and 22 mm 0.09 mm too far.
     """
-    found = float(imager.sensor_distance) / core_magnification(imager, depths) - float(imager.reduced_depth(0.0))
+    found = float(imager.reduced_sensor_distance) / core_magnification(imager, depths) - float(
+        imager.reduced_depth(0.0)
+    )
     return jnp.asarray(found, imager.sensor_distance.dtype)
 
 
@@ -150,7 +152,7 @@ def core_shares(
 
 def diffracted(imager: Imager, rays: SpotRays) -> SpotRays:
     """Rays moved at random, but always the same, by as much as the aperture diffracts: a Gaussian as wide as Airy's."""
-    width = float(airy_deviation(imager.wavelength, imager.sensor_distance, imager.array.aperture_diameter))
+    width = float(airy_deviation(imager.wavelength, imager.reduced_sensor_distance, imager.array.aperture_diameter))
     moves = np.random.default_rng(0).normal(0, width, rays.landing.shape[1:])
     return rays._replace(landing=rays.landing + moves)
 

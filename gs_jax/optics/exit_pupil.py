@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ..geometry import Imager
-from .unit import direction_cosines, pupil_disc, pupil_radius, unit_rays
+from .unit import chief_length, direction_cosines, pupil_disc, pupil_radius, unit_rays
 
 # The grid in the exit pupil reaches this much beyond the lens's own radius, for the pupil's distortion.
 _MARGIN = 1.08
@@ -30,7 +30,7 @@ class ExitPupil(NamedTuple):
     """The exit pupil on a square grid.
 
     `coordinate`: along each side, mm. `field` and its modulus `amplitude`. `chief`: where the chief ray meets the
-    sensor, `(x, y)` from the lens's axis, mm; `distance`: its length behind the lens, mm.
+    sensor, `(x, y)` from the lens's axis, mm; `distance`: its length behind the vertex as the sensor sees it, mm.
     """
 
     coordinate: Float[Array, " sample"]
@@ -51,7 +51,7 @@ def trace_exit_pupil(imager: Imager, depth, field, radius, edges, count: int) ->
     radius = pupil_radius(imager, radius)
     reach = _MARGIN * radius
     chief = unit_rays(imager, depth, np.zeros(2), field)
-    distance = jnp.sqrt(imager.sensor_distance**2 + jnp.sum(chief.landing**2))
+    distance = chief_length(imager, chief)
 
     def trace(points):
         rays = unit_rays(imager, depth, points, field)

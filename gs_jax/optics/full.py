@@ -31,7 +31,7 @@ class Halo(eqx.Module):
     area
         Mean clear area of the lenses, mm^2.
     sensor_distance
-        Of the tables, mm.
+        Of the tables, `v'`, mm.
     grid
         The nodes.
     """
@@ -168,7 +168,7 @@ def halo_of(
     return Halo(
         jnp.asarray(table, imager.sensor_distance.dtype),
         jnp.mean(clear_area(imager.array)),
-        imager.sensor_distance,
+        imager.reduced_sensor_distance,
         grid,
     )
 

@@ -11,7 +11,7 @@ from ..geometry import Imager
 from ..lenses import MicrolensArray
 from .aperture import aperture_area
 from .psf import GOLDEN_ANGLE
-from .refraction import on_host, passed, refracted, refracted_ideally, solid_angle
+from .refraction import on_host, passed, refracted, solid_angle
 
 # Radii and angles at which an aperture is asked whether it is open.
 _RADII, _ANGLES = 64, 64
@@ -105,7 +105,7 @@ def transmitted(
     pupil_points: Float[np.ndarray, "point 2"],
     field: Float[np.ndarray, "2"],
 ) -> Float64[np.ndarray, " point"]:
-    """Light that leaves the lens at its points, per area: the share of all that an isotropic point sends out, 1/mm^2.
+    """Light through points of a lens's curved side, per area: the share of all that a point sends out, 1/mm^2.
 
     The solid angle that a piece of the lens takes of the point's light (the cosine's third power: a point that sends
     out as much in all directions has no cosine of its own), less what both faces reflect (Fresnel's equations,
@@ -121,7 +121,6 @@ def transmitted(
 
 def _light(imager, depth, points, field):
     """Of rays to a field, all with their coordinates first: where they land, and their light per area."""
-    ideal = imager.array.thin_lens_focal_length is not None
-    ray = (refracted_ideally if ideal else refracted)(imager, depth, points, field)
+    ray = refracted(imager, depth, points, field)
     light = solid_angle(imager, depth, ray) * passed(imager, ray) / (4 * np.pi)
     return ray.landing, np.where(ray.valid, light, 0)

@@ -165,7 +165,7 @@ def gaussian_psf(
     weights = (weights / jnp.sum(weights))[:, None]
     centroid = jnp.sum(weights * rays.landing, 0)
     spread = jnp.sum(weights * (rays.landing - centroid[None]) ** 2) / 2
-    airy = airy_deviation(imager.wavelength, imager.sensor_distance, 2 * radius)
+    airy = airy_deviation(imager.wavelength, imager.reduced_sensor_distance, 2 * radius)
     sigma = jnp.sqrt(spread + airy**2)
     pitch = imager.sensor.pixel_pitch
     shift = centroid - _map(imager, depth, field, radius.dtype) + pitch * jnp.asarray(offset, radius.dtype)[::-1]

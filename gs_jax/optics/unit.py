@@ -1,11 +1,11 @@
 """One lens unit, exactly: rays through a plano-convex lens by Snell's law, and the wavefront that they carry.
 
-The frame is the lens's own: the axis through its vertex, the plano face toward the object. The object point is
-`field` beside the axis and `depth` in front of the plano face; the vertex is `t` behind that face, so that the
-convex surface takes glass away off the axis; the sensor is `v` behind the vertex. A ray is named by the point
-`(x, y)` at which it leaves the convex surface: that is where neighbouring lenses cut the aperture, and the ray
-through such a point is found exactly. The ray through the vertex is the chief ray. Paths are counted from the
-chief ray's and computed as differences, so that float32 keeps a wavefront to a thousandth of a wave.
+The frame is the lens's own: the axis through its vertex. The object point is `field` beside the axis and `depth` in
+front of the first face, plano or curved; the sensor is `v` behind the other one; the vertex and the plano face are `t`
+apart, so that the curved side takes glass away off the axis. A ray is named by the point `(x, y)` at which it meets the
+curved side: that is where neighbouring lenses cut the aperture, and the ray through such a point is found exactly. The
+ray through the vertex is the chief ray. Paths are counted from the chief ray's and computed as differences, so that
+float32 keeps a wavefront to a thousandth of a wave.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.safe import safe_sqrt
 from ..geometry import Imager
-from .refraction import Refraction, as_air, dot, refracted, refracted_ideally, secant, slope_in_glass
+from .refraction import Refraction, as_air, dot, refracted, secant, slope_in_glass
 
 Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]]
 
@@ -30,8 +30,8 @@ class UnitRay(NamedTuple):
     """A ray behind the lens.
 
     `landing`: where it meets the sensor, `(x, y)` from the lens's axis, mm. `tangent`: its slopes `dx/dz, dy/dz`.
-    `path`: optical path from the object to the sensor less the chief ray's, mm. `valid`: False if the pupil point is
-    not on the sphere or the light is reflected totally; the other numbers are then finite and meaningless.
+    `path`: optical path from the object to the sensor less the chief ray's, mm. `valid`: False if the surface
+    does not reach the pupil point or the light is reflected totally; the other numbers are then finite and meaningless.
     """
 
     landing: Float[Array, "*batch 2"]
@@ -50,16 +50,16 @@ def unit_rays(
     """Rays from one object point through points of the lens, to the sensor.
 
     With `thin_lens_focal_length` the unit is an ideal lens in the vertex plane: the object's image at
-    `1/v' = 1/f - 1/z'` is free of aberrations.
+    `1/f - 1/z'` is free of aberrations.
 
     Parameters
     ----------
     imager
         Its array says what the lens is, its `sensor_distance` where the sensor is.
     depth
-        `z` of the object point, in front of the plano face, mm.
+        `z` of the object point, in front of the array, mm.
     pupil_points
-        `(*batch, 2)` points `(x, y)` at which the rays leave the lens, from its axis, mm.
+        `(*batch, 2)` points `(x, y)` at which the rays meet the curved side, from the axis, mm.
     field
         `(x, y)` of the object point from the lens's axis, mm.
     """
@@ -82,7 +82,8 @@ def wavefront(
 ) -> Float[Array, "*batch"]:
     """Wavefront error, mm: optical path to the reference sphere less the chief ray's.
 
-    The sphere goes through the vertex and has its centre where the chief ray meets the sensor: what is out of focus on
+    The sphere goes through the vertex, as it is seen from the sensor, and has its centre where the chief ray meets the
+    sensor: what is out of focus on
     the sensor is in the wavefront, as defocus. A path that is too long, hence light that is late, is positive.
 
     Parameters
@@ -97,7 +98,7 @@ def wavefront(
     """
     rays = unit_rays(imager, depth, pupil_points, field)
     chief = unit_rays(imager, depth, np.zeros(2), field)
-    radius2 = jnp.sum(chief.landing**2) + imager.sensor_distance**2
+    radius2 = chief_length(imager, chief) ** 2
     offset = rays.landing - chief.landing.reshape((1,) * (rays.path.ndim) + (2,))
     cosines = direction_cosines(rays.tangent)
     along, offset2 = jnp.sum(offset * cosines, -1), jnp.sum(offset**2, -1)
@@ -152,17 +153,25 @@ def best_focus(
     points, weights = pupil_disc(pupil_radius(imager, radius))
 
     def error(vergence):
-        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence)
+        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence - imager.array.air_behind)
         return _without_tilt(wavefront(moved, depth, points, field), points, weights)
 
-    # Gauss-Newton: the wavefront is all but linear in 1/v, so that the first step is right to 1e-3.
+    # Gauss-Newton: the wavefront is all but linear in 1/v', so that the first step is right to 1e-3.
     vergence = 1 / imager.array.focal_length - 1 / imager.reduced_depth(jnp.asarray(depth, weights.dtype))
 
     def step(_, vergence):
         value, slope = jax.jvp(error, (vergence,), (jnp.ones_like(vergence),))
         return vergence - jnp.sum(weights * value * slope) / jnp.sum(weights * slope**2)
 
-    return 1 / jax.lax.fori_loop(0, _STEPS, step, vergence)
+    return 1 / jax.lax.fori_loop(0, _STEPS, step, vergence) - imager.array.air_behind
+
+
+def chief_length(imager: Imager, chief: UnitRay) -> Float[Array, ""]:
+    """From the vertex, as it is seen from the sensor, to the sensor along the chief ray, mm."""
+    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.air_behind
+    if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `refraction.as_air`
+        behind = behind * n / jnp.sqrt(n**2 + (n**2 - 1) * squared)
+    return (imager.sensor_distance + behind) * jnp.sqrt(1 + squared)
 
 
 def pupil_radius(imager: Imager, radius: Float[ArrayLike, ""] | None = None) -> Float[Array, ""]:
@@ -201,11 +210,10 @@ def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch
 
 def _ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
     """Quantities with `_chief` are those of the ray through the vertex."""
+    ray = refracted(imager, depth, point, field)
     if imager.array.thin_lens_focal_length is None:
-        ray = refracted(imager, depth, point, field)
         return UnitRay(ray.landing, ray.tangent, _thick_path(imager, depth, ray, field), ray.valid)
-    ray = refracted_ideally(imager, depth, point, field)
-    v, reduced = imager.sensor_distance, imager.reduced_depth(depth)
+    v, reduced = imager.reduced_sensor_distance, imager.reduced_depth(depth)
     vergence, tilt = 1 / imager.array.focal_length - 1 / reduced, -field / reduced
     # |point - image| - |image| = v' (s - s_chief), from the object on; then v (s - s_chief) along the ray.
     longer = (vergence * dot(point, point) - 2 * dot(point, tilt)) / (secant(ray.tangent) + secant(tilt))
@@ -213,18 +221,26 @@ def _ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
 
 
 def _thick_path(imager: Imager, depth: Array, ray: Refraction, field: Array) -> Array:
-    n, t, v = imager.array.refractive_index, imager.array.substrate_thickness, imager.sensor_distance
-    air_chief = as_air(n, t, depth, -field)
+    """At the vertex the surface is parallel to the plane: the chief ray leaves as it came."""
+    array, v = imager.array, imager.sensor_distance
+    n, t = array.refractive_index, array.substrate_thickness
+    plane_first = array.orientation == "plano"
+    air_chief = as_air(n, t, depth, -field) if plane_first else jnp.zeros_like(ray.air)
     h, h_chief = depth + ray.air, depth + air_chief
     q, q_chief = ray.slope, -field / h_chief
     change = ray.point / h + field * (ray.air - air_chief) / (h * h_chief)
-    s_chief, s_glass, s_glass_chief = secant(q_chief), secant(ray.glass), secant(slope_in_glass(n, q_chief))
+    s_chief, s_glass = secant(q_chief), secant(ray.glass)
+    glass_chief = slope_in_glass(n, q_chief)
     squares = dot(change, q + q_chief)
     path = depth * squares / (secant(q) + s_chief)
-    # Snell's law for the square of the slope in glass; see `slope_in_glass`.
-    flat, flat_chief = n**2 + (n**2 - 1) * dot(q, q), n**2 + (n**2 - 1) * dot(q_chief, q_chief)
-    glass_squares = n**2 * squares / (flat * flat_chief)
-    path = path + n * (t * glass_squares / (s_glass + s_glass_chief) - ray.sag * s_glass)
-    # At the vertex the sphere is parallel to the plane: the chief ray leaves as it came.
     s = secant(ray.tangent)
-    return path + ray.sag * s + v * dot(ray.tangent - q_chief, ray.tangent + q_chief) / (s + s_chief)
+    if plane_first:
+        # Snell's law for the square of the slope in glass; see `slope_in_glass`.
+        flat, flat_chief = n**2 + (n**2 - 1) * dot(q, q), n**2 + (n**2 - 1) * dot(q_chief, q_chief)
+        glass_squares, in_air = n**2 * squares / (flat * flat_chief), s
+    else:
+        glass_squares, in_air = dot(ray.glass - glass_chief, ray.glass + glass_chief), secant(q)
+    path = path + n * t * glass_squares / (s_glass + secant(glass_chief))
+    # Off the axis there is air in place of glass.
+    path = path + ray.sag * (in_air - n * s_glass)
+    return path + v * dot(ray.tangent - q_chief, ray.tangent + q_chief) / (s + s_chief)

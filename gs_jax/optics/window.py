@@ -62,6 +62,6 @@ def psf_of_depth(
     size = steps * (2 * math.ceil(pixels + _MARGIN) + 1)
     make = PSFS[kind]
     if kind == "diffraction":  # as fine as the aperture diffracts
-        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
+        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.reduced_sensor_distance))
         make = partial(make, samples=math.ceil(sharp))
     return lambda depth: make(imager, depth, size=size, radius=radius)

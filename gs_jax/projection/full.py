@@ -60,7 +60,7 @@ def _cores_image(volume, imager, grid, optics):
         depth, voxels, stretch, light, _, _ = plane
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * stretch[number]
-        at = grid.at(imager.sensor_distance / magnification - imager.reduced_depth(0.0))
+        at = grid.at(imager.reduced_sensor_distance / magnification - imager.reduced_depth(0.0))
         if imager.tilt is not None:
             # Cores are drawn to the axis of the lens, which leans.
             drawn = (1 / stretch[number] - 1) * imager.lean(depth[None])[0]
@@ -94,7 +94,7 @@ def halo_image(
 ) -> Float[Array, "row column"]:
     """The halo of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm."""
     dtype = nodes.dtype
-    halo, v = optics.grid, (imager.sensor_distance / optics.sensor_distance).astype(dtype)
+    halo, v = optics.grid, (imager.reduced_sensor_distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the pixels of the halo with it.
     pixel = halo.pixel * v
     splat, spread = splat_table(halo), spread_table(halo)

@@ -146,7 +146,7 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
 def _rays(depth, imager, stamps):
     """Magnification, how much of it is the core's own, and parameters of the weight, for each point."""
     reduced = depth + float(imager.reduced_depth(0.0))
-    magnification = float(imager.sensor_distance) / reduced
+    magnification = float(imager.reduced_sensor_distance) / reduced
     if stamps.ring is None:
         return magnification, np.ones_like(reduced), reduced[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
