@@ -1,6 +1,7 @@
 """The lenses on their plate, and the shape of their surface. Lengths are in millimetres."""
 
 import math
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -93,18 +94,37 @@ class MicrolensArray(eqx.Module):
 
     def sag(self, squared_radius: Scalars) -> Scalars:
         """How far the surface is below its vertex, mm, where it `reaches`."""
-        sag = squared_radius / (self.radius_of_curvature + self._root(squared_radius))
-        for order, term in enumerate(self.aspheric_terms, 2):
-            sag = sag + term * squared_radius**order
-        return sag
+        return sag(squared_radius, *self._shape)
 
     def steepness(self, squared_radius: Scalars) -> Scalars:
         """Slope of the surface over the radius, `s'(r) / r`, 1/mm: that has no division by zero on the axis."""
-        steepness = 1 / self._root(squared_radius)
-        for order, term in enumerate(self.aspheric_terms, 2):
-            steepness = steepness + 2 * order * term * squared_radius ** (order - 1)
-        return steepness
+        return steepness(squared_radius, *self._shape)
 
-    def _root(self, squared_radius):
-        root2 = self.radius_of_curvature**2 - (1 + self.conic_constant) * squared_radius
-        return library_of(squared_radius).sqrt(root2)
+    @property
+    def _shape(self):
+        return self.radius_of_curvature, self.conic_constant, self.aspheric_terms
+
+
+def sag(
+    squared_radius: Scalars, radius_of_curvature: Scalar, conic_constant: Scalar, terms: Iterable[Scalar]
+) -> Scalars:
+    """Of `MicrolensArray`'s surface, mm."""
+    total = squared_radius / (radius_of_curvature + _root(squared_radius, radius_of_curvature, conic_constant))
+    for order, term in enumerate(terms, 2):
+        total = total + term * squared_radius**order
+    return total
+
+
+def steepness(
+    squared_radius: Scalars, radius_of_curvature: Scalar, conic_constant: Scalar, terms: Iterable[Scalar]
+) -> Scalars:
+    """Of `MicrolensArray`'s surface, 1/mm."""
+    total = 1 / _root(squared_radius, radius_of_curvature, conic_constant)
+    for order, term in enumerate(terms, 2):
+        total = total + 2 * order * term * squared_radius ** (order - 1)
+    return total
+
+
+def _root(squared_radius, radius_of_curvature, conic_constant):
+    root2 = radius_of_curvature**2 - (1 + conic_constant) * squared_radius
+    return library_of(squared_radius).sqrt(root2)

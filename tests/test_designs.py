@@ -402,3 +402,39 @@ def test_the_written_file_is_the_contracts(tmp_path):
     text = (tmp_path / "a.toml").read_text()
     assert "shape = [400, 300]\n" in text and "working_distance_mm = [18.0, 30.0]\n" in text
     assert tomllib.loads(text) == edited({"provenance": {"made": datetime.date(2026, 1, 1)}})
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ({"orientation": "front"}, "`lens.orientation`: found 'front', allowed: "),
+        ({"conic_constant": 3.0, "aperture_diameter_mm": 2.5}, "allowed: at most 2.0 mm, where the conic ends"),
+        ({"aspheric_terms": [-1.0]}, "with which lenses rise at 0.3"),
+        ({"aspheric_terms": [0.0] * 7}, "allowed: up to 6 numbers"),
+    ],
+)
+def test_a_lens_has_a_shape_that_falls_to_its_rim(tmp_path, lens, said):
+    data = copy.deepcopy(BASE)
+    data["lens"] |= lens
+    path = tmp_path / "shape.toml"
+    path.write_text(tomli_w.dumps(data))
+    with pytest.raises(InputError, match=re.escape(said)):
+        read_design(path)
+
+
+def test_the_shape_of_a_lens_goes_to_the_imager_and_back(tmp_path):
+    shape = {"orientation": "curved", "conic_constant": -0.7, "aspheric_terms": (0.01, -0.002)}
+    data = copy.deepcopy(BASE)
+    data["lens"] |= shape
+    design = Design.model_validate(data)
+    write_design(tmp_path / "shape.toml", design)
+    assert (found := read_design(tmp_path / "shape.toml")) == design
+    array = found.imager().array
+    assert array.orientation == "curved" and float(array.conic_constant) == -0.7
+    np.testing.assert_allclose(array.aspheric_terms, [0.01, -0.002])
+    # The plate counts on the sensor's side.
+    imager = found.imager()
+    np.testing.assert_allclose(imager.reduced_depth(20.0), 20.0)
+    v = design.imaging.sensor_distance_mm
+    np.testing.assert_allclose(imager.reduced_sensor_distance, v + 1 / 1.43)
+    assert "k = -0.7, 2 aspheric terms, curved side to the object" in repr(found)

@@ -209,7 +209,7 @@ def test_by_questions(lab, monkeypatch):
         ("", "t of the plate"),
         ("23 18", "nearest and farthest object"),
         ("18 23", "near below far"),
-        ("", "v from the lens vertices"),
+        ("", "v from the array's back"),
         ("52", "wavelength"),
         ("n", "imaging.wavelength_nm = 52: is it meant?"),
         ("530", ""),

@@ -8,9 +8,12 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from ..lenses import steepness
 from .centers import other_reading
 
 MIN_SPACING_MM = 1e-3
+# Radii at which a lens is asked whether it falls.
+_RADII = 64
 
 
 def check_whole(design) -> None:
@@ -23,10 +26,27 @@ def _check_numbers(design) -> None:
     near, far = design.imaging.working_distance_mm
     if not near < far:
         raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
-    aperture, sphere = design.lens.aperture_diameter_mm, 2 * design.lens.radius_of_curvature_mm
-    if aperture > sphere:
-        limit = f"at most {sphere} mm, twice `lens.radius_of_curvature_mm`"
-        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: {limit}")
+    lens = design.lens
+    aperture, end = lens.aperture_diameter_mm, widest_diameter(lens.radius_of_curvature_mm, lens.conic_constant)
+    if aperture > end:
+        where = "twice `lens.radius_of_curvature_mm`" if not lens.conic_constant else "where the conic ends"
+        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: at most {round(end, 6)} mm, {where}")
+    radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
+    rising = steepness(radii**2, lens.radius_of_curvature_mm, lens.conic_constant, lens.aspheric_terms) <= 0
+    if rising.any():
+        found = f"found {list(lens.aspheric_terms)}, with which lenses rise at {radii[np.argmax(rising)]:.3g} mm"
+        raise ValueError(f"`lens.aspheric_terms`: {found}, allowed: lenses that fall from the vertex to the rim")
+
+
+def widest_diameter(radius: float, conic_constant: float) -> float:
+    """Of a conic surface, mm: where it is vertical; infinite of paraboloids and hyperboloids."""
+    return 2 * radius / math.sqrt(1 + conic_constant) if conic_constant > -1 else math.inf
+
+
+def plate_as_air(thickness: float, refractive_index: float, orientation: str) -> tuple[float, float]:
+    """The plate before the lens vertices and behind them, as so much air, mm: `t/n` and 0, or the other way round."""
+    reduced = thickness / refractive_index
+    return (reduced, 0.0) if orientation == "plano" else (0.0, reduced)
 
 
 def _check_plate(design) -> None:
@@ -75,7 +95,7 @@ def _check_reach(design) -> None:
 def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
     """How far beside the sensor each lens is, and how far its image of the field goes at the nearest depth, mm.
 
-    That image is the disc `v/z' field_radius` about its vertex.
+    That image is the disc `v'/z' field_radius` about its vertex.
     """
     imaging, calibration = design.imaging, design.calibration
     angle = math.radians(calibration.rotation_deg)
@@ -83,8 +103,10 @@ def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
     centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
     middle = np.array(design.sensor.origin_mm or (0.0, 0.0))
     distance = beside_sensor(centers - middle, design.sensor.shape, design.sensor.pixel_pitch_um)
-    plate = design.array.substrate_thickness_mm / design.lens.refractive_index
-    radius = imaging.sensor_distance_mm / (imaging.working_distance_mm[0] + plate) * imaging.field_radius_mm
+    lens = design.lens
+    front, back = plate_as_air(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    near, v = imaging.working_distance_mm[0] + front, imaging.sensor_distance_mm + back
+    radius = v / near * imaging.field_radius_mm
     return distance, radius
 
 

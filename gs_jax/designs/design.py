@@ -19,7 +19,7 @@ from ..base.errors import InputError, InputWarning
 from ..geometry import LONGEST, SHORTEST, Imager, Sensor
 from ..io.disk import read_text, write_text
 from ..io.tables import Table, one_line
-from ..lenses import MicrolensArray
+from ..lenses import MicrolensArray, Orientation
 from .centers import MAX_LENSES, CentersTable, inline_centers
 from .checks import check_whole
 from .plausible import doubts, slips
@@ -38,6 +38,10 @@ Size = Annotated[tuple[Length, Length], Field(strict=False, description="[x, y] 
 Range = Annotated[tuple[Length, Length], Field(strict=False, description="[near, far] in mm, near below far")]
 Shape = Annotated[
     tuple[Pixels, Pixels], Field(strict=False, description="[rows, columns], whole numbers from 2 to 65536")
+]
+Terms = Annotated[
+    tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...],
+    Field(strict=False, max_length=6, description="up to 6 numbers from -1e12 to 1e12"),
 ]
 Slope = Annotated[float, Field(ge=-10, le=10)]
 Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
@@ -73,10 +77,14 @@ class SensorTable(Table):
 
 
 class LensTable(Table):
-    """`[lens]`: one plano-convex microlens. `focal_length_mm` overrides the radius, for a thin-lens study."""
+    """`[lens]`: one plano-convex microlens. `focal_length_mm` overrides the radius, for a thin-lens study.
+
+    At the radius r the curved side is `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A4 r^4 + A6 r^6 + ...` below its
+    vertex, with `c = 1/R` and all lengths in mm.
+    """
 
     radius_of_curvature_mm: Length = Field(
-        title="R of the spherical side, positive; a focal length f in air is R = f (n - 1)"
+        title="R of the curved side at its vertex, positive; a focal length f in air is R = f (n - 1)"
     )
     refractive_index: float = Field(
         gt=1,
@@ -84,7 +92,21 @@ class LensTable(Table):
         title="n of lenses and plate at the wavelength: PDMS 1.43, fused silica 1.46, acrylic 1.49, BK7 1.52",
         description="a number above 1, up to 5",
     )
-    aperture_diameter_mm: Length = Field(title="D of each lens, before neighbours clip it; at most 2 R")
+    aperture_diameter_mm: Length = Field(title="D of each lens, before neighbours clip it; at most 2 R of a sphere")
+    orientation: Orientation = Field(
+        default="plano", title="side of the lenses that faces the object", description='"plano" or "curved"'
+    )
+    conic_constant: float = Field(
+        default=0.0,
+        ge=-100,
+        le=100,
+        title="k of the curved side: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid",
+        description="a number from -100 to 100",
+    )
+    aspheric_terms: Terms = Field(
+        default=(),
+        title="[A4, A6, ...] of the curved side, for millimetres; a lens must fall all the way from its vertex",
+    )
     focal_length_mm: Length | None = Field(
         default=None,
         title="f of an ideal thin lens, in place of the sphere that the radius describes; leave it out for real lenses",
@@ -99,7 +121,7 @@ class ArrayTable(Table):
     substrate_thickness_mm: float = Field(
         ge=0,
         le=1e4,
-        title="t of the plate, from its plano front, toward the object, to the lens vertices",
+        title="t of the plate, from its plano face to the lens vertices",
         description="a number of mm from 0 to 1e4",
     )
     centers_mm: Centers = Field(
@@ -110,9 +132,11 @@ class ArrayTable(Table):
 class ImagingTable(Table):
     """`[imaging]`: where the sensor and the object are."""
 
-    sensor_distance_mm: Length = Field(title="v from the lens vertices to the sensor, positive")
+    sensor_distance_mm: Length = Field(
+        title="v from the array's back to the sensor, positive: from the lens vertices, or the plano face behind them"
+    )
     working_distance_mm: Range = Field(
-        title="nearest and farthest object: depths z from the plate's plano front, positive away from the sensor"
+        title="nearest and farthest object: depths z from the array's front, plano face or lens vertices, positive"
     )
     wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
     field_radius_mm: Length = Field(
@@ -171,7 +195,7 @@ class Design(Table):
         return "\n".join(
             [
                 f"Design {self.name!r}",
-                f"  {len(array.centers_mm)} lenses, {focal}, n = {lens.refractive_index:g}, "
+                f"  {len(array.centers_mm)} lenses, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
                 f"D = {lens.aperture_diameter_mm:g} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
                 f"{array.substrate_thickness_mm:g} mm thick",
                 f"  sensor of {sensor.shape[0]} x {sensor.shape[1]} pixels of {sensor.pixel_pitch_um:g} um "
@@ -194,6 +218,9 @@ class Design(Table):
             substrate_thickness=self.array.substrate_thickness_mm,
             thin_lens_focal_length=lens.focal_length_mm,
             size=self.array.size_mm,
+            orientation=lens.orientation,
+            conic_constant=lens.conic_constant,
+            aspheric_terms=lens.aspheric_terms,
         )
         return Imager(
             array,
@@ -205,6 +232,13 @@ class Design(Table):
             shift=calibration.shift_mm,
             tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
         )
+
+
+def _shape(lens: LensTable) -> str:
+    """What is not a sphere with its plano side to the object, in words."""
+    conic = f", k = {lens.conic_constant:g}" if lens.conic_constant else ""
+    terms = f", {len(lens.aspheric_terms)} aspheric terms" if lens.aspheric_terms else ""
+    return conic + terms + (", curved side to the object" if lens.orientation == "curved" else "")
 
 
 def read_design(path: str | os.PathLike[str]) -> Design:

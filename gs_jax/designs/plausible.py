@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from .checks import plate_as_air
+
 # What is usual, in the unit of the key. Wide: the smallest and the largest that anybody builds of microlenses.
 USUAL: dict[str, tuple[float, float]] = {
     "sensor.pixel_pitch_um": (0.5, 50.0),
@@ -112,14 +114,16 @@ def _numbers(values: list[float]) -> str:
 def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
     lens, array, imaging = data["lens"], data["array"], data["imaging"]
     near, far = imaging["working_distance_mm"]
-    v, plate = imaging["sensor_distance_mm"], array["substrate_thickness_mm"] / lens["refractive_index"]
+    kind = lens.get("orientation", "plano")
+    front, back = plate_as_air(array["substrate_thickness_mm"], lens["refractive_index"], kind)
+    v = imaging["sensor_distance_mm"]
     f = lens.get("focal_length_mm") or lens["radius_of_curvature_mm"] / (lens["refractive_index"] - 1)
     depths = f"{near:g} to {far:g} mm"
-    if near + plate <= f:
+    if near + front <= f:
         said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
         yield f"{said} Nearer than the focal length, {f:.4g} mm, no real image forms."
     else:
-        longest, shortest = (1 / (1 / f - 1 / (depth + plate)) for depth in (near, far))
+        longest, shortest = (1 / (1 / f - 1 / (depth + front)) - back for depth in (near, far))
         if not shortest / _OFF <= v <= longest * _OFF:
             said = f"imaging.sensor_distance_mm = {v:g}: is it meant?"
             yield f"{said} Lenses of f = {f:.4g} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
@@ -134,7 +138,7 @@ def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
             f"{pitch * 1000:.3g} mm, a list in another unit?"
         )
     radius, half = lens["radius_of_curvature_mm"], min(diameter, pitch) / 2
-    height = radius - math.sqrt(radius**2 - half**2)
+    height = radius - math.sqrt(radius**2 - min(half, radius) ** 2)  # of a sphere, which others are not far from
     if 0 < (thickness := array["substrate_thickness_mm"]) < height and not lens.get("focal_length_mm"):
         said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
         yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
