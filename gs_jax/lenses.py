@@ -1,5 +1,6 @@
 """The lenses on their plate, and the shape of their surface. Lengths are in millimetres."""
 
+import dataclasses
 import math
 from collections.abc import Iterable
 from typing import Any, Literal
@@ -12,13 +13,15 @@ from .base.converters import as_float, as_float_or_none, as_pair
 
 # Side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]
+# Numbers that lenses may have of their own.
+EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
 # Of JAX or of NumPy, as the array's own numbers are; `Scalars` are several.
 Scalar = Any
 Scalars = Any
 
 
 class MicrolensArray(eqx.Module):
-    """Plano-convex microlenses on one plate, all alike.
+    """Plano-convex microlenses on one plate, their vertices in one plane.
 
     A surface is a conic with even polynomial terms: it falls `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A_4 r^4 + ...`
     below its vertex, `c = 1/R` (ISO 10110-12).
@@ -27,9 +30,11 @@ class MicrolensArray(eqx.Module):
     ----------
     centers
         Lens vertices `(lens, 2)` in the array's own frame, mm.
-    radius_of_curvature, refractive_index, aperture_diameter, substrate_thickness
-        Of every lens and of the plate that carries them, mm. The aperture is the one before neighbours
-        clip it to its Voronoi cell.
+    radius_of_curvature, aperture_diameter
+        One number for all lenses, or `(lens,)`, mm. The aperture is the one before neighbours clip it: a lens ends
+        where its surface meets theirs, for lenses that are alike at the edge of its Voronoi cell.
+    refractive_index, substrate_thickness
+        Of the lenses and of the plate that carries them; mm, from its plano face to the vertices.
     thin_lens_focal_length
         Overrides the focal length that follows from the radius, mm, for a thin-lens study.
     size
@@ -37,35 +42,50 @@ class MicrolensArray(eqx.Module):
     orientation
         The side of the lenses that faces the object, `"plano"` or `"curved"`.
     conic_constant
-        `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid.
+        `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid. One for all lenses, or `(lens,)`.
     aspheric_terms
         `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
 
     Raises
     ------
     ValueError
-        If `centers` is not `(lens, 2)` or holds no lens, or there is no such orientation.
+        If `centers` is not `(lens, 2)` or holds no lens, a number of each lens is there for too few or too many, or
+        there is no such orientation.
     """
 
     centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
-    radius_of_curvature: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
+    radius_of_curvature: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
     refractive_index: Float[Array, ""] = eqx.field(converter=as_float, default=1.43)
-    aperture_diameter: Float[Array, ""] = eqx.field(converter=as_float, default=2.0)
+    aperture_diameter: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     size: tuple[float, float] = eqx.field(static=True, converter=as_pair, default=(math.inf, math.inf))
     orientation: Orientation = eqx.field(static=True, default="plano")
-    conic_constant: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
+    conic_constant: Float[Array, "*each"] = eqx.field(converter=as_float, default=0.0)
     aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
             raise ValueError(f"`centers` must be (lens, 2) with a lens at least, got {self.centers.shape}.")
+        for name in EACH:
+            if (shape := getattr(self, name).shape) not in ((), self.centers.shape[:1]):
+                raise ValueError(f"`{name}` must be one number or {self.centers.shape[:1]}, got {shape}.")
         if self.orientation not in ("plano", "curved"):
             raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
 
     @property
-    def focal_length(self) -> Float[Array, ""]:
+    def alike(self) -> bool:
+        """Whether all lenses have the same numbers, as one lens unit has; all numbers are scalars then."""
+        return not any(getattr(self, name).ndim for name in EACH)
+
+    def lens(self, index: int) -> "MicrolensArray":
+        """One of the lenses alone, on the same plate."""
+        own = {name: getattr(self, name) for name in EACH}
+        own = {name: value[index] if value.ndim else value for name, value in own.items()}
+        return dataclasses.replace(self, centers=self.centers[index][None], **own)
+
+    @property
+    def focal_length(self) -> Float[Array, "*each"]:
         """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm."""
         if self.thin_lens_focal_length is None:
             return self.radius_of_curvature / (self.refractive_index - 1)

@@ -129,3 +129,13 @@ def test_map_is_separable():
 def test_wrong_shapes_are_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_lenses_may_differ():
+    array = MicrolensArray([[0.0, 0.0], [1.0, 0.0]], radius_of_curvature=[2.0, 2.2], conic_constant=-0.7)
+    assert not array.alike and array.lens(1).alike
+    second = array.lens(1)
+    np.testing.assert_allclose([second.radius_of_curvature, second.conic_constant], [2.2, -0.7])
+    np.testing.assert_array_equal(second.centers, [[1.0, 0.0]])
+    with pytest.raises(ValueError, match=r"`conic_constant` must be one number or \(2,\), got \(3,\)"):
+        MicrolensArray([[0.0, 0.0], [1.0, 0.0]], conic_constant=[0.0, 0.0, 0.0])
