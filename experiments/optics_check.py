@@ -1,9 +1,9 @@
 """The exact rays and the PSF of one lens unit against an independent ray tracer, and against ray-traced captures.
 
-Optiland (a general ray tracer) sends rays through the same plane, plate and sphere. Compared are where they land,
-their optical paths, and what follows: spot size, wavefront error and Strehl ratio against field and depth, with the
-third-order theory beside them. With a folder of ray-traced captures, the spots that each lens makes of a single
-point are compared with our PSF in place, size and brightness.
+Optiland (a general ray tracer) sends rays through the same plane, plate and sphere, or aspheres with either side in
+front. Compared are where they land, their optical paths, and what follows: spot size, wavefront error and Strehl ratio
+against field and depth, with the third-order theory beside them. With a folder of ray-traced captures, the spots that
+each lens makes of a single point are compared with our PSF in place, size and brightness.
 
     python -m experiments.optics_check [DATA] [--out DIR]
 
@@ -30,7 +30,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
-from gs_jax.optics.aberrations import independent_rms, seidel
+from gs_jax.optics.aberrations import independent_rms, of_array
 from gs_jax.optics.aperture import aperture_area
 from gs_jax.optics.psf import diffraction_psf, geometric_psf, strehl
 from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront_rms
@@ -40,13 +40,24 @@ WAVELENGTH = 520e-6
 RADIUS = 0.65
 FIELDS, DEPTHS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0), (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
 SPOTS = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
+SHAPES: dict[str, dict] = {
+    "plano side in front, k = -2": {"conic_constant": -2.0},
+    "curved side in front, sphere": {"orientation": "curved"},
+    "curved side in front, k = -0.7": {"orientation": "curved", "conic_constant": -0.7},
+    "curved side in front, k = -0.7, A4, A6": {
+        "orientation": "curved",
+        "conic_constant": -0.7,
+        "aspheric_terms": (0.004, -0.001),
+    },
+}
 Rays = tuple[Float[np.ndarray, "ray 2"], Float[np.ndarray, "ray 2"], Float[np.ndarray, " ray"]]
 
 
 def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2"], field: float) -> Rays:
     """Landing points, slopes and optical paths of the rays through `points` of the convex surface, by Optiland.
 
-    The object is `field` beside the axis along x. Where a ray has to enter the plate is found by repeated tracing.
+    The object is `field` beside the axis along x. Where a ray has to meet the first vertex's plane is found by repeated
+    tracing.
     """
     with warnings.catch_warnings():
         # Optiland's just-in-time compiler warns about itself.
@@ -57,9 +68,21 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
 
         array, optic = imager.array, Optic()
         glass = IdealMaterial(n=float(array.refractive_index))
+        curved = 1 if array.orientation == "curved" else 2
+        toward = 1 if curved == 1 else -1
+        shape = dict(
+            radius=toward * float(array.radius_of_curvature),
+            conic=float(array.conic_constant),
+            # Of r^2, r^4, ....
+            coefficients=[0.0, *(toward * float(term) for term in array.aspheric_terms)],
+            surface_type="even_asphere",
+            tol=1e-14,
+        )
+        faces = {curved: shape, 3 - curved: {}}
         optic.surfaces.add(index=0, thickness=depth)
-        optic.surfaces.add(index=1, thickness=float(array.substrate_thickness), material=glass, is_stop=True)
-        optic.surfaces.add(index=2, thickness=float(imager.sensor_distance), radius=-float(array.radius_of_curvature))
+        thickness = float(array.substrate_thickness)
+        optic.surfaces.add(index=1, thickness=thickness, material=glass, is_stop=True, **faces[1])
+        optic.surfaces.add(index=2, thickness=float(imager.sensor_distance), **faces[2])
         optic.surfaces.add(index=3)
         optic.wavelengths.add(1000 * WAVELENGTH, is_primary=True)
         entry, one = np.array(points, float), np.ones(len(points))
@@ -71,7 +94,7 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
             optic.surfaces.trace(rays)
             slopes = np.column_stack([rays.L, rays.M]) / rays.N[:, None]
             result = np.column_stack([rays.x, rays.y]), slopes, np.asarray(rays.opd)
-            miss = points - np.column_stack([optic.surfaces.x[2], optic.surfaces.y[2]])
+            miss = points - np.column_stack([optic.surfaces.x[curved], optic.surfaces.y[curved]])
             if np.abs(miss).max() < 1e-13:
                 return result
             entry += miss
@@ -83,7 +106,7 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
     points, weights = map(np.asarray, pupil_disc(radius, 16))
     theirs, slopes, path = optiland_rays(imager, depth, np.vstack([[0, 0], points]), field)
     ours = unit_rays(imager, depth, points, (field, 0.0))
-    error = _on_sphere(theirs, slopes, path, float(imager.sensor_distance))
+    error = _on_sphere(theirs, slopes, path, imager)
     mean, mine, off = weights @ theirs[1:], np.asarray(ours.landing), (field, 0.0)
     return {
         "depth_mm": depth,
@@ -100,12 +123,16 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
     }
 
 
-def _on_sphere(landing: np.ndarray, slopes: np.ndarray, path: np.ndarray, v: float) -> np.ndarray:
-    """Path to the sphere through the vertex about the end of the first ray, less that of the first ray."""
+def _on_sphere(landing: np.ndarray, slopes: np.ndarray, path: np.ndarray, imager: Imager) -> np.ndarray:
+    """Path to the sphere through the vertex, as the sensor sees it, about the end of the first ray, less that ray's."""
+    # Where the first ray, which comes from the vertex, would have come from without the plate.
+    length2 = (landing[0] ** 2).sum() * (1 + 1 / max((slopes[0] ** 2).sum(), 1e-30))
+    if not slopes[0].any():
+        length2 = float(imager.reduced_sensor_distance) ** 2
     cosines = np.column_stack([slopes, np.ones(len(slopes))]) / np.sqrt(1 + (slopes**2).sum(1, keepdims=True))
     offset = np.column_stack([landing - landing[0], np.zeros(len(landing))])
     along = (offset * cosines).sum(1)
-    back = along + np.sqrt(along**2 - (offset**2).sum(1) + v**2 + (landing[0] ** 2).sum())
+    back = along + np.sqrt(along**2 - (offset**2).sum(1) + length2)
     return ((path - back) - (path - back)[0])[1:]
 
 
@@ -119,11 +146,14 @@ def _rms(error: np.ndarray, points: np.ndarray, weights: np.ndarray) -> float:
 def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray) -> float:
     """Highest `|sum exp(2 pi i (L + |P - B|) / wavelength)|^2` over points P of the sensor: Huygens' principle.
 
-    B are the points of the lens, L the paths to them. Nothing of our pupil is in it.
+    B are the points where rays leave the array, L the paths to them. Nothing of our pupil is in it.
     """
     landing, slopes, path = (part[1:] for part in rays)
-    v, radius = float(imager.sensor_distance), float(imager.array.radius_of_curvature)
-    behind = v + radius - np.sqrt(radius**2 - (points**2).sum(1))
+    behind = np.full(len(points), float(imager.sensor_distance))
+    if imager.array.orientation == "plano":
+        behind += np.asarray(imager.array.sag((points**2).sum(1)))
+    else:
+        points = landing - behind[:, None] * slopes
     to_lens = path - behind * np.sqrt(1 + (slopes**2).sum(1))
 
     def dark(place):
@@ -137,9 +167,7 @@ def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray)
 
 
 def _third_order(imager: Imager, depth: float, field: float, radius: float) -> float:
-    array, reduced = imager.array, imager.reduced_depth(depth)
-    lens = (array.focal_length, array.refractive_index, radius)
-    error = seidel(*lens, reduced, field, imager.sensor_distance)
+    error = of_array(imager.array, radius, imager.reduced_depth(depth), field, imager.reduced_sensor_distance)
     return float(independent_rms(error))
 
 
@@ -240,6 +268,16 @@ def run(fields=FIELDS, depths=DEPTHS) -> dict:
     }
 
 
+def shapes(fields=(0.0, 1.5, 3.0)) -> dict:
+    """Aspheres with either side in front, each with the sensor at its best focus for 20 mm, against Optiland."""
+    found = {}
+    for name, lens in SHAPES.items():
+        imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((3, 3), 0.0045), 5.8, 3.0)
+        focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=RADIUS))
+        found[name] = [compare(focused, 20.0, field) for field in fields]
+    return found
+
+
 def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0)) -> list[dict]:
     """Eq. (9) against the PSF's peak, on the axis, for a point at 20 mm at the best focus of each aperture."""
     imager, rows = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0), []
@@ -285,16 +323,30 @@ def gallery(rows: list[dict], count: int = 5) -> Figure:
     return figure
 
 
+_OF_SHAPES = {
+    "field_mm": "field, mm",
+    "landing_difference_nm": "landing, nm",
+    "path_difference_waves": "path, waves",
+    "spot_rms_um": "spot, um RMS",
+    "wavefront_rms_waves": "wavefront, waves RMS",
+    "wavefront_rms_third_order_waves": "third order",
+    "strehl": "Strehl ratio of the PSF",
+    "strehl_optiland": "of Optiland's rays",
+}
+
+
 def report(data: Path | None, progress: Progress) -> Report:
     with jax.enable_x64(True):  # paths to 1e-11 waves
-        result = run() | {"breakdown": breakdown()}
+        result = run() | {"breakdown": breakdown(), "shapes": shapes()}
     keys = ("depth_mm", "field_mm", "landing_difference_nm", "path_difference_waves")
     columns = ("depth, mm", "field, mm", "largest difference to Optiland: landing, nm", "path, waves")
     rows = [[f"{row[key]:.3g}" for key in keys] for row in result["field"] + result["depth"]]
+    others = [(name, row) for name, rows in result["shapes"].items() for row in rows]
+    shaped = [[name, *(f"{row[key]:.3g}" for key in _OF_SHAPES)] for name, row in others]
     broken = [[f"{number:.3g}" for number in row.values()] for row in result["breakdown"]]
     limits = ("pupil radius, mm", "wavefront error, waves RMS", "Strehl ratio of the PSF", "Eq. (9)")
     files: dict[str, Any] = {"curves.png": curves(result), "result.json": result}
-    shown = [table(columns, rows), table(limits, broken)]
+    shown = [table(columns, rows), table(("lens", *_OF_SHAPES.values()), shaped), table(limits, broken)]
     if data is not None:
         found = {f"P1_{scene}": spots(data, scene) for scene in progress.track(SPOTS, "Captures")}
         found["P2_a"] = spots(data, "a", "P2")
