@@ -122,6 +122,38 @@ def test_manufacture(design, focused, terms):
     np.testing.assert_allclose(terms["sag_mm"], 2 - np.sqrt(3), rtol=1e-12)
     slope = np.degrees(np.arcsin(np.asarray(focused.clear_diameter) / 4))
     np.testing.assert_allclose(terms["edge_slope_deg"], slope, rtol=1e-9)
+    np.testing.assert_allclose(terms["least_radius_mm"], 2, rtol=1e-12)
+
+
+def test_manufacture_of_a_conic(focused):
+    """Of an ellipse with the half axes a and b: its curvature along a profile, and R = b^2 / a at the vertex."""
+    k, radius = -0.6, 2.0
+    shaped = eqx.tree_at(lambda c: c.imager.array.conic_constant, focused, jnp.array(k))
+    a, b = radius / (1 + k), radius / (1 + k) ** 0.5
+    half = float(focused.clear_diameter) / 2
+    height = a * np.sqrt(1 - (half / b) ** 2)
+    slope = np.degrees(np.arctan(a / b**2 * half / np.sqrt(1 - (half / b) ** 2)))
+    np.testing.assert_allclose(TERMS["edge_slope_deg"].function(shaped), slope, rtol=1e-12)
+    rim = a * np.sqrt(1 - 1 / b**2)
+    np.testing.assert_allclose(TERMS["sag_mm"].function(shaped), a - rim, rtol=1e-12)
+    # (a^2 sin^2 t + b^2 cos^2 t)^(3/2) / (a b) of the profile, with x = b sin t; across it the normal's length.
+    least = np.asarray(TERMS["least_radius_mm"].function(shaped))
+    t = np.arcsin(half / b)
+    profile = ((a * np.sin(t)) ** 2 + (b * np.cos(t)) ** 2) ** 1.5 / (a * b)
+    across = np.hypot(half, height * b**2 / a**2)
+    np.testing.assert_allclose(least[[0, -1]], [radius, min(profile, across)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("orientation", ["plano", "curved"])
+def test_widths_have_gradients_by_the_shape(orientation):
+    design = small_design()
+    design = design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": orientation})})
+    parent = parent_of(design, depths_mm=(18.0, 23.0), depth_count=2)
+    names = ("conic_constant", "radius_of_curvature_mm", "sensor_distance_mm")
+    values = {name: start_values(parent)[name] for name in names} | {"aperture_diameter_mm": jnp.array(1.1)}
+    shown = ("psf_width_um", "edge_slope_deg", "sag_mm", "least_radius_mm", "wavefront_waves", "light_percent")
+    terms = jax.jit(lambda values: [TERMS[name].function(candidate(parent, values)) for name in shown])
+    check_grads(terms, (values | {"conic_constant": jnp.array(-0.5)},), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
 def small_parent(depth_count):

@@ -99,6 +99,12 @@ def test_no_candidate_magnifies_more(design):
     found = max(float(candidate(parent, corner).magnification.max()) for corner in ({}, *corners))
     assert found <= parent.largest_magnification
     np.testing.assert_allclose(parent.largest_magnification, 5.8 / (10.5 + 1 / 1.8), rtol=1e-12)
+    # With the curved side in front the glass is behind, and makes the sensor's distance longer.
+    turned = design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": "curved"})})
+    parent = parent_of(turned, depths_mm=(18.0, 23.0), free=free)
+    found = max(float(candidate(parent, corner).magnification.max()) for corner in ({}, *corners))
+    assert found <= parent.largest_magnification
+    np.testing.assert_allclose(parent.largest_magnification, (5.8 + 1 / 1.3) / 10.5, rtol=1e-12)
 
 
 def test_a_new_design_holds_the_values(design, parent):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -26,8 +27,10 @@ Result = Float[Array, "..."]
 UM = 1000.0
 # Of the entry points that are terms.
 _GROUP = "gs_jax.terms"
-# Places along a side of the plate where a hole is looked for.
+# Places along a side of the plate where a hole is looked for, and along a lens's radius.
 _PLACES = 41
+# A curvature that is none, 1/mm.
+_FLAT = 1e-6
 
 
 class Term(NamedTuple):
@@ -104,15 +107,34 @@ def hole(c: Microscope) -> Float[Array, " place"]:
 
 
 def sag(c: Microscope) -> Float[Array, ""]:
-    """Height of a whole lens, `R - sqrt(R^2 - D^2/4)`: the deepest that the mold can be."""
-    radius, half = c.imager.array.radius_of_curvature, c.imager.array.aperture_diameter / 2
-    return half**2 / (radius + safe_sqrt(radius**2 - half**2))
+    """Height of a whole lens, of a sphere `R - sqrt(R^2 - D^2/4)`: the deepest that the mold can be."""
+    array = c.imager.array
+    return array.sag(_within(c, (array.aperture_diameter / 2) ** 2))
 
 
 def edge_slope(c: Microscope) -> Float[Array, ""]:
-    """Slope of the surface at the rim of the clear disc, `asin(a / R)`, degrees; at most 90."""
-    sine = jnp.minimum(c.clear_diameter / 2 / c.imager.array.radius_of_curvature, 1 - 1e-6)
-    return jnp.rad2deg(jnp.arcsin(sine))
+    """Slope of the surface at the rim of the clear disc, of a sphere `asin(a / R)`, degrees; at most 90."""
+    square = _within(c, (c.clear_diameter / 2) ** 2)
+    return jnp.rad2deg(jnp.arctan(safe_sqrt(square) * c.imager.array.steepness(square)))
+
+
+def least_radius(c: Microscope) -> Float[Array, " place"]:
+    """Least radius of curvature of the surface at places from the vertex to the rim: of a tool that would cut it."""
+    radii = jnp.linspace(0, 1, _PLACES, dtype=c.clear_diameter.dtype) * c.clear_diameter / 2
+    array, square = c.imager.array, _within(c, radii**2)
+    steepness, change = jax.jvp(array.steepness, (square,), (jnp.ones_like(square),))
+    length2 = 1 + square * steepness**2
+    # Along the radius s'' / (1 + s'^2)^(3/2), across it s' / r / (1 + s'^2)^(1/2).
+    along, across = (steepness + 2 * square * change) / length2**1.5, steepness / length2**0.5
+    return 1 / jnp.maximum(jnp.maximum(along, across), _FLAT)
+
+
+def _within(c: Microscope, squared_radius: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Squared radii, or that of the end of the surface if they are beyond it."""
+    array = c.imager.array
+    ends = 1 + array.conic_constant > 0
+    end = (1 - 1e-6) ** 2 * array.radius_of_curvature**2 / jnp.where(ends, 1 + array.conic_constant, 1)
+    return jnp.where(ends, jnp.minimum(squared_radius, end), squared_radius)
 
 
 TERMS: dict[str, Term] = {
@@ -144,6 +166,7 @@ TERMS: dict[str, Term] = {
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
     "edge_slope_deg": Term("slope at the clear aperture's rim", edge_slope),
+    "least_radius_mm": Term("least radius of curvature of a lens's surface", least_radius),
 }
 
 _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}

@@ -2,7 +2,8 @@
 
 A `Parent` is the design that an optimisation starts from, `start_values` are its parameters by name, and `candidate`
 is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
-goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index.
+goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index and
+the conic constant.
 Solvers do not see units: `Bounds` maps a value to a number of order one without any bound, and back; `Box`, for the one
 solver that keeps bounds by itself, to its share of the way between them.
 """
@@ -19,6 +20,7 @@ from pydantic import ValidationError
 
 from ..base.converters import as_float
 from ..base.errors import InputError
+from ..designs.checks import plate_as_air
 from ..designs.design import Design
 from ..designs.microscope import Microscope
 from ..geometry import Imager
@@ -34,6 +36,7 @@ NAMES = (
     "radius_of_curvature_mm",
     "aperture_diameter_mm",
     "refractive_index",
+    "conic_constant",
     "pitch_mm",
     "centers_mm",
     "depth_span_mm",
@@ -146,12 +149,16 @@ def parent_of(
 
 
 def _largest_magnification(design: Design, near: float, far: float, free: Mapping[str, tuple[float, float]]) -> float:
-    """`v / z'` (Eq. 3) with the farthest sensor, nearest depth and highest index, of the design and of the bounds."""
+    """`v'/z'` (Eq. 3) with the farthest sensor, nearest depth and highest index, of the design and of the bounds."""
     most = lambda name, own: max(own, free.get(name, (own, own))[1])
-    index = most("refractive_index", design.lens.refractive_index)
+    least = lambda name, own: min(own, free.get(name, (own, own))[0])
+    # Of an index that is free the one that makes it largest: the plate is in front, or behind.
+    in_front = design.lens.orientation == "plano"
+    index = (most if in_front else least)("refractive_index", design.lens.refractive_index)
+    front, back = plate_as_air(design.array.substrate_thickness_mm, index, design.lens.orientation)
     nearest = (near + far - most("depth_span_mm", far - near)) / 2
     distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
-    return distance / (nearest + design.array.substrate_thickness_mm / index)
+    return (distance + back) / (nearest + front)
 
 
 def _cells(design: Design) -> Cells:
@@ -175,6 +182,7 @@ def start_values(parent: Parent) -> Values:
         "radius_of_curvature_mm": array.radius_of_curvature,
         "aperture_diameter_mm": array.aperture_diameter,
         "refractive_index": array.refractive_index,
+        "conic_constant": array.conic_constant,
         "pitch_mm": parent.pitch,
         "centers_mm": array.centers,
         "depth_span_mm": parent.span,
@@ -197,14 +205,15 @@ def candidate(parent: Parent, values: Values) -> Microscope:
         i.array.radius_of_curvature,
         i.array.aperture_diameter,
         i.array.refractive_index,
+        i.array.conic_constant,
         i.sensor_distance,
     )
     # Areas before scaling, on the plate as it is: its size cannot be traced.
-    names = "radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "sensor_distance_mm"
-    radius, diameter, index, distance = (values[name] for name in names)
-    unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, index, distance))
+    radius, diameter = values["radius_of_curvature_mm"], values["aperture_diameter_mm"]
+    others = tuple(values[name] for name in ("refractive_index", "conic_constant", "sensor_distance_mm"))
+    unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, *others))
     area, count = _clear_area(parent.cells, unscaled.array), parent.imager.array.centers.shape[0]
-    imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, index, distance))
+    imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, *others))
     offsets = jnp.linspace(-0.5, 0.5, parent.depth_count, dtype=scale.dtype)
     return Microscope(
         imager,
@@ -235,8 +244,8 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
     middle = float(parent.middle)
     working = [round(middle + sign * numbers["depth_span_mm"] / 2, _DIGITS) for sign in (-1, 1)]
     data = design.model_dump()
-    data["lens"] |= {name: numbers[name] for name in ("radius_of_curvature_mm", "aperture_diameter_mm")}
-    data["lens"]["refractive_index"] = numbers["refractive_index"]
+    of_lens = ("radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "conic_constant")
+    data["lens"] |= {name: numbers[name] for name in of_lens}
     data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
     data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}
     try:

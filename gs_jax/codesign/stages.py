@@ -72,7 +72,7 @@ def _check_free(design: Design, study: Study) -> None:
     if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
         found = f"`free.depth_span_mm`: found {list(study.free['depth_span_mm'])}"
         raise InputError(f"{found}, allowed: below {twice:g}, twice the middle of the depths.")
-    of_lens = {"radius_of_curvature_mm", "refractive_index"} & set(study.free)
+    of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
         raise InputError(
             f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
