@@ -1,7 +1,7 @@
 """A ray tracer for random microlens arrays that shares no code with `gs_jax`, to judge its forward model by.
 
-Rays from an isotropic emitter to the plano face, to a sphere and to the sensor, by the vector law of refraction and
-with Fresnel's losses; no diffraction. Of `gs_jax` it takes the numbers of an imager, nothing else.
+Rays from an isotropic emitter to the plano face, to a conic and to the sensor, or to the conic first, by the vector law
+of refraction and with Fresnel's losses; no diffraction. Of `gs_jax` it takes the numbers of an imager, nothing else.
 """
 
 import math
@@ -26,66 +26,95 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int) -> np.ndarray:
     centers = np.asarray(imager.centers, np.float64)
     near = np.argsort(np.linalg.norm(centers[:, None] - centers, axis=-1))[:, 1 : NEIGHBOURS + 1]
     a = imager.array
-    lens = a.radius_of_curvature, a.refractive_index, a.substrate_thickness, a.aperture_diameter / 2
+    lens = a.radius_of_curvature, a.conic_constant, a.refractive_index, a.substrate_thickness, a.aperture_diameter / 2
+    curve_first = a.orientation == "curved"
     numbers = tuple(float(x) for x in (*lens, imager.sensor_distance, imager.sensor.pixel_pitch))
     images = np.zeros((PARTS, *imager.sensor.shape))
-    _traced(np.asarray(emitters, np.float64), centers, near, numbers, images, rays)
+    _traced(np.asarray(emitters, np.float64), centers, near, numbers, curve_first, images, rays)
     return images.sum(0)
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
-def _traced(emitters, centers, near, numbers, images, rays):
+def _traced(emitters, centers, near, numbers, curve_first, images, rays):
     for part in prange(PARTS):
         np.random.seed(part)
         for number in range(part, len(emitters), PARTS):
             for lens in range(len(centers)):
-                _add_spot(images[part], emitters[number], centers[lens], centers[near[lens]], numbers, rays)
+                others = centers[near[lens]] - centers[lens]
+                _add_spot(images[part], emitters[number], centers[lens], others, numbers, curve_first, rays)
 
 
 @njit(fastmath=True, error_model="numpy")
-def _add_spot(image, emitter, center, others, numbers, rays):
-    radius, n, t, aperture, v, pixel = numbers
+def _add_spot(image, emitter, center, others, numbers, curve_first, rays):
+    radius, conic, n, t, aperture, v, pixel = numbers
     x, y, z, intensity = emitter
-    x, y, others = x - center[0], y - center[1], others - center
-    # The part of the front face, a disc, that light of the whole aperture can come through.
-    air = math.hypot(x, y) / (z + t / n)
-    glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (z + t / n)
-    sag = radius - math.sqrt(radius**2 - aperture**2)
-    disc = aperture + sag * air / n / 2 + (t + sag) * aperture / z
+    x, y = x - center[0], y - center[1]
+    sag = aperture**2 / (radius + math.sqrt(radius**2 - (1 + conic) * aperture**2))
+    # The part of the front plane, a disc, that light of the whole aperture can come through.
+    if curve_first:
+        air = math.hypot(x, y) / z
+        disc, toward = aperture * (1 + sag / z) + sag * air / 2, sag / 2 / z
+    else:
+        air = math.hypot(x, y) / (z + t / n)
+        glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (z + t / n)
+        disc, toward = aperture + sag * air / n / 2 + (t + sag) * aperture / z, glass * (t - sag / 2)
     light = intensity * disc**2 / (4 * rays)
     for i in range(rays):
         r, turn = disc * math.sqrt((i + np.random.random()) / rays), 2 * np.pi * np.random.random()
-        front_x = r * math.cos(turn) + x * glass * (t - sag / 2)
-        front_y = r * math.sin(turn) + y * glass * (t - sag / 2)
-        # An isotropic emitter: the solid angle of a piece of the front face.
-        length = math.sqrt((front_x - x) ** 2 + (front_y - y) ** 2 + z**2)
-        outside = (front_x - x) / length, (front_y - y) / length, z / length
-        inside, passed = _refracted(outside, (0.0, 0.0, 1.0), 1 / n)
-        # To the sphere, from its middle, which is at the height t - radius.
-        from_z = radius - t
-        along = front_x * inside[0] + front_y * inside[1] + from_z * inside[2]
-        root = along**2 + radius**2 - front_x**2 - front_y**2 - from_z**2
-        if root < 0:
+        sign = -1 if curve_first else 1
+        front = r * math.cos(turn) + sign * x * toward, r * math.sin(turn) + sign * y * toward
+        # An isotropic emitter: the solid angle of a piece of the front plane.
+        length = math.sqrt((front[0] - x) ** 2 + (front[1] - y) ** 2 + z**2)
+        outside = (front[0] - x) / length, (front[1] - y) / length, z / length
+        if curve_first:
+            cap, normal = _met(front, outside, 0.0, 1.0, radius, conic)
+            inside, passed = _refracted(outside, normal, 1 / n)
+            way = (t - cap[2]) / inside[2]
+            last = cap[0] + way * inside[0], cap[1] + way * inside[1]
+            ray, again = _refracted(inside, (0.0, 0.0, 1.0), n)
+            to_sensor = v
+        else:
+            inside, passed = _refracted(outside, (0.0, 0.0, 1.0), 1 / n)
+            cap, normal = _met(front, inside, t, -1.0, radius, conic)
+            ray, again = _refracted(inside, normal, n)
+            last, to_sensor = (cap[0], cap[1]), v + cap[2]
+        if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
-        way = math.sqrt(root) - along
-        cap_x, cap_y, cap_z = front_x + way * inside[0], front_y + way * inside[1], from_z + way * inside[2]
-        if cap_z <= 0 or cap_x**2 + cap_y**2 > aperture**2:
-            continue
-        clear = True
-        for other in others:
-            if cap_x * other[0] + cap_y * other[1] > (other[0] ** 2 + other[1] ** 2) / 2:
-                clear = False
-                break
-        if not clear:
-            continue
-        ray, again = _refracted(inside, (cap_x / radius, cap_y / radius, cap_z / radius), n)
-        if again == 0 or ray[2] <= 0:
-            continue
-        way = (v + radius - cap_z) / ray[2]
-        row = math.floor((center[1] + cap_y + way * ray[1]) / pixel + image.shape[0] / 2)
-        column = math.floor((center[0] + cap_x + way * ray[0]) / pixel + image.shape[1] / 2)
+        way = to_sensor / ray[2]
+        row = math.floor((center[1] + last[1] + way * ray[1]) / pixel + image.shape[0] / 2)
+        column = math.floor((center[0] + last[0] + way * ray[0]) / pixel + image.shape[1] / 2)
         if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
             image[row, column] += light * passed * again * z / length**3
+
+
+@njit(fastmath=True, error_model="numpy")
+def _met(start, ray, below, toward, radius, conic):
+    """Where a ray meets `x^2 + y^2 = 2 R w - (1 + k) w^2`, `(x, y, w)`, and the normal there, along the ray.
+
+    It starts at `w = below`; `toward` is 1 if w grows along the light. Beside the surface w is out of reach.
+    """
+    deeper = toward * ray[2]
+    a = ray[0] ** 2 + ray[1] ** 2 + (1 + conic) * deeper**2
+    b = start[0] * ray[0] + start[1] * ray[1] + ((1 + conic) * below - radius) * deeper
+    c = start[0] ** 2 + start[1] ** 2 - 2 * radius * below + (1 + conic) * below**2
+    root = math.sqrt(max(b * b - a * c, 0.0))
+    if b * b < a * c:
+        return (0.0, 0.0, 1e9), (0.0, 0.0, 1.0)
+    # From outside the first meeting, from inside the one ahead.
+    way = c / (root - b) if toward > 0 else -c / (b + root)
+    x, y, w = start[0] + way * ray[0], start[1] + way * ray[1], below + way * deeper
+    along = radius - (1 + conic) * w
+    length = math.sqrt(x**2 + y**2 + along**2)
+    return (x, y, w), (-toward * x / length, -toward * y / length, along / length)
+
+
+@njit(fastmath=True, error_model="numpy")
+def _covered(cap, others):
+    """Whether a neighbour's surface is above a point of the lens."""
+    for other in others:
+        if cap[0] * other[0] + cap[1] * other[1] > (other[0] ** 2 + other[1] ** 2) / 2:
+            return True
+    return False
 
 
 @njit(fastmath=True, error_model="numpy")

@@ -31,6 +31,7 @@ from gs_jax.benchmark.report import markdown_table
 from gs_jax.designs.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts.patterns import random_layout
+from gs_jax.lenses import Orientation
 from gs_jax.optics.full import RINGS, full_optics
 from gs_jax.optics.unit import best_focus
 from gs_jax.optics.window import psf_of_depth
@@ -58,17 +59,31 @@ class Device(NamedTuple):
     aperture: float = 1.5
     field_radius: float = 2.2
     depths: tuple[float, float] = (12.5, 15.5)
+    orientation: Orientation = "plano"
+    conic_constant: float = 0.0
 
     def imager(self) -> Imager:
         """What the models get."""
         centers = random_layout(self.lenses, (self.plate, self.plate), diameter=self.aperture, seed=1)
-        array = MicrolensArray(centers, self.radius, self.refractive_index, self.aperture, self.thickness)
+        array = MicrolensArray(
+            centers,
+            self.radius,
+            self.refractive_index,
+            self.aperture,
+            self.thickness,
+            orientation=self.orientation,
+            conic_constant=self.conic_constant,
+        )
         sensor = Sensor((self.pixels, self.pixels), self.pixel)
         v = best_focus(Imager(array, sensor, 1.0, self.field_radius), np.mean(self.depths))
         return Imager(array, sensor, v, self.field_radius)
 
 
-DEVICES = {"R = 1.6": Device(), "thin plate": Device(lenses=150, pixels=3072, pixel=0.004, thickness=0.2)}
+DEVICES = {
+    "R = 1.6": Device(),
+    "thin plate": Device(lenses=150, pixels=3072, pixel=0.004, thickness=0.2),
+    "curved side in front, k = -0.7": Device(orientation="curved", conic_constant=-0.7),
+}
 
 
 def scores(model: np.ndarray, image: np.ndarray) -> dict:

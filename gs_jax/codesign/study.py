@@ -34,6 +34,9 @@ from .parameters import NAMES
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
+# Of what may be free, but lengths.
+_LEAST = {"refractive_index": 1, "centers_mm": -math.inf, "conic_constant": -math.inf}
+
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
 Depths = Annotated[tuple[Positive, Positive], Field(strict=False, description="[near, far] in mm, near below far")]
@@ -206,7 +209,7 @@ def _check_free(study: Study) -> None:
             raise ValueError(f"`free.{name}`: found a key that does not exist, allowed: {', '.join(NAMES)}")
         if not low < high or not math.isfinite(high - low):
             raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: [lowest, highest], lowest below")
-        if name != "centers_mm" and not low > (least := 1 if name == "refractive_index" else 0):
+        if not low > (least := _LEAST.get(name, 0)):
             raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: above {least}")
     if study.depths_mm is not None and not study.depths_mm[0] < study.depths_mm[1]:
         raise ValueError(f"`depths_mm`: found {list(study.depths_mm)}, allowed: [near, far] in mm, near below far")
