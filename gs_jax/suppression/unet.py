@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Float32, PRNGKeyArray
 from ..base.errors import InputError, short_repr
 from ..io import weights
 from ..io.provenance import Provenance
+from .background import mirrored
 
 # The networks that come with the package, and what a file of weights may hold at most.
 PRETRAINED = ("paper", "multislice")
@@ -185,12 +186,7 @@ def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
     count = -(-size // _CORE)
     core = -(-size // (count * network.multiple)) * network.multiple
     offsets = np.arange(-network.margin, core + network.margin)
-    return [(start, _mirrored(start + offsets, size)) for start in range(0, size, core)]
-
-
-def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
-    index = index % (2 * size)
-    return np.minimum(index, 2 * size - 1 - index)
+    return [(start, mirrored(start + offsets, size)) for start in range(0, size, core)]
 
 
 def write_weights(path: str | os.PathLike[str], network: UNet, provenance: Provenance | None = None) -> None:
