@@ -101,8 +101,9 @@ def core_tables(
 ) -> Cores:
     """The cores at some depths: `core_table` of each, with the depths first."""
     aperture = mean_zones(imager.array)
-    tracked = (progress or Progress()).track(depths, "Tracing cores")
-    return Cores(*map(np.stack, zip(*(core_table(imager, z, aperture, reach, ends) for z in tracked), strict=True)))
+    tables = in_threads(lambda depth: core_table(imager, depth, aperture, reach, ends), depths)
+    tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
+    return Cores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
 
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
@@ -119,7 +120,7 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
         beyond = float(imager.reduced_depth(0.0))
         return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
     aperture, fields = mean_zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
-    return np.array(in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths))
+    return np.array(list(in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
 
 
 def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float[Array, " depth"]:
@@ -143,7 +144,7 @@ def core_shares(
         away = np.abs(rays.landing + np.stack([magnification * fields, 0 * fields], -1)[:, None])
         return np.where((away < side / 2).all(-1), rays.light, 0).sum(1)
 
-    return np.array(in_threads(share, depths))
+    return np.array(list(in_threads(share, depths)))
 
 
 def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: Zones):

@@ -16,7 +16,7 @@ _TRUNCATE = 4
 
 def in_bands(rows: int, work: Callable[[slice], object]) -> None:
     """Does some work for every band of rows, on all cores."""
-    in_threads(work, [slice(start, min(start + _SQUARE, rows)) for start in range(0, rows, _SQUARE)])
+    list(in_threads(work, [slice(start, min(start + _SQUARE, rows)) for start in range(0, rows, _SQUARE)]))
 
 
 def smoothed(image: Shaped[np.ndarray, "row column"], deviation: float) -> Float32[np.ndarray, "row column"]:
