@@ -106,12 +106,12 @@ class Sensor(eqx.Module):
         across, along = columns * self.pixel_pitch / 2, rows * self.pixel_pitch / 2
         return x - across, x + across, y + along, y - along
 
-    def to_pixels(self, points: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
-        """Fractional `(row, column)` of points `(x, y)`; pixel centres have whole numbers."""
+    def to_pixels(self, points: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array | np.ndarray, "*batch 2"]:
+        """Fractional `(row, column)` of points `(x, y)`, NumPy's if these are; pixel centres have whole numbers."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
         row = (points[..., 1] - self.origin[1]) / self.pixel_pitch + middle_row
         column = (points[..., 0] - self.origin[0]) / self.pixel_pitch + middle_column
-        return jnp.stack([row, column], axis=-1)
+        return (np if isinstance(points, np.ndarray) else jnp).stack([row, column], axis=-1)
 
     def to_mm(self, pixels: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""

@@ -132,6 +132,8 @@ def test_survival_counts_pixels():
     for level in (-1.0, 0.5, 3.0):
         assert as_bright(np.array([level]))[0] == pytest.approx((light >= level).mean(), abs=1e-12)
     assert as_bright(np.array([100.0]))[0] == 1 / light.size
+    levels = np.array([0.5, 3.0, 100.0])
+    np.testing.assert_array_equal(survival(light, 0.5)(levels), as_bright(levels))
 
 
 def test_the_profile_of_gaussian_spots_is_gaussian_even_with_neighbours():

@@ -106,6 +106,21 @@ def test_tiles_leave_no_seam(monkeypatch, offsets):
     np.testing.assert_allclose(suppress(volume, network), whole, atol=1e-5 * whole.max())
 
 
+@pytest.mark.parametrize("widths", [(3,), (3, 4), (6, 7, 8), (2, 3, 3, 4)])
+def test_the_core_is_the_middle_of_the_whole(widths):
+    """Each of its voxels is the same sum: nothing that the edges spoil is left."""
+    network = small(widths=widths)
+    margin, step = network.margin, network.multiple
+    # The whole has to be of as many voxels as pools divide.
+    spare = -margin % step
+    tile = jnp.asarray(stack(3, 3 * step + 2 * margin + 2 * spare, 2 * step + 2 * margin + 2 * spare))
+    part = tile[:, spare : tile.shape[1] - spare, spare : tile.shape[2] - spare]
+    whole, edge = np.asarray(eqx.filter_jit(network)(tile)), margin + spare
+    core = np.asarray(eqx.filter_jit(network.core)(part))
+    assert core.shape == (3 * step, 2 * step)
+    np.testing.assert_allclose(core, whole[edge:-edge, edge:-edge], atol=1e-6 * np.abs(whole).max())
+
+
 @pytest.mark.parametrize("widths", [(3, 4), (6, 7, 8)])
 def test_no_output_looks_further_than_the_margin(widths):
     """By the gradient of all outputs of the middle; and the margin is not needlessly wide."""

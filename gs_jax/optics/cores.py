@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 
 from ..base.progress import Progress
+from ..base.threads import in_threads
 from ..geometry import Imager, falloff
 from .light import SpotRays, Zones, mean_zones, spot_rays
 from .psf import GOLDEN_ANGLE
@@ -100,8 +101,9 @@ def core_tables(
 ) -> Cores:
     """The cores at some depths: `core_table` of each, with the depths first."""
     aperture = mean_zones(imager.array)
-    tracked = (progress or Progress()).track(depths, "Tracing cores")
-    return Cores(*map(np.stack, zip(*(core_table(imager, z, aperture, reach, ends) for z in tracked), strict=True)))
+    tables = in_threads(lambda depth: core_table(imager, depth, aperture, reach, ends), depths)
+    tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
+    return Cores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
 
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
@@ -118,12 +120,7 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
         beyond = float(imager.reduced_depth(0.0))
         return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
     aperture, fields = mean_zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
-    found = []
-    for depth in depths:
-        rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
-        chief = float(imager.magnification(float(depth)))
-        found.append(chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch))
-    return np.array(found)
+    return np.array(list(in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
 
 
 def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float[Array, " depth"]:
@@ -142,12 +139,21 @@ def core_shares(
     imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"], side: float
 ) -> Float64[np.ndarray, "depth field"]:
     """Share of a point's light that a mean lens brings into a square of this side (mm) about its spot's core."""
-    aperture, shares = mean_zones(imager.array), []
-    for depth, magnification in zip(depths, core_magnification(imager, depths), strict=True):
-        rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
+    aperture = mean_zones(imager.array)
+
+    def share(depth):
+        magnification, rays = _core(imager, float(depth), fields, aperture)
         away = np.abs(rays.landing + np.stack([magnification * fields, 0 * fields], -1)[:, None])
-        shares.append(np.where((away < side / 2).all(-1), rays.light, 0).sum(1))
-    return np.array(shares)
+        return np.where((away < side / 2).all(-1), rays.light, 0).sum(1)
+
+    return np.array(list(in_threads(share, depths)))
+
+
+def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: Zones):
+    """Magnification of the bright core at one depth, and the rays of the fields that say so."""
+    rays = spot_rays(imager, depth, fields, aperture, _RAYS)
+    chief = float(imager.magnification(depth))
+    return chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch), rays
 
 
 def diffracted(imager: Imager, rays: SpotRays) -> SpotRays:

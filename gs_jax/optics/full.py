@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from ..base.progress import Progress
+from ..base.threads import in_threads
 from ..geometry import Imager
 from .cores import RINGS, Cores, core_tables, drawn
 from .halo import HaloGrid, halo_grid, halo_table
@@ -163,8 +164,10 @@ def halo_of(
 ) -> Halo:
     """What the cores leave of the light at each depth, theirs being those of rings with these ends, in field radii."""
     aperture = zones(imager.array)
-    each = zip((progress or Progress()).track(depths, "Tracing halos"), map(Cores, *cores), strict=True)
-    table = np.stack([halo_table(imager, depth, aperture, grid, core, ends) for depth, core in each])
+    each = zip(depths, map(Cores, *cores), strict=True)
+    tables = in_threads(lambda one: halo_table(imager, one[0], aperture, grid, one[1], ends), each)
+    tracked = zip((progress or Progress()).track(depths, "Tracing halos"), tables, strict=True)
+    table = np.stack([table for _, table in tracked])
     return Halo(
         jnp.asarray(table, imager.sensor_distance.dtype),
         jnp.mean(clear_area(imager.array)),

@@ -16,7 +16,7 @@ from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import forward_operator
 from ..solvers.unmatched import Unmatched
-from ..suppression.background import local_levels
+from ..suppression.background import between, square_levels
 from ..voxels import Grid
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
@@ -60,7 +60,7 @@ def explainable(
     rows, columns = model.imager.sensor.shape
     light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))
     light = light.reshape(rows, model.side, columns, model.side).sum((1, 3))
-    return light, np.maximum(local_levels(light)[0], 0) if model.hazy else 0.0
+    return light, np.maximum(between(square_levels(light)[0], light.shape), 0) if model.hazy else 0.0
 
 
 def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:

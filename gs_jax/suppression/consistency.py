@@ -8,15 +8,15 @@ noise, so that offset and gain of the camera do not matter.
 import math
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from ..geometry import Imager, chief_ray
-from .background import local_levels
+from ..optics.refraction import on_host
+from .background import between, smoothed, square_levels
 
 # Of the Gaussian that evens out where in a pixel a spot is, pixels: most that keeps spots 2.5 pixels apart apart.
 _SMOOTHING = 0.7
@@ -37,11 +37,11 @@ class Signal(NamedTuple):
 
 def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
     """Smooths an image a little and takes its background off."""
-    smooth: np.ndarray = gaussian_filter(np.asarray(image, np.float32), _SMOOTHING)
-    background, noise = local_levels(smooth)
-    light = smooth - background
-    least = max(float(np.median(noise)), float(light.max()) / _DYNAMIC_RANGE)
-    return Signal(light, np.maximum(noise, least))
+    light = smoothed(np.asarray(image), _SMOOTHING)
+    background, noise = (between(levels, light.shape) for levels in square_levels(light))
+    light -= background
+    least = max(float(np.median(_some(noise))), float(light.max()) / _DYNAMIC_RANGE)
+    return Signal(light, np.maximum(noise, least, out=noise))
 
 
 class Readings(NamedTuple):
@@ -63,27 +63,25 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
         `pixels` are fractional `(row, column)`, `field` is the distance from the lens's axis, mm; lenses that
         image a point beyond the sensor do not see it.
     """
-    centers = np.asarray(imager.centers, np.float64)
-    tree, depth = KDTree(centers), jnp.asarray(points[:, 2], imager.sensor_distance.dtype)
-    beside = points[:, :2] - np.asarray(imager.lean(depth), np.float64)
+    # In NumPy: other numbers of points need no other program.
+    host, centers = on_host(imager), np.asarray(imager.centers, np.float64)
+    tilt, heights = host.tilt, np.asarray(imager.heights, np.float64)
+    reduced = points[:, 2] + float(imager.reduced_depth(0.0))
+    beside = points[:, :2] if tilt is None else points[:, :2] + reduced[:, None] * tilt
+    tree = KDTree(centers)
     most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
     # With two or more there is an axis of lenses.
     distance, lens = tree.query(beside, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
     distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
-    magnification = np.asarray(imager.magnifications(depth), np.float64)
-    of_each = (
-        magnification[0][:, None] if len(magnification) == 1 else magnification[lens, np.arange(len(lens))[:, None]]
-    )
-    landing = chief_ray(centers[lens], points[:, None, :2], of_each[..., None])
-    pixels = np.asarray(imager.sensor.to_pixels(landing), np.float64)
+    magnification = host.magnification_of((host.sensor_distance / reduced)[:, None], heights[lens])
+    landing = chief_ray(centers[lens], points[:, None, :2], magnification[..., None])
+    pixels = np.asarray(imager.sensor.to_pixels(landing))
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
-    read = lambda part, order: map_coordinates(part, pixels.reshape(-1, 2).T, np.float64, order=order, mode="nearest")
-    light, noise = (
-        np.where(seen, read(part, order).reshape(seen.shape), 0)
-        for part, order in ((signal.light, 1), (signal.noise, 0))
-    )
+    row, column = np.moveaxis(np.floor(pixels + 0.5).astype(int), -1, 0)
+    between = map_coordinates(signal.light, np.moveaxis(pixels, -1, 0), np.float64, order=1, mode="nearest")
+    light, noise = (np.where(seen, read, 0) for read in (between, signal.noise[row, column].astype(np.float64)))
     return Readings(pixels, light, noise, distance, seen)
 
 
@@ -124,11 +122,12 @@ def log_false_alarms(
     return np.where(count > 0, math.log(tests) + chance, np.inf)
 
 
-def survival(light: Float32[np.ndarray, "row column"]):
-    """Function from a level to the share of pixels that reach it: at least one pixel's."""
-    # A tenth of a large image tells the shares well enough; a tenth of a small one would not.
-    pixels = np.sort(light.ravel()[:: max(1, min(10, light.size // 10**6))])
-    return lambda level: np.maximum(pixels.size - np.searchsorted(pixels, level), 1) / pixels.size
+def survival(light: Float32[np.ndarray, "row column"], least: float = -math.inf):
+    """Function from a level, `least` or higher, to the share of pixels that reach it: at least one pixel's."""
+    pixels = _some(light)
+    # As float64, which levels are: or all of it would be converted for each of them.
+    bright = np.sort(pixels[pixels >= least]).astype(np.float64)
+    return lambda level: np.maximum(bright.size - np.searchsorted(bright, level), 1) / pixels.size
 
 
 def spot_profile(readings: Readings, light: Float32[np.ndarray, "row column"]) -> Float64[np.ndarray, " radius"]:
@@ -143,7 +142,7 @@ def spot_profile(readings: Readings, light: Float32[np.ndarray, "row column"]) -
     use = readings.seen & whole & (readings.light > 0)
     place = middle[use][:_EXAMPLES, None] + offset
     values = light[place[..., 0], place[..., 1]] / readings.light[use][:_EXAMPLES, None]
-    radius = np.hypot(*np.moveaxis(place - readings.pixels[use][:_EXAMPLES, None], -1, 0)).round().astype(int)
+    radius = np.hypot(*np.moveaxis(place - readings.pixels[use][:_EXAMPLES, None], -1, 0)).round().astype(np.int8)
     profile = [np.median(some) if (some := values[radius == r]).size else 0.0 for r in range(1, REACH)]
     return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
 
@@ -154,13 +153,19 @@ def without_spots(
     """The light that is left when each spot is taken away: its height times the profile of these spots."""
     profile = spot_profile(readings, light)
     side = np.arange(-REACH, REACH + 1)
-    left = np.pad(light, REACH)
+    left = light.copy()
     for pixel, own in zip(readings.pixels[readings.seen], height[readings.seen], strict=True):
-        row, column = np.floor(pixel + 0.5).astype(int)
-        distance = np.hypot((row + side - pixel[0])[:, None], column + side - pixel[1])
-        square = left[row : row + 2 * REACH + 1, column : column + 2 * REACH + 1]
+        place = [at + side for at in np.floor(pixel + 0.5).astype(int)]
+        row, column = (at[(at >= 0) & (at < size)] for at, size in zip(place, light.shape, strict=True))
+        distance = np.hypot((row - pixel[0])[:, None], column - pixel[1])
+        square = left[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
         square -= (max(own, 0) * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
-    return left[REACH:-REACH, REACH:-REACH]
+    return left
+
+
+def _some(image: Float32[np.ndarray, "row column"]) -> Float32[np.ndarray, " pixel"]:
+    """A tenth of a large image tells shares of pixels well enough; a tenth of a small one would not."""
+    return image.ravel()[:: max(1, min(10, image.size // 10**6))]
 
 
 def _of(share: float, count: Shaped[np.ndarray, " point"]) -> Shaped[np.ndarray, " point"]:

@@ -8,9 +8,8 @@ are rows `(x, y, z, intensity)`, mm; `gs_jax.simulation.phantoms.rasterize` make
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Shaped
+from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
@@ -19,6 +18,7 @@ from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
 from ..projection.backprojection import backproject
 from ..voxels import Grid
+from .background import in_bands
 from .consistency import (
     REACH,
     Readings,
@@ -50,8 +50,8 @@ _FALSE_ALARMS = 0.1
 _REFINEMENTS = 7
 # Width of the voxels that are searched first, pixels.
 _COARSE = 2
-# Planes that are searched at once.
-_PLANES = 16
+# Most planes that are searched at once.
+_PLANES = 32
 # Half the side, in pixels, of the square in which the light of a spot is summed; depths and fields at which the share
 # of the light in it is computed.
 APERTURE, _DEPTHS, FIELDS = 3, 5, 17
@@ -112,17 +112,19 @@ def find_points(
     apparent = np.asarray(apparent_depths(imager, depths), np.float64)
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
     voxels = searched_voxels(imager, searched)
-    rest, candidates = seen, np.zeros((0, 3))
-    points, spots, own = _consistent(candidates, seen, imager, voxels)
+    # What is less is not lit.
+    least = LIT * float(seen.noise.min())
+    as_bright = survival(seen.light, least)
+    points, spots, own = _consistent(np.zeros((0, 3)), seen, as_bright, imager, voxels)
     for _ in range(_SEARCHES):
+        rest = seen._replace(light=without_spots(seen.light, spots, own))
         # A spot between two voxels must not be missed.
-        wide = rest._replace(light=np.asarray(_brightest_neighbour(rest.light)))
+        wide = rest._replace(light=_brightest_neighbour(rest.light))
         new = _candidates(wide, imager, voxels, progress)
         with progress.step("Comparing lenses"):
-            lit = _lit(readings(new, wide, imager), survival(wide.light), count_of(voxels))
+            lit = _lit(readings(new, wide, imager), survival(wide.light, least), count_of(voxels))
             new = _refined(new[lit], voxels, rest, imager)
-            points, spots, own = _consistent(np.concatenate([points, new]), seen, imager, voxels)
-            rest = seen._replace(light=without_spots(seen.light, spots, own))
+            points, spots, own = _consistent(np.concatenate([points, new]), seen, as_bright, imager, voxels)
     # Until here, depths were those of chief rays.
     points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
     found = np.column_stack([points, _intensity(points, spots, own, seen, imager)])
@@ -167,29 +169,41 @@ def _brightness(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (LIT / 2), 1))
 
 
-@jax.jit
-def _brightest_neighbour(light: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+def _brightest_neighbour(light: Float32[np.ndarray, "row column"]) -> Float32[np.ndarray, "row column"]:
     """The most of 3 x 3 pixels; beyond the edge it goes on."""
-    light = jnp.asarray(light)
-    for axis in (0, 1):
-        n = light.shape[axis]
-        padded = jnp.pad(light, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        shifted = [jax.lax.slice_in_dim(padded, start, start + n, axis=axis) for start in range(3)]
-        light = jnp.maximum(jnp.maximum(shifted[0], shifted[1]), shifted[2])
-    return light
+    result = np.empty_like(light)
+
+    def most(band):
+        tall = light[np.clip(np.arange(band.start - 1, band.stop + 1), 0, len(light) - 1)]
+        most = np.maximum(np.maximum(tall[:-2], tall[1:-1]), tall[2:])
+        wide = result[band]
+        wide[:, -1] = most[:, -1]
+        np.maximum(most[:, :-1], most[:, 1:], out=wide[:, :-1])
+        np.maximum(wide[:, 1:], most[:, :-1], out=wide[:, 1:])
+
+    in_bands(len(light), most)
+    return result
 
 
 def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) -> Places:
     """Local maxima of the summed logarithms, at voxels."""
-    image = jnp.asarray(_brightness(rest.light, rest.noise))
-    last = voxels.depths.size - 1
-    # Each part has a plane of its neighbours; the last is as long as the others, its planes after the end repeat.
-    planes = np.arange(_PLANES)
+    bright = np.empty_like(rest.light)
+
+    def brighten(band):
+        bright[band] = _brightness(rest.light[band], rest.noise[band])
+
+    in_bands(len(bright), brighten)
+    image, last = jax.device_put(bright), voxels.depths.size - 1
+    # Each part has a plane of its neighbours; all are equally long, planes after the end repeat.
+    parts = math.ceil((last - 1) / _PLANES)
+    inner = math.ceil((last - 1) / parts)
     found = [np.zeros((0, 3))]
-    for first in progress.track(range(0, last - 1, _PLANES - 2), "Searching for points"):
-        some = np.minimum(first + planes, last)
+    for first in progress.track(range(0, last - 1, inner), "Searching for points"):
+        some = np.minimum(first + np.arange(inner + 2), last)
         volume = backproject(image, imager, voxels.at(voxels.depths[some]))
-        maxima = np.argwhere(np.asarray(_is_maximum(volume))) + (first + 1, 1, 1)
+        is_maximum = np.asarray(_is_maximum(volume))
+        # NumPy takes long to find them in three dimensions at once.
+        maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
         found.append(voxels.to_mm(maxima[maxima[:, 0] < last]))
     return np.concatenate(found)
 
@@ -227,7 +241,7 @@ def _lit(seen: Readings, as_bright, tests: int) -> np.ndarray:
 
 
 def _consistent(
-    candidates: Places, signal: Signal, imager: Imager, voxels: Grid
+    candidates: Places, signal: Signal, as_bright, imager: Imager, voxels: Grid
 ) -> tuple[Places, Readings, Float64[np.ndarray, "point lens"]]:
     """The points among the candidates, their readings, and their own part of what was read.
 
@@ -237,7 +251,7 @@ def _consistent(
     seen = readings(candidates, signal, imager)
     order = np.argsort(-agreed_level(seen.light, seen.seen, SHARE), kind="stable")
     candidates, seen = candidates[order], select_readings(seen, order)
-    as_bright, tests = survival(signal.light), count_of(voxels)
+    tests = count_of(voxels)
     profile = spot_profile(seen, signal.light)
     spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
     tree = KDTree(spots)
@@ -251,8 +265,8 @@ def _consistent(
         if not (bright and _lit(one, as_bright, tests)[0]):
             continue
         height[number] = np.median(left[number, mine])
-        for pixel in seen.pixels[number, mine]:
-            others = tree.query_ball_point(pixel, REACH)
+        pixels = seen.pixels[number, mine]
+        for pixel, others in zip(pixels, tree.query_ball_point(pixels, REACH), strict=True):
             distance = np.hypot(*(spots[others] - pixel).T)
             left[tuple(owner[others].T)] -= height[number] * np.interp(distance, np.arange(REACH + 1), profile)
     points = height > 0

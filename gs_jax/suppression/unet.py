@@ -17,12 +17,15 @@ from jaxtyping import Array, Float, Float32, PRNGKeyArray
 from ..base.errors import InputError, short_repr
 from ..io import weights
 from ..io.provenance import Provenance
+from .background import mirrored
 
 # The networks that come with the package, and what a file of weights may hold at most.
 PRETRAINED = ("paper", "multislice")
 _MOST_LEVELS, _MOST_WIDTH, _MOST_OFFSET = 8, 4096, 64
 # The most voxels of a plane that one call of the network answers for, along each axis: about half a GiB.
 _CORE = 1024
+# Voxels at each edge that a block's two convolutions make of the zeros beyond it.
+_SPOILT = 2
 
 
 class Block(eqx.Module):
@@ -92,23 +95,31 @@ class UNet(eqx.Module):
 
     @property
     def margin(self) -> int:
-        """How far, in voxels, an output may look, rounded up to a multiple of `multiple`.
+        """How far beyond its core, in voxels, a tile reaches that `core` answers for.
 
-        A convolution of level l looks 2^l voxels further, and a pool 2^l - 1 at most: `4 (2^L - 1) + 2 2^L` for the
-        four convolutions of each of the L upper levels and two of the lowest, and `2^L - 1` for the pools.
+        Each of the L levels below the finest needs, on its way down, 2 voxels for its convolutions and twice what the
+        level below it needs; the lowest needs 4, as 2 are wanted beyond it on the way up: `6 * 2^L - 2`.
         """
-        scale = self.multiple
-        reach = 5 * (scale - 1) + 2 * scale
-        return -(-reach // scale) * scale
+        return 6 * self.multiple - _SPOILT
 
     def __call__(self, slices: Float[Array, "channel y x"]) -> Float[Array, "y x"]:
         """What is in focus; it may be a little below zero, which `suppress` cuts off."""
+        return self._through(slices, 0)
+
+    def core(self, slices: Float[Array, "channel y x"]) -> Float[Array, "y_core x_core"]:
+        """The same without `margin` at each edge, where zeros beyond it are seen, and less is computed for it."""
+        return _cut(self._through(slices, _SPOILT), _SPOILT)
+
+    def _through(self, slices, spoilt: int):
+        """What each block gives loses so many voxels at its edges."""
         x, skipped = slices, []
         for level, block in enumerate(self.down):
-            x = block(x if level == 0 else _halved(x))
+            x = _cut(block(x if level == 0 else _halved(x)), spoilt)
             skipped.append(x)
         for narrow, block, same in zip(self.narrow, self.up, reversed(skipped[:-1]), strict=True):
-            x = block(jnp.concatenate([same, _doubled(narrow(x))]))
+            low = _doubled(narrow(x))
+            beside = _cut(same, (same.shape[1] - low.shape[1]) // 2)
+            x = _cut(block(jnp.concatenate([beside, low])), spoilt)
         return self.last(x)[0]
 
 
@@ -176,8 +187,7 @@ def standardized(volume: Float[np.ndarray, "depth y x"]) -> tuple[Float[np.ndarr
 @eqx.filter_jit
 def _inner(network: UNet, tile):
     """The network's answer without the margin, where it would see the tile's edges."""
-    margin = network.margin
-    return jnp.maximum(network(jnp.asarray(tile, network.last.weight.dtype)), 0)[margin:-margin, margin:-margin]
+    return jnp.maximum(network.core(jnp.asarray(tile, network.last.weight.dtype)), 0)
 
 
 def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
@@ -185,12 +195,7 @@ def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
     count = -(-size // _CORE)
     core = -(-size // (count * network.multiple)) * network.multiple
     offsets = np.arange(-network.margin, core + network.margin)
-    return [(start, _mirrored(start + offsets, size)) for start in range(0, size, core)]
-
-
-def _mirrored(index: np.ndarray, size: int) -> np.ndarray:
-    index = index % (2 * size)
-    return np.minimum(index, 2 * size - 1 - index)
+    return [(start, mirrored(start + offsets, size)) for start in range(0, size, core)]
 
 
 def write_weights(path: str | os.PathLike[str], network: UNet, provenance: Provenance | None = None) -> None:
@@ -249,3 +254,8 @@ def _halved(x: Float[Array, "channel y x"]) -> Float[Array, "channel y_half x_ha
 
 def _doubled(x: Float[Array, "channel y x"]) -> Float[Array, "channel y_double x_double"]:
     return jnp.repeat(jnp.repeat(x, 2, 1), 2, 2)
+
+
+def _cut(x: Float[Array, "*channel y x"], edge: int) -> Float[Array, "*channel y_inner x_inner"]:
+    """Without so many voxels at each edge."""
+    return x[..., edge : x.shape[-2] - edge, edge : x.shape[-1] - edge]
