@@ -47,14 +47,23 @@ class Outcome(NamedTuple):
 
 @contextlib.contextmanager
 def opened(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[Design, Study]]:
-    """A design and a study, read where they are files. An `InputError` within names the study's file."""
+    """A design, turned as the study wants it, and a study, read where they are files.
+
+    An `InputError` within names the study's file.
+    """
     found = design if isinstance(design, Design) else read_design(design)
     if isinstance(study, Study):
-        yield found, study
+        yield _turned(found, study), study
         return
     question = read_study(study)
     with errors_name_file(study):
-        yield found, question
+        yield _turned(found, question), question
+
+
+def _turned(design: Design, study: Study) -> Design:
+    if study.orientation is None:
+        return design
+    return design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": study.orientation})})
 
 
 def optimize(

@@ -28,6 +28,7 @@ from pydantic import Field, ValidationError, model_validator
 from ..base.errors import InputError, short_repr
 from ..io.disk import read_text
 from ..io.tables import Table, one_line
+from ..lenses import Orientation
 from .objectives import check_term
 from .parameters import NAMES
 
@@ -123,12 +124,14 @@ class Study(Table):
     """A study, with the tables and keys of its file; the module's docstring has one.
 
     `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.
-    `starts`: the first stage also starts from this many points at random between the bounds less one, and the best
-    goes on; `seed` says which.
+    `orientation`: the side of the lenses toward the object, if it is not to be the design's; which is better, two
+    studies tell. `starts`: the first stage also starts from this many points at random between the bounds less one, and
+    the best goes on; `seed` says which.
     """
 
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
     name: str = Field(default="optimized", description="a string")
+    orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
