@@ -14,6 +14,9 @@ from . import rows as r, vectors as v
 from .rows import BOOL, BUFFERS, FAR, FIRST, ONE, PARTS, PER_BUFFER, ZERO
 from .vectors import WIDTH, carray
 
+# Rows of a volume that are asked for before they are read: processors do not guess that a patch's next row is next.
+AHEAD = 2
+
 
 def gather(job_address, part, _):
     """Image to volume; a part is a band of rows of voxels."""
@@ -125,6 +128,7 @@ def scatter(job_address, part, _):
                     continue
                 at_row = r.address(job, FIRST) + 4 * ((d * rows + y_start + k) * columns + x_start)
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
+                    v.fetch(at_row + 4 * (AHEAD * columns + c))
                     voxels = r.voxels(at_row, c, columns - x_start - c, at_edge)
                     value = voxels * r.weight(tables, d, y2 + v.load(at_x2 + 4 * c))
                     after = value * v.load(at_right + 4 * c)
@@ -206,6 +210,7 @@ def rays_bar(job_address, part, _):
                 at_row = r.address(job, FIRST + 1) + 4 * ((d * rows + y_start + k) * columns + x_start)
                 by_y, by_y2 = v.zeros(), v.zeros()
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
+                    v.fetch(at_row + 4 * (AHEAD * columns + c))
                     voxels, fraction = r.voxels(at_row, c, columns - x_start - c, at_edge), v.load(at_right + 4 * c)
                     before, after = v.load_even(at_pairs + 8 * c), v.load_odd(at_pairs + 8 * c)
                     along_x = after - before
