@@ -144,9 +144,9 @@ def _overlap_save(kernels, images, shapes, shift):
 
 
 def _side(size):
-    """Of the tiles: the cache holds three of 256, and at least half of each way is to be kept."""
-    side = 128
-    while side < 2 * size:
+    """Of the tiles: larger ones waste less at their edges, and outgrow the cache."""
+    side = 256
+    while side < 3 * size:
         side *= 2
     return side
 
