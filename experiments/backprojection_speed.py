@@ -336,9 +336,9 @@ def markdown(found: dict) -> str:
     parts = [
         "# Speed of back-projection",
         f"{machine}.",
-        "Warm medians. Processor: of all cores together, at least. In ours: the median of the ratio to gs_jax in the same "
-        "round. A pair is a voxel and a lens that sees it. Memory: what a fresh process that has the inputs adds at its "
-        "peak while it compiles and runs.",
+        "Warm medians. Processor: of all cores together, at least. In ours: the median of the ratio to gs_jax in the "
+        "same round. A pair is a voxel and a lens that sees it. Memory: what a fresh process that has the inputs adds "
+        "at its peak while it compiles and runs.",
     ]
     parts += [f"## {title}\n\n{markdown_table(columns, rows)}" for title, columns, rows in tables(found)]
     return "\n\n".join(parts) + "\n"
