@@ -12,7 +12,7 @@ from .convolve import convolved, image_in_groups, with_margin
 from .full import full_image
 
 # Depths that share a transform back, for the memory of as many sharp images.
-_TOGETHER = 3
+_TOGETHER = 2
 
 Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | None
 

@@ -43,11 +43,7 @@ def gather(job_address, part, _):
         if first >= last:
             continue
         for d in range(depths):
-            for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
+            r.columns(tables, lens, d, wide, low, right, x2)
             begin, end = 0, nx
             for k in range(first, last):
                 y2 = tables.y_distance2[lens, d, k]
@@ -58,9 +54,7 @@ def gather(job_address, part, _):
                     begin, end = 0, nx
                     continue
                 if has_image:
-                    i, down = r.pixel_and_fraction(
-                        np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                    )
+                    i, down = r.line(tables, lens, d, k, tall)
                     one, two = low[end - 1] // WIDTH, (low[begin] + 1) // WIDTH + 1
                     r.blend(job, FIRST, i, one, two, ONE - down, down, at_blended)
                     for c in range(begin, end):
@@ -111,11 +105,8 @@ def scatter(job_address, part, _):
                 continue
             span = np.int64(tables.x_pixel[lens, d, 0]) - np.int64(tables.x_pixel[lens, d, nx - 1])
             many = 1 if span >= 2 * nx else 2 if span >= nx else 4
+            r.columns(tables, lens, d, wide, low, right, x2)
             for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
                 target[c] = at_lines + (c & (many - 1)) * length + 4 * low[c]
             begin, end = 0, nx
             for k in range(first, last):
@@ -135,9 +126,7 @@ def scatter(job_address, part, _):
                     v.store_pairs(at_pairs + 8 * c, value - after, after)
                 for c in range(begin, end):
                     v.add_two(at_pairs + 8 * c, target[c])
-                i, down = r.pixel_and_fraction(
-                    np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                )
+                i, down = r.line(tables, lens, d, k, tall)
                 # What is another part's goes to a line that nobody reads.
                 at_upper = r.address(job, FIRST + 1) + 4 * i * wide
                 at_lower = at_upper + 4 * wide if i + 1 < bottom else at_spare
@@ -181,11 +170,7 @@ def rays_bar(job_address, part, _):
     for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
         y_start, x_start = tables.y_start[lens], tables.x_start[lens]
         for d in range(depths):
-            for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
+            r.columns(tables, lens, d, wide, low, right, x2)
             begin, end = 0, nx
             x_bars[:], bars[:] = ZERO, ZERO
             for k in range(ny):
@@ -198,9 +183,7 @@ def rays_bar(job_address, part, _):
                     begin, end = 0, nx
                     continue
                 if has_image:
-                    i, down = r.pixel_and_fraction(
-                        np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                    )
+                    i, down = r.line(tables, lens, d, k, tall)
                     one, two = low[end - 1] // WIDTH, (low[begin] + 1) // WIDTH + 1
                     r.blend(job, FIRST, i, one, two, ONE - down, down, at_lines)
                     r.blend(job, FIRST, i, one, two, -ONE, ONE, at_slope_line)

@@ -10,7 +10,6 @@ from typing import Any
 
 from llvmlite import ir
 from numba import carray as _carray, extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
-from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
 from .native import WIDTH
@@ -293,11 +292,11 @@ def fetch(_, address):
     """Ask for what is at an address, which need not be one, before it is read or written."""
 
     def code(context, builder, signature, arguments):
-        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        place = builder.inttoptr(arguments[0], byte)
-        builder.call(function, [place, number(0), number(3), number(1)])
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        # To read, keep as long as can be, data.
+        builder.call(prefetch, [_pointer(builder, arguments[0], ir.IntType(8)), _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
     return types.none(address), code
