@@ -60,7 +60,8 @@ def test_adjoint(whole):
     scale = jnp.linalg.norm(image) * jnp.linalg.norm(other)
     total = sum(jnp.vdot(a, b) for a, b in zip(sharp, back, strict=True))
     assert abs(total - forth) < 1e-6 * scale
-    sizes = convolve.Sizes(image.shape, sharp[0].shape, whole, symmetric=False)
+    (rows, columns), (tall, wide) = image.shape, sharp[0].shape
+    sizes = convolve.Sizes((rows, columns), (tall, wide), whole, symmetric=False)
     for ours, plain in zip(back, unwrap(convolve._correlate)(sizes, kernels, other), strict=True):
         np.testing.assert_allclose(ours, plain, atol=2e-6 * float(jnp.abs(plain).max()))
 
