@@ -255,8 +255,7 @@ def any_light(_, vector):
 
     def code(context, builder, signature, arguments):
         lit = builder.fcmp_unordered("!=", arguments[0], ir.Constant(_FLOATS, [0.0] * WIDTH))
-        bits = ir.IntType(WIDTH)
-        return builder.icmp_unsigned("!=", builder.bitcast(lit, bits), bits(0))
+        return builder.icmp_unsigned("!=", builder.bitcast(lit, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
 
     return types.boolean(vector), code
 
@@ -266,9 +265,8 @@ def transpose(_, source, target):
     """Sixteen rows of sixteen numbers to columns."""
 
     def code(context, builder, signature, arguments):
-        row = lambda address, number: _pointer(
-            builder, builder.add(address, ir.IntType(64)(4 * WIDTH * number)), _FLOATS
-        )
+        place = lambda address, number: builder.add(address, ir.IntType(64)(4 * WIDTH * number))
+        row = lambda address, number: _pointer(builder, place(address, number), _FLOATS)
         rows = [builder.load(row(arguments[0], number), align=4) for number in range(WIDTH)]
         # Squares of 1, 2, 4 and 8 a side change places across the diagonal.
         size = 1
@@ -295,7 +293,6 @@ def fetch(_, address):
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
         prefetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        # To read, keep as long as can be, data.
         builder.call(prefetch, [_pointer(builder, arguments[0], ir.IntType(8)), _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
