@@ -148,23 +148,28 @@ def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
         results[name] = calls[name]()  # warm-up
     check(s, results)
     results.clear()
-    times = {name: [] for name in calls}
+    times, processor = {name: [] for name in calls}, {name: [] for name in calls}
     for number in range(rounds):
         for name, call in calls.items():
             if number < 3 or np.median(times[name]) < 1:  # three times is enough for the slow
                 call()  # what the last contestant left behind, in caches and in pages to map, is not this one's cost
+                before = time.process_time()
                 times[name].append(timed(call)[0])
+                processor[name].append(time.process_time() - before)
                 time.sleep(0.02)  # threads that wait for more work of the last contestant go to sleep
     pairs = count_pairs(plain(s.imager, s.grid), s.imager.sensor.shape)
     measured = {
         name: {
             "median_s": float(np.median(t)),
             "min_s": min(t),
+            # Of all cores together, at least: on a busy machine the steadiest.
+            "processor_s": min(processor[name]),
             "rounds": len(t),
             "compile_s": compiled_s[name],
             "pairs_per_s": pairs / float(np.median(t)),
             # Round by round: then it matters less what else the machine does.
             "ratio": float(np.median([a / b for a, b in zip(t, times["gs_jax"], strict=False)])),
+            "processor_ratio": min(processor[name]) / min(processor["gs_jax"]),
         }
         for name, t in times.items()
     }
@@ -249,18 +254,19 @@ def slope(axis: str, results: Sequence[dict], name: str) -> float:
 def bars(result: dict) -> list[dict]:
     """What was promised for full scale, and what was found."""
     of = lambda name, key: result["contestants"].get(name, {}).get(key, float("nan"))
-    ratio = partial(of, key="ratio")
+    ratios = lambda name: np.array([of(name, "ratio"), of(name, "processor_ratio")])
     volume_mib = result["depths"] * result["voxels"] ** 2 * 4 / 2**20
     image_mib = result["pixels"] ** 2 * 4 / 2**20
     rows = [
-        ("time of the paper's loop in numba, in ours", ratio("numba, the paper's loop"), ">=", 5),
-        ("our time, in that of numba lens patches", 1 / ratio("numba, lens patches"), "<=", 1.05),
-        ("the paper's 18 s, in ours", PAPER_S / of("gs_jax", "median_s"), ">=", 100),
-        ("adjoint, in back-projections", ratio("gs_jax, adjoint"), "<=", 1.5),
-        ("value and gradient by centres and v, in back-projections", ratio("gs_jax, value and gradient"), "<=", 3),
+        ("time of the paper's loop in numba, in ours", ratios("numba, the paper's loop"), ">=", 5),
+        ("our time, in that of numba lens patches", 1 / ratios("numba, lens patches"), "<=", 1.05),
+        ("the paper's 18 s, in ours", (PAPER_S / of("gs_jax", "median_s"), None), ">=", 100),
+        ("back-projection, ms (video rate)", (1e3 * of("gs_jax", "median_s"), None), "<=", 33),
+        ("adjoint, in back-projections", ratios("gs_jax, adjoint"), "<=", 1.5),
+        ("value and gradient by centres and v, in back-projections", ratios("gs_jax, value and gradient"), "<=", 3),
         (
             "memory with the image, MiB",
-            image_mib + of("gs_jax", "extra_mib"),
+            (image_mib + of("gs_jax", "extra_mib"), None),
             "<=",
             image_mib + 3 * volume_mib + 300 * 1e6 / 2**20,
         ),
@@ -269,17 +275,18 @@ def bars(result: dict) -> list[dict]:
         {
             "job": result["job"],
             "what": what,
-            "found": found,
+            "found": float(found),
+            "by_processor": None if processor is None else float(processor),
             "sign": sign,
             "bar": bar,
             "met": bool(found >= bar if sign == ">=" else found <= bar),
         }
-        for what, found, sign, bar in rows
+        for what, (found, processor), sign, bar in rows
         if not np.isnan(found)  # memory is measured for the first
     ]
 
 
-COLUMNS = ("", "median, ms", "fastest, ms", "in ours", "compile, s", "pairs / s", "memory, MiB")
+COLUMNS = ("", "median, ms", "fastest, ms", "processor, ms", "in ours", "compile, s", "pairs / s", "memory, MiB")
 
 
 def job_rows(result: dict) -> list[list[str]]:
@@ -289,6 +296,7 @@ def job_rows(result: dict) -> list[list[str]]:
             name,
             f"{1e3 * m['median_s']:.1f}",
             f"{1e3 * m['min_s']:.1f}",
+            f"{1e3 * m['processor_s']:.1f}",
             f"{m['ratio']:.2f}",
             f"{m['compile_s']:.1f}",
             f"{m['pairs_per_s']:.2e}",
@@ -300,7 +308,14 @@ def job_rows(result: dict) -> list[list[str]]:
 
 def bar_rows(found: dict) -> list[list[str]]:
     return [
-        [b["job"], b["what"], f"{b['found']:.3g}", f"{b['sign']} {b['bar']:.3g}", "yes" if b["met"] else "NO"]
+        [
+            b["job"],
+            b["what"],
+            f"{b['found']:.3g}",
+            "" if b["by_processor"] is None else f"{b['by_processor']:.3g}",
+            f"{b['sign']} {b['bar']:.3g}",
+            "yes" if b["met"] else "NO",
+        ]
         for b in found
     ]
 
@@ -311,7 +326,7 @@ def tables(found: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
     slopes = [[axis, *(f"{s[name]:.2f}" for name in IN_STUDY)] for axis, s in found["slopes"].items()]
     return [
         *jobs,
-        ("Against the bars", ("", "", "found", "bar", "met"), bar_rows(found["bars"])),
+        ("Against the bars", ("", "", "found", "in processor time", "bar", "met"), bar_rows(found["bars"])),
         ("Exponent of the cost between the two largest sizes", ("in", *IN_STUDY), slopes),
     ]
 
@@ -321,8 +336,9 @@ def markdown(found: dict) -> str:
     parts = [
         "# Speed of back-projection",
         f"{machine}.",
-        "Warm medians. In ours: the median of the ratio to gs_jax in the same round. A pair is a voxel and a lens that "
-        "sees it. Memory: what a fresh process that has the inputs adds at its peak while it compiles and runs.",
+        "Warm medians. Processor: of all cores together, at least. In ours: the median of the ratio to gs_jax in the "
+        "same round. A pair is a voxel and a lens that sees it. Memory: what a fresh process that has the inputs adds "
+        "at its peak while it compiles and runs.",
     ]
     parts += [f"## {title}\n\n{markdown_table(columns, rows)}" for title, columns, rows in tables(found)]
     return "\n\n".join(parts) + "\n"

@@ -51,7 +51,7 @@ def test_run_at_toy_size(tmp_path):
     assert json.loads((tmp_path / "speed.json").read_text()).keys() == {"machine", "jobs", "study", "slopes", "bars"}
     assert found["jobs"][0]["contestants"].keys() == set(names)
     assert found["jobs"][0]["contestants"]["gs_jax"].keys() == {
-        "median_s", "min_s", "rounds", "compile_s", "pairs_per_s", "ratio",
+        "median_s", "min_s", "processor_s", "rounds", "compile_s", "pairs_per_s", "ratio", "processor_ratio",
     }  # fmt: skip
     assert "| NumPy |" in (tmp_path / "speed.md").read_text()
     assert (tmp_path / "speed.png").stat().st_size < 150_000

@@ -2,13 +2,14 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import fig3_resolution, fig5_fwhm_depth, forward_model, table1
-from experiments.backprojection_speed import Job
+from experiments.backprojection_speed import Job, inputs
 from experiments.profiles import dip, fwhm, local_maxima
-from gs_jax import Grid, Imager, MicrolensArray, Sensor
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
 from gs_jax.base.progress import Progress
 from gs_jax.designs.design import read_design
 
@@ -48,13 +49,23 @@ def test_table_1_has_every_row_of_the_paper():
 def test_the_forward_model_at_toy_size(tmp_path):
     sizes = [Job(voxels=9, pixels=n, lenses=9, depths=2) for n in (100, 200)]
     found = forward_model.run({"pixels": sizes}, sizes[0], progress=Progress())
+    models = (forward_model.WHOLE, "near", "full", "two rings")
     assert set(found["levels"]) == {
-        f"{level}{of}" for level in ("near", "full", "two rings") for of in ("", ", adjoint")
+        f"{model}{of}" for model in models for of in ("", ", adjoint", ", Richardson-Lucy step")
     }
+    assert [row[2] for row in forward_model.bars(found["levels"])] == [">= 2", "", ""]
     assert [row["pixels"] for row in found["cost"]["pixels"]] == [100, 200]
     assert 0 < found["zones"]["mean"] < found["zones"]["worst"]
     forward_model.picture({"cost": {axis: found["cost"]["pixels"] for axis in ("depths", "lenses", "pixels")}})
     json.dumps(found)
+
+
+def test_whole_images_are_the_same_model():
+    job = Job(voxels=9, pixels=200, lenses=9, depths=2)
+    s, psf = inputs(job), jnp.asarray(np.random.default_rng(0).random((2, 65, 65)), jnp.float32)
+    ours = forward(s.volume, s.imager, s.grid, psf)
+    theirs = forward_model.by_whole_images(s.volume, s.imager, s.grid, psf)
+    np.testing.assert_allclose(ours, theirs, atol=1e-5 * float(theirs.max()))
 
 
 def test_zones_do_not_matter_to_a_wide_flat_field():

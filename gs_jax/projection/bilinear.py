@@ -54,7 +54,7 @@ def volume_to_image(shapes: Shapes, rays: Rays, volume):
     return linear_call(_scatter, _gather, _rays_bar_by_volume, shapes, rays, volume)
 
 
-@native_on_cpu(native.gather)
+@native_on_cpu("gather", native.gather)
 def _gather(shapes: Shapes, rays: Rays, image):
     """dB/d(volume); of an image of ones, but cheaper, if `image` is None."""
 
@@ -74,7 +74,7 @@ def _gather(shapes: Shapes, rays: Rays, image):
     return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
 
 
-@native_on_cpu(native.scatter)
+@native_on_cpu("scatter", native.scatter)
 def _scatter(shapes: Shapes, rays: Rays, volume):
     """By gathering: each pixel looks for the voxels that reach it, along x and then along y."""
     # Neighbouring rays are `spacing` apart, and a pixel is reached from less than one pixel on either side.
@@ -102,7 +102,7 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
     return lax.scan(add_lens, image, (rays.y, rays.x, rays.spacing))[0]
 
 
-@native_on_cpu(native.rays_bar)
+@native_on_cpu("rays_bar", native.rays_bar)
 def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:
     """dB/d(rays): sums over one axis of what a ray and its envelope change on the other."""
 

@@ -18,12 +18,14 @@ import numpy as np
 from llvmlite import ir
 from numba import cfunc, types
 
-from . import kernels
+from . import kernels, tiles
 from .native import TARGET
 from .rows import BUFFERS, PARTS, PER_BUFFER
 from .vectors import FAST, carray, inline, intrinsic, pointer
 
-KERNELS = {function.__name__: function for function in (kernels.gather, kernels.scatter, kernels.rays_bar)}
+KERNELS = {
+    function.__name__: function for function in (kernels.gather, kernels.scatter, kernels.rays_bar, tiles.overlap_save)
+}
 
 # Places in structures, in units of 8 bytes.
 _EXTENSION, _API, _CONTEXT, _ARGUMENTS, _RESULTS, _ATTRIBUTES = 1, 2, 3, 5, 10, 20  # of the frame
@@ -119,7 +121,7 @@ def _list(job, first, items):
 
 @inline
 def _use_large_pages(job, place, advise):
-    """For the first result: to map 100 MB in small ones takes as long as half of a kernel."""
+    """For a result: to map 100 MB in small ones takes as long as half of a kernel."""
     page = 2**21
     first = (job[place] + page - 1) // page * page
     pages = (job[place] + 4 * job[place + 2] * job[place + 3] * job[place + 4] - first) // page
@@ -147,8 +149,8 @@ def handle(frame_address, _):
     job[_REFERENCES], job[_NEXT], job[_DONE], job[PARTS] = 1, 0, 0, parts
     job[_KERNEL], job[_FREE_ME] = table[_FIRST_KERNEL + which], table[_FREE]
     listed = _list(job, 0, frame[_ARGUMENTS : _ARGUMENTS + 5])
-    _list(job, listed, frame[_RESULTS : _RESULTS + 5])
-    _use_large_pages(job, BUFFERS + PER_BUFFER * listed, table[_ADVISE])
+    for result in range(listed, _list(job, listed, frame[_RESULTS : _RESULTS + 5])):
+        _use_large_pages(job, BUFFERS + PER_BUFFER * result, table[_ADVISE])
     # XLA reads and writes the structures of its functions here.
     api, scratch, at_scratch = _at(frame[_API], 19), job[_SCRATCH:], address + 8 * _SCRATCH
     threads = address + 8 * (_SCRATCH + 8)
@@ -229,4 +231,5 @@ def _compile(function, result, arguments) -> int:
 @cache
 def _sources() -> int:
     folder = Path(__file__).parent
-    return crc32(b"".join((folder / f"{name}.py").read_bytes() for name in ("bridge", "kernels", "rows", "vectors")))
+    names = ("bridge", "kernels", "rows", "tiles", "vectors")
+    return crc32(b"".join((folder / f"{name}.py").read_bytes() for name in names))

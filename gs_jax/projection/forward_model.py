@@ -3,15 +3,17 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
 from ..optics.full import FullOptics
 from ..voxels import Grid
 from .backprojection import as_volume, backproject_adjoint
-from .convolve import add_spectrum, image_of, padded_shape, with_margin
+from .convolve import convolved, image_in_groups, with_margin
 from .full import full_image
+
+# Depths that share a transform back, for the memory of as many sharp images.
+_TOGETHER = 2
 
 Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | None
 
@@ -72,16 +74,17 @@ def forward(
     size = psf.shape[-1]
     if psf.shape != (grid.depths.size, size, size) or size % 2 == 0:
         raise ValueError(f"`psf` must be ({grid.depths.size}, size, size) with an odd size, got {psf.shape}.")
-    wide, padded = with_margin(imager, size), padded_shape(imager.sensor, size)
+    wide = with_margin(imager, size)
 
-    # Not kept for the gradient: a spectrum for each depth is more than the volume.
+    # Not kept for the gradient: sharp images of all depths are more than the volume.
     @jax.checkpoint
-    def add_depth(spectrum, plane):
-        depth, voxels, kernel = plane
-        sharp = backproject_adjoint(voxels[None], wide, grid.at(depth))
-        return add_spectrum(spectrum, sharp, kernel, padded), None
+    def add_depths(image, planes):
+        depths, volume, kernels = planes
+        sharp = [
+            backproject_adjoint(volume[one], wide, grid.at(depths[one]))
+            for one in (slice(n, n + 1) for n in range(depths.size))
+        ]
+        return image + convolved(sharp, kernels)
 
-    dark = jnp.zeros((padded[0], padded[1] // 2 + 1), volume.dtype)
     planes = grid.depths, volume, jnp.asarray(psf, volume.dtype)
-    spectrum = lax.scan(add_depth, lax.complex(dark, dark), planes)[0]
-    return image_of(spectrum, imager.sensor, size - 1, padded)
+    return image_in_groups(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), planes, _TOGETHER)

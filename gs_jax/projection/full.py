@@ -16,12 +16,14 @@ from ..optics.full import FullOptics, Halo
 from ..optics.light import clear_area
 from ..voxels import Grid
 from .bilinear import Shapes, volume_to_image
-from .convolve import add_halved, add_symmetric_spectrum, image_of, padded_shape, with_margin
+from .convolve import convolved, doubled, image_in_groups, with_margin
 from .polar import apply, splat_table, spread_table
 from .rays import RingLight, trace
 
 # Lenses whose halos are computed at once, which bounds the memory.
 _LENSES = 64
+# Depths whose cores are convolved at once.
+_TOGETHER = 1
 # The halo passes several linear interpolations, which blur it by about this variance, in squared pixels. Wiener's
 # filter undoes that, as far as the blur leaves more than this share of a frequency's power.
 _BLUR, _NOISE = 0.7, 0.02
@@ -50,10 +52,8 @@ def halved(imager: Imager) -> Imager:
 def _cores_image(volume, imager, grid, optics):
     """The inner ring on the sensor's pixels, the others on pixels twice as large: their cores are wider."""
     sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
-    size = optics.kernel.shape[-1]
-    # Even: a pixel that is twice as large is two pixels.
-    padded = padded_shape(sensor, size + 1)
-    wide, wide_halved = with_margin(imager, size), with_margin(halved(imager), optics.wide_kernels.shape[-1])
+    small = optics.wide_kernels.shape[-1]
+    wide, wide_halved = with_margin(imager, optics.kernel.shape[-1]), with_margin(halved(imager), small)
     dtype = volume.dtype
 
     def sharp(imager, plane, number):
@@ -69,24 +69,23 @@ def _cores_image(volume, imager, grid, optics):
         rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
         return volume_to_image(Shapes(imager.sensor.shape, at.volume_shape, weight), rays, voxels[None])
 
-    # Not kept for the gradient: spectra for each depth are more than the volume.
+    # Not kept for the gradient: sharp images for each depth are more than the volume.
     @jax.checkpoint
-    def add_depth(spectra, plane):
-        fine, coarse = spectra
-        *_, kernel, wide_kernels = plane
-        fine = add_symmetric_spectrum(fine, sharp(wide, plane, 0), kernel, padded)
-        for number in range(1, len(rings)):
-            coarse = add_symmetric_spectrum(coarse, sharp(wide_halved, plane, number), wide_kernels[number - 1], half)
-        return (fine, coarse), None
+    def add_depths(images, planes):
+        fine, coarse = images
+        each = [jax.tree.map(lambda a, n=n: a[n], planes) for n in range(len(planes[0]))]
+        *_, kernels, wide_kernels = planes
+        fine = fine + convolved([sharp(wide, plane, 0) for plane in each], kernels, symmetric=True)
+        outer = [sharp(wide_halved, plane, number) for plane in each for number in range(1, len(rings))]
+        wide_kernels = wide_kernels.reshape(-1, small, small)
+        return fine, coarse + convolved(outer, wide_kernels, whole=True, symmetric=True)
 
-    half = padded[0] // 2, padded[1] // 2
-    dark = [jnp.zeros((rows, columns // 2 + 1), dtype) for rows, columns in (padded, half)]
     kernels = (part.astype(dtype) for part in (optics.kernel, optics.wide_kernels))
-    tables = optics.stretch, optics.light, *kernels
-    start = tuple(lax.complex(part, part) for part in dark)
-    fine, coarse = lax.scan(add_depth, start, (grid.depths, volume, *tables))[0]
-    first = size // 2 - 2 * (optics.wide_kernels.shape[-1] // 2)
-    return image_of(add_halved(fine, coarse, padded, first), sensor, size // 2, padded)
+    planes = grid.depths, volume, optics.stretch, optics.light, *kernels
+    whole = [n + small - 1 for n in wide_halved.sensor.shape]
+    dark = jnp.zeros(sensor.shape, dtype), jnp.zeros(whole, dtype)
+    fine, coarse = image_in_groups(add_depths, dark, planes, _TOGETHER)
+    return fine + doubled(coarse, small, sensor.shape)
 
 
 def halo_image(

@@ -14,6 +14,9 @@ from . import rows as r, vectors as v
 from .rows import BOOL, BUFFERS, FAR, FIRST, ONE, PARTS, PER_BUFFER, ZERO
 from .vectors import WIDTH, carray
 
+# Rows of a volume that are asked for before they are read: processors do not guess that a patch's next row is next.
+AHEAD = 2
+
 
 def gather(job_address, part, _):
     """Image to volume; a part is a band of rows of voxels."""
@@ -40,11 +43,7 @@ def gather(job_address, part, _):
         if first >= last:
             continue
         for d in range(depths):
-            for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
+            r.columns(tables, lens, d, wide, low, right, x2)
             begin, end = 0, nx
             for k in range(first, last):
                 y2 = tables.y_distance2[lens, d, k]
@@ -55,9 +54,7 @@ def gather(job_address, part, _):
                     begin, end = 0, nx
                     continue
                 if has_image:
-                    i, down = r.pixel_and_fraction(
-                        np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                    )
+                    i, down = r.line(tables, lens, d, k, tall)
                     one, two = low[end - 1] // WIDTH, (low[begin] + 1) // WIDTH + 1
                     r.blend(job, FIRST, i, one, two, ONE - down, down, at_blended)
                     for c in range(begin, end):
@@ -108,11 +105,8 @@ def scatter(job_address, part, _):
                 continue
             span = np.int64(tables.x_pixel[lens, d, 0]) - np.int64(tables.x_pixel[lens, d, nx - 1])
             many = 1 if span >= 2 * nx else 2 if span >= nx else 4
+            r.columns(tables, lens, d, wide, low, right, x2)
             for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
                 target[c] = at_lines + (c & (many - 1)) * length + 4 * low[c]
             begin, end = 0, nx
             for k in range(first, last):
@@ -125,15 +119,14 @@ def scatter(job_address, part, _):
                     continue
                 at_row = r.address(job, FIRST) + 4 * ((d * rows + y_start + k) * columns + x_start)
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
+                    v.fetch(at_row + 4 * (AHEAD * columns + c))
                     voxels = r.voxels(at_row, c, columns - x_start - c, at_edge)
                     value = voxels * r.weight(tables, d, y2 + v.load(at_x2 + 4 * c))
                     after = value * v.load(at_right + 4 * c)
                     v.store_pairs(at_pairs + 8 * c, value - after, after)
                 for c in range(begin, end):
                     v.add_two(at_pairs + 8 * c, target[c])
-                i, down = r.pixel_and_fraction(
-                    np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                )
+                i, down = r.line(tables, lens, d, k, tall)
                 # What is another part's goes to a line that nobody reads.
                 at_upper = r.address(job, FIRST + 1) + 4 * i * wide
                 at_lower = at_upper + 4 * wide if i + 1 < bottom else at_spare
@@ -177,11 +170,7 @@ def rays_bar(job_address, part, _):
     for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
         y_start, x_start = tables.y_start[lens], tables.x_start[lens]
         for d in range(depths):
-            for c in range(nx):
-                x2[c] = tables.x_distance2[lens, d, c]
-                low[c], right[c] = r.pixel_and_fraction(
-                    np.int64(tables.x_pixel[lens, d, c]), tables.x_fraction[lens, d, c], wide
-                )
+            r.columns(tables, lens, d, wide, low, right, x2)
             begin, end = 0, nx
             x_bars[:], bars[:] = ZERO, ZERO
             for k in range(ny):
@@ -194,9 +183,7 @@ def rays_bar(job_address, part, _):
                     begin, end = 0, nx
                     continue
                 if has_image:
-                    i, down = r.pixel_and_fraction(
-                        np.int64(tables.y_pixel[lens, d, k]), tables.y_fraction[lens, d, k], tall
-                    )
+                    i, down = r.line(tables, lens, d, k, tall)
                     one, two = low[end - 1] // WIDTH, (low[begin] + 1) // WIDTH + 1
                     r.blend(job, FIRST, i, one, two, ONE - down, down, at_lines)
                     r.blend(job, FIRST, i, one, two, -ONE, ONE, at_slope_line)
@@ -206,6 +193,7 @@ def rays_bar(job_address, part, _):
                 at_row = r.address(job, FIRST + 1) + 4 * ((d * rows + y_start + k) * columns + x_start)
                 by_y, by_y2 = v.zeros(), v.zeros()
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
+                    v.fetch(at_row + 4 * (AHEAD * columns + c))
                     voxels, fraction = r.voxels(at_row, c, columns - x_start - c, at_edge), v.load(at_right + 4 * c)
                     before, after = v.load_even(at_pairs + 8 * c), v.load_odd(at_pairs + 8 * c)
                     along_x = after - before

@@ -1,4 +1,4 @@
-"""The bilinear form on a processor, by compiled kernels where these are at hand; by XLA everywhere else."""
+"""On a processor by compiled kernels, where these are at hand; by XLA everywhere else."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +16,8 @@ from .rays import Envelope, Rays
 
 # Parts of a kernel's work, for threads to share: the more, the more evenly, and the more is done twice at their edges.
 _PARTS = 32
+# Numbers that kernels handle at once.
+WIDTH = 16
 # As which XLA knows the handler.
 TARGET = "gs_jax_native"
 _lock = Lock()
@@ -32,18 +34,18 @@ def once() -> Iterator[None]:
         _once.reset(token)
 
 
-def native_on_cpu(native: Callable) -> Callable[[Callable], Callable]:
-    """Let `native` do on processors what the decorated function does, if it can.
+def native_on_cpu(kernel: str, native: Callable) -> Callable[[Callable], Callable]:
+    """Let `native`, which calls a kernel, do on processors what the decorated function does, if it can.
 
-    Both take shapes, rays and arrays. Derivatives are those of the decorated function, `__wrapped__`.
+    Both take static shapes and pytrees of arrays. Derivatives are those of the decorated function, `__wrapped__`.
     """
 
     def decorate(function):
         @wraps(function)
-        def either(shapes, rays, *arrays):
-            if not _suits(shapes, rays, arrays) or kernel_number(native.__name__) is None:
-                return function(shapes, rays, *arrays)
-            return lax.platform_dependent(rays, *arrays, cpu=partial(native, shapes), default=partial(function, shapes))
+        def either(shapes, *arrays):
+            if not _suits(shapes, arrays) or kernel_number(kernel) is None:
+                return function(shapes, *arrays)
+            return lax.platform_dependent(*arrays, cpu=partial(native, shapes), default=partial(function, shapes))
 
         return either
 
@@ -75,10 +77,11 @@ def rays_bar(shapes, rays: Rays, image, volume) -> Rays:
     )
 
 
-def _suits(shapes, rays: Rays, arrays) -> bool:
-    # Float64 is for those who compare. Sixteen pixels are read at once.
-    single = rays.parameters.dtype == jnp.float32 and all(a is None or a.dtype != jnp.float64 for a in arrays)
-    return jax.default_backend() == "cpu" and single and shapes.image[1] >= 16 and not _once.get()
+def _suits(shapes, arrays) -> bool:
+    # Float64 is for those who compare.
+    first = arrays[0].parameters if isinstance(arrays[0], Rays) else arrays[0]
+    single = first.dtype == jnp.float32 and all(a.dtype != jnp.float64 for a in jax.tree.leaves(arrays[1:]))
+    return jax.default_backend() == "cpu" and single and shapes.image[1] >= WIDTH and not _once.get()
 
 
 def kernel_number(name: str) -> int | None:
@@ -98,10 +101,15 @@ def _load(name):
         return None
 
 
-def _call(kernel: str, results, shapes, rays: Rays, *arrays):
+def call(kernel: str, results, *buffers):
+    """A kernel's results, each of at most three axes as the buffers are."""
+    number = np.array(kernel_number(kernel), np.int64)[()]
+    return jax.ffi.ffi_call(TARGET, results)(*buffers, kernel=number, parts=np.int64(_PARTS))
+
+
+def _call(kernel, results, shapes, rays: Rays, *arrays):
     axes = [part for axis in (rays.y, rays.x) for part in (axis.start, axis.pixel, axis.fraction, axis.distance2)]
-    call, number = jax.ffi.ffi_call(TARGET, results), np.array(kernel_number(kernel), np.int64)[()]
-    return call(_numbers(shapes.weight), rays.parameters, *axes, *arrays, kernel=number, parts=np.int64(_PARTS))
+    return call(kernel, results, _numbers(shapes.weight), rays.parameters, *axes, *arrays)
 
 
 def _pixels(image):

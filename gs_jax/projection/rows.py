@@ -158,10 +158,24 @@ def chord(x2, y2, limit2, begin, end):
 
 
 @inline
-def pixel_and_fraction(pixel, fraction, pixels):
+def _pixel_and_fraction(pixel, fraction, pixels):
     """The pixel below a ray, with a neighbour above it also at the sensor's edge."""
-    low = min(max(pixel, 0), pixels - 2)
-    return low, fraction + np.float32(pixel - low)
+    low = min(max(np.int64(pixel), 0), pixels - 2)
+    return low, fraction + np.float32(np.int64(pixel) - low)
+
+
+@inline
+def line(tables, lens, d, k, pixels):
+    """The row of pixels that a row of voxels meets, and how far it is to the next."""
+    return _pixel_and_fraction(tables.y_pixel[lens, d, k], tables.y_fraction[lens, d, k], pixels)
+
+
+@inline
+def columns(tables, lens, d, pixels, low, right, x2):
+    """The same of all columns of voxels, and their squared distances."""
+    for c in range(low.size):
+        x2[c] = tables.x_distance2[lens, d, c]
+        low[c], right[c] = _pixel_and_fraction(tables.x_pixel[lens, d, c], tables.x_fraction[lens, d, c], pixels)
 
 
 @inline

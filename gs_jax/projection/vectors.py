@@ -12,7 +12,8 @@ from llvmlite import ir
 from numba import carray as _carray, extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-WIDTH = 16
+from .native import WIDTH
+
 # Any order of sums, but NaN stays NaN.
 FLAGS = ("reassoc", "nsz", "arcp", "contract", "afn")
 FAST = {"fastmath": set(FLAGS), "error_model": "numpy"}
@@ -26,6 +27,11 @@ carray: Any = _carray
 def inline(function):
     """A function for kernels, without what type checkers have wrapped around it."""
     return njit(inline="always", **FAST)(unwrap(function))
+
+
+def function(function):
+    """A function for kernels that is compiled once, however often it is called."""
+    return njit(**FAST)(unwrap(function))
 
 
 class Vector(types.Type):
@@ -230,3 +236,64 @@ def store_one(_, address, number):
         return context.get_dummy_value()
 
     return types.none(address, number), code
+
+
+@intrinsic
+def either(_, first, second):
+    """All bits of both: zero where both are."""
+
+    def code(context, builder, signature, arguments):
+        bits = [builder.bitcast(value, ir.VectorType(_I32, WIDTH)) for value in arguments]
+        return builder.bitcast(builder.or_(*bits), _FLOATS)
+
+    return VECTOR(first, second), code
+
+
+@intrinsic
+def any_light(_, vector):
+    """Whether one of the sixteen is not zero."""
+
+    def code(context, builder, signature, arguments):
+        lit = builder.fcmp_unordered("!=", arguments[0], ir.Constant(_FLOATS, [0.0] * WIDTH))
+        return builder.icmp_unsigned("!=", builder.bitcast(lit, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
+
+    return types.boolean(vector), code
+
+
+@intrinsic
+def transpose(_, source, target):
+    """Sixteen rows of sixteen numbers to columns."""
+
+    def code(context, builder, signature, arguments):
+        place = lambda address, number: builder.add(address, ir.IntType(64)(4 * WIDTH * number))
+        row = lambda address, number: _pointer(builder, place(address, number), _FLOATS)
+        rows = [builder.load(row(arguments[0], number), align=4) for number in range(WIDTH)]
+        # Squares of 1, 2, 4 and 8 a side change places across the diagonal.
+        size = 1
+        while size < WIDTH:
+            upper = [i if i & size == 0 else WIDTH + i - size for i in range(WIDTH)]
+            lower = [i + size if i & size == 0 else WIDTH + i for i in range(WIDTH)]
+            for one in (i for i in range(WIDTH) if i & size == 0):
+                pair = rows[one], rows[one + size]
+                for number, order in ((one, upper), (one + size, lower)):
+                    rows[number] = builder.shuffle_vector(*pair, ir.Constant(ir.VectorType(_I32, WIDTH), order))
+            size *= 2
+        for number, value in enumerate(rows):
+            builder.store(value, row(arguments[1], number), align=4)
+        return context.get_dummy_value()
+
+    return types.none(source, target), code
+
+
+@intrinsic
+def fetch(_, address):
+    """Ask for what is at an address, which need not be one, before it is read or written."""
+
+    def code(context, builder, signature, arguments):
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        builder.call(prefetch, [_pointer(builder, arguments[0], ir.IntType(8)), _I32(0), _I32(3), _I32(1)])
+        return context.get_dummy_value()
+
+    return types.none(address), code

@@ -1,0 +1,95 @@
+"""Sums of convolutions: by tiles in numba and by large transforms, against SciPy's; their derivatives."""
+
+from functools import partial
+from inspect import unwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.signal import fftconvolve
+
+from gs_jax.projection import convolve, native
+from gs_jax.projection.convolve import convolved, doubled
+
+
+def problem(shape=(170, 205), size=9, count=2, dtype=jnp.float32, *, symmetric=False):
+    rng = np.random.default_rng(0)
+    sharp = tuple(jnp.asarray(rng.normal(size=shape), dtype) for _ in range(count))
+    kernels = rng.normal(size=(count, size, size))
+    if symmetric:
+        kernels = kernels + kernels[:, ::-1]
+        kernels = kernels + kernels[:, :, ::-1]
+    return sharp, jnp.asarray(kernels, dtype)
+
+
+def expected(sharp, kernels, *, whole):
+    """What is on the sensor is beyond the margin, half a kernel and one line."""
+    fit, mode = ((lambda a: a), "full") if whole else ((lambda a: a[1:-1, 1:-1]), "valid")
+    pairs = zip(sharp, kernels, strict=True)
+    return sum(fftconvolve(fit(np.asarray(a, float)), np.asarray(k, float), mode=mode) for a, k in pairs)
+
+
+# Tiles of 256 and 512 pixels, one and an odd number of them; images of odd and even sizes.
+SIZES = [((170, 205), 9, 2), ((30, 41), 3, 1), ((260, 300), 65, 3), ((301, 333), 129, 2)]
+
+
+@pytest.mark.parametrize(("shape", "size", "count"), SIZES)
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_sum_is_scipys(shape, size, count, whole, dtype):
+    sharp, kernels = problem(shape, size, count, dtype, symmetric=whole)
+    function = jax.jit(partial(convolved, whole=whole, symmetric=whole))
+    has_kernels = native.kernel_number("overlap_save") is not None
+    text = function.lower(sharp, kernels).as_text()
+    assert (native.TARGET in text) == (dtype == jnp.float32 and has_kernels)
+    right = expected(sharp, kernels, whole=whole)
+    # As an FFT rounds: against the largest.
+    tolerance = 2e-6 if dtype == jnp.float32 else 1e-13
+    np.testing.assert_allclose(function(sharp, kernels), right, atol=tolerance * np.abs(right).max())
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_adjoint(whole):
+    sharp, kernels = problem()
+    image = convolved(sharp, kernels, whole=whole)
+    other = jnp.cos(jnp.arange(image.size, dtype=jnp.float32)).reshape(image.shape)
+    (back,) = jax.linear_transpose(lambda sharp: convolved(sharp, kernels, whole=whole), sharp)(other)
+    forth = jnp.vdot(image, other)
+    scale = jnp.linalg.norm(image) * jnp.linalg.norm(other)
+    total = sum(jnp.vdot(a, b) for a, b in zip(sharp, back, strict=True))
+    assert abs(total - forth) < 1e-6 * scale
+    (rows, columns), (tall, wide) = image.shape, sharp[0].shape
+    sizes = convolve.Sizes((rows, columns), (tall, wide), whole, symmetric=False)
+    for ours, plain in zip(back, unwrap(convolve._correlate)(sizes, kernels, other), strict=True):
+        np.testing.assert_allclose(ours, plain, atol=2e-6 * float(jnp.abs(plain).max()))
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_derivatives(whole):
+    sharp, kernels = problem((20, 23), 5, 2, jnp.float64)
+    check_grads(jax.jit(partial(convolved, whole=whole)), (sharp, kernels), order=1, eps=1e-3, atol=1e-9, rtol=1e-9)
+    single = problem((20, 23), 5, 2)
+    by_kernels = jax.grad(lambda sharp, kernels: (convolved(sharp, kernels) ** 2).sum(), argnums=1)
+    np.testing.assert_allclose(by_kernels(*single), by_kernels(sharp, kernels), rtol=1e-4)
+
+
+def test_tiles_in_the_dark_are_left_out():
+    sharp, kernels = problem((600, 400), 9, 2)
+    lit = sharp[0].at[200:].set(0)
+    found = convolved((lit, jnp.zeros_like(lit)), kernels)
+    right = expected((lit,), kernels[:1], whole=False)
+    np.testing.assert_allclose(found, right, atol=2e-6 * np.abs(right).max())
+    # Exactly: tiles keep 240 lines.
+    assert not np.any(found[240:])
+    assert np.isnan(convolved((sharp[0].at[300, 100].set(jnp.nan), lit), kernels)).any()
+
+
+def test_doubled_is_a_sinc():
+    n, fine = np.arange(64), np.arange(100)
+    wave = lambda place: np.cos(2 * np.pi * 5 * place / 64)
+    coarse = jnp.asarray(wave(n)[:, None] * wave(n)[None])
+    # The middle of the first fine pixel is a quarter of a large one before that of its large one.
+    place = wave(6 - 0.25 + fine / 2)
+    np.testing.assert_allclose(doubled(coarse, 6, (100, 100)), place[:, None] * place[None] / 4, atol=1e-12)
