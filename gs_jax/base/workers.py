@@ -79,33 +79,35 @@ class Workers:
                 if each is not None:
                     each.close(timeout=_END)
 
-    def stream(
-        self, build: Callable[[], Callable[[Item], Result]], items: Iterable[Item]
-    ) -> Iterator[tuple[Item, Callable[[], Result]]]:
-        """Each item, when its job is done, with what gives its result, or raises what the job raised.
+    def stream_of(
+        self, build: Callable[[], Callable[[Item], Result]]
+    ) -> Callable[[Iterable[Item]], Iterator[tuple[Item, Callable[[], Result]]]]:
+        """From items to each of them, when its job is done, with what gives its result, or raises what the job raised.
 
         Parameters
         ----------
         build
-            Makes the function that is called with each item: in this process, or in each worker once, so that each
+            Makes the function that is called with each item: in this process, or in each worker, once, so that each
             compiles once. For workers it can be pickled, as its items and results can.
-        items
-            Taken as they are needed. A job whose worker dies is done again by another, so it writes nothing, or what
-            may be written twice.
 
         Returns
         -------
-        Iterator
-            In the order of items if this process does them; else as they are done.
+        Callable
+            Its items are taken as they are needed. They come in their order if this process does the jobs; else as the
+            jobs are done. A job whose worker dies is done again by another, so it writes nothing, or what may be
+            written twice.
         """
         if self._client is None:
             function = build()
-            yield from ((item, partial(function, item)) for item in items)
-            return
+            return lambda items: ((item, partial(function, item)) for item in items)
         import jax
+
+        double: Any = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        return partial(self._stream, _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, pickle.dumps(build)))
+
+    def _stream(self, work: _Work, items):
         from distributed import as_completed
 
-        work = _Work(uuid.uuid4().hex, __version__, os.getcwd(), jax.config.jax_enable_x64, pickle.dumps(build))  # pyright: ignore[reportAttributeAccessIssue]
         left, waiting, done = iter(items), {}, as_completed(loop=self._client.loop)
         try:
             while True:

@@ -111,7 +111,7 @@ def reconstruct_frames_by(
     frames = series.unfinished
     items = ((frame, series.exists) for frame in frames)
     with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as done:
-        for (frame, _), result in workers.stream(partial(_writer, opened, series.path, series.grid), items):
+        for (frame, _), result in workers.stream_of(partial(_writer, opened, series.path, series.grid))(items):
             try:
                 volume, note = result()
             except InputError as error:
