@@ -96,6 +96,7 @@ def command(
     points: Path | None,
     force: bool,
     frame_interval: float | None,
+    track: float | None,
     resume: bool,
     camera: CaptureOptions,
     workers: Workers,
@@ -127,6 +128,12 @@ def command(
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
+    if track:
+        from ..suppression.tracking import linker
+
+        if not points:
+            raise InputError("--track: found no --points, allowed: with POINTS.csv, which has the particles.")
+        linker()
     check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
@@ -148,7 +155,8 @@ def command(
     making = partial(maker, imager, grid, inversion, **options, weights=weights)
     again = partial(imaged_again, imager, grid, optics) if method == "unrolled" or suppress == "unet" else None
     with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
-        given = {"--resume": resume, "--frame-interval": frame_interval, "--workers or --scheduler": workers.elsewhere}
+        given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
+        given["--workers or --scheduler"] = workers.elsewhere
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
             with workers:
@@ -162,6 +170,7 @@ def command(
                     camera=camera,
                     progress=progress,
                     points=points,
+                    track=track,
                     weights=weights,
                     interval=frame_interval,
                     resume=resume,

@@ -17,12 +17,12 @@ from ..base.workers import Workers
 from .captures import CaptureOptions
 from .files import provenance_of
 from .interrupt import RESUMABLE, kept
-from .options import Number, depth_range
+from .options import UM, Number, depth_range
 
 # Frames that failed and are named as they do; later ones are counted, and are all in the store.
 _NAMED = 10
 # Options that say where results go and how, not what they are.
-_ELSEWHERE = ("capture", "design", "output", "points", "resume", "force", "workers", "scheduler")
+_ELSEWHERE = ("capture", "design", "output", "points", "track", "resume", "force", "workers", "scheduler")
 
 
 def recording_options(command):
@@ -38,7 +38,13 @@ def recording_options(command):
         help="Of a recording: keep the frames that a run left in VOLUME.zarr, if any, and make the others. Without it "
         "an unfinished VOLUME.zarr is replaced by --force alone.",
     )
-    return interval(resume(command))
+    track = click.option(
+        "--track",
+        type=UM,
+        help="Of a recording with --points: how far a particle moves from frame to frame at most, um; POINTS.csv then "
+        "says which particle a point is. Needs pip install 'gs-jax[track]'.",
+    )
+    return interval(track(resume(command)))
 
 
 def check_recording(capture: Path, recording, output: Path, *, resume: bool, given: dict[str, Any], force: bool):
@@ -104,6 +110,7 @@ def reconstruct_recording(
     camera: CaptureOptions,
     progress: Progress,
     points: Path | None,
+    track: float | None,
     weights: Path | None,
     interval: float | None,
     resume: bool,
@@ -152,10 +159,9 @@ def reconstruct_recording(
     run(series, failed=failed, progress=progress)
     say()
     seconds, new = time.monotonic() - began, len(series.finished) - before
+    found = ""
     if points:
-        from ..io.points import write_points_in_time
-
-        write_points_in_time(points, ((frame, note["points"]) for frame, note in series.notes()), provenance=provenance)
+        found = _write_points(points, series, track, provenance)
     camera.say()
     check = _say_of_frames(series)
     size = " x ".join(map(str, (series.count, *grid.volume_shape)))
@@ -166,6 +172,8 @@ def reconstruct_recording(
     click.echo(f"{output}: {rate}")
     if check:
         click.echo(f"{output}: {check}")
+    if points:
+        click.echo(f"{points}: {found}")
     if series.failed:
         some = ", ".join(map(str, sorted(series.failed)[:_NAMED])) + (", ..." if len(series.failed) > _NAMED else "")
         what = f"{len(series.failed)} of {series.count} frames failed and are empty: {some}"
@@ -187,6 +195,26 @@ def _request(names, provenance) -> dict[str, str]:
     request["points"] = str(bool(given.get("points")))
     request["names of frames"] = hashlib.sha256("\n".join(names).encode()).hexdigest()
     return request
+
+
+def _write_points(path, series, track, provenance) -> str:
+    """Writes the points of all frames, and gives their number, and that of particles, in words."""
+    from ..io.points import write_points_in_time
+    from ..suppression.tracking import tracked
+
+    points, particles = 0, 0
+
+    def counted(frames):
+        nonlocal points, particles
+        for frame, columns in frames:
+            points += len(columns["x_mm"])
+            particles = max([particles, *(1 + number for number in columns.get("particle", ()))])
+            yield frame, columns
+
+    frames = ((frame, note["points"]) for frame, note in series.notes())
+    write_points_in_time(path, counted(tracked(frames, track / 1000) if track else frames), provenance=provenance)
+    words = f"{points} point{'s' * (points != 1)}"
+    return f"{words} of {particles} particle{'s' * (particles != 1)}" if track else words
 
 
 def _columns(points, evidence) -> dict[str, list]:
