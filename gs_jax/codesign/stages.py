@@ -210,8 +210,6 @@ def run_stages(
                     log.ends.append(end)
                     each(None)
                     advance()
-                log.steps.sort(key=lambda step: step["start"])
-                log.ends.sort(key=lambda end: end["start"])
             else:
                 for start in starts:
                     state = _begun(problem, stage, terms, values, start)
@@ -219,6 +217,9 @@ def run_stages(
                         state, saved = restored(*saved, state), None
                     log.ends.append(_run_start(stage, terms, values, start, state, log.steps, each))
                     advance()
+        # Workers end them in any order.
+        for records in (log.steps, log.ends):
+            records.sort(key=lambda record: (record["stage"], record["start"]))
         free = best_end(log, stage.number)["free"]
         values = stage.values({name: jnp.asarray(x, values[name].dtype) for name, x in free.items()}, values)
     return values
