@@ -5,10 +5,12 @@ for.
 """
 
 import contextlib
+import math
 import os
 import pickle
 import signal
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -20,9 +22,10 @@ from .errors import InputError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Jobs that wait at each worker, so that none waits for a job; seconds that a scheduler has to answer, and a worker to
-# end.
-_AHEAD, _ANSWER, _END = 2, 10, 2
+# Jobs given out for each worker, so that none waits for one.
+_AHEAD = 2
+# Seconds that a scheduler has to answer, that a worker has to end, and between two looks at how many workers there are.
+_ANSWER, _END, _LOOK = 10, 2, 1.0
 _lock = threading.Lock()
 # What this worker runs now, by token.
 _functions: dict[str, Callable[[Any], Any]] = {}
@@ -109,9 +112,13 @@ class Workers:
         from distributed import as_completed
 
         left, waiting, done = iter(items), {}, as_completed(loop=self._client.loop)
+        looked, threads = -math.inf, 1
         try:
             while True:
-                room = _AHEAD * max(1, sum(self._client.nthreads().values())) - len(waiting)
+                # Workers come and go; to ask the scheduler takes as long as to give it a job.
+                if time.monotonic() - looked > _LOOK:
+                    looked, threads = time.monotonic(), max(1, sum(self._client.nthreads().values()))
+                room = _AHEAD * threads - len(waiting)
                 # What counts comes first: the other would take an item, and drop it.
                 for _, item in zip(range(room), left, strict=False):
                     future = self._client.submit(_run, work, item, pure=False)
