@@ -181,7 +181,8 @@ def picture(found: dict) -> Figure:
     most = 0
     for key, label in (("long, here", "one process"), ("long, 2 workers", "two workers and who asks them")):
         _, done, memory = np.array(found[key]["seconds_frames_mib"]).T
-        axes.plot(done, memory, label=label)
+        running = done < found[key]["frames"]  # what is left is the end of the processes
+        axes.plot(done[running], memory[running], label=label)
         most = max(most, memory.max())
     axes.set(xlabel="frames written", ylabel="resident memory, MiB", ylim=(0, 1.2 * most))
     axes.legend(fontsize=8)
