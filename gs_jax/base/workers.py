@@ -166,7 +166,7 @@ class Workers:
             self._cluster = LocalCluster(
                 n_workers=self.count,
                 threads_per_worker=1,
-                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                dashboard_address="127.0.0.1:0",
                 memory_limit=None,
                 preload=[__name__],
                 env=_threads(max(1, CPU_COUNT // self.count)),
