@@ -41,23 +41,32 @@ def test_the_drawing_is_drawn_and_small(tmp_path, monkeypatch):
         assert 10_000 < path.stat().st_size < 200_000
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", DESIGN / "README.md", DESIGN / "KEYS.md", DESIGN / "LAB.md"])
+@pytest.mark.parametrize(
+    "path", [ROOT / "README.md", *(DESIGN / f"{n}.md" for n in ("README", "KEYS", "LAB", "CLUSTER"))]
+)
 def test_links_lead_somewhere(path):
     for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text(encoding="utf-8")):
         assert (path.parent / link).exists(), link
 
 
-def test_the_readme_leads_to_both():
+def test_the_readme_leads_to_all():
     text = (ROOT / "README.md").read_text()
-    assert "design/KEYS.md" in text and "design/LAB.md" in text
+    assert all(f"design/{name}.md" in text for name in ("KEYS", "LAB", "CLUSTER"))
 
 
-def test_the_commands_of_the_lab_page_exist():
+@pytest.mark.parametrize(
+    "page, named",
+    [
+        ("LAB.md", {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"}),
+        ("CLUSTER.md", {"reconstruct", "optimize", "pareto", "train"}),
+    ],
+)
+def test_the_commands_of_a_page_exist(page, named):
     """Each with options that it has."""
-    text = (DESIGN / "LAB.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    text = (DESIGN / page).read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line for block in re.findall(r"```\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
     said = [shlex.split(line, comments=True) for line in lines if line.startswith("gs-jax ")]
-    assert {words[1] for words in said} >= {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"}
+    assert {words[1] for words in said} >= named
     for _, name, *rest in said:
         assert name in COMMANDS
         command = commands.get_command(click.Context(commands), name)

@@ -72,9 +72,24 @@ def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
         assert capsys.readouterr().err.splitlines()[0] == wanted
 
 
+def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):
+    """As of a recording: the first frame compiles for 20 s, the second waits a second for the first to be written."""
+    times = iter([0.0, 20.0, 21.0, *(21.0 + 0.1 * n for n in range(1, 5000))])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
+    monkeypatch.setattr(module, "most_memory", lambda: 2**30)
+    with Progress() as progress:
+        list(progress.track(range(800), "Reconstructing"))
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if "in all" in line]
+    assert said == ["gs-jax: Reconstructing: about 80 s in all, 1 GiB of memory"]
+    # After the line for the first frame, which knows no better.
+    assert all(int(left) <= 80 for left in re.findall(r"about (\d+) s left", "\n".join(lines[1:])))
+
+
 def test_the_terminal_announces_it_too(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(module, "_LONG", 0.0)
+    monkeypatch.setattr(module, "_TELLING", 0.0)
     with Progress() as progress:
         list(progress.track(range(3), "Imaging"))
     assert "Imaging: about" in capsys.readouterr().err
@@ -86,7 +101,7 @@ def test_the_memory_that_is_announced_is_what_is_taken(folder, method):
     arguments = ["gs-jax", *RECONSTRUCT, "--method", method, "--steps", "4", "--voxel-um", "50", "-o", "v.ome.tif"]
     code = (
         "import sys; from gs_jax.base import progress, memory; from gs_jax.__main__ import main\n"
-        f"progress._LONG = 0; sys.argv = {arguments!r}\n"
+        f"progress._LONG = progress._TELLING = 0; sys.argv = {arguments!r}\n"
         "try:\n    main()\nfinally:\n    print(memory.most_memory() / 2**30)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)

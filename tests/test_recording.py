@@ -106,15 +106,18 @@ def test_what_viewers_are_told(folder, monkeypatch, capsys):
     monkeypatch.setattr(ngff, "CHUNK", 16)
     monkeypatch.setattr(volume_series, "CHUNK", 16)
     run(monkeypatch, capsys, *command(save("rec.tif"), "--frame-interval", "0.05"))
-    attributes = json.loads((folder / "v.zarr" / ".zattrs").read_text())
+    attributes = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]
     (image,) = attributes["multiscales"]
-    assert image["version"] == "0.4" and image["axes"] == [
+    assert attributes["version"] == "0.5" and image["axes"] == [
         {"name": "t", "type": "time", "unit": "second"},
         *({"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"),
     ]
     levels = [level(name=each["path"]) for each in image["datasets"]]
     assert [level.shape for level in levels] == [(5, 5, 39, 33), (5, 5, 20, 17), (5, 5, 10, 9)]
     assert [level.chunks for level in levels] == [(1, 1, 16, 16), (1, 1, 16, 16), (1, 1, 10, 9)]
+    # A frame is a file.
+    assert [level.shards for level in levels] == [(1, 5, 48, 48), (1, 5, 32, 32), (1, 5, 10, 9)]
+    assert len(list((folder / "v.zarr" / "0" / "c").rglob("*"))) == 5 * 4
     transforms = [each["coordinateTransformations"] for each in image["datasets"]]
     assert [scale["scale"] for scale, _ in transforms] == [[0.05, 1000, 50 * n, 50 * n] for n in (1, 2, 4)]
     # Of wider voxels, the first centre lies further in.
@@ -137,7 +140,7 @@ def test_what_viewers_are_told(folder, monkeypatch, capsys):
 
 def test_without_an_interval_time_has_no_unit(folder, monkeypatch, capsys):
     run(monkeypatch, capsys, *command(save("rec.tif")))
-    (image,) = json.loads((folder / "v.zarr" / ".zattrs").read_text())["multiscales"]
+    (image,) = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]["multiscales"]
     assert image["axes"][0] == {"name": "t", "type": "time"}
     assert image["datasets"][0]["coordinateTransformations"][0]["scale"][0] == 1
 
@@ -170,8 +173,8 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, c
     run(monkeypatch, capsys, *command("rec.tif", output="w.zarr"))
     resumed, uninterrupted = files(folder / "v.zarr"), files(folder / "w.zarr")
     for each in (resumed, uninterrupted):
-        attributes = json.loads(each.pop(".zattrs"))
-        assert attributes["multiscales"][0]["datasets"] and each.pop(JOURNAL).count(b"\n") == 61
+        attributes = json.loads(each.pop("zarr.json"))["attributes"]
+        assert attributes["ome"]["multiscales"][0]["datasets"] and each.pop(JOURNAL).count(b"\n") == 61
     assert resumed.keys() == uninterrupted.keys()
     # What was killed computed the geometry in float32, the tests do in float64.
     np.testing.assert_allclose(volumes(), volumes("w.zarr"), rtol=1e-4)

@@ -21,6 +21,8 @@ from .memory import most_memory
 
 # Seconds between two lines; what takes longer than a minute is announced.
 _EVERY, _LONG = 10.0, 60.0
+# Seconds of parts after the first that tell how long the others take.
+_TELLING = 3.0
 # How much is shown: QUIET is nothing, VERBOSE a line after every piece of work.
 QUIET, NORMAL, VERBOSE = -1, 0, 1
 shown: ContextVar[int] = ContextVar("shown", default=NORMAL)
@@ -77,7 +79,7 @@ class Progress:
         """Work of `total` parts; what it yields is called after each.
 
         `quarter`: what would take a fourth of the time. `rate`: what the parts are, if so many a second are shown.
-        After the second part, work of more than a minute is announced: its time, the memory, and the quarter.
+        Soon after the second part, work of more than a minute is announced: its time, the memory, and the quarter.
         """
         if bars := self._bars:
             task = bars.add_task(description, total=total, rate="")
@@ -104,25 +106,36 @@ class Progress:
 
 
 class _Forecast:
-    """Called after each part; after the second, without what the first compiled, it says how long all will take.
+    """Called after each part; when what comes after the first tells, it says how long all will take.
 
+    The first part compiles, and of the others the longest is left out: it may have waited for the first to be written.
     And how much memory: the most that was taken, as further parts take no more.
     """
 
     def __init__(self, description: str, total: int | None, say: Callable[[str], object], quarter: str):
         self.description, self.total, self.say, self.quarter = description, total, say, quarter
-        self.done, self.first = 0, 0.0
+        self.done, self.first, self.last, self.longest, self.said = 0, 0.0, 0.0, 0.0, False
 
     def __call__(self, now: float) -> None:
         self.done += 1
-        if self.total is None or self.done > 2:
-            return
         if self.done == 1:
             self.first = now
-        elif (whole := (now - self.first) * self.total) > _LONG:
+        else:
+            self.longest = max(self.longest, now - self.last)
+        self.last = now
+        if self.total is None or self.said or self.done < 2 or now - self.first < _TELLING:
+            return
+        self.said = True
+        if (whole := self.each * self.total) > _LONG:
             sooner = f"; {self.quarter}: about {_in_words(whole / 4)}" if self.quarter else ""
             memory = f"{most_memory() / 2**30:.2g} GiB of memory"
             self.say(f"gs-jax: {self.description}: about {_in_words(whole)} in all, {memory}{sooner}")
+
+    @property
+    def each(self) -> float:
+        """Seconds of a part, once there are two."""
+        left_out = self.done > 2
+        return (self.last - self.first - left_out * self.longest) / (self.done - 1 - left_out)
 
 
 def _in_words(seconds: float) -> str:
@@ -147,7 +160,8 @@ class _Lines:
     def say(self, now: float) -> None:
         self.last = now
         taken, left = self.last - self.began, (self.total or self.done) - self.done
-        time_left = f", about {taken / self.done * left:.0f} s left" if left and self.done else ""
+        each = self.forecast.each if self.done > 1 else taken
+        time_left = f", about {each * left:.0f} s left" if left and self.done else ""
         of, digits = f" of {self.total}" if self.total else "", 0 if taken >= _EVERY else 2
         rate = f", {self.done / taken:.3g} {self.rate}/s" if self.rate and taken > 0 else ""
         line = f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{rate}{time_left}"

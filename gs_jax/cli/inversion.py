@@ -48,6 +48,13 @@ def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress,
     return made
 
 
+def imaged_again(imager, grid, optics, volume, image, progress):
+    """How far a volume that is imaged again is from its image."""
+    from ..reconstruction.reprojection import reproject
+
+    return reproject(volume, image, imager, grid, optics=optics, progress=progress)
+
+
 def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
     """The method of this name, with the options that were given, if it has them."""
     from ..reconstruction.methods import METHODS as BY_NAME

@@ -6,9 +6,10 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import Workers
 from .files import check_may_write, force_option, provenance_of
 from .interrupt import RESUMABLE, kept
-from .options import DESIGN
+from .options import DESIGN, worker_options
 
 
 @click.command(
@@ -19,11 +20,13 @@ from .options import DESIGN
 @click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
 @click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")
+@worker_options
 @force_option
-def command(design: Path, study: Path, resume: bool, output: Path, force: bool):
+def command(design: Path, study: Path, resume: bool, output: Path, force: bool, workers: Workers):
     """Search for a better microscope than that of the file DESIGN, and show before and after.
 
-    Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history).
+    Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history). Workers run
+    the starts of the study's first stage.
     """
     import jax
     from rich.console import Console
@@ -41,8 +44,9 @@ def command(design: Path, study: Path, resume: bool, output: Path, force: bool):
     if resume and not checkpoint.exists():
         raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
     kept[checkpoint] = RESUMABLE
-    with Progress() as progress:
-        outcome = search.optimize(design, study, progress=progress, checkpoint=checkpoint, resume=resume)
+    with Progress() as progress, workers:
+        how = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
+        outcome = search.optimize(design, study, **how)
     write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study))
     checkpoint.unlink(missing_ok=True)
     Console().print(before_and_after(outcome))

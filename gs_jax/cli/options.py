@@ -4,10 +4,13 @@ Commands import what they run when they run: their help needs none of it. So the
 again.
 """
 
+import functools
 import math
 from pathlib import Path
 
 import click
+
+from ..base.workers import Workers
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MOST_DEPTHS = 10_000
@@ -79,6 +82,24 @@ def shipped_designs() -> list[Path]:
 DESIGN = DesignFile()
 MM = Number(least=1e-3, most=1e4, unit="mm")
 UM = Number(least=1e-2, most=1e6, unit="um")
+
+
+def worker_options(command):
+    """Who does the work; the command takes it as `workers`, and enters it when there is work."""
+
+    @functools.wraps(command)
+    def taking(*arguments, workers, scheduler, **given):
+        return command(*arguments, workers=Workers(workers, scheduler), **given)
+
+    count = click.option(
+        "--workers",
+        type=click.IntRange(1, 1000),
+        help="Processes of this machine that share the work. Needs pip install 'gs-jax[cluster]'.  [default: this one]",
+    )
+    address = click.option(
+        "--scheduler", help="Address of a Dask scheduler whose workers do the work: tcp://HOST:8786."
+    )
+    return count(address(taking))
 
 
 def depth_range(depths: list[float]) -> str:

@@ -5,15 +5,18 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.disk import check_output, make_folder, write_json
 from .files import check_may_write, provenance_of
 from .interrupt import PARTIAL, kept
+from .options import worker_options
 
 
 @click.command("pareto", epilog="Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
 @click.argument("study", type=Path)
 @click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
-def command(study: Path, out: Path):
+@worker_options
+def command(study: Path, out: Path, workers: Workers):
     """Show the trade-off that the file STUDY asks for: its one goal against one or two moving limits.
 
     The folder gets pareto.json, the designs' numbers, which grows as they are found, and pareto.png.
@@ -45,8 +48,8 @@ def command(study: Path, out: Path):
         write_json(numbers, {KEY: provenance} | as_json(front))
         kept[numbers] = PARTIAL
 
-    with Progress() as progress, errors_name_file(study):
-        front = trade_off(parent, question, each=each, progress=progress)
+    with Progress() as progress, workers, errors_name_file(study):
+        front = trade_off(parent, question, each=each, progress=progress, workers=workers)
     write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):

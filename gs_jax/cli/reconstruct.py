@@ -1,16 +1,18 @@
 """`gs-jax reconstruct`: a capture to a volume, or to points; a recording to volumes in time."""
 
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.disk import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
-from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range
+from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range, worker_options
 from .recording import check_recording, in_words, reconstruct_recording, recording_options
 
 
@@ -74,6 +76,7 @@ from .recording import check_recording, in_words, reconstruct_recording, recordi
     help="POINTS.csv: write the points that the capture shows, too; of a recording with their frame, from 0.",
 )
 @recording_options
+@worker_options
 @capture_options
 @force_option
 def command(
@@ -93,8 +96,10 @@ def command(
     points: Path | None,
     force: bool,
     frame_interval: float | None,
+    track: float | None,
     resume: bool,
     camera: CaptureOptions,
+    workers: Workers,
 ):
     """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
 
@@ -118,11 +123,17 @@ def command(
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.native import once
     from ..reconstruction.pipeline import COARSE, voxel_grid
-    from .inversion import maker, method_of
+    from .inversion import imaged_again, maker, method_of
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
+    if track:
+        from ..suppression.tracking import linker
+
+        if not points:
+            raise InputError("--track: found no --points, allowed: with POINTS.csv, which has the particles.")
+        linker()
     check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
@@ -140,35 +151,34 @@ def command(
     imager = camera.imager(microscope.imager())
     pixels = 1 if method == "backproject" else COARSE
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
-    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points}
+    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points is not None}
+    making = partial(maker, imager, grid, inversion, **options, weights=weights)
+    again = partial(imaged_again, imager, grid, optics) if method == "unrolled" or suppress == "unet" else None
     with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
-        again = None
-        if method == "unrolled" or suppress == "unet":
-            from ..reconstruction.reprojection import reproject
-
-            again = lambda volume, image, progress: reproject(
-                volume, image, imager, grid, optics=optics, progress=progress
-            )
-        check_recording(capture, recording, output, resume=resume, interval=frame_interval, force=force)
+        given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
+        given["--workers or --scheduler"] = workers.elsewhere
+        check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
-            return reconstruct_recording(
-                recording,
-                design_text(microscope),
-                imager,
-                grid,
-                maker(imager, grid, inversion, progress, **options, weights=weights),
-                output,
-                name=capture.name,
-                camera=camera,
-                progress=progress,
-                points=points,
-                weights=weights,
-                interval=frame_interval,
-                resume=resume,
-                again=again,
-            )
+            with workers:
+                return reconstruct_recording(
+                    recording,
+                    design_text(microscope),
+                    grid,
+                    making,
+                    output,
+                    capture=capture,
+                    camera=camera,
+                    progress=progress,
+                    points=points,
+                    track=track,
+                    weights=weights,
+                    interval=frame_interval,
+                    resume=resume,
+                    workers=workers,
+                    again=again,
+                )
         image = camera.read(capture)
-        made = maker(imager, grid, inversion, progress, **options, weights=weights)
+        made = making(progress)
         # The paper's method is a single pass. All others, and points, are many.
         with once() if method == "backproject" and suppress != "points" and not points else nullcontext():
             volume, found, evidence, warning = made(image, progress)

@@ -7,9 +7,11 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.disk import check_output, write_json
 from .files import check_may_write, provenance_of
 from .interrupt import RESUMABLE, kept
+from .options import worker_options
 
 # Those of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
@@ -24,9 +26,10 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
-def command(network: str, steps: int | None, seed: int, resume: bool, output: Path):
+@worker_options
+def command(network: str, steps: int | None, seed: int, resume: bool, output: Path, workers: Workers):
     """Train networks: for background suppression the paper's, or ours, which looks at seven slices; or for the unrolled
-    inversion.
+    inversion. Workers simulate the captures that networks are trained on.
 
     Beside WEIGHTS.npz it keeps WEIGHTS.checkpoint, which an interrupt leaves there, and WEIGHTS.json, the losses; for
     seven slices also the folder WEIGHTS-stacks, the simulated captures that they are trained on (0.4 GB; it may be
@@ -52,9 +55,12 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
         if network == "paper":
             recipe = paper_recipe()
         elif network == "multislice":
-            recipe = multislice_recipe(stacks(output.with_name(f"{output.stem}-stacks"), _STACKS, seed, progress))
+            folder = output.with_name(f"{output.stem}-stacks")
+            with workers:
+                recipe = multislice_recipe(stacks(folder, _STACKS, seed, progress, workers=workers))
         else:
-            recipe = unrolled_recipe(unrolled_cases(_CASES, seed, progress))
+            with workers:
+                recipe = unrolled_recipe(unrolled_cases(_CASES, seed, progress, workers=workers))
         begin = partial(read_checkpoint, checkpoint) if resume else start
         state = begin(recipe, steps=steps, seed=seed)
         with progress.counter("Training", steps - int(state.step)) as advance:

@@ -31,8 +31,8 @@ class Log:
     ends: list[dict[str, Any]] = field(default_factory=list)
 
 
-def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, design: Design, state: State) -> None:
-    """Write the file, whole or not at all."""
+def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, design: Design, state: State | None) -> None:
+    """Write the file, whole or not at all; the state is None between two starts."""
     head = {"format": _FORMAT, "of": _digest(study, design), "log": asdict(log)}
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(json.dumps(head).encode() + b"\n")
@@ -40,7 +40,7 @@ def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, desig
 
 
 def read_checkpoint(path: str | os.PathLike[str], study: Study, design: Design) -> tuple[Log, bytes]:
-    """The log, and the state for `restored`.
+    """The log, and the state for `restored`, empty between two starts.
 
     Raises
     ------

@@ -1,14 +1,15 @@
 """Trade-offs between two or three things that are wanted: what one costs in the others.
 
 The epsilon constraint (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971): one term is the goal,
-and limits on one or two others move from value to value. Each search is that of `gs_jax.codesign.search`, from where
-the one before ended. Every point is a design that a search found, so the true front
-may be better, not worse.
+and limits on one or two others move from value to value. Each search is that of `gs_jax.codesign.search`: the first
+from the design, the others, which may run at once, from where the first ended. Every point is a design that a search
+found, so the true front may be better, not worse.
 """
 
 import contextlib
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..designs.design import Design
 from .checkpoint import Log
 from .objectives import unit_of
@@ -66,6 +68,7 @@ def trade_off(
     *,
     each: Callable[[Front], object] = lambda front: None,
     progress: Progress | None = None,
+    workers: Workers | None = None,
 ) -> Front:
     """What a study's one goal costs in its one or two moving limits.
 
@@ -78,6 +81,8 @@ def trade_off(
         the other for each combination of limits. Its own `design` is not looked at.
     each
         Called with the front so far after each point.
+    workers
+        Who runs the searches; this process by default. The result is the same.
 
     Raises
     ------
@@ -85,7 +90,7 @@ def trade_off(
         If a file cannot be read, the study does not fit the design or moves no limit.
     """
     with opened(design, study) as (parent, question):
-        return _trade_off(sweep_of(parent, question), each, progress or Progress())
+        return _trade_off(sweep_of(parent, question), each, progress or Progress(), workers or Workers())
 
 
 class Sweep(NamedTuple):
@@ -106,21 +111,39 @@ def sweep_of(design: Design, study: Study) -> Sweep:
     return Sweep(problem_of(design, wider), kept, moving)
 
 
-def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress) -> Front:
+def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress, workers: Workers) -> Front:
     problem, kept, moving = sweep
-    study, entries = problem.study, entries_of(problem.parent, [*kept, *moving])
-    stages = [make_stage(problem, index) for index in range(len(study.stages))]
-    points, last = [], start_values(problem.parent)
-    front = lambda: _front([*kept, *moving], [next(t for t in kept if t.is_goal), *moving], points)
-    combinations = list(itertools.product(*(limit.targets for limit in study.pareto)))
-    for limits in progress.track(combinations, "Trade-off"):
-        now = _with_targets(kept, moving, limits)
-        # A search that comes to no number spoils no other: its point is the one before.
-        with contextlib.suppress(InputError):
-            last = run_stages(problem, stages, now, last, log=Log())
-        points.append(Point(last, rows_of(now, entries, last)))
-        each(front())
+    objectives = [next(term for term in kept if term.is_goal), *moving]
+    combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
+    stream, points = workers.stream_of(partial(_searcher, sweep)), {}
+    front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
+    with progress.counter("Trade-off", len(combinations)) as advance:
+        values = start_values(problem.parent)
+        for some in (combinations[:1], combinations[1:]):
+            first = len(points)
+            for (number, *_), result in stream((first + i, limits, values) for i, limits in enumerate(some)):
+                points[number] = result()
+                each(front())
+                advance()
+            values = points[0].values
     return front()
+
+
+def _searcher(sweep: Sweep):
+    """From the number of a point, its limits and where to start, to the point."""
+    problem, kept, moving = sweep
+    entries = entries_of(problem.parent, [*kept, *moving])
+    stages = [make_stage(problem, index) for index in range(len(problem.study.stages))]
+
+    def search(job):
+        _, limits, values = job
+        terms = _with_targets(kept, moving, limits)
+        # A search that comes to no number spoils no other: its point is where it started.
+        with contextlib.suppress(InputError):
+            values = run_stages(problem, stages, terms, values, log=Log())
+        return Point(values, rows_of(terms, entries, values))
+
+    return search
 
 
 def _term(limit: LimitTable) -> TermTable:

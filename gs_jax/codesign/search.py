@@ -15,11 +15,12 @@ from typing import NamedTuple
 
 from ..base.errors import errors_name_file
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..designs.design import Design, read_design
 from .checkpoint import Log, read_checkpoint, write_checkpoint
-from .parameters import Values, new_design, start_values
+from .parameters import new_design, start_values
 from .solve import State
-from .stages import Stage, entries_of, make_stage, problem_of, rows_of, run_stages
+from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import Study, read_study
 from .targets import Row
 
@@ -74,6 +75,7 @@ def optimize(
     checkpoint: PathLike | None = None,
     resume: bool = False,
     every: float = _EVERY,
+    workers: Workers | None = None,
 ) -> Outcome:
     """Search for a design that does what a study wants.
 
@@ -91,6 +93,8 @@ def optimize(
         Go on from that file, with the same result as without the interruption.
     every
         Seconds between two checkpoints.
+    workers
+        Who runs the first stage's starts; this process by default. The result is the same.
 
     Raises
     ------
@@ -100,30 +104,30 @@ def optimize(
     """
     with opened(design, study) as (parent, question):
         path = None if checkpoint is None else Path(checkpoint)
-        return _optimize(parent, question, progress, path, resume, every)
+        return _optimize(parent, question, progress, path, resume, every, workers)
 
 
 def _optimize(
-    design: Design, study: Study, progress: Progress | None, checkpoint: Path | None, resume: bool, every: float
+    design: Design,
+    study: Study,
+    progress: Progress | None,
+    checkpoint: Path | None,
+    resume: bool,
+    every: float,
+    workers: Workers | None,
 ) -> Outcome:
     began = time.monotonic()
     log, saved = Log(), None
     if resume and checkpoint:
         log, state = read_checkpoint(checkpoint, study, design)
-        saved = checkpoint, state
-    problem, saver = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
-
-    def each(stage: Stage, start: int, values: Values, state: State) -> None:
-        worst = dict(zip(stage.labels, map(float, stage.watch(state.free, values)), strict=True))
-        record = {"stage": stage.number, "start": start, "step": int(state.step), "cost": float(state.cost)}
-        log.steps.append(record | worst)
-        saver(state)
-
+        saved = (checkpoint, state) if state else None
+    problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.parent)
     before = rows_of(study.terms, entries_of(problem.parent, study.terms), values)
     # Made when they are needed: what compiles is seen in the progress.
     stages = (make_stage(problem, index) for index in range(len(study.stages)))
-    values = run_stages(problem, stages, study.terms, values, log=log, progress=progress, each=each, saved=saved)
+    how = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
+    values = run_stages(problem, stages, study.terms, values, **how)
     found = new_design(design, problem.parent, values).model_copy(update={"name": study.name})
     written = problem_of(found, study.model_copy(update={"depths_mm": None})).parent
     after = rows_of(study.terms, entries_of(written, study.terms), start_values(written))
@@ -131,13 +135,13 @@ def _optimize(
 
 
 class _Saver:
-    """Writes a checkpoint after the first step, and then now and then."""
+    """Writes a checkpoint after the first step and then now and then, and after each start that a worker ran."""
 
     def __init__(self, path: Path | None, every: float, log: Log, study: Study, design: Design):
         self.path, self.every, self.last = path, every, -math.inf
         self.log, self.study, self.design = log, study, design
 
-    def __call__(self, state: State) -> None:
-        if self.path is not None and time.monotonic() - self.last >= self.every:
+    def __call__(self, state: State | None) -> None:
+        if self.path is not None and (state is None or time.monotonic() - self.last >= self.every):
             write_checkpoint(self.path, self.log, self.study, self.design, state)
             self.last = time.monotonic()

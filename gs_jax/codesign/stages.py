@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..designs.design import Design
 from .checkpoint import Log, restored
 from .parameters import Bounds, Box, Parent, Values, candidate, parent_of, start_values
@@ -167,8 +168,9 @@ def run_stages(
     *,
     log: Log,
     progress: Progress | None = None,
-    each: Callable[[Stage, int, Values, State], None] = lambda *_: None,
+    each: Callable[[State | None], None] = lambda state: None,
     saved: tuple[Path, bytes] | None = None,
+    workers: Workers | None = None,
 ) -> Values:
     """The parameters that the stages come to, one after the other; each keeps what the one before it found.
 
@@ -179,11 +181,13 @@ def run_stages(
     values
         To start from.
     log
-        Ends are added to it; what already ended according to it is not run again.
+        Steps and ends are added to it; what already ended according to it is not run again.
     each
-        Called after every step, with the stage, the number of the start, the parameters before the stage, the state.
+        Called after every step with the state; with None after every start that a worker ran.
     saved
-        A checkpoint, to go on from.
+        The state of the first start that has not ended, to go on from.
+    workers
+        Who runs the starts of the first stage, if there are several; this process by default.
 
     Raises
     ------
@@ -192,31 +196,74 @@ def run_stages(
     """
     progress = progress or Progress()
     for stage in stages:
-        wanted = terms_of(stage.table, terms)
-        given = targets_of(wanted), values
-        done = sum(end["stage"] == stage.number for end in log.ends)
-        starts = range(done, problem.study.starts if stage.number == 0 else 1)
-        for start in progress.track(starts, f"Stage {stage.number + 1}, {stage.table.solver}"):
-            state = stage.steps.begin(stage.free(random_start(problem, values, start)), given)
-            if saved is not None:
-                state, saved = restored(*saved, state), None
-            after_step, limit = partial(each, stage, start, values), stage.table.steps
-            state, reason = run(stage.steps, state, given, limit=limit, enough=stage.enough, each=after_step)
-            worst = zip(wanted, stage.watch(state.free, values), strict=True)
-            log.ends.append(
-                {
-                    "stage": stage.number,
-                    "start": start,
-                    "steps": int(state.step),
-                    "cost": float(state.cost),
-                    "met": all(assess(term, np.asarray(x)[None]).met is not False for term, x in worst),
-                    "reason": reason,
-                    "free": {name: np.asarray(x).tolist() for name, x in state.free.items()},
-                }
-            )
+        ended = {end["start"] for end in log.ends if end["stage"] == stage.number}
+        starts = [start for start in range(problem.study.starts if stage.number == 0 else 1) if start not in ended]
+        with progress.counter(f"Stage {stage.number + 1}, {stage.table.solver}", len(starts)) as advance:
+            if workers and workers.elsewhere and len(starts) > 1:
+                # What was saved within a start is left: a worker runs it from its beginning.
+                saved = None
+                log.steps[:] = [step for step in log.steps if step["start"] in ended]
+                stream = workers.stream_of(partial(_starts_of_worker, problem, terms, values))
+                for _, result in stream(starts):
+                    steps, end = result()
+                    log.steps.extend(steps)
+                    log.ends.append(end)
+                    each(None)
+                    advance()
+            else:
+                for start in starts:
+                    state = _begun(problem, stage, terms, values, start)
+                    if saved is not None:
+                        state, saved = restored(*saved, state), None
+                    log.ends.append(_run_start(stage, terms, values, start, state, log.steps, each))
+                    advance()
+        # Workers end them in any order.
+        for records in (log.steps, log.ends):
+            records.sort(key=lambda record: (record["stage"], record["start"]))
         free = best_end(log, stage.number)["free"]
         values = stage.values({name: jnp.asarray(x, values[name].dtype) for name, x in free.items()}, values)
     return values
+
+
+def _starts_of_worker(problem, terms, values):
+    """From a start of the first stage to the records of its steps and of its end."""
+    stage = make_stage(problem, 0)
+
+    def run_alone(start):
+        steps, state = [], _begun(problem, stage, terms, values, start)
+        end = _run_start(stage, terms, values, start, state, steps, lambda state: None)
+        return steps, end
+
+    return run_alone
+
+
+def _begun(problem, stage, terms, values, start) -> State:
+    given = targets_of(terms_of(stage.table, terms)), values
+    return stage.steps.begin(stage.free(random_start(problem, values, start)), given)
+
+
+def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any]:
+    """Runs a start from its state, adds a record for each step, and returns that of its end."""
+    wanted = terms_of(stage.table, terms)
+
+    def after_step(state):
+        worst = dict(zip(stage.labels, map(float, stage.watch(state.free, values)), strict=True))
+        record = {"stage": stage.number, "start": start, "step": int(state.step), "cost": float(state.cost)}
+        steps.append(record | worst)
+        each(state)
+
+    limit, given = stage.table.steps, (targets_of(wanted), values)
+    state, reason = run(stage.steps, state, given, limit=limit, enough=stage.enough, each=after_step)
+    worst = zip(wanted, stage.watch(state.free, values), strict=True)
+    return {
+        "stage": stage.number,
+        "start": start,
+        "steps": int(state.step),
+        "cost": float(state.cost),
+        "met": all(assess(term, np.asarray(x)[None]).met is not False for term, x in worst),
+        "reason": reason,
+        "free": {name: np.asarray(x).tolist() for name, x in state.free.items()},
+    }
 
 
 def best_end(log: Log, stage: int) -> dict[str, Any]:

@@ -1,4 +1,8 @@
-"""What OME-Zarr 0.4 says of an image: axes, scales, what to show; volumes, and volumes in time."""
+"""What OME-Zarr says of an image: axes, scales, what to show; volumes (0.4), and volumes in time (0.5).
+
+Of volumes in time each frame is a file, a shard of Zarr 3; of single ones each plane is, which readers of Zarr 2 alone
+read too.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -87,7 +91,7 @@ def image_attributes(
     window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
     channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
     multiscale = {
-        "version": "0.4",
+        **({} if in_time else {"version": "0.4"}),
         "name": title(path),
         "axes": axes,
         "datasets": [
@@ -96,6 +100,7 @@ def image_attributes(
         ],
     }
     attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
+    attributes = {"ome": {"version": "0.5", **attributes}} if in_time else attributes
     return attributes | ({KEY: dict(provenance)} if provenance else {})
 
 
@@ -107,10 +112,28 @@ def _transforms(scale, first, side):
     return [{"type": "scale", "scale": wider}, {"type": "translation", "translation": inner}]
 
 
-def chunked(shape: tuple[int, ...]) -> dict[str, Any]:
-    """How an array is stored: planes, or squares of them, each a file."""
+def chunked(shape: tuple[int, int, int]) -> dict[str, Any]:
+    """How a volume is stored: planes, or squares of them, each a file."""
     return {
-        "chunks": (*[1] * (len(shape) - 2), *(min(n, CHUNK) for n in shape[-2:])),
+        "chunks": (1, *_square(shape)),
         "compressors": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1},
         "chunk_key_encoding": {"name": "v2", "separator": "/"},
     }
+
+
+def sharded(shape: tuple[int, int, int, int]) -> dict[str, Any]:
+    """How volumes in time are stored: planes, or squares of them, those of a frame in one file."""
+    from zarr.codecs import BloscCodec
+
+    rows, columns = _square(shape)
+    whole = (-(-shape[-2] // rows) * rows, -(-shape[-1] // columns) * columns)
+    return {
+        "chunks": (1, 1, rows, columns),
+        "shards": (1, shape[1], *whole),
+        "compressors": BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+        "dimension_names": tuple("tzyx"),
+    }
+
+
+def _square(shape):
+    return tuple(min(n, CHUNK) for n in shape[-2:])

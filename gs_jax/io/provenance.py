@@ -109,6 +109,8 @@ def _in_png(path: Path) -> dict:
 
 
 def _in_zarr(path: Path) -> dict:
+    if (path / "zarr.json").exists():
+        return json.loads(read_text(path / "zarr.json")).get("attributes", {}).get(KEY, {})
     place = path / ".zattrs"
     return _in_json(place) if place.exists() else {}
 

@@ -23,12 +23,13 @@ from ..solvers.unrolled import Unrolled
 from ..voxels import Grid
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
+from .sharding import backproject_by_all
 from .system import System, explainable, model_of, slow_waves
 
 Image = Num[Array | np.ndarray, "row column"]
 Volume = Float32[np.ndarray, "depth y x"]
 
-# Planes between two steps of the progress bar; a plane more or less changes neither speed nor memory.
+# Planes of a device between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16
 # Of the default voxel of an iterative method, which is as wide as so many pixels.
 COARSE = 4
@@ -82,9 +83,10 @@ def reconstruct(
 ) -> Volume:
     """The volume that an image shows.
 
-    Back-projection takes the image as it is, some planes at a time. The other methods explain the light above the
-    camera's offset: the image's darkest percent, or nothing if that is negative, as it was taken off already. They run
-    step by step, and can be interrupted after each; the second call with the same shapes compiles nothing.
+    Back-projection takes the image as it is, some planes at a time, on all devices there are. The other methods explain
+    the light above the camera's offset: the image's darkest percent, or nothing if that is negative, as it was taken
+    off already. They run step by step, and can be interrupted after each; the second call with the same shapes compiles
+    nothing.
 
     With optics by name, iterative methods sum as many pixels as the voxels are wide. Light that the optics does not
     hold is background, and is fitted by no voxel. With "full" that varies slowly: FISTA and ADMM leave the image's
@@ -192,13 +194,15 @@ def _explained(image, model, system, method, stop_at_noise, progress):
 
 def _back_projected(image, imager, grid, method, progress):
     options = {"method": method.interpolation, "normalize": method.normalize}
-    if grid.depths.size <= _PLANES:
-        return np.asarray(backproject(image, imager, grid, **options), np.float32)
+    planes = _PLANES * (devices := jax.local_device_count())
+    project = backproject if devices == 1 else backproject_by_all
+    if grid.depths.size <= planes:
+        return np.asarray(project(image, imager, grid, **options), np.float32)
     image, depths = jnp.asarray(image), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
-    for first in progress.track(range(0, depths.size, _PLANES), "Back-projecting", quarter=_wider(grid)):
-        some = slice(first, first + _PLANES)
-        volume[some] = backproject(image, imager, grid.at(depths[some]), **options)
+    for first in progress.track(range(0, depths.size, planes), "Back-projecting", quarter=_wider(grid)):
+        some = slice(first, first + planes)
+        volume[some] = project(image, imager, grid.at(depths[some]), **options)
     return volume
 
 

@@ -1,9 +1,11 @@
-"""From a recording to volumes in time: frames are read ahead and written behind while one is computed."""
+"""From a recording to volumes in time: frames are read ahead and written behind while one is computed, or are shared
+out to workers."""
 
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,9 +13,12 @@ from jaxtyping import Float32
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..io.volume_series import Note, VolumeSeries
+from ..base.workers import Workers
+from ..geometry import Grid
+from ..io.volume_series import Note, VolumeSeries, opened_levels, write_frame
 
 Frame = TypeVar("Frame")
+Volume = Float32[np.ndarray, "depth row column"]
 
 # Frames that are read before they are asked for. One volume is written while the next is computed.
 AHEAD = 2
@@ -22,7 +27,7 @@ AHEAD = 2
 def reconstruct_frames(
     series: VolumeSeries,
     read: Callable[[int], Frame],
-    make: Callable[[Frame], tuple[Float32[np.ndarray, "depth row column"], Note]],
+    make: Callable[[Frame], tuple[Volume, Note]],
     *,
     failed: Callable[[int, str], object] = lambda frame, reason: None,
     progress: Progress | None = None,
@@ -57,9 +62,7 @@ def reconstruct_frames(
         try:
             for frame, found in _ahead(reader, frames, read):
                 try:
-                    volume, note = make(found.result())
-                    if not np.isfinite(volume).all():
-                        raise InputError("found a NaN or an infinity in the volume, allowed: finite numbers.")
+                    volume, note = _finite(*make(found.result()))
                     job = partial(series.write, frame, volume, note)
                 except InputError as error:
                     job = partial(series.fail, frame, str(error))
@@ -75,6 +78,74 @@ def reconstruct_frames(
         finally:
             reader.shutdown(cancel_futures=True)
             writer.shutdown()
+    _check_some(series)
+
+
+def reconstruct_frames_by(
+    workers: Workers,
+    series: VolumeSeries,
+    opened: Callable[[], tuple[Callable[[int], Frame], Callable[[Frame], tuple[Volume, Note]]]],
+    *,
+    failed: Callable[[int, str], object] = lambda frame, reason: None,
+    progress: Progress | None = None,
+) -> None:
+    """As `reconstruct_frames`, by other processes, which write the volumes where the store is; this one says which.
+
+    A frame whose worker died is made again: the same files hold the same. The first few volumes come here, where the
+    first makes the store.
+
+    Parameters
+    ----------
+    workers
+        Other processes, entered.
+    series, failed, progress
+        As for `reconstruct_frames`.
+    opened
+        Gives `read` and `make`, once in each worker; can be pickled.
+
+    Raises
+    ------
+    InputError
+        As `reconstruct_frames`.
+    """
+    frames = series.unfinished
+    items = ((frame, series.exists) for frame in frames)
+    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as done:
+        for (frame, _), result in workers.stream_of(partial(_writer, opened, series.path, series.grid))(items):
+            try:
+                volume, note = result()
+            except InputError as error:
+                series.fail(frame, str(error))
+                failed(frame, str(error))
+            else:
+                series.write(frame, volume, note)
+            done()
+    _check_some(series)
+
+
+def _writer(opened, path: Path, grid: Grid):
+    """From a frame and whether the store is there to its volume, or None if it is written there; and the note."""
+    read, make = opened()
+    levels = cache(partial(opened_levels, path, grid))
+
+    def written(item):
+        frame, exists = item
+        volume, note = _finite(*make(read(frame)))
+        if not exists:
+            return volume, note
+        write_frame(path, levels(), frame, volume)
+        return None, note
+
+    return written
+
+
+def _finite(volume, note):
+    if not np.isfinite(volume).all():
+        raise InputError("found a NaN or an infinity in the volume, allowed: finite numbers.")
+    return volume, note
+
+
+def _check_some(series):
     if series.failed and not series.finished:
         raise InputError(series.failed[min(series.failed)])
 

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Float32
 
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..optics.cores import apparent_depths
 from ..reconstruction.system import System, above_offset
 from ..solvers.unrolled import State, Unrolled, untrained
@@ -83,19 +84,36 @@ def finished(network: Unrolled) -> Unrolled:
     return dataclasses.replace(network, first=_FIRST, last=_LAST, steps=_FIRST + network.power.size + _LAST)
 
 
-def unrolled_cases(count: int, seed: int, progress: Progress | None = None, kind: Kind = UNROLLED) -> list[Case]:
-    """The first examples of a seed, with the tables of their microscopes as they are known."""
-    cases, optics, networks = [], None, untrained(key=jax.random.key(0))
-    for number in (progress or Progress()).track(range(count), "Simulating captures"):
-        image, imager, grid, truth = example(seed, number, kind)
-        if number % SCENES == 0:
-            optics = tables(imager, np.asarray(grid.depths, np.float64), kind)
-        seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
-        light = above_offset(image)
-        unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
-        system = System(imager, grid, optics, seen)
-        cases.append(Case(light / unit, system, truth / unit, _started(networks, system, light / unit)))
-    return cases
+def unrolled_cases(
+    count: int, seed: int, progress: Progress | None = None, kind: Kind = UNROLLED, workers: Workers | None = None
+) -> list[Case]:
+    """The first examples of a seed, with the tables of their microscopes as they are known; by workers, if any."""
+    groups = [range(first, min(first + SCENES, count)) for first in range(0, count, SCENES)]
+    stream, found = (workers or Workers()).stream_of(partial(_simulator, seed, kind)), {}
+    with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
+        for group, result in stream(groups):
+            found[group.start] = result()
+            advance()
+    return [case for start in sorted(found) for case in found[start]]
+
+
+def _simulator(seed: int, kind: Kind):
+    """From the numbers of what one microscope images to its cases."""
+    networks = untrained(key=jax.random.key(0))
+
+    def simulate(numbers):
+        cases, optics = [], None
+        for number in numbers:
+            image, imager, grid, truth = example(seed, number, kind)
+            optics = optics or tables(imager, np.asarray(grid.depths, np.float64), kind)
+            seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
+            light = above_offset(image)
+            unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
+            system = System(imager, grid, optics, seen)
+            cases.append(Case(light / unit, system, truth / unit, _started(networks, system, light / unit)))
+        return cases
+
+    return simulate
 
 
 @eqx.filter_jit

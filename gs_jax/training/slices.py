@@ -5,9 +5,7 @@ Everything is a function of a seed and a number: the same arguments give the sam
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +15,7 @@ from jaxtyping import Float16, Float32
 from scipy.ndimage import gaussian_filter
 
 from ..base.progress import Progress
+from ..base.workers import Workers
 from ..io.disk import atomic_write, decoding, make_folder
 from ..optics.cores import apparent_depths
 from ..projection.backprojection import backproject
@@ -103,8 +102,9 @@ def stacks(
     progress: Progress | None = None,
     *,
     kinds: Sequence[Kind] = KINDS,
+    workers: Workers | None = None,
 ) -> list[Stack]:
-    """The first `count` simulated stacks of a seed, from `folder`, or made and kept there.
+    """The first `count` simulated stacks of a seed, from `folder`, or made and kept there, by workers if there are any.
 
     Raises
     ------
@@ -113,11 +113,12 @@ def stacks(
     """
     folder = make_folder(folder)
     missing = [number for number in range(count) if not _path(folder, seed, number).exists()]
-    # What one microscope images stays in one process.
+    # What one microscope images is made by one worker.
     groups = [[n for n in missing if n // SCENES == group] for group in sorted({n // SCENES for n in missing})]
-    counter = (progress or Progress()).counter("Simulating captures", len(groups))
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool, counter as advance:
-        for _ in pool.map(partial(_keep, folder, seed, kinds), groups):
+    stream = (workers or Workers()).stream_of(partial(_keeper, folder, seed, kinds))
+    with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
+        for _, result in stream(groups):
+            result()
             advance()
     return [_read(_path(folder, seed, number)) for number in range(count)]
 
@@ -126,11 +127,14 @@ def _path(folder: Path, seed: int, number: int) -> Path:
     return folder / f"{seed}-{number}.npz"
 
 
-def _keep(folder: Path, seed: int, kinds: Sequence[Kind], numbers: list[int]) -> None:
-    for number in numbers:
-        stack = simulated_stack(seed, number, kinds)
-        with atomic_write(_path(folder, seed, number)) as temporary:
-            np.savez(temporary, allow_pickle=False, volume=stack.volume, truth=stack.truth)
+def _keeper(folder: Path, seed: int, kinds: Sequence[Kind]):
+    def keep(numbers: list[int]) -> None:
+        for number in numbers:
+            stack = simulated_stack(seed, number, kinds)
+            with atomic_write(_path(folder, seed, number)) as temporary:
+                np.savez(temporary, allow_pickle=False, volume=stack.volume, truth=stack.truth)
+
+    return keep
 
 
 def _read(path: Path) -> Stack:

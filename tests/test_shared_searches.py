@@ -1,0 +1,103 @@
+"""Searches and training data by several workers are those of one process."""
+
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+import pytest
+
+from gs_jax.base.progress import Progress
+from gs_jax.codesign.pareto import as_json, trade_off
+from gs_jax.codesign.search import optimize
+from gs_jax.codesign.study import Study
+from gs_jax.designs.builtin import geomscope
+from gs_jax.training.examples import SCENES
+from gs_jax.training.recipes import unrolled_cases
+from gs_jax.training.slices import stacks
+
+from .test_pareto import STUDY
+from .test_training import TINY
+from .test_unrolled import TINY as TINY_UNROLLED
+from .test_workers import two
+
+__all__ = ["two"]
+
+SEVERAL = Study.model_validate(
+    STUDY
+    | {
+        "free": {"sensor_distance_mm": [2.0, 6.5], "aperture_diameter_mm": [0.1, 1.5]},
+        "terms": [{"name": "focus_offset", "at_most": 0.2}, {"name": "light_percent", "maximise": 0.001}],
+        "stages": [{"solver": "levenberg-marquardt"}, {"solver": "bfgs", "free": ["aperture_diameter_mm"]}],
+        "starts": 4,
+        "pareto": [],
+    }
+)
+
+
+def assert_same(found, wanted):
+    """Threads may share out a sum in another way: rounding, and what a search makes of it."""
+    assert found.design.model_dump().keys() == wanted.design.model_dump().keys()
+    for name in ("steps", "ends"):
+        for a, b in zip(getattr(found.log, name), getattr(wanted.log, name), strict=True):
+            assert {key: a[key] for key in ("stage", "start")} == {key: b[key] for key in ("stage", "start")}
+            assert a["cost"] == pytest.approx(b["cost"], rel=1e-9, abs=1e-12)
+    for a, b in zip(found.after, wanted.after, strict=True):
+        np.testing.assert_allclose(a[:2], b[:2], rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return optimize(geomscope(sensor_distance_mm=4.0), SEVERAL)
+
+
+def test_starts_of_a_search(two, alone, tmp_path):
+    found = optimize(geomscope(sensor_distance_mm=4.0), SEVERAL, workers=two, checkpoint=tmp_path / "c")
+    assert_same(found, alone)
+
+
+class Interrupted(Progress):
+    """After so many parts."""
+
+    left = 2
+
+    @contextmanager
+    def counter(self, description, total, *, quarter="", rate=""):
+        def advance():
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+        yield advance
+
+
+@pytest.mark.parametrize("first, then", [(True, False), (False, True), (True, True)])
+def test_an_interrupted_search_goes_on_whoever_runs_it(two, alone, tmp_path, first, then):
+    how = {"checkpoint": tmp_path / "c", "every": 0.0}
+    with pytest.raises(KeyboardInterrupt):
+        optimize(
+            geomscope(sensor_distance_mm=4.0), SEVERAL, progress=Interrupted(), workers=two if first else None, **how
+        )
+    again = optimize(geomscope(sensor_distance_mm=4.0), SEVERAL, resume=True, workers=two if then else None, **how)
+    assert_same(again, alone)
+
+
+def test_points_of_a_front(two):
+    limits = {"pareto": [{"name": "depth_of_field_mm", "at_least": [3.0, 6.0, 9.0, 12.0]}]}
+    study, sizes = Study.model_validate(STUDY | limits), []
+    found = trade_off(geomscope(), study, workers=two, each=lambda front: sizes.append(len(front.points)))
+    np.testing.assert_allclose(found.values, trade_off(geomscope(), study).values, rtol=1e-9)
+    assert sizes == [1, 2, 3, 4] and len(as_json(found)["points"]) == 4
+
+
+def test_training_data(two, tmp_path):
+    made = stacks(tmp_path / "two", SCENES + 1, 5, kinds=TINY, workers=two)
+    for a, b in zip(made, stacks(tmp_path / "one", SCENES + 1, 5, kinds=TINY), strict=True):
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-3 * np.abs(y).max())
+
+
+def test_training_cases(two):
+    made, alone = (unrolled_cases(SCENES + 1, 0, kind=TINY_UNROLLED, workers=workers) for workers in (two, None))
+    for a, b in zip(made, alone, strict=True):
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5 * (np.abs(y).max() + 1e-30))

@@ -1,0 +1,193 @@
+"""Jobs that other processes do: the same results, whoever does them and whoever dies."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from gs_jax.base.errors import InputError
+from gs_jax.base.workers import Workers
+from gs_jax.io.volume_series import JOURNAL
+
+from .test_cli import folder, run
+from .test_recording import FRAMES, command, files, save, volumes
+
+__all__ = ["folder"]
+
+distributed = pytest.importorskip("distributed", reason="needs pip install 'gs-jax[cluster]'")
+
+
+@pytest.fixture(scope="module")
+def two():
+    with Workers(2) as workers:
+        yield workers
+
+
+def squares(path: Path):
+    """Notes who makes it; the job 7 ends its worker the first time."""
+    with open(path / "made", "a") as file:
+        file.write(f"{os.getpid()}\n")
+
+    def square(number):
+        if number == 7 and not (path / "killed").exists():
+            (path / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if number == 5:
+            raise InputError("found five.")
+        return number**2, os.getpid()
+
+    return square
+
+
+def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(two, tmp_path):
+    found, refused = {}, []
+    for number, result in two.stream_of(partial(squares, tmp_path))(range(40)):
+        try:
+            found[number] = result()
+        except InputError as error:
+            refused.append(str(error))
+    assert {number: square for number, (square, _) in found.items()} == {n: n**2 for n in range(40) if n != 5}
+    assert refused == ["found five."] and (tmp_path / "killed").exists()
+    # Each worker makes the function once: two, and the one that came for another.
+    made = (tmp_path / "made").read_text().split()
+    assert len(made) == len(set(made)) <= 3 and {str(process) for _, process in found.values()} <= set(made)
+    assert str(os.getpid()) not in made
+
+
+def settings():
+    import jax
+
+    return lambda _: (str(jax.numpy.zeros(()).dtype), os.getcwd(), os.environ["NPROC"])
+
+
+def test_workers_share_the_cores_and_have_this_process_settings(two, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ((_, result),) = two.stream_of(settings)([0])
+    dtype, where, threads = result()
+    assert (dtype, where) == ("float64", str(tmp_path)) and 2 * int(threads) <= max(2, os.cpu_count() or 1)
+
+
+def test_no_more_is_taken_than_is_needed(two):
+    """However long the recording is."""
+    taken = []
+
+    def items():
+        for number in range(30):
+            taken.append(number)
+            yield number
+
+    for done, (_, result) in enumerate(two.stream_of(settings)(items())):
+        assert result() and len(taken) - done <= 5
+
+
+def test_in_this_process_jobs_are_done_one_by_one():
+    done = []
+    with Workers() as workers:
+        for number, result in workers.stream_of(lambda: done.append)([1, 2]):
+            assert len(done) == number - 1
+            result()
+    assert done == [1, 2] and not Workers().elsewhere
+
+
+def test_nothing_of_dask_is_imported_unless_it_is_asked_for(folder):
+    save("rec.tif", FRAMES[:1].repeat(2, 0))
+    code = (
+        f"import sys; sys.argv = ['gs-jax', *{command('rec.tif')!r}]\n"
+        "from gs_jax.__main__ import main\n"
+        "try:\n    main()\nfinally:\n    assert not {'dask', 'distributed', 'trackpy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
+    save("rec.tif")
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{nobody.getsockname()[1]}"
+        monkeypatch.setattr("gs_jax.base.workers._ANSWER", 0.5)
+        for options, words in (
+            (
+                ("--scheduler", address),
+                f"--scheduler: found nobody who answers at {address}, allowed: a Dask scheduler",
+            ),
+            (("--scheduler", "nowhere"), "--scheduler: found nobody who answers at nowhere"),
+            (("--scheduler", address, "--workers", "2"), "--workers: found --scheduler beside it"),
+        ):
+            status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
+            assert status == 2 and words in err and err.count("\n") == 1
+    status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--workers", "2"))
+    assert status == 2 and "--workers or --scheduler: found a single capture" in err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--workers", "2"))
+    assert (status, err) == (
+        2,
+        "gs-jax: --workers: found no Dask, allowed: after pip install 'gs-jax[cluster]'.\n",
+    )
+    assert not (folder / "v.zarr").exists()
+
+
+def started(*options):
+    """The command as a process, when a few frames of it are written; and its workers."""
+    arguments = [sys.executable, "-m", "gs_jax", *command("rec.tif", *options)]
+    process = psutil.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    journal, deadline = Path("v.zarr") / JOURNAL, time.monotonic() + 200
+    while not (journal.exists() and journal.read_bytes().count(b"\n") > 3) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    children = process.children(recursive=True)
+    return process, [each for each in children if "spawn_main" in " ".join(each.cmdline())]
+
+
+def numbers():
+    """Of the frames in the journal, in its order."""
+    return [json.loads(line)["frame"] for line in (Path("v.zarr") / JOURNAL).read_text().splitlines()[1:]]
+
+
+def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, capsys):
+    """The same bytes as by one process, each frame once."""
+    frames = np.random.default_rng(1).integers(101, 130, (60, 96, 80)).astype(np.uint16)
+    frames[50, 40, 40] = 65535
+    save("rec.tif", frames)
+    process, workers = started("--workers", "2", "--suppress", "clusters", "--points", "p.csv")
+    workers[0].kill()
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0 and "60 frames in" in out and "Traceback" not in err, err
+    assert "1 frame: pixels filled from neighbours" in out and sorted(numbers()) == list(range(60))
+    by_two, points = files(folder / "v.zarr"), (folder / "p.csv").read_bytes()
+    arguments = command("rec.tif", "--suppress", "clusters", "--points", "p.csv", "--force")
+    subprocess.run([sys.executable, "-m", "gs_jax", *arguments], check=True, capture_output=True)
+    by_one = files(folder / "v.zarr")
+    for each in (by_two, by_one):
+        each.pop(JOURNAL)
+        # It says by which command, and what is shown is as bright as the first volume that was done.
+        each.pop("zarr.json")
+    assert by_two == by_one and points == (folder / "p.csv").read_bytes()
+
+
+def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, capsys):
+    frames = np.random.default_rng(2).integers(100, 3000, (300, 96, 80)).astype(np.uint16)
+    save("rec.tif", frames)
+    process, workers = started("--workers", "2")
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in err, err
+    assert err.endswith("gs-jax: interrupted; v.zarr has what is done, and --resume goes on from it\n")
+    assert not psutil.wait_procs(workers, timeout=20)[1]
+    before = numbers()
+    # What it says that it has is there.
+    assert len(before) >= 3 and volumes()[before].any((1, 2, 3)).all()
+    monkeypatch.setattr("gs_jax.base.workers._ANSWER", 60)
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+        arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
+        status, out, _ = run(monkeypatch, capsys, *arguments)
+    assert status == 0 and f"{300 - len(before)} frames in" in out and sorted(numbers()) == list(range(300))
+    assert volumes().any((1, 2, 3)).all()
