@@ -8,8 +8,9 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Num
 
-from ..geometry import Grid, Imager
+from ..geometry import Imager
 from ..projection.backprojection import backproject
+from ..voxels import Grid
 
 
 def backproject_by_all(
