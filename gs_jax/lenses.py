@@ -78,6 +78,12 @@ class MicrolensArray(eqx.Module):
         """Whether all lenses have the same numbers, as one lens unit has; all numbers are scalars then."""
         return not any(getattr(self, name).ndim for name in EACH)
 
+    def check_alike(self) -> None:
+        """`ValueError` unless all lenses are alike: what is computed for a lens unit has one for all of them."""
+        if not self.alike:
+            found = ", ".join(name for name in EACH if getattr(self, name).ndim)
+            raise ValueError(f"Found lenses that differ ({found}), allowed: lenses that are alike; `lens(k)` is one.")
+
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""
         own = {name: getattr(self, name) for name in EACH}

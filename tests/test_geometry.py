@@ -7,6 +7,8 @@ from scipy import integrate
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray, envelope
+from gs_jax.optics.aperture import aperture_area
+from gs_jax.optics.unit import unit_rays
 
 from .helpers import scene
 
@@ -137,5 +139,16 @@ def test_lenses_may_differ():
     second = array.lens(1)
     np.testing.assert_allclose([second.radius_of_curvature, second.conic_constant], [2.2, -0.7])
     np.testing.assert_array_equal(second.centers, [[1.0, 0.0]])
+    for of_a_unit in (aperture_area, lambda array: unit_rays(imager_of(array), 20.0, np.zeros(2))):
+        of_a_unit(second)
+        with pytest.raises(ValueError, match=r"Found lenses that differ \(radius_of_curvature\), allowed: "):
+            of_a_unit(array)
+
+
+def imager_of(array):
+    return Imager(array, Sensor((8, 8), 0.01), 5.8, 3.0)
+
+
+def test_an_array_says_what_its_numbers_may_be():
     with pytest.raises(ValueError, match=r"`conic_constant` must be one number or \(2,\), got \(3,\)"):
         MicrolensArray([[0.0, 0.0], [1.0, 0.0]], conic_constant=[0.0, 0.0, 0.0])

@@ -30,7 +30,13 @@ def aperture_area(array: MicrolensArray) -> Float[Array, " lens"]:
     The integral is exact, a sum over the straight edges; so are its derivatives, which a quadrature in angle gets wrong
     at the corners. Only the 64 nearest lenses count as neighbours: enough unless the lenses are in heaps of more
     than that.
+
+    Raises
+    ------
+    ValueError
+        If lenses differ: what bounds them are no straight edges.
     """
+    array.check_alike()
     count = min(_NEIGHBOURS, array.centers.shape[0] - 1)
     radius = array.aperture_diameter / 2
     sides = jnp.array([[1, 0], [-1, 0], [0, 1], [0, -1]], array.centers.dtype)

@@ -60,7 +60,14 @@ def secant(slope: Coordinates) -> Scalars:
 
 
 def refracted(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> Refraction:
-    """The ray from a field through a point of the curved side, or of an ideal lens, and on to the sensor."""
+    """The ray from a field through a point of the curved side, or of an ideal lens, and on to the sensor.
+
+    Raises
+    ------
+    ValueError
+        If the imager's lenses differ.
+    """
+    imager.array.check_alike()
     if imager.array.thin_lens_focal_length is not None:
         return _ideally(imager, depth, point, field)
     through = _plane_first if imager.array.orientation == "plano" else _curve_first

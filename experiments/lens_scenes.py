@@ -1,0 +1,143 @@
+"""Whether better lenses make better volumes: scenes at three depths, seen by three microscopes for the same time.
+
+Letters, beads and snowflakes at 18.5, 20.5 and 22.5 mm are imaged by `experiments/ray_tracer.py`, which shares no code
+with `gs_jax`, on the sensor's own pixels; photons and read noise are those of one exposure for all designs, so a small
+aperture pays for its sharpness. Volumes are found by Richardson-Lucy with the full model. The truth is the scene on the
+voxels, blurred laterally by one voxel (standard deviation); it is scored after the gain that fits best.
+
+    python -m experiments.lens_scenes [--out DIR]
+
+Writes `lens_scenes.json`, `lens_scenes.md` and `lens_scenes.png`; about twenty minutes on two cores.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
+
+from experiments.common import Report, main, table
+from experiments.ray_tracer import traced
+from gs_jax import Grid, Imager, RichardsonLucy, Sensor, reconstruct
+from gs_jax.base.progress import Progress
+from gs_jax.benchmark.report import markdown_table
+from gs_jax.designs.design import read_design
+from gs_jax.metrics import quality
+from gs_jax.simulation.phantoms import letters, random_points, rasterize, snowflake
+
+FOLDER = Path(__file__).parents[1] / "design"
+DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")
+DEPTHS = (18.5, 20.5, 22.5)
+# Where each depth's part of a scene is, mm, and how large it is.
+PLACES, HEIGHT = ((-1.2, -0.5), (0.0, 0.9), (1.2, -0.5)), 1.1
+# Pixels of the sensor's middle, lenses that are looked at, and the volume, mm.
+PIXELS, REACH, VOXEL, FIELD = 2560, 6.5, 0.024, 4.4
+# Emitters of a scene, drawn at random, and rays of each to each lens.
+SAMPLES, RAYS = 60_000, 12
+# Electrons of the brightest pixel of `geomscope`'s capture: the exposures. And of read noise.
+EXPOSURES, READ_NOISE = (20_000, 1_000), 2.0
+STEPS = 30
+
+
+def cropped(imager: Imager, pixels: int = PIXELS, reach: float = REACH) -> Imager:
+    """The middle of a sensor, and the lenses near it."""
+    centers = np.asarray(imager.array.centers)
+    near = np.hypot(*centers.T) < reach
+    array = dataclasses.replace(imager.array, centers=centers[near])
+    sensor = Sensor((pixels, pixels), imager.sensor.pixel_pitch)
+    return eqx.tree_at(lambda i: (i.array, i.sensor), imager, (array, sensor))
+
+
+def scenes() -> dict[str, np.ndarray]:
+    """Emitters `(x, y, z, intensity)` of each scene, close together."""
+    at = lambda part, xy: part + np.array([*xy, 0.0, 0.0])
+    places = list(zip(DEPTHS, PLACES, strict=True))
+    words = [at(letters(a, depth=z, height=HEIGHT, pitch=0.008), xy) for a, (z, xy) in zip("GSJ", places, strict=True)]
+    flakes = [at(snowflake((z, z), 1.7, width=0.12, pitch=0.01), xy) for z, xy in places]
+    middles = [random_points(15, (FIELD - 0.6, FIELD - 0.6), (z, z + 1e-6), seed=k) for k, z in enumerate(DEPTHS)]
+    # Of a bead's disc, 60 um wide.
+    r, turn = 0.03 * np.sqrt((np.arange(60) + 0.5) / 60), np.arange(60) * np.pi * (3 - 5**0.5)
+    disc = np.stack([r * np.cos(turn), r * np.sin(turn), 0 * r, 0 * r], -1)
+    beads = (np.concatenate(middles)[:, None] + disc).reshape(-1, 4)
+    beads[:, 2] = np.repeat(DEPTHS, 15 * 60)
+    return {"letters": np.concatenate(words), "beads": beads, "snowflakes": np.concatenate(flakes)}
+
+
+def sampled(emitters: np.ndarray, count: int, blur: float = 0.004) -> np.ndarray:
+    """Emitters at random, as many as light wants, a little off: no lattice."""
+    rng = np.random.default_rng(0)
+    some = emitters[rng.choice(len(emitters), count, p=emitters[:, 3] / emitters[:, 3].sum())]
+    some[:, :2] += rng.uniform(-blur, blur, (count, 2))
+    some[:, 3] = 1 / count
+    return some
+
+
+def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Progress, **sizes: Any) -> dict[str, Any]:
+    """For each scene the truth, and for each design and exposure scores and the volume."""
+    count = round(FIELD / VOXEL) | 1
+    grid = Grid(DEPTHS, (count, count), VOXEL)
+    imagers = {name: cropped(read_design(FOLDER / f"{name}.toml").imager(), **sizes) for name in names}
+    found: dict[str, Any] = {}
+    for scene, emitters in scenes().items():
+        truth = gaussian_filter(np.asarray(rasterize(emitters, grid), np.float32), (0, 1, 1))
+        some = sampled(emitters, samples)
+        each = progress.track(imagers.items(), f"Tracing {scene}")
+        clean = {name: traced(some, imager, rays) for name, imager in each}
+        found[scene] = {"truth": truth, "empty": quality(np.zeros_like(truth), truth).psnr_db}
+        for exposure in EXPOSURES:
+            time = exposure / clean[names[0]].max()
+            for name, imager in imagers.items():
+                rng = np.random.default_rng(exposure)
+                image = rng.poisson(time * clean[name]) + rng.normal(0, READ_NOISE, clean[name].shape)
+                volume = reconstruct(image.astype(np.float32), imager, grid, RichardsonLucy(STEPS), progress=progress)
+                score = quality(volume, truth)
+                electrons = float(time * clean[name].sum())
+                record = {"psnr_db": score.psnr_db, "ssim": score.ssim, "electrons": electrons}
+                found[scene][f"{name}, {exposure}"] = record | {"volume": score.gain * np.asarray(volume)}
+    return found
+
+
+def pictures(found: dict[str, Any], names=DESIGNS) -> Figure:
+    """The brightest of the depths, in the truth and in each volume at the longer exposure, on one scale a scene."""
+    figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(found)), dpi=100, layout="constrained")
+    axes = figure.subplots(len(found), len(names) + 1, squeeze=False)
+    for row, (scene, parts) in zip(axes, found.items(), strict=True):
+        shown = {"truth": parts["truth"]} | {name: parts[f"{name}, {EXPOSURES[0]}"]["volume"] for name in names}
+        for axis, (name, volume) in zip(row, shown.items(), strict=True):
+            extent = (-FIELD / 2, FIELD / 2, FIELD / 2, -FIELD / 2)
+            axis.imshow(volume.max(0), cmap="gray", vmin=0, vmax=parts["truth"].max(), extent=extent)
+            psnr = "" if name == "truth" else f", {parts[f'{name}, {EXPOSURES[0]}']['psnr_db']:.1f} dB"
+            axis.set_title(f"{scene}: {name}{psnr}", fontsize=8)
+            axis.tick_params(labelsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("x, mm", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y, mm", fontsize=8)
+    return figure
+
+
+def report(progress: Progress) -> Report:
+    found = run(progress=progress)
+    columns = ("scene", "exposure, electrons", *DESIGNS, "empty")
+    rows = []
+    for scene, parts in found.items():
+        for exposure in EXPOSURES:
+            scores = [f"{parts[f'{name}, {exposure}']['psnr_db']:.2f}" for name in DESIGNS]
+            rows.append([scene, f"{exposure}", *scores, f"{parts['empty']:.2f}"])
+    numbers = {
+        scene: {
+            key: {k: v for k, v in part.items() if k != "volume"} if isinstance(part, dict) else part
+            for key, part in parts.items()
+            if key != "truth"
+        }
+        for scene, parts in found.items()
+    }
+    files = {"lens_scenes.json": numbers, "lens_scenes.md": markdown_table(columns, rows)}
+    return Report(files | {"lens_scenes.png": pictures(found)}, [table(columns, rows)])
+
+
+if __name__ == "__main__":
+    main(report)
