@@ -5,7 +5,7 @@ Lengths are in millimetres, lateral points `(x, y)`, volumes `[depth, row, colum
 The microscope:
 
     Imager               A microlens array in front of a sensor, and the light: the one geometry of the package
-    MicrolensArray       Plano-convex microlenses on one plate, the plano side toward the object
+    MicrolensArray       Plano-convex microlenses on one plate, their vertices in one plane
     Sensor               A camera sensor of square pixels, in the plane `z = -v` behind the lenses
     Grid                 Voxels of the object space; centred on the axis, unless it has another origin
     Design               A microscope, with the tables and keys of its file

@@ -15,8 +15,8 @@ from .plausible import USUAL, unit_of
 
 FRAME = (
     "Lengths have the unit that their key ends in. +x is along a row of the image as it is shown (right), +y along a "
-    "column (down), both from the sensor's middle; depths z are positive from the plate toward the object, the sensor "
-    "distance v is positive from the lenses to the sensor."
+    "column (down), both from the sensor's middle; depths z are positive from the array's front toward the object, the "
+    "sensor distance v is positive from its back to the sensor."
 )
 # Of a file with comments: the many centres come late.
 _LAST = ("array", "provenance")
