@@ -19,7 +19,7 @@ def _options(command):
         least, most = (getattr(bound, side) for bound, side in zip(field.metadata, ("ge", "le"), strict=True))
         unit = name.rpartition("_")[2] if "_" in name else ""
         text = f"{str(field.title)[:1].upper()}{str(field.title)[1:]}.  [default: {field.default:g}]"
-        kind = Number(least=least, most=most, unit=unit)
+        kind = Number(least=float(least), most=float(most), unit=unit)
         command = click.option(f"--{name.replace('_', '-')}", type=kind, help=text)(command)
     return command
 

@@ -97,7 +97,7 @@ def _by_tolerance(outcome: Outcome) -> Table:
 
 
 def _by_depth(outcome: Outcome) -> Table:
-    title = "Of the devices: as designed, median, the worst twentieth; depths RMS over five places"
+    title = "As designed, and of the devices; depth errors are RMS over five places"
     heads = ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num")
     table = _empty(title, heads)
     one, many = _linear(outcome.nominal), _linear(outcome.devices)
@@ -107,7 +107,7 @@ def _by_depth(outcome: Outcome) -> Table:
         cells = (1000 * one[0][row], *1000 * np.percentile(width, (50, _HIGH)))
         ratios = (one[1][row], *np.percentile(ratio, (50, _LOW)))
         cells = (depth, *cells, *(x if x >= 1e-3 else 0.0 for x in ratios), designed[row], calibrated[row])
-        table.add_row(*(f"{x:.3g}" for x in cells))
+        table.add_row(*(f"{x:.0f}" if x >= 100 else f"{x:.3g}" for x in cells))
     return table
 
 
@@ -215,7 +215,9 @@ def picture(outcome: Outcome) -> Figure:
 
 
 def _draw_shares(axes, outcome: Outcome) -> None:
-    found, labels = changes(outcome), ("spot width", "Strehl ratio", "depth", "depth,\ncalibrated")
+    found = changes(outcome)
+    below = "" if found[next(iter(RULED))]["strehl_percent"] is not None else f",\nnot above {LEAST_STREHL:g}"
+    labels = ("spot width", f"Strehl ratio{below}", "depth", "depth,\ncalibrated")
     rows = np.arange(len(labels))
     values = np.array([[(x or 0.0) ** 2 for x in found[name].values()] for name in RULED])
     total = values.sum(0)

@@ -2,8 +2,8 @@
 
 A printer makes a slope `s` of terraces, `layer` high and `layer / s` wide, and smooths their edges over its `pixel`, to
 ramps of that width. From the wanted slope this differs by up to `(layer - pixel s) / 2` to both sides, by a sawtooth:
-the mean square is `(layer - pixel s)^2 / 12`, that of its slope `s (layer / pixel - s)`. Where a terrace is narrower
-than a pixel nothing of it is left.
+the mean square is `(layer - pixel s)^2 / 12`, that of its slope `s (layer / pixel - s)`. Where terraces are narrower
+than a pixel nothing is left of them: of a running mean over a pixel there would be a tail, but what prints is rounder.
 """
 
 import jax.numpy as jnp
