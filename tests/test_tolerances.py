@@ -111,14 +111,15 @@ def test_a_literal_staircase(slope, layer, pixel):
 def test_steps_of_a_lens_are_in_its_middle():
     """Where a terrace is wider than a pixel: for small slopes r / R, integrals over the disc are elementary."""
     array, layer, pixel = single().array, 1e-4, 5e-3
-    steepest, edge = layer / pixel, 0.2 / 1.4
-    height, steep = lens_squares(array, 0.02, layer, pixel)
-    edge = 0.02 / 1.4
-    wanted = 2 / edge**2 * (steepest * edge**3 / 3 - edge**4 / 4)
-    np.testing.assert_allclose(steep, wanted, rtol=1e-3)
+    steepest, edge = layer / pixel, 0.02 / 1.4
+    slope = 2 / edge**2 * (steepest * edge**3 / 3 - edge**4 / 4)
     inner = (steepest**2 * edge**2 / 2 - 2 * steepest * edge**3 / 3 + edge**4 / 4) * 2 / edge**2
+    height, bent = lens_squares(array, 0.02, layer, pixel, 1e-7)
     np.testing.assert_allclose(height, pixel**2 * inner / 12, rtol=1e-3)
-    assert lens_squares(array, 0.2, 0.0, pixel) == (0, 0)
+    # All rays are bent by steps of many waves, and next to none by thin ones.
+    np.testing.assert_allclose(bent, slope, rtol=2e-2)
+    assert lens_squares(array, 0.02, layer, pixel, 520e-6)[1] < 0.02 * slope
+    assert lens_squares(array, 0.2, 0.0, pixel, 520e-6) == (0, 0)
 
 
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
@@ -213,7 +214,8 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
         for row, one in list(enumerate(spots(pinholes.points)))[::4]:
             place = lambda q, one=one, believed=believed: off(believed, [(q, *one[1:])])
             z = least_squares(place, one[0], **tight).x[2]
-            np.testing.assert_allclose(found[row], z - one[0][2], atol=1e-5)
+            # Our steps end within 0.1 um: a thousandth of what can be told apart.
+            np.testing.assert_allclose(found[row], z - one[0][2], atol=1e-4)
 
 
 def test_gradients_are_finite_differences(design, outcome):
@@ -313,7 +315,7 @@ def test_designs_that_have_no_answer(design, monkeypatch):
     with pytest.raises(InputError, match="`lens.focal_length_mm`: found 3, allowed: none"):
         tolerance(ideal)
     few = design.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
-    with pytest.raises(InputError, match="that 1 lenses see, allowed: 2 or more"):
+    with pytest.raises(InputError, match="lenses see, allowed: 2 or more"):
         tolerance(design.model_copy(update={"array": few}))
     with pytest.raises(InputError, match="`max_width` must be positive"):
         tolerance(design, max_width=-1.0)

@@ -22,8 +22,7 @@ def log_sharpness(
 
     Both are averages over the plate (the width's square), whose tilt brings lenses nearer to the sensor or farther; the
     width's over the field, too, as `gs_jax.designs.spots.psf_width` has it. Slopes that steps of the printer add widen
-    spots by `(n - 1)` times the slope times `v'`. That is the mean square, exact in wave optics too, where little light
-    may go far.
+    spots by `(n - 1)` times the slope times `v'`.
 
     Parameters
     ----------
@@ -37,7 +36,7 @@ def log_sharpness(
     imager = built(nominal.imager, errors)
     widths, ratios = jax.vmap(lambda height: _at(nominal, imager, height))(_heights(nominal.imager, imager))
     array, radius = imager.array, nominal.clear_diameter / 2
-    height_square, slope_square = lens_squares(array, radius, errors.layer, pixel)
+    height_square, slope_square = lens_squares(array, radius, errors.layer, pixel, imager.wavelength)
     # A printer's steps are along the radius: half of their slopes' square is along each axis.
     bent = (array.refractive_index - 1) * imager.reduced_depth(nominal.depths)
     squared = jnp.mean(widths**2, 0) + (FWHM * bent) ** 2 * slope_square / 2

@@ -97,7 +97,7 @@ def _by_tolerance(outcome: Outcome) -> Table:
 
 
 def _by_depth(outcome: Outcome) -> Table:
-    title = "As designed, and of the devices; depth errors are RMS over five places"
+    title = "By depth: as designed, and of the devices"
     heads = ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num")
     table = _empty(title, heads)
     one, many = _linear(outcome.nominal), _linear(outcome.devices)

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..lenses import MicrolensArray
-from ..optics.unit import pupil_disc
+
+# Of equal area, in a lens: terraces are wide in its middle alone.
+_RINGS = 256
 
 Real = Float[Array | np.ndarray, ""] | float
 
@@ -26,17 +28,22 @@ def step_squares(
 
 
 def lens_squares(
-    array: MicrolensArray, radius: Real, layer: Real, pixel: Real
+    array: MicrolensArray, radius: Real, layer: Real, pixel: Real, wavelength: Real
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """`step_squares`, averaged over a lens within a radius, mm."""
-    points, weights = pupil_disc(jnp.asarray(radius))
-    squared = jnp.sum(points**2, -1)
-    slope = array.steepness(squared) * jnp.sqrt(squared)
-    height, tilt = step_squares(slope, layer, pixel)
-    return jnp.sum(weights * height), jnp.sum(weights * tilt)
+    """Mean squares of a lens's height error, mm^2, and of the slope that bends rays, within a radius, mm.
+
+    Steps of many waves bend rays by their slope. Thin ones diffract, a little light far away, and leave the core as
+    narrow as it is. Between them slopes count by the share of the light that their height takes from the core.
+    """
+    squared = jnp.asarray((np.arange(_RINGS) + 0.5) / _RINGS) * radius**2
+    height, slope = step_squares(array.steepness(squared) * jnp.sqrt(squared), layer, pixel)
+    moved = -jnp.expm1(log_strehl_of_height(height, array.refractive_index, wavelength))
+    return jnp.mean(height), jnp.mean(slope * moved)
 
 
-def log_strehl_of_height(square: Real, refractive_index: Real, wavelength: Real) -> Float[Array, ""]:
+def log_strehl_of_height(
+    square: Real | Float[Array, " place"], refractive_index: Real, wavelength: Real
+) -> Float[Array, "..."]:
     """Logarithm of `exp(-(2 pi (n - 1) sigma / lambda)^2)`, the light that stays in the spot's core.
 
     Exact for heights of a normal distribution; `square` is `sigma^2`, mm^2.
