@@ -24,10 +24,10 @@ from gs_jax.optics.psf import strehl
 from gs_jax.optics.unit import pupil_disc
 from gs_jax.tolerances.amounts import Tolerances
 from gs_jax.tolerances.analysis import Outcome, _judged, _of_devices, _Question, together, tolerance
-from gs_jax.tolerances.depth_errors import Bench, bench_of, depth_errors
 from gs_jax.tolerances.devices import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
 from gs_jax.tolerances.images import log_sharpness
 from gs_jax.tolerances.outcome import as_json, changes, costs, picture, sentences
+from gs_jax.tolerances.points import Bench, bench_of, depth_errors
 from gs_jax.tolerances.reading import read_tolerances
 from gs_jax.tolerances.surface import lens_squares, step_squares
 

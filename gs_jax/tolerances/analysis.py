@@ -17,9 +17,9 @@ from ..designs.microscope import Microscope
 from ..designs.sheet import confusion_of, microscope_of
 from ..layouts.cells import check_positive, coverage
 from .amounts import Tolerances
-from .depth_errors import Bench, bench_of, depth_errors
 from .devices import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
 from .images import log_sharpness
+from .points import Bench, bench_of, depth_errors
 
 # Depths of a caller who names none; devices at a time, and those of them whose rays are in memory together.
 _DEPTHS, _BATCH, _TOGETHER = 5, 64, 8
@@ -115,7 +115,7 @@ def tolerance(
         Where devices are judged, from the plate, mm; by default five over the working distance.
     sources
         Places `(x, y, z)` of the point sources by which devices are calibrated, mm, one a capture; see
-        `gs_jax.tolerances.depth_errors.bench_of` for the default.
+        `gs_jax.tolerances.points.bench_of` for the default.
     max_width
         Of spots in the object, mm; by default 1.2 times the design's, depth by depth.
     min_strehl

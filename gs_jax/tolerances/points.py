@@ -40,7 +40,7 @@ _STEPS = {"radius": 0.01, "conic": 0.05, "index": 0.005}
 # they are none that people ask for.
 _DEPTHS = 4
 # Gauss's and Newton's: lenses that are not where the fit has them leave an error, which each makes a few times smaller.
-_ROUNDS = 6
+_ROUNDS = 10
 
 
 class Sights(NamedTuple):
