@@ -76,7 +76,7 @@ def bench_of(
     depths
         Of the points, mm.
     sources
-        Places `(x, y, z)` of what is photographed to calibrate, mm. By default four, as people are told to: on the axis
+        Places `(x, y, z)` of what is photographed to calibrate, mm. By default four, the least that people are told: on the axis
         at the nearest, the middle and the farthest depth, and a field radius beside the axis at the middle one.
 
     Raises
