@@ -76,8 +76,8 @@ def bench_of(
     depths
         Of the points, mm.
     sources
-        Places `(x, y, z)` of what is photographed to calibrate, mm. By default four, the least that people are told: on the axis
-        at the nearest, the middle and the farthest depth, and a field radius beside the axis at the middle one.
+        Places `(x, y, z)` of what is photographed to calibrate, mm. By default four, the least that people are told: on
+        the axis at the nearest, the middle and the farthest depth, and a field radius beside it at the middle one.
 
     Raises
     ------
