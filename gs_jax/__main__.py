@@ -31,6 +31,7 @@ COMMANDS = (
     "layout",
     "optimize",
     "pareto",
+    "tolerance",
     "benchmark",
     "mold",
     "mask",

@@ -30,6 +30,7 @@ ORDER = [
     "training",
     "codesign",
     "mold",
+    "tolerances",
     "benchmark",
     "demo",
     "cli",

@@ -159,14 +159,20 @@ def offsets_of(imager: Imager, depths: Float[np.ndarray, " source"]) -> Offsets:
     nodes = np.unique(depths)
     if len(nodes) > _DEPTHS:
         nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
-    fields, v = np.linspace(0, imager.field_radius, _FIELDS), float(imager.sensor_distance)
-    # A tilt turns the field a little; the lens is the same.
-    level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
-    farther = eqx.tree_at(lambda i: i.sensor_distance, level, level.sensor_distance * (1 + _STEP))
-    powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
-    here, beyond = (np.linalg.lstsq(powers, core_offsets(each, nodes, fields).T)[0].T for each in (level, farther))
+    v = float(imager.sensor_distance)
+    farther = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
+    here, beyond = (core_powers(each, nodes) for each in (imager, farther))
     tables = nodes, here, (beyond - here) / (v * _STEP), v
     return Offsets(*(jnp.asarray(table, imager.sensor_distance.dtype) for table in tables))
+
+
+def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "depth power"]:
+    """How far cores are from chief rays by exact rays, as coefficients of odd powers of the field, mm."""
+    fields = np.linspace(0, imager.field_radius, _FIELDS)
+    # A tilt turns the field a little; the lens is the same.
+    level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
+    powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
+    return np.linalg.lstsq(powers, core_offsets(level, depths, fields).T)[0].T
 
 
 @jax.jit

@@ -1,0 +1,107 @@
+"""`gs-jax tolerance`: how well a microscope must be made."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..base.errors import InputError, errors_name_file
+from ..base.progress import Progress
+from ..io.disk import check_output, write_json
+from ..tolerances.amounts import Tolerances
+from .files import check_may_write, provenance_of
+from .options import DESIGN, UM, Depths, Number
+
+
+def _options(command):
+    """An option for each tolerance."""
+    for name, field in reversed(Tolerances.model_fields.items()):
+        least, most = (getattr(bound, side) for bound, side in zip(field.metadata, ("ge", "le"), strict=True))
+        unit = name.rpartition("_")[2] if "_" in name else ""
+        text = f"{str(field.title)[:1].upper()}{str(field.title)[1:]}.  [default: {field.default:g}]"
+        kind = Number(least=float(least), most=float(most), unit=unit)
+        command = click.option(f"--{name.replace('_', '-')}", type=kind, help=text)(command)
+    return command
+
+
+@click.command("tolerance", epilog="Example: gs-jax tolerance geomscope --sensor-distance-um 20 -o tolerance.json")
+@click.argument("design", type=DESIGN)
+@click.option("-o", "--output", type=Path, help="TOLERANCE.json: write the numbers too, and a picture (.png) beside.")
+@click.option("--tolerances", "file", type=Path, help="TOML file of tolerances: position_um = 3.0 and so on.")
+@_options
+@click.option("--max-width-um", type=UM, help="Target: width of spots, in the object.  [default: 1.2 of the design's]")
+@click.option(
+    "--min-strehl",
+    type=Number(least=1e-3, most=1.0, unit=""),
+    help="Target: Strehl ratio on the axis.  [default: 0.8 of the design's, where that is 0.1 or more]",
+)
+@click.option(
+    "--max-depth-error-um", type=UM, help="Target: error of calibrated depths.  [default: the axial resolution, Eq. 6]"
+)
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: five over the working distance]")
+@click.option(
+    "--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of the sources to calibrate by.  [default: four]"
+)
+@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, show_default=True, help="Devices to draw.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Which devices.")
+def command(
+    design: Path,
+    output: Path | None,
+    file: Path | None,
+    max_width_um: float | None,
+    min_strehl: float | None,
+    max_depth_error_um: float | None,
+    depths: list[float] | None,
+    positions: Path | None,
+    draws: int,
+    seed: int,
+    **amounts: Any,
+):
+    """Show how well the microscope of DESIGN must be made: what tolerances do to spots and depths, and the yield.
+
+    Tolerances are standard deviations; roughness and printed layers are what every device has. Depth errors are those
+    of points that are found with the design's geometry, and with one that is calibrated first.
+    """
+    import jax
+    import numpy as np
+    from rich.console import Console
+
+    from ..designs.design import design_text, read_design
+    from ..io.figures import write_figure
+    from ..io.positions import read_positions
+    from ..io.provenance import KEY
+    from ..tolerances.analysis import tolerance
+    from ..tolerances.outcome import as_json, picture, sentences, tables
+    from ..tolerances.reading import read_tolerances
+
+    # Least squares of a few numbers in many steps: single precision leaves micrometres.
+    jax.config.update("jax_enable_x64", True)
+    drawing = output and output.with_suffix(".png")
+    if output and drawing:
+        check_output(output, [".json"])
+        check_output(drawing, [".png"])
+        check_may_write(output, drawing, inputs=(design, file, positions))
+    given = {name: value for name, value in amounts.items() if value is not None}
+    chosen = (read_tolerances(file) if file else Tolerances()).model_copy(update=given)
+    sources = None
+    if positions:
+        sources, _ = read_positions(positions, [])
+        if not len(sources) or np.isnan(sources).any() or not (sources[:, 2] > 0).all():
+            raise InputError(f"{positions}: found a source whose place is not known, allowed: x, y and z > 0 of each.")
+    microscope = read_design(design)
+    um = lambda value: value and value / 1000
+    targets = {"max_width": um(max_width_um), "min_strehl": min_strehl, "max_depth_error": um(max_depth_error_um)}
+    with Progress() as progress, errors_name_file(design):
+        found = tolerance(
+            microscope, chosen, depths=depths, sources=sources, draws=draws, seed=seed, progress=progress, **targets
+        )
+    if output and drawing:
+        provenance = provenance_of(design, file, positions, design=design_text(microscope))
+        write_json(output, {KEY: provenance, "seed": seed} | as_json(found))
+        write_figure(drawing, picture(found))
+    console = Console()
+    for table in tables(found):
+        console.print(table)
+        console.print()
+    for sentence in sentences(found):
+        click.echo(f"- {sentence}")

@@ -1,0 +1,339 @@
+"""Tolerances against what is not ours: a literal staircase, Optiland's rays of wrong lenses, SciPy's fits, formulas."""
+
+import dataclasses
+import json
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from experiments.optics_check import optiland_rays
+from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
+from gs_jax.cli.tolerance import command
+from gs_jax.designs.microscope import Microscope
+from gs_jax.designs.spots import field_heights
+from gs_jax.geometry import envelope
+from gs_jax.optics import theory
+from gs_jax.optics.axial import axial_strehl
+from gs_jax.optics.psf import strehl
+from gs_jax.optics.unit import pupil_disc
+from gs_jax.tolerances.amounts import Tolerances
+from gs_jax.tolerances.analysis import Outcome, _judged, _of_devices, _Question, together, tolerance
+from gs_jax.tolerances.devices import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
+from gs_jax.tolerances.images import log_sharpness
+from gs_jax.tolerances.outcome import as_json, changes, costs, picture, sentences
+from gs_jax.tolerances.points import Bench, bench_of, depth_errors
+from gs_jax.tolerances.reading import read_tolerances
+from gs_jax.tolerances.surface import lens_squares, step_squares
+
+from .test_cli import run
+
+DEPTHS = (18.0, 20.0, 23.0)
+DESIGN = """
+name = "small"
+[sensor]
+pixel_pitch_um = 10.0
+shape = [700, 700]
+[lens]
+radius_of_curvature_mm = 1.4
+refractive_index = 1.43
+aperture_diameter_mm = 0.4
+[array]
+size_mm = [6.0, 6.0]
+substrate_thickness_mm = 1.0
+centers_mm = [[-2.0, -2.1], [0.1, -1.9], [2.1, -2.0], [-1.9, 0.1], [0.0, 0.0], [1.9, -0.1], [-2.1, 2.0], [0.1, 2.1],
+    [2.0, 1.9], [-1.0, -1.1], [1.0, -0.9], [-0.9, 1.0], [1.1, 1.0]]
+[imaging]
+sensor_distance_mm = 3.8
+working_distance_mm = [18.0, 23.0]
+wavelength_nm = 520.0
+field_radius_mm = 2.5
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "design.toml").write_text(DESIGN)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def design() -> Design:
+    return Design.model_validate(tomllib.loads(DESIGN))
+
+
+@pytest.fixture(scope="module")
+def outcome(design) -> Outcome:
+    return tolerance(design, depths=DEPTHS, draws=100)
+
+
+@pytest.fixture(scope="module")
+def pinholes(design) -> Bench:
+    """Of lenses whose cores are on their chief rays, which have closed forms."""
+    bench = bench_of(design.imager(), np.array(DEPTHS))
+    nothing = bench.offsets._replace(here=0 * bench.offsets.here, slope=0 * bench.offsets.slope)
+    return bench._replace(offsets=nothing, changes=0 * bench.changes)
+
+
+def judged(imager: Imager, diameter=0.4) -> Microscope:
+    one, depths = jnp.ones(()), jnp.array(DEPTHS)
+    return Microscope(imager, depths, diameter * one, imager.field_radius * one, 0.01 * one, one)
+
+
+def single(**lens) -> Imager:
+    array = MicrolensArray([[0.0, 0.0]], radius_of_curvature=1.4, aperture_diameter=0.4, size=(1.0, 1.0), **lens)
+    return Imager(array, Sensor((3, 3), 0.0045), 3.8, 2.0, tilt=(0.0, 0.0))
+
+
+@pytest.mark.parametrize("slope, layer, pixel", [(0.1, 1e-3, 5e-3), (0.02, 1e-3, 5e-3), (0.19, 1e-3, 5e-3)])
+def test_a_literal_staircase(slope, layer, pixel):
+    """Terraces, their edges smoothed by a running mean over a pixel: less the wanted slope, over whole terraces."""
+    count, wide = 2**14, layer / slope
+    x = (np.arange(8 * count) + 0.5) * wide / count
+    stairs = layer * np.floor(x / wide)
+    window = max(round(pixel / wide * count), 1)
+    sums = np.cumsum(np.insert(stairs, 0, 0))
+    smooth = (sums[window:] - sums[:-window]) / window
+    left = smooth - slope * x[: smooth.size]
+    left = left[: smooth.size // count * count]
+    left = left - left.mean()
+    rise = np.diff(left) / (x[1] - x[0])
+    height, steep = step_squares(np.array([slope]), layer, pixel)
+    np.testing.assert_allclose([height[0], steep[0]], [left.var(), (rise**2).mean()], rtol=5e-3, atol=1e-12)
+
+
+def test_steps_of_a_lens_are_in_its_middle():
+    """Where a terrace is wider than a pixel: for small slopes r / R, integrals over the disc are elementary."""
+    array, layer, pixel = single().array, 1e-4, 5e-3
+    steepest, edge = layer / pixel, 0.02 / 1.4
+    slope = 2 / edge**2 * (steepest * edge**3 / 3 - edge**4 / 4)
+    inner = (steepest**2 * edge**2 / 2 - 2 * steepest * edge**3 / 3 + edge**4 / 4) * 2 / edge**2
+    height, bent = lens_squares(array, 0.02, layer, pixel, 1e-7)
+    np.testing.assert_allclose(height, pixel**2 * inner / 12, rtol=1e-3)
+    # All rays are bent by steps of many waves, and next to none by thin ones.
+    np.testing.assert_allclose(bent, slope, rtol=2e-2)
+    assert lens_squares(array, 0.02, layer, pixel, 520e-6)[1] < 0.02 * slope
+    assert lens_squares(array, 0.2, 0.0, pixel, 520e-6) == (0, 0)
+
+
+@pytest.mark.parametrize("orientation", ["plano", "curved"])
+def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation):
+    imager = single(orientation=orientation)
+    if orientation == "curved":
+        imager = dataclasses.replace(imager, sensor_distance=3.1)
+    for depth in (16.0, 20.0, 26.0):
+        found = axial_strehl(imager, depth, radius=0.17)
+        np.testing.assert_allclose(found, strehl(imager, depth, radius=0.17), atol=3e-4)
+    check_grads(lambda v: axial_strehl(dataclasses.replace(imager, sensor_distance=v), 18.0), (3.7,), 1, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_images_of_wrong_lenses_by_optilands_rays(seed):
+    """Radius, conic, index and distance wrong at once, 3 standard deviations of the defaults and more."""
+    pytest.importorskip("optiland")
+    nominal = judged(single())
+    spreads = without(without(spreads_of(Tolerances(layer_um=0, roughness_nm=0)), "tilt"), "position")
+    errors = jax.tree.map(lambda x: 3 * x, in_units(drawn(jax.random.key(seed), 1), spreads))
+    width, ratio = map(np.exp, log_sharpness(nominal, errors, jnp.array(0.005)))
+    imager = built(nominal.imager, errors)
+    points, weights = map(np.asarray, pupil_disc(0.2))
+    airy = float(theory.airy_deviation(imager.wavelength, imager.sensor_distance, 0.4))
+    sag, v = np.asarray(imager.array.sag((points**2).sum(1))), float(imager.sensor_distance)
+    for row, depth in enumerate(DEPTHS[:2]):
+        squares, shares = [], []
+        for height in np.asarray(field_heights(nominal)):
+            landing, _, _ = optiland_rays(imager, depth, points, height)
+            squares.append(weights @ ((landing - weights @ landing) ** 2).sum(1) / 2)
+            shares.append(float(envelope(height**2, float(imager.reduced_depth(depth)), imager.field_radius)))
+        rays = np.average(squares, weights=shares)
+        sigma = np.sqrt(rays + airy**2 + 0.0045**2 / 12)
+        np.testing.assert_allclose(width[row], theory.FWHM * sigma / imager.magnification(depth), rtol=1e-6)
+        # Huygens: from the lens's surface to the middle of the spot, without obliquity.
+        landing, _, path = optiland_rays(imager, depth, points, 0.0)
+        there = np.hypot(v + sag, np.hypot(*(landing - points).T))
+        middle = np.hypot(v + sag, np.hypot(*points.T))
+        light = np.abs(weights @ np.exp(2j * np.pi / float(imager.wavelength) * (path - there + middle))) ** 2
+        np.testing.assert_allclose(ratio[row], light, rtol=0.01)
+
+
+def test_wrong_distances_and_indices_have_closed_forms(design, pinholes):
+    """`M = v/z'` is what is seen, whatever made it: `-z' dv / (v + dv)`, and the plate's `t/n`."""
+    nothing, n, v = no_errors(len(design.array.centers_mm)), 1.43, 3.8
+    reduced = np.asarray(pinholes.points.points)[:, 2] + 1 / n
+    farther, after = depth_errors(pinholes, dataclasses.replace(nothing, sensor_distance=jnp.array(0.05)))
+    np.testing.assert_allclose(farther, -reduced * 0.05 / (v + 0.05), rtol=1e-6)
+    np.testing.assert_allclose(after, 0, atol=1e-9)
+    denser, _ = depth_errors(pinholes, dataclasses.replace(nothing, index=jnp.array(0.01)))
+    np.testing.assert_allclose(denser, 1 / (n + 0.01) - 1 / n, rtol=1e-6)
+    leaning, after = depth_errors(pinholes, dataclasses.replace(nothing, tilt=jnp.array([0.01, -0.004])))
+    assert np.abs(leaning).max() > 0.05
+    np.testing.assert_allclose(after, 0, atol=1e-9)
+
+
+def lines(centers, point, v, tilt, rotation, shift, plate) -> np.ndarray:
+    """Straight lines in space, from a point through the vertices of a plate that is turned as a body, to the sensor."""
+    turned = Rotation.from_euler("z", rotation).apply(np.column_stack([centers, 0 * centers[:, 0]]))
+    turned[:, :2] += shift
+    axis = np.cross([*tilt, 0], [0, 0, 1])
+    vertices = Rotation.from_rotvec(np.arctan(np.hypot(*tilt)) * axis / max(float(np.linalg.norm(axis)), 1e-300)).apply(
+        turned
+    ) + [0, 0, v]
+    source = np.array([*point[:2], point[2] + plate + v])
+    along = vertices - source
+    return (vertices - along * (vertices[:, 2:] / along[:, 2:]))[:, :2]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_depths_by_scipys_fits(design, pinholes, seed):
+    """The device's spots, the calibration and the points by straight lines and SciPy; nothing of ours."""
+    centers, nominal = np.array(design.array.centers_mm), design.imager()
+    spreads = dataclasses.replace(spreads_of(Tolerances()), radius=jnp.zeros(()), conic=jnp.zeros(()))
+    errors = in_units(drawn(jax.random.key(seed), len(centers)), spreads)
+    v, plate = 3.8 + float(errors.sensor_distance), 1 / (1.43 + float(errors.index))
+    wrong, tilt = centers + np.asarray(errors.centers), np.asarray(errors.tilt)
+    tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "x_scale": "jac"}
+
+    def spots(sights):
+        pairs = zip(np.asarray(sights.points), np.asarray(sights.lenses), np.asarray(sights.are), strict=True)
+        return [(p, seen[are], lines(wrong[seen[are]], p, v, tilt, 0, (0, 0), plate)) for p, seen, are in pairs]
+
+    def off(unknown, some):
+        made = [lines(centers[at], p, unknown[0], unknown[1:3], unknown[3], unknown[4:], 1 / 1.43) for p, at, _ in some]
+        return np.concatenate([(a - b[2]).ravel() for a, b in zip(made, some, strict=True)])
+
+    seen = spots(pinholes.sources)
+    fitted = least_squares(off, [3.8, 0, 0, 0, 0, 0], args=(seen,), **tight).x
+    assert nominal.tilt is None
+    for found, believed in zip(depth_errors(pinholes, errors), ([3.8, 0, 0, 0, 0, 0], fitted), strict=True):
+        for row, one in list(enumerate(spots(pinholes.points)))[::4]:
+            place = lambda q, one=one, believed=believed: off(believed, [(q, *one[1:])])
+            z = least_squares(place, one[0], **tight).x[2]
+            # Our steps end within 0.1 um: a thousandth of what can be told apart.
+            np.testing.assert_allclose(found[row], z - one[0][2], atol=1e-4)
+
+
+def test_gradients_are_finite_differences(design, outcome):
+    spreads, nothing = spreads_of(outcome.tolerances), no_errors(len(design.array.centers_mm))
+    microscope = _judged(design, np.array(DEPTHS))
+    question = _Question(microscope, bench_of(microscope.imager, np.array(DEPTHS)), jnp.array(0.005))
+    fields = ["radius", "conic", "index", "sensor_distance"]
+    ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(spreads, f)}) for f in fields for s in (1, -1)]
+    found = _of_devices(question, jax.tree.map(lambda *parts: jnp.stack(parts), *ends))
+    names = {field: name for name, field in RULED.items()}
+    for row, field in enumerate(fields):
+        for part, by_gradient in zip(found, outcome.alone[names[field]], strict=True):
+            slope = np.abs(part[2 * row] - part[2 * row + 1]) / 0.02
+            np.testing.assert_allclose(slope, by_gradient, rtol=1e-3, atol=1e-6)
+
+
+def test_what_is_drawn_is_what_gradients_say(outcome):
+    """Where all is nearly linear; 100 devices have an RMS within 20 % or so."""
+    found = changes(outcome)
+    for key in ("depth_error_um", "depth_error_calibrated_um"):
+        assert found["all, drawn"][key] == pytest.approx(found["all, by gradient"][key], rel=0.25)
+    squares = [sum(np.asarray(outcome.alone[n].calibrated) ** 2 for n in RULED if n not in LEVELS)]
+    np.testing.assert_allclose(together(outcome.alone).calibrated, np.sqrt(squares[0]))
+
+
+def test_what_a_calibration_is_for(outcome):
+    """Distance and tilt are found by it and cost nothing; what remains is where lenses are, and what they are."""
+    alone = outcome.alone
+    assert all(np.abs(alone[name].calibrated).max() < 1e-3 for name in ("sensor distance", "tilt"))
+    assert alone["position"].calibrated.max() > 0.01 and alone["sensor distance"].designed.min() > 0.2
+    # The closed form, but for cores that move with the distance.
+    np.testing.assert_allclose(alone["sensor distance"].designed[:5], (18 + 1 / 1.43) * 0.05 / 3.8, rtol=0.05)
+
+
+def test_roughness_takes_light_from_the_core(outcome):
+    lost = -((2 * np.pi * 0.43 * 20e-6 / 520e-6) ** 2)
+    np.testing.assert_allclose(outcome.alone["roughness"].log_strehl, lost, rtol=1e-6)
+    np.testing.assert_allclose(outcome.alone["roughness"].log_width, 0, atol=1e-12)
+    assert (np.asarray(outcome.alone["printed layers"].log_width) > 0).all()
+
+
+def test_yields(design, outcome):
+    assert 0 <= outcome.all_met.mean() <= min(met.mean() for met in outcome.met.values())
+    assert set(outcome.yields_without) == set(RULED) and costs(outcome)[0] in sentences(outcome)[1]
+    perfect = Tolerances(**dict.fromkeys(set(Tolerances.model_fields) - {"pixel_um"}, 0.0))
+    good = tolerance(design, perfect, depths=DEPTHS, draws=2)
+    assert good.all_met.all() and not good.yields_without
+    assert "No tolerance alone costs yield" in sentences(good)[1]
+    hard = tolerance(design, perfect, depths=DEPTHS, draws=2, max_width=1e-4)
+    assert not hard.met["spot width"].any() and hard.met["depth"].all()
+
+
+def test_the_picture_and_the_numbers(outcome):
+    figure = picture(outcome)
+    assert len(figure.axes) == 4 and all(", " in axes.get_xlabel() for axes in figure.axes)
+    numbers = json.loads(json.dumps(as_json(outcome), allow_nan=False))
+    assert numbers["depth_mm"] == list(DEPTHS) and len(numbers["places_mm"]) == 5
+    low, middle, high = (numbers["drawn"]["spot_width_um"][key] for key in ("p5", "p50", "p95"))
+    assert all(a < b < c for a, b, c in zip(low, middle, high, strict=True))
+    assert set(numbers["by_gradient"]) == {*RULED, "all"} and sorted(numbers["costs"]) == sorted(RULED)
+
+
+def test_the_command(folder, monkeypatch, capsys):
+    (folder / "made.toml").write_text("position_um = 1.0\ntilt_deg = 0.1\n")
+    options = ("--tolerances", "made.toml", "--tilt-deg", 0.3, "--depths", "18:22:2", "--draws", 20, "-q")
+    status, out, err = run(monkeypatch, capsys, "tolerance", "design.toml", *options, "-o", "t.json")
+    assert (status, err) == (0, "") and "Yield:" in out and "all, by gradient" in out and "…" not in out
+    assert max(map(len, out.split("- Yield")[0].splitlines())) <= 80
+    numbers = json.loads((folder / "t.json").read_text())
+    assert numbers["tolerances"] == Tolerances(position_um=1.0, tilt_deg=0.3).model_dump()
+    assert numbers["drawn"]["devices"] == 20 and numbers["provenance"]["command"].startswith("gs-jax tolerance")
+    assert {path.name for path in folder.iterdir()} == {"design.toml", "made.toml", "t.json", "t.png"}
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--position-um", "-1"), "found '-1', allowed: 0 to 1000 um"),
+        (("--index", "x"), "found 'x', allowed: 0 to 0.1"),
+        (("--tolerances", "wrong.toml"), "`possition_um`: found a key that does not exist, allowed: `position_um`"),
+        (("-o", "t.txt"), "found the suffix '.txt', allowed: .json"),
+        (("--draws", "0"), "0 is not in the range"),
+        (("--positions", "places.csv"), "places.csv: found a source whose place is not known"),
+        (("--min-strehl", "2"), "found '2', allowed: 0.001 to 1"),
+    ],
+)
+def test_wrong_input_is_one_line(folder, monkeypatch, capsys, arguments, message):
+    (folder / "wrong.toml").write_text("possition_um = 1.0\n")
+    (folder / "places.csv").write_text("x_mm,y_mm\n0,0\n")
+    status, _, err = run(monkeypatch, capsys, "tolerance", "design.toml", *arguments)
+    assert status == 2 and message in err and len(err.strip().splitlines()) == 1
+    assert not (folder / "t.json").exists()
+
+
+def test_designs_that_have_no_answer(design, monkeypatch):
+    ideal = design.model_copy(update={"lens": design.lens.model_copy(update={"focal_length_mm": 3.0})})
+    with pytest.raises(InputError, match="`lens.focal_length_mm`: found 3, allowed: none"):
+        tolerance(ideal)
+    few = design.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
+    with pytest.raises(InputError, match="lenses see, allowed: 2 or more"):
+        tolerance(design.model_copy(update={"array": few}))
+    with pytest.raises(InputError, match="`max_width` must be positive"):
+        tolerance(design, max_width=-1.0)
+    with pytest.raises(InputError, match="`draws` must be one or more"):
+        tolerance(design, draws=0)
+    plain = design.imager()
+    array = dataclasses.replace(plain.array, radius_of_curvature=np.full(13, 1.4))
+    monkeypatch.setattr(Design, "imager", lambda self: dataclasses.replace(plain, array=array))
+    with pytest.raises(InputError, match="found lenses that differ, allowed: lenses that are alike"):
+        tolerance(design)
+
+
+def test_files_and_options_say_the_same(folder):
+    (folder / "all.toml").write_text("\n".join(f"{k} = {v}" for k, v in Tolerances().model_dump().items()))
+    assert read_tolerances("all.toml") == Tolerances()
+    options = {param.name for param in command.params}
+    assert set(Tolerances.model_fields) <= options
+    for text in ("roughness_nm = -1.0", "conic = true", "nonsense"):
+        (folder / "bad.toml").write_text(text)
+        with pytest.raises(InputError, match="bad.toml"):
+            read_tolerances("bad.toml")
