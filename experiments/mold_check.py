@@ -20,12 +20,19 @@ from gs_jax.base.progress import Progress
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
-from gs_jax.mold.caps import facet_surface
-from gs_jax.mold.checks import array_volume, mold_volume
 from gs_jax.mold.measurement import quality, verify
 from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
 from gs_jax.mold.pictures import draw_solid
-from gs_jax.mold.solids import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
+from gs_jax.mold.solids import (
+    MoldShape,
+    array_solid,
+    cast_solid,
+    engravings,
+    mold_block,
+    mold_solid,
+    plate_thickness,
+)
+from gs_jax.mold.volumes import array_volume, mold_volume
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
 CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -83,11 +90,13 @@ def draw(design: Design, records: list[dict]) -> Figure:
 
 
 def _draw_facets(axes, array: MicrolensArray) -> None:
-    surface = facet_surface(array, 2e-3)
-    x, y, height = surface.vertices.T
-    shown = np.abs(surface.vertices[surface.facets, :2]).max(axis=(1, 2)) < 2.2
-    image = axes.tripcolor(x, y, surface.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
-    axes.triplot(x, y, surface.facets[shown], color="white", linewidth=0.25)
+    mesh = printable(array_solid(array, 2e-3))
+    x, y, z = mesh.vertices.T
+    height = -plate_thickness(array) - z
+    corners = mesh.vertices[mesh.facets]
+    shown = (np.abs(corners[..., :2]).max(axis=(1, 2)) < 2.2) & (corners[..., 2].max(axis=1) < 0)
+    image = axes.tripcolor(x, y, mesh.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
+    axes.triplot(x, y, mesh.facets[shown], color="white", linewidth=0.25)
     axes.set(xlim=(-1.8, 1.8), ylim=(1.8, -1.8), aspect="equal", xlabel="x, mm", ylabel="y, mm")
     axes.set_title("facets within 2 um of the lenses")
     axes.figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
