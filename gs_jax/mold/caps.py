@@ -104,18 +104,22 @@ def cap_sag(array: MicrolensArray) -> float:
 
 
 def surface(
-    caps: list[Cap], points: Float[np.ndarray, "point 2"]
+    caps: list[Cap], points: Float[np.ndarray, "point 2"], margin: float = 0.0
 ) -> tuple[Float[np.ndarray, " point"], Int[np.ndarray, " point"]]:
-    """Height of the surface over the land at points `(x, y)`, mm, and whose lens it is; -1 of walls and land."""
+    """Height of the surface over the land at points `(x, y)`, mm, and whose lens it is.
+
+    That is -1 of walls and land, and where the lens is not higher than anything else by more than the margin, mm.
+    """
     land = max(cap.rim for cap in caps)
-    height, owner = np.zeros(len(points)), np.full(len(points), -1)
+    height, second, owner = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), -1)
     for number, (cap, (here, squared)) in enumerate(zip(caps, _around(caps, points, land), strict=True)):
         beyond = np.sqrt(np.maximum(squared, cap.reach**2)) - cap.reach
         its = land - cap.sag(np.minimum(squared, cap.reach**2)) - beyond / math.tan(DRAFT)
         higher = its > height[here]
+        second[here] = np.maximum(second[here], np.minimum(its, height[here]))
         height[here[higher]] = its[higher]
         owner[here[higher]] = np.where(beyond[higher] > 0, -1, number)
-    return height, owner
+    return height, np.where(height - second > margin, owner, -1) if margin else owner
 
 
 def visible_reaches(caps: list[Cap], size: tuple[float, float]) -> list[float]:

@@ -147,8 +147,8 @@ def judge(measured: dict[str, Any], *, chord: float, radius: float) -> list[Find
     missing = measured["lenses_not_measured"]
     center, larger = measured["center_deviation_max_um"], measured["radius_deviation_max_percent"]
     bent, certain = measured["conic_deviation_max"], measured["lenses_conic_measured"]
-    # Coarse facets have vertices that are lifted, by less than the chord error.
-    kept = center <= 1000 * CENTER_TOLERANCE and larger <= 100 * max(RADIUS_TOLERANCE, chord / radius)
+    # Coarse facets have vertices that are lifted, by less than the chord error: what was an asphere is another one.
+    kept = center <= 1000 * CENTER_TOLERANCE and larger <= 100 * max(RADIUS_TOLERANCE, 5 * chord / radius)
     text = f"read back, lenses are within {center:.2g} um of their places and {larger:.2g} % of their radius"
     if certain:
         uncertain = measured["conic_uncertainty_max"]

@@ -19,6 +19,8 @@ from .mesh_files import Mesh
 # A facet belongs to a lens if its corners are so close to the lens's surface and its normal so close to the surface's.
 _NEAR = 0.02
 _ALIGNED = math.cos(math.radians(20))
+# And if the lens is higher than all others by more than this: about a groove a facet may be either's.
+_CLEARLY = 2e-3
 # Five unknowns, and one more to see that they fit.
 _FEWEST = 6
 # Coordinates of float32 some 10 mm from the origin are rounded by so much, RMS.
@@ -27,6 +29,8 @@ _ROUNDED = 3e-7
 _ASTRAY = 10
 # A conic constant that vertices determine less well is not reported.
 _MOST_UNCERTAIN = 0.1
+# Nor is a lens whose centre, mm, or radius, as a fraction, they determine less well than this.
+_UNCERTAIN = 3e-4
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,7 @@ def verify(mesh: Mesh, array: MicrolensArray, *, scale: float = 1.0) -> Verifica
     facets = _by_lens(lens, len(design))
     measured = [_errors(vertices[mesh.facets[its]], was.cap) for its, was in zip(facets, design, strict=True)]
     offset, surface_rms, slope_rms = np.array(measured).T
-    known = np.array([1.0 if its.vertices >= _FEWEST else np.nan for its in found])
+    known = np.array([1.0 if its.determined else np.nan for its in found])
     values = lambda name: np.array([getattr(its, name) for its in found], float) * known
     certain = np.where(values("conic_deviation") <= _MOST_UNCERTAIN, 1.0, np.nan)
     return Verification(
@@ -116,6 +120,7 @@ class _Found:
     conic: float = math.nan
     conic_deviation: float = math.nan
     vertices: int = 0
+    determined: bool = False
 
 
 def _look(vertices, facets, lenses: list[_Found]) -> tuple[list[_Found], np.ndarray]:
@@ -141,7 +146,7 @@ def _by_lens(lens, count: int) -> list[np.ndarray]:
 def _belonging(corners, lenses: list[_Found]):
     """The lens of each facet, -1 for none."""
     middle = corners.mean(axis=1)
-    _, lens = surface([its.cap for its in lenses], middle[:, :2])
+    _, lens = surface([its.cap for its in lenses], middle[:, :2], _CLEARLY)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for here, its in zip(_by_lens(lens, len(lenses)), lenses, strict=True):
         off = np.abs(_outside(corners[here], its)[0]).max(axis=1)
@@ -167,8 +172,8 @@ def _outside(points, its: _Found):
 def _fit(its: _Found, points) -> _Found:
     """The surface through points: least squares of their distances, by Gauss and Newton."""
     if len(points) < _FEWEST:
-        return replace(its, vertices=len(points))
-    # Where facets of two lenses cut each other in slivers, a vertex may seem one lens's alone. Least absolute distances,
+        return replace(its, vertices=len(points), determined=False)
+    # Where facets of two lenses cut each other in slivers, a vertex may seem one lens's. Least absolute distances,
     # by least squares that are weighted anew, do not follow such vertices; then they are left out.
     for _ in range(8):
         its = _step(its, points, 4, weight=1 / np.sqrt(np.abs(_outside(points, its)[0]) + _ROUNDED))
@@ -178,15 +183,17 @@ def _fit(its: _Found, points) -> _Found:
         its = _step(its, points, 4)
     residual, gradient = _gradient(its, points)
     misfit = float(np.sqrt((residual**2).mean()))
-    its = replace(its, misfit=misfit, conic=math.nan, conic_deviation=math.nan, vertices=len(points))
-    if _deviation(gradient, 0.0) > _MOST_UNCERTAIN:
-        return its
+    x, y, _, radius = _deviations(gradient[:, :4], misfit)
+    determined = bool(max(x, y, radius / its.cap.radius) < _UNCERTAIN)
+    its = replace(its, misfit=misfit, conic=math.nan, vertices=len(points), determined=determined)
+    if not determined or _deviations(gradient, 0.0)[-1] > _MOST_UNCERTAIN:
+        return replace(its, conic_deviation=math.nan)
     free = its
     for _ in range(6):
         free = _step(free, points, 5)
     residual, gradient = _gradient(free, points)
     scatter = math.sqrt((residual**2).sum() / max(len(points) - 5, 1))
-    return replace(its, conic=free.cap.conic, conic_deviation=_deviation(gradient, scatter))
+    return replace(its, conic=free.cap.conic, conic_deviation=float(_deviations(gradient, scatter)[-1]))
 
 
 def _step(its: _Found, points, unknowns: int, weight=1.0) -> _Found:
@@ -210,10 +217,10 @@ def _gradient(its: _Found, points):
     return residual, np.column_stack([normal, normal[:, 2] * by_radius, normal[:, 2] * by_conic])
 
 
-def _deviation(gradient, scatter: float) -> float:
-    """Standard deviation of the conic constant, if points scatter as they do, or at least by their rounding."""
-    variance = np.linalg.pinv(gradient.T @ gradient, rcond=1e-15, hermitian=True)[-1, -1]
-    return max(scatter, _ROUNDED) * math.sqrt(variance)
+def _deviations(gradient, scatter: float):
+    """Standard deviations of the unknowns, if points scatter as they do, or at least by their rounding."""
+    variances = np.diag(np.linalg.pinv(gradient.T @ gradient, rcond=1e-15, hermitian=True))
+    return max(scatter, _ROUNDED) * np.sqrt(np.maximum(variances, 0))
 
 
 def _errors(corners, cap: Cap) -> tuple[float, float, float]:
