@@ -110,7 +110,8 @@ def outside(array, points):
     offs = []
     for cap in caps_of(array):
         squared = ((points[:, :2] - cap.center) ** 2).sum(axis=1)
-        here = squared <= cap.reach**2
+        # The edge's corners are a little outside its circle.
+        here = squared <= (cap.reach + CHORD) ** 2
         squared = np.where(here, squared, 0)
         off = (points[:, 2] - cap_sag(array) + cap.sag(squared)) / np.sqrt(1 + squared * cap.steepness(squared) ** 2)
         offs.append(np.where(here, off, np.inf))

@@ -88,13 +88,15 @@ def facet_cap(cap: Cap, reach: float, chord: float) -> Facets:
     inside, side = _hexagonal(maps, radius)
     # The edge is an arc in the plane, and on the surface it is as far from point to point as a facet is wide.
     count = max(6, math.ceil(2 * math.pi * reach / min(side, math.sqrt(8 * reach * chord))))
-    angle = 2 * math.pi * np.arange(count) / count
-    ring = reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    step = 2 * math.pi / count
+    angle = step * np.arange(count)
+    # As large as the disc, so that walls are, too: its corners are outside the circle by less than its chords inside.
+    ring = reach * math.sqrt(step / math.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = np.concatenate([ring, inside if len(inside) else np.zeros((1, 2))])
     for _ in range(_ROUNDS):
         flat = _scaled(points, maps.radii, maps.conformal)
         facets = _delaunay(flat)
-        vertices = np.column_stack([points, -cap.sag((points**2).sum(axis=1))])
+        vertices = np.column_stack([points, -cap.sag(np.minimum((points**2).sum(axis=1), reach**2))])
         more = _splits(flat, vertices[facets], facets, radius)
         more = _scaled(more, maps.conformal, maps.radii)
         more = more[np.hypot(*more.T) < reach * math.cos(math.pi / count)]

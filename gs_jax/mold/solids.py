@@ -150,7 +150,7 @@ def _body(cap: Cap, reach, chord, land, deep) -> m3.Manifold:
     height = land - sag
     if height[:count].max() < _LOWEST_WALL:
         height[:count] = 0
-    foot = points[:count] * (1 + (height[0] + deep) * math.tan(DRAFT) / reach)
+    foot = points[:count] * (1 + (height[0] + deep) * math.tan(DRAFT) / math.hypot(*points[0]))
     vertices = np.concatenate([np.column_stack([points, height]), np.column_stack([foot, np.full(count, -deep)])])
     top = np.arange(count)
     after, under, bottom = np.roll(top, -1), len(points), len(points) + top
