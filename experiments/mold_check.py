@@ -1,11 +1,13 @@
 """From the paper's array to a part: what the facets of its mold cost, and whether they are where the lenses should be.
 
-The array and its mold are made for several chord errors, written as STL, read back and measured: volume, places and
-radii of the lenses, and the wavefront error of the facets. Without the authors' centres our built-in layout is used.
+The array and its mold are made for several chord errors, written as STL, read back and measured: volume, places, radii
+and conic constants of the lenses, and the wavefront error of the facets. Then the same with lenses that all differ, in
+radius, conic constant and aperture. Without the authors' centres our built-in layout is used.
 
     python -m experiments.mold_check [--out DIR]
 """
 
+import dataclasses
 import tempfile
 import time
 from collections.abc import Sequence
@@ -15,17 +17,24 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from gs_jax import MicrolensArray
+from gs_jax import Imager, MicrolensArray
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
-from gs_jax.mold.caps import facet_surface
-from gs_jax.mold.checks import array_volume, mold_volume
 from gs_jax.mold.measurement import quality, verify
 from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
 from gs_jax.mold.pictures import draw_solid
-from gs_jax.mold.solids import MoldShape, array_solid, cast_solid, engravings, mold_block, mold_solid
+from gs_jax.mold.solids import (
+    MoldShape,
+    array_solid,
+    cast_solid,
+    engravings,
+    mold_block,
+    mold_solid,
+    plate_thickness,
+)
+from gs_jax.mold.volumes import array_volume, mold_volume
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
 CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -34,12 +43,24 @@ CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)
 def run(design: Design, chords_um: Sequence[float] = CHORDS_UM, progress: Progress | None = None) -> list[dict]:
     """One record a chord error."""
     items = chords_um if progress is None else progress.track(chords_um, "Chord errors")
-    return [measure(design, chord_um) for chord_um in items]
+    return [measure(design.imager(), chord_um, design.name) for chord_um in items]
 
 
-def measure(design: Design, chord_um: float) -> dict:
+def differing(imager: Imager) -> Imager:
+    """The same microscope with lenses that all differ: random radii, conic constants and apertures."""
+    array, random = imager.array, np.random.default_rng(0)
+    draw = lambda low, high: random.uniform(low, high, len(array.centers))
+    each = {
+        "radius_of_curvature": np.asarray(array.radius_of_curvature) * draw(0.9, 1.1),
+        "conic_constant": draw(-1.0, 0.0),
+        "aperture_diameter": np.asarray(array.aperture_diameter) * draw(0.6, 1.0),
+    }
+    return dataclasses.replace(imager, array=dataclasses.replace(array, **each))
+
+
+def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     """The array and the mold at one chord error, through a file and back."""
-    array, shape = design.imager().array, MoldShape(label=design.name)
+    array, shape = imager.array, MoldShape(label=label)
     started = time.perf_counter()
     part = array_solid(array, chord_um / 1000)
     made = time.perf_counter() - started
@@ -50,7 +71,7 @@ def measure(design: Design, chord_um: float) -> dict:
     block = float(np.prod(np.diff(mold_block(array, shape), axis=0)))
     engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
     cast = cast_solid(array, part, shape).volume()
-    numbers = quality(verify(meshes[1], array), design.imager())
+    numbers = quality(verify(meshes[1], array), imager)
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
@@ -83,11 +104,13 @@ def draw(design: Design, records: list[dict]) -> Figure:
 
 
 def _draw_facets(axes, array: MicrolensArray) -> None:
-    surface = facet_surface(array, 2e-3)
-    x, y, height = surface.vertices.T
-    shown = np.abs(surface.vertices[surface.facets, :2]).max(axis=(1, 2)) < 2.2
-    image = axes.tripcolor(x, y, surface.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
-    axes.triplot(x, y, surface.facets[shown], color="white", linewidth=0.25)
+    mesh = printable(array_solid(array, 2e-3))
+    x, y, z = mesh.vertices.T
+    height = -plate_thickness(array) - z
+    corners = mesh.vertices[mesh.facets]
+    shown = (np.abs(corners[..., :2]).max(axis=(1, 2)) < 2.2) & (corners[..., 2].max(axis=1) < 0)
+    image = axes.tripcolor(x, y, mesh.facets[shown], 1000 * height, shading="gouraud", cmap="viridis")
+    axes.triplot(x, y, mesh.facets[shown], color="white", linewidth=0.25)
     axes.set(xlim=(-1.8, 1.8), ylim=(1.8, -1.8), aspect="equal", xlabel="x, mm", ylabel="y, mm")
     axes.set_title("facets within 2 um of the lenses")
     axes.figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
@@ -115,6 +138,7 @@ COLUMNS = {
     "block_filled_error": ("block filled, off", "{:.1e}"),
     "center_deviation_max_um": ("centres within, um", "{:.1e}"),
     "radius_deviation_max_percent": ("radii within, %", "{:.4f}"),
+    "conic_deviation_max": ("conic constants within", "{:.1e}"),
     "surface_error_rms_um": ("surface, um RMS", "{:.4f}"),
     "wavefront_error_rms_waves": ("waves RMS", "{:.4f}"),
     "strehl_of_facets_median": ("Strehl ratio", "{:.3f}"),
@@ -128,9 +152,13 @@ def rows(records: list[dict]) -> list[list[str]]:
 def report(progress: Progress) -> Report:
     design = read_design(CENTERS) if CENTERS.exists() else geomscope()
     records = run(design, progress=progress)
-    titles, lines = [title for title, _ in COLUMNS.values()], rows(records)
-    text = markdown_table(titles, lines) + "\n"
-    return Report({"mold.json": records, "mold.md": text, "mold.png": draw(design, records)}, [table(titles, lines)])
+    others = [
+        measure(differing(design.imager()), chord_um) for chord_um in progress.track((0.5, 2.0), "Unequal lenses")
+    ]
+    titles, lines, unequal = [title for title, _ in COLUMNS.values()], rows(records), rows(others)
+    text = "\n\n".join(markdown_table(titles, part) for part in (lines, unequal)) + "\n"
+    data = {"mold.json": {"alike": records, "unequal": others}, "mold.md": text, "mold.png": draw(design, records)}
+    return Report(data, [table(titles, lines), table(titles, unequal)])
 
 
 if __name__ == "__main__":

@@ -16,9 +16,10 @@ from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make
-from gs_jax.mold.checks import Finding, array_volume, check_design, refuse_errors
+from gs_jax.mold.checks import Finding, check_design, refuse_errors
 from gs_jax.mold.make import make_mold
 from gs_jax.mold.solids import MoldShape, plate_thickness
+from gs_jax.mold.volumes import array_volume
 
 DESIGN = """
 name = "small $x"

@@ -15,7 +15,8 @@ from .options import DESIGN
 def command(design: Path, output: Path):
     """Draw the opaque mask between the lenses of the file DESIGN, to have it made.
 
-    Openings are the lenses' clear discs; the sheet is as large as the mold, with its alignment marks. DXF and SVG are
+    Openings are the lenses' clear discs; the sheet is as large as the mold, with its alignment marks, and seen as the
+    mold from above: from the plano side of the lenses. DXF and SVG are
     in mm, GDSII in um (it needs `pip install 'gs-jax[gds]'`). Beside the drawing, .json says where it comes from.
     """
     from ..designs.design import design_text, read_design

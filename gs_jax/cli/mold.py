@@ -68,9 +68,9 @@ def command(
 ):
     """Make the negative mold of the array of the file DESIGN, to print and to cast the array in.
 
-    Units are mm. The array lies in the mold as it faces the sensor: x and y are the design's, lenses look toward -z.
-    A picture (.png) and a report (.json, .txt) of the same name are written beside it; what was written is read back
-    and measured.
+    Units are mm. Lenses look toward -z. If the plano side faces the object, x and y are the design's; if the curved
+    side does, the array lies turned over about x, with its y against the design's. A picture (.png) and a report
+    (.json, .txt) of the same name are written beside it; what was written is read back and measured.
     """
     from ..designs.design import design_text, read_design
     from ..mold.make import make_mold, report_text

@@ -1,249 +1,160 @@
-"""The surface of an array of spherical caps on a plate, as facets whose distance from the spheres is bounded.
+"""The lenses of an array as the part has them: one a cap of its own, of any profile that falls from vertex to rim.
 
-A lens of radius of curvature R and aperture D is the part of a sphere above the plate's plane: its height over the
-plane at the distance r from its axis is `h(r) = sqrt(R^2 - r^2) - sqrt(R^2 - D^2/4)`, zero at the rim and beyond. The
-surface is the maximum over the lenses. The vertices of a lens lie on one sphere, so its facets are the upper side of
-their convex hull: of all triangulations the one closest to the sphere. Host code; lengths in mm.
+All vertices lie in one plane, and heights are over the land, the plane between the lenses. The land is at the deepest
+rim's sag: what is alike ends in it. A lens whose rim is higher stands on a wall, with a draft so that a cast can be
+peeled and that walls which touch are one body. The surface is the highest of caps, walls and land: lenses end where
+they meet, or at their discs. Lengths in mm, angles in radians.
 """
 
 import math
 from dataclasses import dataclass
 
-import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import ConvexHull, KDTree
 
-from ..base.progress import Progress
-from ..layouts.cells import cross
-from ..lenses import MicrolensArray
-from .outlines import Plan, draw_plan
+from ..lenses import MicrolensArray, sag, steepness
 
-# How often facets that are too large are split. One or two rounds are enough; more would mean that none is.
-_ROUNDS = 20
-# The largest chord error in heights of a lens: with fewer facets it is no lens.
-COARSEST = 0.1
-# More take gigabytes of memory and of disk.
-MAX_FACETS = 5_000_000
+# Of walls, from the axis: usual for what is to come off a mold.
+DRAFT = math.radians(5)
+# Steeper rims are neither printed nor peeled well, and hide their facets from above.
+STEEPEST = math.radians(75)
 
 
 @dataclass(frozen=True)
-class Surface:
-    """Facets over the plate, counter-clockwise in (x, y), with heights over the plate's plane.
+class Cap:
+    """One lens.
 
     Parameters
     ----------
-    vertices
-        `(x, y, height)`, mm.
-    facets
-        Of the lenses, then of the plate between them, as indices of vertices.
-    lens
-        The lens of each facet, -1 for the plate.
-    lift
-        How far outside the sphere the lenses' vertices are, mm (`facet_surface`).
+    center
+        Its vertex `(x, y)` in the part's frame, mm.
+    reach
+        Radius of its disc, mm.
+    radius, conic, terms
+        Of `MicrolensArray`'s surface: radius of curvature, conic constant, A_4, A_6, ....
     """
 
-    vertices: Float[np.ndarray, "vertex 3"]
-    facets: Int[np.ndarray, "facet 3"]
-    lens: Int[np.ndarray, " facet"]
-    lift: float
+    center: Float[np.ndarray, "2"]
+    reach: float
+    radius: float
+    conic: float
+    terms: tuple[float, ...] = ()
+
+    def sag(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """How far the surface is below its vertex at a squared distance from the axis, mm."""
+        return sag(np.asarray(squared, float), self.radius, self.conic, self.terms)
+
+    def steepness(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Slope over the distance from the axis, 1/mm."""
+        return steepness(np.asarray(squared, float), self.radius, self.conic, self.terms)
+
+    @property
+    def rim(self) -> float:
+        """Sag of the rim, mm."""
+        return float(self.sag(np.array([self.reach**2]))[0])
+
+    @property
+    def widest(self) -> float:
+        """Radius up to which the disc could be made, mm: the surface falls, by no more than `STEEPEST`."""
+        low, high = 0.0, self.reach
+        if self._is_made(high):
+            return high
+        # What is wrong somewhere is wrong at the first such place: profiles are asked at many.
+        radii = np.linspace(low, high, 1025)
+        first = next(i for i, r in enumerate(radii) if not self._is_made(r))
+        low, high = (radii[first - 1], radii[first]) if first else (0.0, 0.0)
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._is_made(middle) else (low, middle)
+        return float(low)
+
+    def _is_made(self, reach) -> bool:
+        squared = np.linspace(0, reach, 257) ** 2
+        if not ((1 + self.conic) * squared < self.radius**2).all():
+            return False
+        steep = self.steepness(squared)
+        return bool((steep > 0).all() and (steep * np.sqrt(squared) <= math.tan(STEEPEST)).all())
+
+
+def caps_of(array: MicrolensArray) -> list[Cap]:
+    """The lenses of an array, in the part's frame.
+
+    That is the design's if the plano side faces the object: x and y as the sensor's. A part lies with its lenses
+    toward -z, so one whose curved side faces the object has been turned over, about x: its y runs against the
+    sensor's. A part that was not turned but had its lenses on the other face would be mirrored.
+    """
+    count = len(array.centers)
+    numbers = (array.aperture_diameter, array.radius_of_curvature, array.conic_constant)
+    diameter, radius, conic = (np.broadcast_to(np.asarray(x, float), count).tolist() for x in numbers)
+    terms = tuple(np.asarray(array.aspheric_terms, float).tolist())
+    return [
+        Cap(center, d / 2, r, k, terms)
+        for center, d, r, k in zip(part_centers(array), diameter, radius, conic, strict=True)
+    ]
+
+
+def part_centers(array: MicrolensArray) -> Float[np.ndarray, "lens 2"]:
+    """The lens vertices in the part's frame, mm."""
+    return np.asarray(array.centers, float) * (1.0, 1.0 if array.orientation == "plano" else -1.0)
 
 
 def cap_sag(array: MicrolensArray) -> float:
-    """Height of a whole lens over the plate's plane, `R - sqrt(R^2 - D^2/4)`, mm."""
-    radius, reach = float(array.radius_of_curvature), float(array.aperture_diameter) / 2
-    return radius - math.sqrt(radius**2 - reach**2)
+    """Height of the vertices over the land, mm: the deepest rim's sag, `R - sqrt(R^2 - D^2/4)` of spheres alike."""
+    return max(cap.rim for cap in caps_of(array))
 
 
-def cap_height(array: MicrolensArray, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:
-    """Height of the surface over the plate's plane at points `(x, y)`, mm. Lenses are equal: the nearest is highest."""
-    distance, _ = KDTree(np.asarray(array.centers, float)).query(points)
-    radius, reach = float(array.radius_of_curvature), float(array.aperture_diameter) / 2
-    return np.sqrt(radius**2 - np.minimum(distance, reach) ** 2) - math.sqrt(radius**2 - reach**2)
+def surface(
+    caps: list[Cap], points: Float[np.ndarray, "point 2"], margin: float = 0.0
+) -> tuple[Float[np.ndarray, " point"], Int[np.ndarray, " point"]]:
+    """Height of the surface over the land at points `(x, y)`, mm, and whose lens it is.
 
-
-def facet_surface(array: MicrolensArray, chord: float, progress: Progress | None = None) -> Surface:
-    """The array's surface as facets.
-
-    Vertices on the sphere itself would leave every facet inside it: the part would be too thin by three quarters of the
-    chord error. They are lifted by the mean depth of the facets, so that the surface is right on average (in thickness
-    and volume), and no farther from the sphere than before.
-
-    Parameters
-    ----------
-    array
-        Lenses on a plate of finite size.
-    chord
-        The largest distance between a facet and its sphere, mm.
-    progress
-        Shows how many lenses are done.
-
-    Returns
-    -------
-    Surface
-        Without cracks: neighbours share the vertices of their common edge.
-
-    Raises
-    ------
-    InputError
-        If a lens lies outside the plate, or the plate is infinite.
-    ValueError
-        If `chord` is not positive and at most a tenth of the height of a lens, or takes millions of facets.
-    RuntimeError
-        If no facets are found for a lens; rims that slope by 75 degrees and less have them.
+    That is -1 of walls and land, and where the lens is not higher than anything else by more than the margin, mm.
     """
-    coarsest = cap_sag(array) * COARSEST
-    if not 0 < chord <= coarsest:
-        raise ValueError(f"`chord` must be positive and at most {coarsest:.4g} mm, got {chord}.")
-    if (count := estimated_facets(array, chord)) > MAX_FACETS:
-        raise ValueError(f"`chord` of {chord} mm takes about {count:.2g} facets, allowed: up to {MAX_FACETS:.2g}.")
-    plan = draw_plan(array, chord)
-    centers, radius = np.asarray(array.centers, float), float(array.radius_of_curvature)
-    inside = _hexagonal(radius, float(array.aperture_diameter) / 2, chord)
-    points, facets, owners, first = [plan.points], [], [], len(plan.points)
-    lenses = list(zip(centers, plan.outlines, strict=True))
-    for i, (center, outline) in enumerate((progress or Progress()).track(lenses, "Tessellating")):
-        ring = plan.points[outline.cap] - center
-        added, cap = _facet_cap(ring, inside, radius, chord)
-        index = np.concatenate([outline.cap, np.arange(first, first + len(added))])
-        points.append(added + center)
-        facets.append(index[cap])
-        owners.append(np.full(len(cap), i))
-        first += len(added)
-    plan_points, lens = np.concatenate(points), np.concatenate(owners)
-    lens_facets = np.concatenate(facets)
-    lift = _mean_depth(plan_points, lens_facets, centers[lens], radius)
-    height = _heights(array, plan, plan_points, lens_facets, lens, radius + lift)
-    flat = [_facet_flat(plan.points, polygon) for outline in plan.outlines for polygon in outline.flats]
-    plate = np.concatenate([np.zeros((0, 3), int), *flat])
-    return Surface(
-        vertices=np.column_stack([plan_points, height]),
-        facets=np.concatenate([lens_facets, plate]),
-        lens=np.concatenate([lens, np.full(len(plate), -1)]),
-        lift=lift,
-    )
+    land = max(cap.rim for cap in caps)
+    height, second, owner = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), -1)
+    for number, (cap, (here, squared)) in enumerate(zip(caps, _around(caps, points, land), strict=True)):
+        beyond = np.sqrt(np.maximum(squared, cap.reach**2)) - cap.reach
+        its = land - cap.sag(np.minimum(squared, cap.reach**2)) - beyond / math.tan(DRAFT)
+        higher = its > height[here]
+        second[here] = np.maximum(second[here], np.minimum(its, height[here]))
+        height[here[higher]] = its[higher]
+        owner[here[higher]] = np.where(beyond[higher] > 0, -1, number)
+    return height, np.where(height - second > margin, owner, -1) if margin else owner
 
 
-def estimated_facets(array: MicrolensArray, chord: float) -> float:
-    """About how many facets the lenses take: equilateral ones of `side^2 = 6 R chord`, and a fifth for the edges."""
-    discs = len(array.centers) * math.pi / 4 * float(array.aperture_diameter) ** 2
-    facet = math.sqrt(3) / 4 * 6 * float(array.radius_of_curvature) * chord
-    return 1.2 * min(math.prod(array.size), discs) / facet
+def visible_reaches(caps: list[Cap], size: tuple[float, float]) -> list[float]:
+    """How far from its vertex each lens may be seen, mm: up to its disc, or less if others hide the rest of it.
 
-
-def _heights(array, plan: Plan, points, facets, lens, radius):
-    """Of each vertex over the plate's plane; the plate's own vertices, the lenses' rims among them, lie in it."""
-    owner = np.zeros(len(points), int)
-    owner[facets] = lens[:, None]
-    squared = ((points - np.asarray(array.centers, float)[owner]) ** 2).sum(axis=1)
-    reach = float(array.aperture_diameter) / 2
-    height = np.sqrt(np.maximum(radius**2 - squared, 0)) - math.sqrt(float(array.radius_of_curvature) ** 2 - reach**2)
-    height[: len(plan.points)][plan.on_plate] = 0
-    return height
-
-
-def _hexagonal(radius, reach, chord):
-    """A hexagonal lattice over a cap, seen from above: nearly equilateral facets of the largest size.
-
-    The lattice is laid out in Lambert's equal-area projection, which stretches by no more than `1 / cos(theta/2)` at
-    the polar angle `theta`. A facet's depth is `rho^2 / (2 R)` for its circumradius `rho`.
+    The plate is cut into tiles. Over a tile a lens is no higher than at the tile's nearest point, and some lens is as
+    high as at its farthest point: a lens that is lower than that is not seen there.
     """
-    theta = math.asin(min(reach / radius, 1.0))
-    side = 0.98 * math.sqrt(3) * facet_circumradius(radius, chord) * math.cos(theta / 2)
-    limit = 2 * radius * math.sin(theta / 2)
-    count = math.ceil(limit / side) + 1
-    i, j = np.meshgrid(*[np.arange(-2 * count, 2 * count + 1)] * 2)
-    lattice = side * np.stack([i + j / 2, math.sqrt(3) / 2 * j], axis=-1).reshape(-1, 2)
-    q = (lattice**2).sum(axis=1) / radius**2
-    lattice = lattice[q * radius**2 < limit**2] * np.sqrt(1 - q[q * radius**2 < limit**2] / 4)[:, None]
-    polar = np.arcsin(np.hypot(*lattice.T) / radius)
-    return lattice[polar * radius < theta * radius - side / 2], side
+    land = max(cap.rim for cap in caps)
+    step = math.sqrt(math.prod(size) / (400 * len(caps)))
+    count = [math.ceil(side / step) for side in size]
+    middles = [(np.arange(n) + 0.5) * (side / n) - side / 2 for n, side in zip(count, size, strict=True)]
+    tiles = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    half = math.hypot(*(side / n for n, side in zip(count, size, strict=True))) / 2
+    least = np.zeros(len(tiles))
+    near = list(_around(caps, tiles, land, half))
+    for cap, (here, squared) in zip(caps, near, strict=True):
+        far = np.sqrt(squared) + half
+        here, far = here[far <= cap.reach], far[far <= cap.reach]
+        least[here] = np.maximum(least[here], land - cap.sag(far**2))
+    reaches = []
+    for cap, (here, squared) in zip(caps, near, strict=True):
+        distance = np.sqrt(squared)
+        highest = land - cap.sag(np.clip(distance - half, 0, cap.reach) ** 2)
+        reaches.append(min(cap.reach, float((distance + half)[highest >= least[here]].max(initial=half))))
+    return reaches
 
 
-def facet_circumradius(radius: float, chord: float) -> float:
-    """Circumradius of a triangle whose corners lie on a sphere and whose plane dips `chord` below it, mm."""
-    return math.sqrt(2 * radius * chord - chord**2)
-
-
-def _facet_cap(ring, lattice, radius, chord):
-    """Points to add within a convex ring, and facets over both; all seen from the lens's axis."""
-    points, side = lattice
-    start, along = ring, np.roll(ring, -1, axis=0) - ring
-    normal = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
-    reach = (normal * start).sum(axis=1)
-    # Foreshortened: what is steep seems close to the edge.
-    cos = np.sqrt(1 - (points**2).sum(axis=1) / radius**2)
-    room = (reach - points @ normal.T).min(axis=1)
-    added = points[room > side / 2 * cos]
-    if not len(added):
-        added = ring.mean(axis=0, keepdims=True)
-    for _ in range(_ROUNDS):
-        vertices = _on_sphere(np.concatenate([ring, added]), radius)
-        facets = _upper_hull(vertices, len(ring))
-        more = _splits(vertices, facets, radius, chord, side)
-        more = more[(more @ normal.T < reach).all(axis=1)]
-        if not len(more):
-            return added, facets
-        added = np.concatenate([added, more])
-    raise RuntimeError(f"facets within {chord} mm of a sphere of radius {radius} mm were not found")
-
-
-def _on_sphere(points, radius):
-    return np.column_stack([points, np.sqrt(np.maximum(radius**2 - (points**2).sum(axis=1), 0))])
-
-
-def _upper_hull(vertices, ring):
-    """Facets over the ring of the first vertices, counter-clockwise seen from above."""
-    hull = ConvexHull(vertices)
-    facets = hull.simplices[hull.equations[:, 2] > 1e-9]
-    a, b, c = (vertices[facets[:, k], :2] for k in range(3))
-    clockwise = cross(b - a, c - a) < 0
-    facets = np.where(clockwise[:, None], facets[:, ::-1], facets)
-    # Rounding error may leave a facet standing over an edge of the ring, outside it.
-    n = len(vertices)
-    edge = np.arange(ring) * n + np.roll(np.arange(ring), -1)
-    while True:
-        forward = facets * n + np.roll(facets, -1, axis=1)
-        backward = np.roll(facets, -1, axis=1) * n + facets
-        outer = ~np.isin(forward, backward)
-        wrong = (outer & ~np.isin(forward, edge)).any(axis=1)
-        if not wrong.any():
-            return facets
-        facets = facets[~wrong]
-
-
-def _splits(vertices, facets, radius, chord, side):
-    """Points on the sphere over the middle of each facet that dips too far: of its circle, or of its longest edge."""
-    corners = vertices[facets]
-    edges = np.roll(corners, -1, axis=1) - corners
-    squared = (edges**2).sum(axis=2)
-    longest = squared.argmax(axis=1)
-    obtuse = 2 * squared.max(axis=1) > squared.sum(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    area2 = np.linalg.norm(normal, axis=1)
-    circle = np.sqrt(squared.prod(axis=1)) / (2 * np.maximum(area2, 1e-300))
-    reach = np.where(obtuse, np.sqrt(squared.max(axis=1)) / 2, circle)
-    wrong = reach > facet_circumradius(radius, chord) * (1 + 1e-6)
-    rows = np.flatnonzero(wrong)
-    middle = corners[rows, longest[rows]] + edges[rows, longest[rows]] / 2
-    direction = np.where(obtuse[rows, None], middle, normal[rows])
-    points = radius * direction[:, :2] / np.linalg.norm(direction, axis=1)[:, None]
-    crowded = {j for _, j in KDTree(points).query_pairs(side / 2)} if len(points) else set()
-    return points[[i for i in range(len(points)) if i not in crowded]]
-
-
-def _mean_depth(points, facets, centers, radius):
-    """Of the facets below the sphere that their corners lie on, over the area of the plan.
-
-    `|x|^2` has the mean `3/4 g^2 + R^2/4` over a triangle with its corners at `|x| = R` and its centroid at `|x| = g`.
-    """
-    corners = _on_sphere((points[facets] - centers[:, None]).reshape(-1, 2), radius).reshape(-1, 3, 3)
-    centroid = (corners.mean(axis=1) ** 2).sum(axis=1)
-    a, b, c = corners[..., :2].transpose(1, 0, 2)
-    area = cross(b - a, c - a)
-    return float((area * 3 * (radius**2 - centroid)).sum() / (area.sum() * 8 * radius))
-
-
-def _facet_flat(points, polygon):
-    index = np.concatenate(polygon)
-    return index[manifold3d.triangulate([points[ring] for ring in polygon])]
+def _around(caps, points, land, margin=0.0):
+    """For each lens the points on or near its cap and wall, and their squared distances from its axis."""
+    order = np.argsort(points[:, 0], kind="stable")
+    x = points[order, 0]
+    for cap in caps:
+        reach = cap.reach + (land - cap.rim) * math.tan(DRAFT) + margin
+        first, last = np.searchsorted(x, cap.center[0] + np.array([-reach, reach]))
+        here = order[first:last]
+        squared = ((points[here] - cap.center) ** 2).sum(axis=1)
+        yield here[squared < reach**2], squared[squared < reach**2]

@@ -9,21 +9,24 @@ from typing import Literal
 
 import manifold3d as m3
 import numpy as np
+from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..designs.design import Design
-from ..layouts.cells import cell_edges, coverage, largest_hole, nearest_neighbour_distances
+from ..layouts.cells import cell_edges, coverage, largest_hole
 from ..lenses import MicrolensArray
-from .caps import COARSEST, MAX_FACETS, cap_sag, estimated_facets
+from .caps import STEEPEST, cap_sag, caps_of, surface, visible_reaches
+from .facets import estimated_facets
 from .mesh_files import Mesh
-from .solids import STEEPEST, MoldShape, engravings, mold_block, plate_thickness, widest_aperture
+from .solids import MAX_FACETS, MoldShape, coarsest_chord, plate_thickness, too_wide
+from .volumes import VOLUME_TOLERANCE
 
-# Of a solid's volume against the analytic one. Facets within 0.5 um of the lenses come within 1e-5.
-VOLUME_TOLERANCE = 1e-4
 # Thinner sheets of cast silicone tear when they are peeled off, thinner prints warp.
 THINNEST_MM = 0.3
 # Of steps in a surface, RMS: a Strehl ratio of 0.8, Marechal's criterion.
 MOST_WAVES = 1 / 14
+# Places a side of the plate at which lenses that differ are looked at: what is counted is right to a percent.
+_PLACES = 1000
 
 
 @dataclass(frozen=True)
@@ -54,33 +57,43 @@ def check_design(
     shape
         What is around the array in its mold.
     chord
-        The largest distance between a facet and its sphere, mm.
+        The largest distance between a facet and its lens, mm.
     resolution
         The smallest feature that the printer makes, mm.
     layer
         Thickness of its layers, mm, if it prints any.
     """
-    array = design.imager().array
+    imager = design.imager()
+    array = imager.array
+    # What cannot be made is not looked at any closer.
+    if (first := _slope(array)).level == "error":
+        return [first]
     return [
-        _focal_length(design),
+        _focal_length(array),
         _plate(array),
         _walls(shape),
-        _slope(array),
+        first,
         _spacing(array, resolution),
         _ridges(array, resolution),
         _holes(array),
         _chord(array, chord, resolution),
-        *([] if layer is None else [_layers(design, array, layer)]),
+        *([] if layer is None else [_layers(array, float(imager.wavelength), layer)]),
     ]
 
 
-def _focal_length(design: Design) -> Finding:
-    given, lens = design.lens.focal_length_mm, design.lens
-    f = lens.radius_of_curvature_mm / (lens.refractive_index - 1)
-    if given is None or math.isclose(given, f, rel_tol=1e-3):
-        return Finding("focal length", "ok", f"the lenses' focal length is R / (n - 1) = {f:.4g} mm.")
-    allowed = f"R / (n - 1) = {f:.4g} mm, which is what a part has, or no such key"
-    return Finding("focal length", "error", f"`lens.focal_length_mm`: found {given:g}, allowed: {allowed}.")
+def _focal_length(array: MicrolensArray) -> Finding:
+    given = array.thin_lens_focal_length
+    f = np.asarray(array.radius_of_curvature, float) / (float(array.refractive_index) - 1)
+    if given is None or np.allclose(given, f, rtol=1e-3, atol=0):
+        return Finding("focal length", "ok", f"the lenses' focal length is R / (n - 1) = {_range(f)} mm.")
+    allowed = f"R / (n - 1) = {_range(f)} mm, which is what a part has, or no such key"
+    return Finding("focal length", "error", f"`lens.focal_length_mm`: found {float(given):g}, allowed: {allowed}.")
+
+
+def _range(values) -> str:
+    """One number, or from the least to the largest."""
+    low, high = f"{np.min(values):.4g}", f"{np.max(values):.4g}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _plate(array: MicrolensArray) -> Finding:
@@ -103,14 +116,16 @@ def _walls(shape: MoldShape) -> Finding:
 
 
 def _slope(array: MicrolensArray) -> Finding:
-    n = float(array.refractive_index)
-    slope = math.asin(min(float(array.aperture_diameter) / 2 / float(array.radius_of_curvature), 1.0))
-    degrees, critical = math.degrees(slope), math.degrees(math.asin(1 / n))
-    text = f"the lenses' rims slope by asin(D / 2R) = {degrees:.3g} degrees"
-    if slope > STEEPEST:
-        found = f"`lens.aperture_diameter_mm`: found {float(array.aperture_diameter):g}"
-        allowed = f"at most {widest_aperture(array):.4g} mm, with rims that slope by {math.degrees(STEEPEST):g} degrees"
-        return Finding("edge slope", "error", f"{found}, allowed: {allowed}.")
+    caps = caps_of(array)
+    if fault := too_wide(caps):
+        allowed = f"at most {fault.allowed}, with lenses that slope by {math.degrees(STEEPEST):g} degrees"
+        text = f"`lens.aperture_diameter_mm`: found {fault.found}, allowed: {allowed}."
+        return Finding("edge slope", "error", text)
+    radii = [np.linspace(0, cap.reach, 257) for cap in caps]
+    slope = max(float((r * cap.steepness(r**2)).max()) for cap, r in zip(caps, radii, strict=True))
+    degrees, critical = math.degrees(math.atan(slope)), math.degrees(math.asin(1 / float(array.refractive_index)))
+    is_sphere = array.alike and caps[0].conic == 0 and not caps[0].terms
+    text = f"the lenses slope by {'asin(D / 2R) =' if is_sphere else 'up to'} {degrees:.3g} degrees"
     if degrees > critical:
         reason = f"beyond {critical:.3g} degrees, asin(1 / n), light along the axis is totally reflected"
         return Finding("edge slope", "warning", f"{text}; {reason}.")
@@ -118,13 +133,16 @@ def _slope(array: MicrolensArray) -> Finding:
 
 
 def _spacing(array: MicrolensArray, resolution: float) -> Finding:
-    centers = np.asarray(array.centers, float)
-    reach = float(array.aperture_diameter) / 2
-    if len(centers) == 1:
-        return Finding("smallest feature", "ok", f"a single lens, {2 * reach:g} mm wide.")
-    spacing = float(nearest_neighbour_distances(centers).min())
-    radius = float(array.radius_of_curvature)
-    groove = radius - math.sqrt(radius**2 - min(spacing / 2, reach) ** 2)
+    caps = caps_of(array)
+    if len(caps) == 1:
+        return Finding("smallest feature", "ok", f"a single lens, {2 * caps[0].reach:g} mm wide.")
+    centers = np.stack([cap.center for cap in caps])
+    distance, nearest = map(np.asarray, KDTree(centers).query(centers, k=2))
+    first = int(distance[:, 1].argmin())
+    pair = [caps[first], caps[int(nearest[first, 1])]]
+    along = np.linspace(0, 1, 1001)[:, None]
+    height, _ = surface(pair, pair[0].center * (1 - along) + pair[1].center * along)
+    groove, spacing = max(cap.rim for cap in pair) - height.min(), distance[first, 1]
     text = f"the closest lenses are {spacing:.4g} mm apart, with a groove {1000 * groove:.4g} um deep between them"
     if groove < resolution:
         return Finding(
@@ -135,35 +153,58 @@ def _spacing(array: MicrolensArray, resolution: float) -> Finding:
 
 def _ridges(array: MicrolensArray, resolution: float) -> Finding:
     """The mold's ridges between lenses are sharp: a printer rounds them to its resolution."""
+    total = _length_of_ridges(array)
+    share = total * resolution / math.prod(array.size)
+    text = f"{total:.4g} mm of sharp edges between lenses: rounded over {1000 * resolution:g} um they are "
+    return Finding("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
+
+
+def _length_of_ridges(array: MicrolensArray) -> float:
+    if not array.alike:
+        # Cauchy and Crofton: as often as lines of a grid cross it.
+        owner = _owners(array)
+        steps = np.array(array.size) / _PLACES
+        crossings = [
+            ((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in ((owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1]))
+        ]
+        return math.pi / 4 * float(crossings @ steps[::-1])
     centers, reach = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
     edges, side = cell_edges(centers, array.size), np.array(array.size) / 2
     half = np.sqrt(np.maximum(reach**2 - edges.height**2, 0))
     first, last = (np.clip(t, -half, half) for t in (edges.low, edges.high))
     between = (np.abs(centers[edges.lens] + (edges.start + edges.end) / 2) < side * (1 - 1e-6)).all(axis=1)
     # Each ridge is an edge of two cells.
-    total = float((last - first)[between].sum()) / 2
-    share = total * resolution / math.prod(array.size)
-    text = f"{total:.4g} mm of sharp edges between lenses: rounded over {1000 * resolution:g} um they are "
-    return Finding("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
+    return float((last - first)[between].sum()) / 2
+
+
+def _owners(array: MicrolensArray):
+    """The lens that is seen at places of a grid over the plate, -1 for none."""
+    x, y = (((np.arange(_PLACES) + 0.5) / _PLACES - 0.5) * side for side in array.size)
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return surface(caps_of(array), places)[1].reshape(_PLACES, _PLACES)
 
 
 def _holes(array: MicrolensArray) -> Finding:
     centers = np.asarray(array.centers, float)
-    share = 1 - coverage(centers, array.size, diameter=float(array.aperture_diameter))
+    if array.alike:
+        share = 1 - coverage(centers, array.size, diameter=float(array.aperture_diameter))
+    else:
+        share = float((_owners(array) < 0).mean())
     hole = largest_hole(centers, array.size)
     if share < 1e-6:
         return Finding("coverage", "ok", "lenses cover the whole plate.")
     area = share * math.prod(array.size)
-    text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is flat, up to {hole:.3g} mm from the nearest lens"
+    text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is no lens, up to {hole:.3g} mm from the nearest lens"
     return Finding("coverage", "warning", f"{text}: without a mask (`gs-jax mask`) light goes through it unfocused.")
 
 
 def _chord(array: MicrolensArray, chord: float, resolution: float) -> Finding:
-    limit = cap_sag(array) * COARSEST
+    caps = caps_of(array)
+    limit = coarsest_chord(caps)
     if chord > limit:
         allowed = f"at most {1000 * limit:.4g} um, a tenth of the height of a lens"
         return Finding("facets", "error", f"the chord error: found {1000 * chord:g} um, allowed: {allowed}.")
-    if (count := estimated_facets(array, chord)) > MAX_FACETS:
+    if (count := estimated_facets(caps, visible_reaches(caps, array.size), chord)) > MAX_FACETS:
         allowed = f"at least {1000 * chord * count / MAX_FACETS:.2g} um; it takes about {count:.2g} facets"
         return Finding("facets", "error", f"the chord error: found {1000 * chord:g} um, allowed: {allowed}.")
     text = f"facets within {1000 * chord:g} um of the lenses"
@@ -172,70 +213,15 @@ def _chord(array: MicrolensArray, chord: float, resolution: float) -> Finding:
     return Finding("facets", "ok", f"{text}.")
 
 
-def _layers(design: Design, array: MicrolensArray, layer: float) -> Finding:
+def _layers(array: MicrolensArray, wavelength: float, layer: float) -> Finding:
     """Steps of the surface: evenly spread errors of a layer have a standard deviation of a layer over root 12."""
-    sag, wavelength = cap_sag(array), design.imaging.wavelength_nm * 1e-6
+    sag = cap_sag(array)
     waves = (float(array.refractive_index) - 1) * layer / math.sqrt(12) / wavelength
     text = f"a lens is {sag / layer:.3g} layers of {1000 * layer:g} um high; their steps are {waves:.2g} waves RMS"
     if waves > MOST_WAVES:
         finest = 1000 * layer * MOST_WAVES / waves
         return Finding("layers", "warning", f"{text}: smooth them, or print layers of {finest:.2g} um.")
     return Finding("layers", "ok", f"{text}.")
-
-
-def caps_volume(array: MicrolensArray, nodes: int = 64) -> float:
-    """Volume of the lenses over the plate's plane, by quadrature over the sectors of their cells, mm^3.
-
-    In the direction `phi` a cap ends at `r = min(D/2, d / cos(phi))`, with `d` the distance of the cell's edge, and
-    holds `int h r dr = (R^3 - (R^2 - r^2)^{3/2}) / 3 - sqrt(R^2 - D^2/4) r^2 / 2`. What ends at the rim is a constant.
-    For what ends at the edge, `r = d cosh(u)` and `dphi = du / cosh(u)`: smooth even where the edge passes by the
-    vertex.
-
-    Raises
-    ------
-    InputError
-        If a lens lies outside the plate, or the plate is infinite.
-    """
-    radius, reach = float(array.radius_of_curvature), float(array.aperture_diameter) / 2
-    held = lambda r2: (radius**3 - (radius**2 - r2) ** 1.5) / 3 - math.sqrt(radius**2 - reach**2) * r2 / 2
-    edges = cell_edges(np.asarray(array.centers, float), array.size)
-    # An edge through the vertex has no sector.
-    off, *ends = (x[edges.height > 1e-12] for x in (edges.height, edges.low, edges.high))
-    half = np.sqrt(np.maximum(reach**2 - off**2, 0))
-    within = [np.clip(t, -half, half) for t in ends]
-    at_rim = (
-        np.arctan2(ends[1], off) - np.arctan2(ends[0], off) - np.arctan2(within[1], off) + np.arctan2(within[0], off)
-    )
-    low, high = (np.arcsinh(t / off)[:, None] for t in within)
-    x, weights = np.polynomial.legendre.leggauss(nodes)
-    cosh = np.cosh((high + low) / 2 + (high - low) / 2 * x)
-    at_edge = (high - low)[:, 0] / 2 * ((held(np.minimum(off[:, None] * cosh, reach) ** 2) / cosh) @ weights)
-    return float((held(reach**2) * at_rim + at_edge).sum())
-
-
-def array_volume(array: MicrolensArray) -> float:
-    """Volume of the array: plate and lenses, mm^3."""
-    return math.prod(array.size) * plate_thickness(array) + caps_volume(array)
-
-
-def mold_volume(array: MicrolensArray, shape: MoldShape) -> float:
-    """Volume of the mold: the block, less lenses, what the walls enclose, and engraved marks and label, mm^3."""
-    low, high = mold_block(array, shape)
-    deep = plate_thickness(array) * shape.scale + shape.headroom
-    flare = deep * math.tan(shape.draft)
-    areas = [math.prod(side * shape.scale + wider for side in array.size) for wider in (0.0, flare, 2 * flare)]
-    enclosed = deep * (areas[0] + 4 * areas[1] + areas[2]) / 6
-    above = m3.Manifold.cube([*(high - low)[:2], 1e3]).translate([*low[:2], high[2]])
-    engraved = sum((tool - above).volume() for tool in engravings(array, shape))
-    return math.prod(high - low) - shape.scale**3 * caps_volume(array) - enclosed - engraved
-
-
-def volume_tolerance(array: MicrolensArray, chord: float) -> float:
-    """How far a volume may be from the analytic one, as a fraction: coarse facets cannot do as well as fine ones.
-
-    Facets are right on average but for their rims: a quarter of the chord error over the plate is more than they miss.
-    """
-    return max(VOLUME_TOLERANCE, chord / 4 * math.prod(array.size) / array_volume(array))
 
 
 def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUME_TOLERANCE) -> list[Finding]:

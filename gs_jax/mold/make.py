@@ -12,26 +12,26 @@ from ..designs.design import Design, read_design
 from ..io.disk import atomic_write, check_output, write_json, write_text
 from ..io.figures import write_figure
 from ..io.provenance import KEY, Provenance
-from .caps import facet_surface
-from .checks import (
-    Finding,
-    array_volume,
-    check_design,
-    check_solid,
-    mold_volume,
-    refuse_errors,
-    volume_tolerance,
-)
+from .caps import caps_of, part_centers
+from .checks import Finding, check_design, check_solid, refuse_errors
 from .measurement import quality, verify
 from .mesh_files import MESH_SUFFIXES, printable, read_mesh, write_mesh
 from .pictures import preview
-from .solids import MoldShape, mold_solid, plate_thickness, solid_of
+from .solids import MoldShape, array_solid, mold_solid
+from .volumes import array_volume, mold_volume, volume_tolerance
 
 # What a part must keep of its design: far below what a calibration of the assembled microscope corrects.
 CENTER_TOLERANCE = 1e-3
 RADIUS_TOLERANCE = 1e-3
+CONIC_TOLERANCE = 1e-2
 # The Strehl ratio of what counts as a perfect surface, Marechal's criterion.
 GOOD_STREHL = 0.8
+# Of a part, by the side of the lenses that faces the object.
+_FRAMES = {
+    "plano": "x, y as the sensor's, z toward the object; plano face (object's side) at z = 0, lenses toward -z",
+    "curved": "x as the sensor's, y against it, z toward the sensor: turned over about x; "
+    "plano face (sensor's side) at z = 0, lenses toward -z",
+}
 
 
 def make_mold(
@@ -61,7 +61,7 @@ def make_mold(
     shape
         Of the mold. Its shrinkage is made up for in the array too.
     chord
-        The largest distance between a facet and its sphere, mm.
+        The largest distance between a facet and its lens, mm.
     resolution
         The smallest feature that the printer makes, mm.
     layer
@@ -92,9 +92,8 @@ def make_mold(
     refuse_errors(findings, source)
     imager = design.imager()
     array = imager.array
-    surface = facet_surface(array, chord, progress)
+    part = array_solid(array, chord, progress=progress)
     with progress.step("Building and checking the solid"):
-        part = solid_of(surface, plate_thickness(array))
         solid = part.scale([shape.scale] * 3) if positive else mold_solid(array, part, shape)
         volume = shape.scale**3 * array_volume(array) if positive else mold_volume(array, shape)
         mesh = printable(solid)
@@ -106,14 +105,14 @@ def make_mold(
         write_mesh(temporary, mesh, f"{design.name} {name}", provenance)
         lenses = verify(read_mesh(temporary), array, scale=shape.scale)
         measured = quality(lenses, imager)
-        findings += judge(measured, chord=chord, radius=design.lens.radius_of_curvature_mm)
+        findings += judge(measured, chord=chord, radius=min(cap.radius for cap in caps_of(array)))
         _stop_at_fault(findings)
     report = {
         "design": design.name,
         "part": name,
         "file": path.name,
         "unit": "mm",
-        "frame": "x, y as the sensor's, z toward the object; plano face at z = 0, lenses toward -z",
+        "frame": _FRAMES[array.orientation],
         "size_mm": np.ptp(mesh.vertices.astype(float), axis=0).round(6).tolist(),
         "facets": len(mesh.facets),
         "file_bytes": path.stat().st_size,
@@ -125,8 +124,9 @@ def make_mold(
         "draft_deg": math.degrees(shape.draft),
         "checks": [asdict(finding) for finding in findings],
         "verification": measured,
-        "lens_center_deviation_um": (1000 * (lenses.center - np.asarray(array.centers, float))).tolist(),
+        "lens_center_deviation_um": (1000 * (lenses.center - part_centers(array))).tolist(),
         "lens_radius_mm": lenses.radius.tolist(),
+        "lens_conic_constant": lenses.conic.tolist(),
         "lens_surface_error_rms_um": (1000 * lenses.surface_rms).tolist(),
     }
     with progress.step("Drawing"):
@@ -146,10 +146,15 @@ def judge(measured: dict[str, Any], *, chord: float, radius: float) -> list[Find
     """What was measured, in words, against what a part must keep of its design; chord error and radius in mm."""
     missing = measured["lenses_not_measured"]
     center, larger = measured["center_deviation_max_um"], measured["radius_deviation_max_percent"]
-    # Coarse facets have vertices that are lifted, by less than the chord error.
-    kept = center <= 1000 * CENTER_TOLERANCE and larger <= 100 * max(RADIUS_TOLERANCE, chord / radius)
-    text = f"read back, lenses are within {center:.2g} um of their places and {larger:.2g} % of their radius."
-    findings = [Finding("lenses", "ok" if kept else "error", text)]
+    bent, certain = measured["conic_deviation_max"], measured["lenses_conic_measured"]
+    # Coarse facets have vertices that are lifted, by less than the chord error: what was an asphere is another one.
+    kept = center <= 1000 * CENTER_TOLERANCE and larger <= 100 * max(RADIUS_TOLERANCE, 5 * chord / radius)
+    text = f"read back, lenses are within {center:.2g} um of their places and {larger:.2g} % of their radius"
+    if certain:
+        uncertain = measured["conic_uncertainty_max"]
+        kept = kept and bent <= max(CONIC_TOLERANCE, 10 * chord / radius) + 3 * uncertain
+        text += f", conic constants of {certain} within {bent:.2g} (uncertain by {uncertain:.1g} and less)"
+    findings = [Finding("lenses", "ok" if kept else "error", f"{text}.")]
     if missing:
         text = f"{len(missing)} lenses have too few facets to be measured: {', '.join(map(str, missing[:10]))}."
         findings.append(Finding("lenses not measured", "warning", text))

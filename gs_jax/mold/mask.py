@@ -1,8 +1,9 @@
 """The opaque mask between the lenses: what it covers, as a drawing to have it made.
 
-In the design's frame, x and y as the sensor's, mm. Drawings have +y up, so they show the sheet from the object's side,
-as the mold from above: +z is toward the viewer. Openings are the lenses' clear discs. The sheet is as large as the
-mold, and has its marks.
+In the part's frame (`solids`), mm: the design's, x and y as the sensor's, if the plano side faces the object. Drawings
+have +y up, so they show the sheet as the mold from above, from the plano side: the object's, or, if the curved side
+faces the object, the sensor's. Openings are the lenses' clear discs. The sheet is as large as the mold, and has its
+marks.
 """
 
 import math
@@ -21,6 +22,7 @@ from ..base.errors import InputError
 from ..io.disk import atomic_write, check_output
 from ..io.provenance import Provenance, write_sidecar
 from ..lenses import MicrolensArray
+from .caps import caps_of
 from .solids import MoldShape, mark_plans, mold_block
 
 Ring = Float[np.ndarray, "corner 2"]
@@ -60,24 +62,28 @@ def mask_plan(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
     """
     if not np.isfinite(np.asarray(array.size, float)).all():
         raise InputError("`array.size_mm`: found an infinite plate, allowed: a finite one.")
-    centers, diameter = np.asarray(array.centers, float), float(array.aperture_diameter)
-    side = np.asarray(array.size, float)
-    nearest = KDTree(centers).query(centers, k=2)[0][:, 1]
-    within = (np.abs(centers) + diameter / 2 <= side / 2).all(1)
-    alone = (nearest > diameter) & within
-    # A chord of a circle is that far inside it.
-    count = 4 * math.ceil(math.pi / 4 / math.acos(1 - min(2 * _CHORD / diameter, 1)))
-    disc = m3.CrossSection.circle(diameter / 2, count)
-    others = m3.CrossSection.batch_boolean([disc.translate(at) for at in centers[~alone].tolist()], m3.OpType.Add)
+    caps, side = caps_of(array), np.asarray(array.size, float)
+    centers, reach = np.stack([cap.center for cap in caps]), np.array([cap.reach for cap in caps])
+    alone = np.all(np.abs(centers) + reach[:, None] <= side / 2, axis=1)
+    pairs = KDTree(centers).query_pairs(2 * reach.max(), output_type="ndarray")
+    meet = np.hypot(*(centers[pairs[:, 0]] - centers[pairs[:, 1]]).T) <= reach[pairs].sum(axis=1)
+    alone[pairs[meet]] = False
+    discs = [_disc(r).translate(at) for at, r in zip(centers[~alone].tolist(), reach[~alone].tolist(), strict=True)]
+    others = m3.CrossSection.batch_boolean(discs, m3.OpType.Add)
     plate = m3.CrossSection.square(side.tolist(), center=True)
     together = others ^ plate
     if (plate - together).area() < 1e-6 * plate.area():
         raise InputError("`lens.aperture_diameter_mm`: found lenses that cover the plate, allowed: some of it left.")
     (left, bottom, _), (right, top, _) = mold_block(array, shape)
     outline = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
-    circles = np.column_stack([centers[alone], np.full(alone.sum(), diameter)])
+    circles = np.column_stack([centers[alone], 2 * reach[alone]])
     marks = [ring for plan in mark_plans(array, shape) for ring in plan.to_polygons()]
     return Mask(outline, circles, together.to_polygons(), marks)
+
+
+def _disc(radius: float) -> m3.CrossSection:
+    # A chord of a circle is that far inside it.
+    return m3.CrossSection.circle(radius, 4 * math.ceil(math.pi / 4 / math.acos(1 - min(_CHORD / radius, 1))))
 
 
 def write_mask(path: str | os.PathLike[str], mask: Mask, provenance: Provenance | None = None) -> None:

@@ -1,33 +1,36 @@
 """What was written is read back: where its lenses are, how they are curved, and what facets do to light.
 
-Lengths in mm. A mold and an array are measured alike, both are in the design's frame.
+Lengths in mm. A mold and an array are measured alike, both are in the part's frame.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from ..geometry import Imager
 from ..lenses import MicrolensArray
-from .caps import cap_sag
+from .caps import Cap, caps_of, part_centers, surface
+from .facets import NODES, WEIGHTS
 from .mesh_files import Mesh
-from .solids import plate_thickness
 
-# A facet belongs to a lens if its corners are so close to the lens's sphere and its normal so close to the sphere's.
+# A facet belongs to a lens if its corners are so close to the lens's surface and its normal so close to the surface's.
 _NEAR = 0.02
 _ALIGNED = math.cos(math.radians(20))
-# Four unknowns, and one more to see that they fit.
-_FEWEST = 5
-
-# Dunavant's rule of degree 4 on a triangle: a facet's distance from a sphere is a quadratic, its square a quartic.
-_NODES = np.array(
-    [[1 - 2 * a if i == j else a for j in range(3)] for a in (0.445948490915965, 0.091576213509771) for i in range(3)]
-)
-_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
+# And if the lens is higher than all others by more than this: about a groove a facet may be either's.
+_CLEARLY = 2e-3
+# Five unknowns, and one more to see that they fit.
+_FEWEST = 6
+# Coordinates of float32 some 10 mm from the origin are rounded by so much, RMS.
+_ROUNDED = 3e-7
+# A vertex is no lens's if it is so many times as far off as the median.
+_ASTRAY = 10
+# A conic constant that vertices determine less well is not reported.
+_MOST_UNCERTAIN = 0.1
+# Nor is a lens whose centre, mm, or radius, as a fraction, they determine less well than this.
+_UNCERTAIN = 3e-4
 
 
 @dataclass(frozen=True)
@@ -37,22 +40,28 @@ class Verification:
     Parameters
     ----------
     center
-        Axis of the sphere that fits the vertices best, `(x, y)`, mm.
+        Axis of the surface that fits the vertices best, with the design's conic constant, `(x, y)`, mm.
     radius
-        Radius of that sphere, mm.
+        Radius of curvature of that surface, mm.
     misfit
         Root mean square distance of the vertices from it, mm.
+    conic, conic_deviation
+        The conic constant that fits best, the radius being free too, and its standard deviation, as the vertices'
+        scatter and their rounding leave it: `r^4 / (8 R^3)` is all that it changes, so little apertures say little. NaN
+        where the deviation is above 0.1.
     offset, surface_rms
-        Mean distance of the facets outside the design's sphere, and what is left of it, root mean square, mm.
+        Mean distance of the facets outside the design's surface, and what is left of it, root mean square, mm.
     slope_rms
-        Root mean square angle between a facet and the design's sphere, radians.
+        Root mean square angle between a facet and the design's surface, radians.
     vertices
-        How many were measured.
+        How many were measured: those of one lens alone.
     """
 
     center: Float[np.ndarray, "lens 2"]
     radius: Float[np.ndarray, " lens"]
     misfit: Float[np.ndarray, " lens"]
+    conic: Float[np.ndarray, " lens"]
+    conic_deviation: Float[np.ndarray, " lens"]
     offset: Float[np.ndarray, " lens"]
     surface_rms: Float[np.ndarray, " lens"]
     slope_rms: Float[np.ndarray, " lens"]
@@ -65,9 +74,9 @@ def verify(mesh: Mesh, array: MicrolensArray, *, scale: float = 1.0) -> Verifica
     Parameters
     ----------
     mesh
-        As read back, in the design's frame.
+        As read back, in the part's frame.
     array
-        What it should be: tells which facets are whose.
+        What it should be: tells which facets are whose, and the aspheric terms.
     scale
         By how much the mesh is larger than the array, `MoldShape.scale` for a mold.
 
@@ -76,105 +85,156 @@ def verify(mesh: Mesh, array: MicrolensArray, *, scale: float = 1.0) -> Verifica
     ValueError
         If the mesh has no facet near any lens.
     """
-    vertices = mesh.vertices.astype(float) / scale
-    radius = float(array.radius_of_curvature)
-    sphere = np.column_stack([array.centers, np.full(len(array.centers), radius - float(array.substrate_thickness))])
+    # Depths below the vertices' plane.
+    vertices = mesh.vertices.astype(float) / scale + (0, 0, float(array.substrate_thickness))
+    design = [_Found(cap) for cap in caps_of(array)]
     # The second look starts from where the lenses were found, in case that is not where they should be.
-    fit = _look(vertices, mesh.facets, array, sphere, np.full(len(sphere), radius))
-    fit = _look(vertices, mesh.facets, array, fit.center, fit.radius)
-    offset, surface, slope = _facet_errors(vertices[fit.facets], fit.lens, sphere, radius)
-    known = np.where(fit.count < _FEWEST, np.nan, 1.0)
-    center = fit.center[:, :2] * known[:, None]
-    return Verification(center, fit.radius * known, fit.misfit * known, offset, surface, slope, fit.count)
+    found, _ = _look(vertices, mesh.facets, design)
+    found, lens = _look(vertices, mesh.facets, found)
+    facets = _by_lens(lens, len(design))
+    measured = [_errors(vertices[mesh.facets[its]], was.cap) for its, was in zip(facets, design, strict=True)]
+    offset, surface_rms, slope_rms = np.array(measured).T
+    known = np.array([1.0 if its.determined else np.nan for its in found])
+    values = lambda name: np.array([getattr(its, name) for its in found], float) * known
+    certain = np.where(values("conic_deviation") <= _MOST_UNCERTAIN, 1.0, np.nan)
+    return Verification(
+        center=np.stack([its.cap.center for its in found]) * known[:, None],
+        radius=np.array([its.cap.radius for its in found]) * known,
+        misfit=values("misfit"),
+        conic=values("conic") * certain,
+        conic_deviation=values("conic_deviation"),
+        offset=offset,
+        surface_rms=surface_rms,
+        slope_rms=slope_rms,
+        vertices=np.array([its.vertices for its in found]),
+    )
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """Spheres, how well they fit how many vertices, and the facets of each."""
+class _Found:
+    """A lens, the sag of its vertex below where the design has it, and how well how many mesh vertices fit it."""
 
-    center: np.ndarray
-    radius: np.ndarray
-    misfit: np.ndarray
-    count: np.ndarray
-    facets: np.ndarray
-    lens: np.ndarray
+    cap: Cap
+    vertex: float = 0.0
+    misfit: float = math.nan
+    conic: float = math.nan
+    conic_deviation: float = math.nan
+    vertices: int = 0
+    determined: bool = False
 
 
-def _look(vertices, facets, array, center, radius) -> _Fit:
-    """The spheres through the vertices that are close to others."""
-    facets, lens = _belonging(vertices, facets, array, center, radius)
-    if not len(facets):
+def _look(vertices, facets, lenses: list[_Found]) -> tuple[list[_Found], np.ndarray]:
+    """The surfaces through the vertices that are close to others, and the lens of each facet, -1 for none."""
+    lens = _belonging(vertices[facets], lenses)
+    if (lens < 0).all():
         raise ValueError(f"`mesh` has no facet within {_NEAR} mm of any lens of the array.")
-    point, owner = _vertices_of(vertices, facets, lens, array)
-    count = np.bincount(owner, minlength=len(radius))
-    return _Fit(*_fit(vertices[point], owner, center, radius), count, facets, lens)
+    # Vertices of two lenses lie where facets of both meet, those on a rim are as much the plate's: on no surface.
+    least, most = np.full(len(vertices), len(lenses)), np.full(len(vertices), -1)
+    np.minimum.at(least, facets, lens[:, None])
+    np.maximum.at(most, facets, lens[:, None])
+    of_lens = _by_lens(np.where(least == most, most, -1), len(lenses))
+    return [_fit(its, vertices[points]) for its, points in zip(lenses, of_lens, strict=True)], lens
 
 
-def _belonging(vertices, facets, array, sphere, radius):
-    """The facets of each lens's cap, and the lens of each."""
-    corners = vertices[facets]
+def _by_lens(lens, count: int) -> list[np.ndarray]:
+    """Which of them are each lens's."""
+    order = np.argsort(lens, kind="stable")
+    ends = np.searchsorted(lens[order], np.arange(count + 1))
+    return [order[first:last] for first, last in zip(ends, ends[1:], strict=False)]
+
+
+def _belonging(corners, lenses: list[_Found]):
+    """The lens of each facet, -1 for none."""
     middle = corners.mean(axis=1)
-    distance, lens = map(np.asarray, KDTree(sphere[:, :2]).query(middle[:, :2]))
-    spoke = middle - sphere[lens]
+    _, lens = surface([its.cap for its in lenses], middle[:, :2], _CLEARLY)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(spoke, axis=1)
-    aligned = np.abs((normal * spoke).sum(axis=1)) > _ALIGNED * size
-    off = np.abs(np.linalg.norm(corners - sphere[lens, None], axis=2) - radius[lens, None]).max(axis=1)
-    kept = aligned & (off < _NEAR) & (distance < float(array.aperture_diameter) / 2) & (spoke[:, 2] < 0)
-    return facets[kept], lens[kept]
+    for here, its in zip(_by_lens(lens, len(lenses)), lenses, strict=True):
+        off = np.abs(_outside(corners[here], its)[0]).max(axis=1)
+        _, upright = _outside(middle[here], its)
+        aligned = np.abs((normal[here] * upright).sum(axis=1)) > _ALIGNED * np.linalg.norm(normal[here], axis=1)
+        lens[here[~(aligned & (off < _NEAR))]] = -1
+    return lens
 
 
-def _vertices_of(vertices, facets, lens, array):
-    """Which vertices each lens has. Those on its rim are as much the plate's, and are left out."""
-    pairs = np.unique(np.repeat(lens, 3) * len(vertices) + facets.ravel())
-    owner, point = np.divmod(pairs, len(vertices))
-    above = -plate_thickness(array) - vertices[point, 2]
-    kept = above > cap_sag(array) / 300
-    return point[kept], owner[kept]
+def _outside(points, its: _Found):
+    """How far points are outside a lens's surface, to first order, and the surface's normal there.
+
+    Points are `(x, y, z)` over the vertices' plane, and lenses look toward -z.
+    """
+    spoke = points[..., :2] - its.cap.center
+    squared = np.minimum((spoke**2).sum(axis=-1), its.cap.reach**2)
+    steep = its.cap.steepness(squared)[..., None]
+    normal = np.concatenate([steep * spoke, -np.ones_like(steep)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return (points[..., 2] - its.vertex - its.cap.sag(squared)) * normal[..., 2], normal
 
 
-def _fit(points, owner, center, radius):
-    """Spheres through the points of each owner: Gauss and Newton's steps on the sum of squared distances."""
-    count = len(center)
-    unknowns = np.column_stack([center, radius])
+def _fit(its: _Found, points) -> _Found:
+    """The surface through points: least squares of their distances, by Gauss and Newton."""
+    if len(points) < _FEWEST:
+        return replace(its, vertices=len(points), determined=False)
+    # Where facets of two lenses cut each other in slivers, a vertex may seem one lens's. Least absolute distances,
+    # by least squares that are weighted anew, do not follow such vertices; then they are left out.
+    for _ in range(8):
+        its = _step(its, points, 4, weight=1 / np.sqrt(np.abs(_outside(points, its)[0]) + _ROUNDED))
+    off = np.abs(_outside(points, its)[0])
+    points = points[off <= _ASTRAY * np.median(off) + _ROUNDED]
+    for _ in range(3):
+        its = _step(its, points, 4)
+    residual, gradient = _gradient(its, points)
+    misfit = float(np.sqrt((residual**2).mean()))
+    x, y, _, radius = _deviations(gradient[:, :4], misfit)
+    determined = bool(max(x, y, radius / its.cap.radius) < _UNCERTAIN)
+    its = replace(its, misfit=misfit, conic=math.nan, vertices=len(points), determined=determined)
+    if not determined or _deviations(gradient, 0.0)[-1] > _MOST_UNCERTAIN:
+        return replace(its, conic_deviation=math.nan)
+    free = its
     for _ in range(6):
-        spoke, residual = _residual(points, unknowns[owner])
-        gradient = np.column_stack([-spoke, -np.ones(len(points))])
-        normal = np.zeros((count, 4, 4))
-        right = np.zeros((count, 4))
-        for i in range(4):
-            right[:, i] = np.bincount(owner, gradient[:, i] * residual, count)
-            for j in range(4):
-                normal[:, i, j] = np.bincount(owner, gradient[:, i] * gradient[:, j], count)
-        # The pseudo-inverse: what too few points say nothing of stays.
-        unknowns = unknowns - (np.linalg.pinv(normal, rcond=1e-14, hermitian=True) @ right[..., None])[..., 0]
-    squares = np.bincount(owner, _residual(points, unknowns[owner])[1] ** 2, count)
-    return unknowns[:, :3], unknowns[:, 3], np.sqrt(squares / np.maximum(np.bincount(owner, minlength=count), 1))
+        free = _step(free, points, 5)
+    residual, gradient = _gradient(free, points)
+    scatter = math.sqrt((residual**2).sum() / max(len(points) - 5, 1))
+    return replace(its, conic=free.cap.conic, conic_deviation=float(_deviations(gradient, scatter)[-1]))
 
 
-def _residual(points, spheres):
-    """Unit vectors from the centres of spheres, `(x, y, z, radius)`, to points, and how far outside the points are."""
-    spoke = points - spheres[:, :3]
-    length = np.linalg.norm(spoke, axis=1)
-    return spoke / length[:, None], length - spheres[:, 3]
+def _step(its: _Found, points, unknowns: int, weight=1.0) -> _Found:
+    """Of centre, vertex, radius and, the fifth, conic constant."""
+    residual, gradient = _gradient(its, points)
+    weighted = (gradient[:, :unknowns].T * weight).T
+    x, y, vertex, radius, conic = (*np.linalg.lstsq(weighted, weight * residual, rcond=1e-12)[0], 0.0)[:5]
+    cap = its.cap
+    cap = replace(cap, center=cap.center + (x, y), radius=cap.radius + radius, conic=cap.conic + conic)
+    return replace(its, cap=cap, vertex=its.vertex + vertex)
 
 
-def _facet_errors(corners, lens, sphere, radius):
-    """Mean and spread of the facets' distance outside the design's sphere, and their slope against it, by lens."""
-    count = len(sphere)
-    spoke = np.einsum("qk,fkx->fqx", _NODES, corners - sphere[lens, None])
-    distance = np.linalg.norm(spoke, axis=2)
+def _gradient(its: _Found, points):
+    """How far points are outside, and by how much less that is for each of the five unknowns."""
+    cap = its.cap
+    residual, normal = _outside(points, its)
+    squared = np.minimum(((points[:, :2] - cap.center) ** 2).sum(axis=1), cap.reach**2)
+    root = np.sqrt(cap.radius**2 - (1 + cap.conic) * squared)
+    by_radius = -squared / (root * (cap.radius + root))
+    by_conic = squared**2 / (2 * root * (cap.radius + root) ** 2)
+    return residual, np.column_stack([normal, normal[:, 2] * by_radius, normal[:, 2] * by_conic])
+
+
+def _deviations(gradient, scatter: float):
+    """Standard deviations of the unknowns, if points scatter as they do, or at least by their rounding."""
+    variances = np.diag(np.linalg.pinv(gradient.T @ gradient, rcond=1e-15, hermitian=True))
+    return max(scatter, _ROUNDED) * np.sqrt(np.maximum(variances, 0))
+
+
+def _errors(corners, cap: Cap) -> tuple[float, float, float]:
+    """Mean and spread of the facets' distance outside the design's surface, and their slope against it."""
+    if not len(corners):
+        return math.nan, math.nan, math.nan
+    error, upright = _outside(np.einsum("qk,fkx->fqx", NODES, corners), _Found(cap))
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # Light comes along the axis: a facet counts as much as its shadow.
     area = np.abs(normal[:, 2])
-    cosine = np.abs(np.einsum("fqx,fx->fq", spoke, normal)) / (distance * np.linalg.norm(normal, axis=1)[:, None])
-    square_slope = 2 * (1 - np.minimum(cosine, 1)) @ _WEIGHTS
-    total = np.bincount(lens, area, count)
-    total[total == 0] = np.nan
-    mean = lambda values: np.bincount(lens, area * values, count) / total
-    error = distance - radius
-    offset = mean(error @ _WEIGHTS)
-    return offset, np.sqrt(mean((error - offset[lens, None]) ** 2 @ _WEIGHTS)), np.sqrt(mean(square_slope))
+    cosine = np.abs((upright * normal[:, None]).sum(axis=2)) / np.linalg.norm(normal, axis=1)[:, None]
+    mean = lambda values: float(area @ (values @ WEIGHTS) / area.sum())
+    offset = mean(error)
+    return offset, math.sqrt(mean((error - offset) ** 2)), math.sqrt(mean(2 * (1 - np.minimum(cosine, 1))))
 
 
 def quality(found: Verification, imager: Imager) -> dict[str, Any]:
@@ -193,8 +253,9 @@ def quality(found: Verification, imager: Imager) -> dict[str, Any]:
     """
     array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.reduced_sensor_distance)
     bend = float(array.refractive_index) - 1
-    shift = np.linalg.norm(found.center - np.asarray(array.centers, float), axis=1)
-    larger = found.radius / float(array.radius_of_curvature) - 1
+    shift = np.linalg.norm(found.center - part_centers(array), axis=1)
+    larger = found.radius / np.asarray(array.radius_of_curvature, float) - 1
+    bent = found.conic - np.asarray(array.conic_constant, float)
     waves = bend * found.surface_rms / wavelength
     strehl = np.exp(-((2 * np.pi * waves) ** 2))
     measured = np.isfinite(found.radius)
@@ -205,7 +266,10 @@ def quality(found: Verification, imager: Imager) -> dict[str, Any]:
         "lenses_not_measured": (np.flatnonzero(~measured) + 1).tolist(),
         "center_deviation_max_um": 1000 * worst(shift),
         "radius_deviation_max_percent": 100 * worst(larger),
-        "sphere_misfit_max_um": 1000 * worst(found.misfit),
+        "lenses_conic_measured": int(np.isfinite(found.conic).sum()),
+        "conic_deviation_max": worst(bent),
+        "conic_uncertainty_max": worst(np.where(np.isfinite(bent), found.conic_deviation, np.nan)),
+        "surface_misfit_max_um": 1000 * worst(found.misfit),
         "surface_offset_max_um": 1000 * worst(found.offset),
         "surface_error_rms_um": 1000 * _mean_square(found.surface_rms),
         "slope_error_rms_mrad": 1000 * _mean_square(found.slope_rms),

@@ -1,4 +1,4 @@
-"""A picture of an array or its mold: the height of the lenses seen from the sensor, and the part in perspective."""
+"""A picture of an array or its mold: the height of the lenses as they are seen, and the part in perspective."""
 
 import math
 
@@ -10,8 +10,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..lenses import MicrolensArray
-from .caps import COARSEST, cap_height, cap_sag
-from .solids import MoldShape, array_solid, mold_solid
+from .caps import caps_of, surface
+from .solids import MoldShape, array_solid, coarsest_chord, mold_solid
 
 # Facets that a perspective view draws: more cannot be told apart.
 _FACETS = 20_000
@@ -41,21 +41,25 @@ def preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> Figure
 
 def _draw_heights(figure, axes, array, what):
     x, y = (np.linspace(-side / 2, side / 2, _PIXELS) for side in array.size)
-    height = 1000 * cap_height(array, np.stack(np.meshgrid(x, y), axis=-1))
-    shaded = LightSource(azdeg=315, altdeg=50).hillshade(height / 1000, dx=x[1] - x[0], dy=y[1] - y[0])
-    half_x, half_y = array.size[0] / 2, array.size[1] / 2
-    extent = (-half_x, half_x, half_y, -half_y)
-    image = axes.imshow(height, cmap="viridis", extent=extent, vmin=0)
+    caps = caps_of(array)
+    height = surface(caps, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].reshape(_PIXELS, _PIXELS)
+    shaded = LightSource(azdeg=315, altdeg=50).hillshade(height, dx=x[1] - x[0], dy=y[1] - y[0])
+    # A part that has been turned over is drawn as it lies, with the design's y.
+    from_sensor = array.orientation == "plano"
+    bottom = array.size[1] / 2 if from_sensor else -array.size[1] / 2
+    extent = (-array.size[0] / 2, array.size[0] / 2, bottom, -bottom)
+    image = axes.imshow(1000 * height, cmap="viridis", extent=extent, vmin=0)
     axes.imshow(shaded, cmap="gray", extent=extent, alpha=0.45)
-    axes.set(title=f"{what}, seen from the sensor", xlabel="x, mm", ylabel="y, mm")
+    seen = "the sensor" if from_sensor else "the object"
+    axes.set(title=f"{what}, seen from {seen}", xlabel="x, mm", ylabel="y, mm")
     figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
 
 
 def _coarse(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold:
-    radius = float(array.radius_of_curvature)
+    caps = caps_of(array)
     # Equilateral facets of a sphere: a depth of `side^2 / (6 R)` below it.
-    chord = math.prod(array.size) / (_FACETS * 1.5 * math.sqrt(3) * radius)
-    part = array_solid(array, min(chord, cap_sag(array) * COARSEST))
+    chord = math.prod(array.size) / (_FACETS * 1.5 * math.sqrt(3) * min(cap.radius for cap in caps))
+    part = array_solid(array, min(chord, coarsest_chord(caps)))
     return part if shape is None else mold_solid(array, part, shape)
 
 

@@ -1,9 +1,11 @@
 """The microlens array as a solid, and the negative mold to cast it in.
 
-Both are in the design's frame: x and y as the sensor's, z toward the object. The plano face is z = 0, the vertices of
-the lenses, which look at the sensor, are at z = -t. The optics counts the plate's thickness t to the vertices, and so
-does the part: between lenses it is thinner by their sag. The frame is right-handed, as it is for a camera whose
-ordinary pictures are not mirrored; a part that is mirrored would be another design.
+Both are in the part's frame: the plano face is z = 0, the vertices of the lenses are at z = -t. The optics counts the
+plate's thickness t to the vertices, and so does the part: between lenses it is thinner, by the deepest rim's sag.
+If the plano side faces the object that is the design's frame, x and y as the sensor's and z toward the object. If the
+curved side does, the part has been turned over about x: y runs against the sensor's, z points toward the sensor. The
+frame is right-handed, as it is for a camera whose ordinary pictures are not mirrored; a part that is mirrored would be
+another design.
 
 The mold holds the array as it lies, lenses down, and opens upward, toward +z: pour, cover with a glass plate, cure,
 peel. Lengths in mm, angles in radians.
@@ -11,6 +13,7 @@ peel. Lengths in mm, angles in radians.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import manifold3d as m3
 import numpy as np
@@ -18,18 +21,24 @@ from jaxtyping import Float
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
+from ..base.errors import InputError
 from ..base.progress import Progress
-from ..layouts.cells import nearest_neighbour_distances
+from ..layouts.cells import half_size, in_mm, nearest_neighbour_distances
 from ..lenses import MicrolensArray
-from .caps import Surface, cap_sag, facet_surface
+from .caps import DRAFT, Cap, cap_sag, caps_of, visible_reaches
+from .facets import estimated_facets, facet_cap
 
 # How far a tool that cuts reaches beyond what it cuts: no two faces coincide.
 _BEYOND = 1.0
 # Depth of what is engraved in the rim.
 ENGRAVED = 0.4
-# Steeper rims are neither printed nor peeled well, and hide their facets from above.
-STEEPEST = math.radians(75)
 CLOSEST = 1e-3
+# The largest chord error in heights of a lens: with fewer facets it is no lens.
+COARSEST = 0.1
+# More take gigabytes of memory and of disk.
+MAX_FACETS = 5_000_000
+# A wall that is lower is none, mm: ten times what float32 can tell apart on a 20 mm plate.
+_LOWEST_WALL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -84,19 +93,21 @@ class MoldShape:
 
 
 def plate_thickness(array: MicrolensArray) -> float:
-    """Thickness of the array between its lenses: the optics' plate up to the vertices, less their sag, mm."""
+    """Thickness of the array between its lenses: the optics' plate up to the vertices, less the deepest sag, mm."""
     return float(array.substrate_thickness) - cap_sag(array)
 
 
 def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progress | None = None) -> m3.Manifold:
     """The array as a solid: the plate with its lenses, plano behind, straight sides.
 
+    Each lens is a body of its own, down into the plate; the part is their union.
+
     Parameters
     ----------
     array
         Lenses on a plate of finite size, thicker than the lenses' sag.
     chord
-        The largest distance between a facet and its sphere, mm.
+        The largest distance between a facet and its lens's surface, mm.
     progress
         Shows how many lenses are done.
 
@@ -106,76 +117,80 @@ def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progres
         If a lens lies outside the plate, or the plate is infinite.
     ValueError
         If two lenses are at one place, their rims are too steep, the plate is not thicker than their sag, or `chord` is
-        out of its range.
+        not positive and at most a tenth of the height of a lens, or takes millions of facets.
     """
     check_array(array)
-    return solid_of(facet_surface(array, chord, progress), plate_thickness(array))
+    caps, thickness = caps_of(array), plate_thickness(array)
+    coarsest, reaches = coarsest_chord(caps), visible_reaches(caps, array.size)
+    if not 0 < chord <= coarsest:
+        raise ValueError(f"`chord` must be positive and at most {coarsest:.4g} mm, got {chord}.")
+    if (count := estimated_facets(caps, reaches, chord)) > MAX_FACETS:
+        raise ValueError(f"`chord` of {chord} mm takes about {count:.2g} facets, allowed: up to {MAX_FACETS:.2g}.")
+    # Heights over the land, lenses up.
+    land, (x, y) = cap_sag(array), array.size
+    pairs = list(zip(caps, reaches, strict=True))
+    bodies = [
+        _body(cap, reach, chord, land, thickness / 2)
+        for cap, reach in (progress or Progress()).track(pairs, "Tessellating")
+    ]
+    box = lambda low, high: m3.Manifold.cube([x, y, high - low]).translate([-x / 2, -y / 2, low])
+    lenses = m3.Manifold.batch_boolean(bodies, m3.OpType.Add) ^ box(-thickness, land + _BEYOND)
+    # Lenses down: mirrored, which turns a solid's facets too.
+    return checked((lenses + box(-thickness, 0)).mirror([0, 0, 1]).translate([0, 0, -thickness]))
+
+
+def coarsest_chord(caps: list[Cap]) -> float:
+    """The largest chord error that leaves every lens one, mm."""
+    return COARSEST * min(cap.rim for cap in caps)
+
+
+def _body(cap: Cap, reach, chord, land, deep) -> m3.Manifold:
+    """A lens and what carries it: from its rim, or where others hide it, a wall with a draft down into the plate."""
+    points, sag, facets, count = facet_cap(cap, reach, chord)
+    height = land - sag
+    if height[:count].max() < _LOWEST_WALL:
+        height[:count] = 0
+    foot = points[:count] * (1 + (height[0] + deep) * math.tan(DRAFT) / math.hypot(*points[0]))
+    vertices = np.concatenate([np.column_stack([points, height]), np.column_stack([foot, np.full(count, -deep)])])
+    top = np.arange(count)
+    after, under, bottom = np.roll(top, -1), len(points), len(points) + top
+    wall = [np.stack([top, bottom, under + after], axis=1), np.stack([top, under + after, after], axis=1)]
+    floor = np.stack([np.full(count - 2, under), bottom[2:], bottom[1:-1]], axis=1)
+    mesh = m3.Mesh64(vertices, np.concatenate([facets, *wall, floor]).astype(np.uint64))
+    return checked(m3.Manifold(mesh)).translate([*cap.center.tolist(), 0.0])
 
 
 def check_array(array: MicrolensArray) -> None:
-    """`ValueError` for an array that has no solid."""
-    aperture, widest = float(array.aperture_diameter), widest_aperture(array)
-    if not 0 < aperture <= widest:
-        raise ValueError(f"`aperture_diameter` must be positive and at most {widest:.4g} mm, got {aperture:g}.")
+    """`ValueError` for an array that has no solid; `InputError` if it has lenses outside its plate."""
+    centers, half = np.asarray(array.centers, float), half_size(array.size)
+    if not np.isfinite(centers).all():
+        raise ValueError("`centers` must be finite.")
+    if outside := int((np.abs(centers) > half * (1 + 1e-9)).any(axis=1).sum()):
+        raise InputError(f"`centers` must be points on a plate of {in_mm(half)}, got {outside} outside.")
+    if fault := too_wide(caps_of(array)):
+        raise ValueError(f"`aperture_diameter` must be positive and at most {fault.allowed}, got {fault.found}.")
     if not plate_thickness(array) > 0:
         allowed = f"more than the lenses' sag, {cap_sag(array):.4g} mm"
         raise ValueError(f"`substrate_thickness` must be {allowed}, got {float(array.substrate_thickness):g} mm.")
-    centers = np.asarray(array.centers, float)
-    if not np.isfinite(centers).all():
-        raise ValueError("`centers` must be finite.")
     # An array of JAX's float32 is exact to a little less than the limit.
     if len(centers) > 1 and (closest := nearest_neighbour_distances(centers).min()) < 0.99 * CLOSEST:
         raise ValueError(f"`centers` must be {CLOSEST} mm apart or more, got two lenses {closest:.3g} mm apart.")
 
 
-def widest_aperture(array: MicrolensArray) -> float:
-    """The widest lens that can be made, mm: its rim slopes by `asin(D / 2R)`, which is limited."""
-    return 2 * float(array.radius_of_curvature) * math.sin(STEEPEST)
+class Fault(NamedTuple):
+    """What was found, and what is allowed, in words."""
+
+    found: str
+    allowed: str
 
 
-def solid_of(surface: Surface, thickness: float) -> m3.Manifold:
-    """The solid between a surface over the plate and the plano face, `thickness` behind the plate's plane.
-
-    Raises
-    ------
-    RuntimeError
-        If the surface has a crack: a fault of the program.
-    """
-    loop = _boundary(surface)
-    top = surface.vertices[loop]
-    half = np.abs(surface.vertices[:, :2]).max(axis=0)
-    is_corner = (np.abs(top[:, :2]) == half).all(axis=1)
-    start = int(np.flatnonzero(is_corner)[0])
-    loop, top, is_corner = (np.roll(x, -start, axis=0) for x in (loop, top, is_corner))
-    corners = [*np.flatnonzero(is_corner), len(loop)]
-    back = len(surface.vertices) + np.arange(4)
-    facets = [surface.facets, back[[[0, 2, 1], [0, 3, 2]]]]
-    for side in range(4):
-        edge = np.append(loop, loop[0])[corners[side] : corners[side + 1] + 1]
-        index = np.concatenate([back[[side, (side + 1) % 4]], edge[::-1]])
-        height = np.concatenate([[-thickness] * 2, surface.vertices[edge[::-1], 2]])
-        along = np.linalg.norm(surface.vertices[edge, :2] - surface.vertices[edge[0], :2], axis=1)
-        polygon = np.column_stack([np.concatenate([[0, along[-1]], along[::-1]]), height])
-        facets.append(index[m3.triangulate([polygon])])
-    behind = np.column_stack([top[is_corner, :2], np.full(4, -thickness)])
-    vertices = np.concatenate([surface.vertices, behind])
-    # From heights over the plate, lenses up, to the design's frame, lenses down: mirrored, so turned inside out.
-    vertices[:, 2] = -thickness - vertices[:, 2]
-    return checked(m3.Manifold(m3.Mesh64(vertices, np.concatenate(facets)[:, ::-1].astype(np.uint64))))
-
-
-def _boundary(surface: Surface):
-    """Vertices around the plate, counter-clockwise."""
-    a, b = surface.facets, np.roll(surface.facets, -1, axis=1)
-    n = len(surface.vertices)
-    free = ~np.isin(a * n + b, b * n + a)
-    after = dict(zip(a[free].tolist(), b[free].tolist(), strict=True))
-    loop = [next(iter(after))]
-    while (following := after.get(loop[-1], loop[0])) != loop[0]:
-        loop.append(following)
-    if len(loop) != free.sum():
-        raise RuntimeError(f"the surface has a crack: {free.sum() - len(loop)} edges within the plate have one facet")
-    return np.array(loop)
+def too_wide(caps: list[Cap]) -> Fault | None:
+    """The first lens that is too wide to be made, if there is one: its aperture's diameter."""
+    for number, cap in enumerate(caps, 1):
+        if not 0 < cap.reach or cap.widest < cap.reach:
+            which = f" for lens {number}" if len({cap.reach for cap in caps}) > 1 else ""
+            return Fault(f"{2 * cap.reach:g}", f"{2 * cap.widest:.4g} mm{which}")
+    return None
 
 
 def checked(solid: m3.Manifold) -> m3.Manifold:
