@@ -54,6 +54,11 @@ def command(name, *options, output="v.zarr"):
     return ("reconstruct", name, "design.toml", *OPTIONS, "-o", output, *options)
 
 
+def beside_progress(err):
+    """What was said but for how far it is, which a busy machine says."""
+    return [line for line in err.splitlines() if not line.startswith("gs-jax: Reconstructing: ")]
+
+
 def level(path="v.zarr", name="0") -> Any:
     """An array of a store, as any reader of Zarr has it."""
     return zarr.open_group(path, mode="r")[name]
@@ -76,7 +81,7 @@ def expected(frames=FRAMES, **options):
 @pytest.mark.parametrize("name", ["rec.tif", "rec.npy", "frames", "frames/f*.tif", "rec.zarr"])
 def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name):
     status, out, err = run(monkeypatch, capsys, *command(save(name)))
-    assert (status, err) == (0, "")
+    assert (status, beside_progress(err)) == (0, [])
     assert "5 x 5 x 39 x 33 voxels (t, z, y, x), 50 um laterally, 5 depths from 18 to 22 mm" in out
     assert "frames/s" in out
     # Of one type and compiled in one way: float32 rounding is the same.
@@ -98,7 +103,11 @@ def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
 
 def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
-    assert (status, err) == (0, "") and out.count("imaged again") == 1 and "v.zarr: frame 0 imaged again is" in out
+    assert (
+        (status, beside_progress(err)) == (0, [])
+        and out.count("imaged again") == 1
+        and "v.zarr: frame 0 imaged again is" in out
+    )
 
 
 def test_what_viewers_are_told(folder, monkeypatch, capsys):

@@ -100,4 +100,4 @@ def test_training_cases(two):
     made, alone = (unrolled_cases(SCENES + 1, 0, kind=TINY_UNROLLED, workers=workers) for workers in (two, None))
     for a, b in zip(made, alone, strict=True):
         for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5 * (np.abs(y).max() + 1e-30))
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5 * np.abs(y).max(initial=1e-30))
