@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -127,10 +128,14 @@ def _writer(opened, path: Path, grid: Grid):
     """From a frame and whether the store is there to its volume, or None if it is written there; and the note."""
     read, make = opened()
     levels = cache(partial(opened_levels, path, grid))
+    reading = Lock()
 
     def written(item):
         frame, exists = item
-        volume, note = _finite(*make(read(frame)))
+        # A worker of several threads has one file open for all of them.
+        with reading:
+            found = read(frame)
+        volume, note = _finite(*make(found))
         if not exists:
             return volume, note
         write_frame(path, levels(), frame, volume)
