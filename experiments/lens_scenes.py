@@ -33,13 +33,14 @@ DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")
 DEPTHS = (18.5, 20.5, 22.5)
 # Where each depth's part of a scene is, mm, and how large it is.
 PLACES, HEIGHT = ((-1.2, -0.5), (0.0, 0.9), (1.2, -0.5)), 1.1
-# Pixels of the sensor's middle, lenses that are looked at, and the volume, mm.
-PIXELS, REACH, VOXEL, FIELD = 2560, 6.5, 0.024, 4.4
+# Pixels of the sensor's middle, lenses that are looked at, and the volume, mm. Voxels are as wide as the resolution
+# that the designs aim at: if pixels were wider in the object, the voxels of that design would fit noise.
+PIXELS, REACH, VOXEL, FIELD = 2560, 6.5, 0.04, 4.4
 # Emitters of a scene, drawn at random, and rays of each to each lens.
 SAMPLES, RAYS = 60_000, 12
 # Electrons of the brightest pixel of `geomscope`'s capture: the exposures. And of read noise.
 EXPOSURES, READ_NOISE = (20_000, 1_000), 2.0
-STEPS = 30
+STEPS = 20
 
 
 def cropped(imager: Imager, pixels: int = PIXELS, reach: float = REACH) -> Imager:
@@ -104,18 +105,18 @@ def pictures(found: dict[str, Any], names=DESIGNS) -> Figure:
     """The brightest of the depths, in the truth and in each volume at the longer exposure, on one scale a scene."""
     figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(found)), dpi=100, layout="constrained")
     axes = figure.subplots(len(found), len(names) + 1, squeeze=False)
-    for row, (scene, parts) in zip(axes, found.items(), strict=True):
+    for row, parts in zip(axes, found.values(), strict=True):
         shown = {"truth": parts["truth"]} | {name: parts[f"{name}, {EXPOSURES[0]}"]["volume"] for name in names}
         for axis, (name, volume) in zip(row, shown.items(), strict=True):
             extent = (-FIELD / 2, FIELD / 2, FIELD / 2, -FIELD / 2)
             axis.imshow(volume.max(0), cmap="gray", vmin=0, vmax=parts["truth"].max(), extent=extent)
             psnr = "" if name == "truth" else f", {parts[f'{name}, {EXPOSURES[0]}']['psnr_db']:.1f} dB"
-            axis.set_title(f"{scene}: {name}{psnr}", fontsize=8)
+            axis.set_title(f"{name}{psnr}", fontsize=8)
             axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("x, mm", fontsize=8)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("y, mm", fontsize=8)
+    for axis, scene in zip(axes[:, 0], found, strict=True):
+        axis.set_ylabel(f"{scene}\ny, mm", fontsize=8)
     return figure
 
 
