@@ -43,6 +43,9 @@ centers_origin = "corner"            # of the plate, where both are least
 mirror = true                        # the list shows the other side of the plate
 ```
 
+Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` are numbers of each lens, in place of the
+keys of these names in `[lens]`.
+
 Pixels (`"px"`) are those of a capture: the first pixel's middle is (0, 0), x the column, y the row. `mirror` turns the
 plate over about its y axis, x against -x; about its x axis is the same with half a turn. `gs-jax calibrate` finds both
 by itself, and turns and shifts the array.

@@ -85,6 +85,13 @@ class Sensor(eqx.Module):
     ------
     ValueError
         If there are fewer than 2 x 2 pixels, the pitch is not positive, or the origin is not finite.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> sensor = gs.Sensor((3000, 4096), pixel_pitch=0.00345)
+    >>> print(sensor.to_pixels(np.array([0.0, 0.0])))  # the middle, (row, column)
+    [1499.5 2047.5]
     """
 
     shape: tuple[int, int] = eqx.field(static=True, converter=as_shape)
@@ -147,6 +154,16 @@ class Imager(eqx.Module):
     ------
     ValueError
         If `field_radius` is not positive, or `wavelength` is none in mm.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9]], substrate_thickness=0.0)
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> print(round(float(scope.magnification(20.0)), 3))  # v / z'
+    0.29
+    >>> scope.project(np.array([[0.0, 0.0, 20.0]])).shape  # where each lens images a point, (x, y) in mm
+    (2, 1, 2)
     """
 
     array: MicrolensArray

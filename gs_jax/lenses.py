@@ -6,10 +6,13 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from .base.arrays import library_of
 from .base.converters import as_float, as_float_or_none, as_pair
+from .base.errors import InputError
 
 # Side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]
@@ -45,12 +48,21 @@ class MicrolensArray(eqx.Module):
         `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid. One for all lenses, or `(lens,)`.
     aspheric_terms
         `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
+    others
+        Lenses on the same plate that are not looked at, but end these where their surfaces meet; see `some`.
 
     Raises
     ------
     ValueError
         If `centers` is not `(lens, 2)` or holds no lens, a number of each lens is there for too few or too many, or
         there is no such orientation.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[0.0, 0.0], [1.2, 0.0]], radius_of_curvature=2.0, refractive_index=1.43)
+    >>> print(round(float(array.focal_length), 2))  # R / (n - 1), mm
+    4.65
     """
 
     centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
@@ -63,6 +75,7 @@ class MicrolensArray(eqx.Module):
     orientation: Orientation = eqx.field(static=True, default="plano")
     conic_constant: Float[Array, "*each"] = eqx.field(converter=as_float, default=0.0)
     aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
+    others: "MicrolensArray | None" = None
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
@@ -79,16 +92,39 @@ class MicrolensArray(eqx.Module):
         return not any(getattr(self, name).ndim for name in EACH)
 
     def check_alike(self) -> None:
-        """`ValueError` unless all lenses are alike: what is computed for a lens unit has one for all of them."""
+        """`InputError` unless all lenses are alike: what is computed for a lens unit has one for all of them."""
         if not self.alike:
             found = ", ".join(name for name in EACH if getattr(self, name).ndim)
-            raise ValueError(f"Found lenses that differ ({found}), allowed: lenses that are alike; `lens(k)` is one.")
+            raise InputError(f"Found lenses that differ ({found}), allowed: lenses that are alike; `lens(k)` is one.")
 
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""
+        return dataclasses.replace(self, centers=self.centers[index][None], others=None, **self._numbers(index))
+
+    def some(self, which: Int[np.ndarray, " kept"]) -> "MicrolensArray":
+        """Lenses that are alike, such as one of `kinds`, as an array whose `others` are the rest.
+
+        The numbers are those of the first of them.
+        """
+        rest = np.setdiff1d(np.arange(len(self.centers)), which)
+        others = dataclasses.replace(self, centers=self.centers[rest], **self._numbers(rest)) if rest.size else None
+        return dataclasses.replace(self, centers=self.centers[which], others=others, **self._numbers(which[0]))
+
+    @property
+    def whole(self) -> "MicrolensArray":
+        """These lenses and then the others, as one array."""
+        if self.others is None:
+            return self
+        both = self, self.others
+        each = {
+            name: jnp.concatenate([jnp.broadcast_to(getattr(part, name), len(part.centers)) for part in both])
+            for name in EACH
+        }
+        return dataclasses.replace(self, centers=jnp.concatenate([p.centers for p in both]), others=None, **each)
+
+    def _numbers(self, index) -> dict[str, Any]:
         own = {name: getattr(self, name) for name in EACH}
-        own = {name: value[index] if value.ndim else value for name, value in own.items()}
-        return dataclasses.replace(self, centers=self.centers[index][None], **own)
+        return {name: value[index] if value.ndim else value for name, value in own.items()}
 
     @property
     def focal_length(self) -> Float[Array, "*each"]:
@@ -129,6 +165,14 @@ class MicrolensArray(eqx.Module):
     @property
     def _shape(self):
         return self.radius_of_curvature, self.conic_constant, self.aspheric_terms
+
+
+def kinds(array: MicrolensArray) -> list[Int[np.ndarray, " lens"]]:
+    """Which lenses have the same numbers, kind by kind, in the order of their first lenses. Host code."""
+    count = len(array.centers)
+    numbers = [np.broadcast_to(np.asarray(getattr(array, name)), count) for name in EACH]
+    _, first, kind = np.unique(np.stack(numbers, -1), axis=0, return_index=True, return_inverse=True)
+    return [np.flatnonzero(kind.ravel() == number) for number in np.argsort(first)]
 
 
 def sag(

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,8 @@ ORIENTATIONS = pytest.mark.parametrize("plano", [True, False])
 
 def lens(plano, **parts):
     """Of the same curvature, with a plate that counts for nothing."""
-    parts = {"radius_of_curvature": R, "refractive_index": N} | parts
-    return MicrolensArray([[0.0, 0.0]], orientation="plano" if plano else "curved", **parts)
+    given: dict[str, Any] = {"radius_of_curvature": R, "refractive_index": N} | parts
+    return MicrolensArray([[0.0, 0.0]], orientation="plano" if plano else "curved", **given)
 
 
 def refract(direction, normal, n, n_):

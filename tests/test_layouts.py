@@ -231,6 +231,12 @@ def test_measures_refuse_lenses_beside_the_plate():
             measure(np.array([[0.0, 0.0], [0.0, 1.6]]), (4, 3))
 
 
+def test_a_lens_on_the_edge_is_on_the_plate_in_single_precision():
+    """Of a file that holds tenths of micrometres: 9.6 mm is more in float32."""
+    centers = np.array([[9.6, 0.0], [0.0, -9.6], [0.0, 0.0]], np.float32)
+    assert coverage(centers, (19.2, 19.2), diameter=1.0) == pytest.approx(2 * np.pi / 4 / 19.2**2, rel=1e-3)
+
+
 def test_authors_layout():
     """Their 213 centres: pitch 1.230 mm, SD 0.099 mm, and discs of 2 mm that cover 98.3 % (FACTS.md)."""
     centers = np.loadtxt(needs("geomscope/centers.csv"), delimiter=",", skiprows=1)

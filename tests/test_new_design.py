@@ -294,6 +294,9 @@ def refused_by(node: Any, value: Any, top: Any) -> str | None:
     """Where a schema of the kind that is written refuses a value; None where it does not."""
     if "$ref" in node:
         return refused_by(top["$defs"][node["$ref"].rpartition("/")[2]], value, top)
+    if "type" not in node:
+        found = [refused_by(each, value, top) for each in node["oneOf"]]
+        return None if found.count(None) == 1 else next(filter(None, reversed(found)))
     if not is_kind(value, node["type"]) or value not in node.get("enum", [value]):
         return "kind"
     if node["type"] == "object":
@@ -328,6 +331,10 @@ def test_the_schema_takes_what_is_shipped(folder, monkeypatch, capsys):
     assert refused_by(made, file, made) == "oneOf"
     del file["array"]["centers_mm"]
     assert refused_by(made, file, made) is None
+    file["lens"]["radius_of_curvature_mm"] = [2.0, 1.9]
+    assert refused_by(made, file, made) is None
+    file["lens"]["radius_of_curvature_mm"] = [2.0, -1.9]
+    assert refused_by(made, file, made) == "range"
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,16 @@ from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
 from gs_jax.cli.tolerance import command
 from gs_jax.designs.microscope import Microscope
+from gs_jax.designs.sheet import microscope_of
 from gs_jax.designs.spots import field_heights
 from gs_jax.geometry import envelope
 from gs_jax.optics import theory
 from gs_jax.optics.axial import axial_strehl
 from gs_jax.optics.psf import strehl
 from gs_jax.optics.unit import pupil_disc
+from gs_jax.report.facts import tolerance_facts
 from gs_jax.tolerances.amounts import Tolerances
-from gs_jax.tolerances.analysis import Outcome, _judged, _of_devices, _Question, together, tolerance
+from gs_jax.tolerances.analysis import Outcome, _of_devices, _Question, together, tolerance
 from gs_jax.tolerances.devices import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
 from gs_jax.tolerances.images import log_sharpness
 from gs_jax.tolerances.outcome import as_json, changes, costs, picture, sentences
@@ -220,7 +222,7 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
 
 def test_gradients_are_finite_differences(design, outcome):
     spreads, nothing = spreads_of(outcome.tolerances), no_errors(len(design.array.centers_mm))
-    microscope = _judged(design, np.array(DEPTHS))
+    microscope = microscope_of(design, np.array(DEPTHS))
     question = _Question(microscope, bench_of(microscope.imager, np.array(DEPTHS)), jnp.array(0.005))
     fields = ["radius", "conic", "index", "sensor_distance"]
     ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(spreads, f)}) for f in fields for s in (1, -1)]
@@ -276,6 +278,9 @@ def test_the_picture_and_the_numbers(outcome):
     low, middle, high = (numbers["drawn"]["spot_width_um"][key] for key in ("p5", "p50", "p95"))
     assert all(a < b < c for a, b, c in zip(low, middle, high, strict=True))
     assert set(numbers["by_gradient"]) == {*RULED, "all"} and sorted(numbers["costs"]) == sorted(RULED)
+    shown = tolerance_facts(numbers)
+    assert {row[0] for row in shown.rows} > set(RULED) and {len(row) for row in shown.rows} == {6}
+    assert shown.widths["devices, median"] == (numbers["depth_mm"], middle)
 
 
 def test_the_command(folder, monkeypatch, capsys):

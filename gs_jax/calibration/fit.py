@@ -120,9 +120,23 @@ def calibrate(
     Raises
     ------
     InputError
-        If points and captures do not fit together, no pattern of lenses is seen, or the spots do not determine what is
-        to be fitted.
+        If points and captures do not fit together, lenses differ, no pattern of lenses is seen, or the spots do not
+        determine what is to be fitted.
+
+    Examples
+    --------
+    >>> import dataclasses
+    >>> import gs_jax as gs, numpy as np
+    >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
+    >>> listed = gs.Imager(array, gs.Sensor((600, 600), 0.0135), sensor_distance=5.8, field_radius=3.0)
+    >>> true = dataclasses.replace(listed, sensor_distance=5.9, rotation=0.02)
+    >>> places = np.array([[0.0, 0.0, 18.0], [0.5, 0.3, 20.0], [0.0, 0.0, 22.0]])  # one source a capture
+    >>> images = [gs.simulate(np.array([[*place, 1.0]]), true, optics="near", psf="geometric") for place in places]
+    >>> found = gs.calibrate(images, places, listed, fit=("sensor_distance", "rotation"))
+    >>> print(round(float(found.imager.sensor_distance), 1), round(float(found.imager.rotation), 3), found.mirrored)
+    5.9 0.02 False
     """
+    imager.array.check_alike()
     progress = progress or Progress()
     captures = np.arange(len(points)) if captures is None else captures
     sources = Sources(np.array(points, np.float64), np.asarray(captures))

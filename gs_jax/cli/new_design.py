@@ -126,10 +126,11 @@ def command(output: Path, centers: Path | None, name: str | None, force: bool, *
         click.echo(f"by default: {', '.join(taken)}")
     if left_out:
         click.echo(f"left out: {left_out} lenses beyond the sensor's reach; the plate is {_shown(known['size_mm'])} mm")
-    f = design.lens.radius_of_curvature_mm / (design.lens.refractive_index - 1)
+    radius = known["radius_of_curvature_mm"]
+    f = radius / (design.lens.refractive_index - 1)
     click.echo(
         f"{output}: {len(design.array.centers_mm)} lenses of f = {f:.4g} mm (R = "
-        f"{design.lens.radius_of_curvature_mm:.4g} mm), sensor at {design.imaging.sensor_distance_mm:g} mm; "
+        f"{radius:.4g} mm), sensor at {design.imaging.sensor_distance_mm:g} mm; "
         f"see gs-jax metrics {output}"
     )
 
@@ -205,13 +206,15 @@ def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
 
 def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     """The file's centres, once it is known how it is meant."""
-    from ..designs.centers import read_centers, unit_of_file
+    from ..designs.centers import lens_columns, read_centers, unit_of_file
     from ..designs.start import check_origin_said, check_unit_said
 
     columns, unit, origin = (known.get(f"centers_{key}") for key in ("columns", "unit", "origin"))
     size = tuple(known["size_mm"]) if "size_mm" in known else None
     shape, pitch = tuple(map(float, known["shape"])), known["pixel_pitch_um"] / 1000
     found = unit_of_file(file, columns)
+    if own := next(iter(lens_columns(file, columns)), None):
+        raise InputError(f"{file}: found a column {own}, allowed: in the `centers_file` of a design alone.")
     if unit is None and found is None and asking:
         unit = click.prompt("unit of the file's numbers", "mm", type=click.Choice(["mm", "um", "px"]))
     place = {"columns": columns, "unit": unit, "size": size, "shape": shape, "pixel_pitch": pitch}

@@ -12,6 +12,12 @@ def geomscope(*, sensor_distance_mm: float = 5.8) -> Design:
     sensor_distance_mm
         The paper prints about 4 mm, where a point at 20 mm is far out of focus: its thin-lens image forms at
         6.06 mm, and traced rays are sharpest at 5.8 mm.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> gs.geomscope().imaging.sensor_distance_mm, gs.geomscope(sensor_distance_mm=4.0).imaging.sensor_distance_mm
+    (5.8, 4.0)
     """
     size = (20.0, 20.0)
     centers = random_layout(200, size, pitch=1.23, pitch_sd=0.09, diameter=2.0, seed=0).round(4)

@@ -19,6 +19,8 @@ CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000
 UNITS = ("mm", "um", "px")
 ORIGINS = ("center", "corner")
+# Keys of `[lens]` that may have a number for each lens, and columns of these names in the file of the centres.
+LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
 # As headers write them; both letters that look like a Greek mu.
 _UNIT = {
     "mm": r"mm|millimet(?:er|re)s?",
@@ -66,10 +68,12 @@ class _Centers(Table):
 def inline_centers(path: Path, data: dict[str, Any]) -> None:
     """Replaces, in the tables of the design file `path`, what `CentersTable` says by `centers_mm`.
 
+    Columns of the file that are called as keys of `[lens]` become these keys.
+
     Raises
     ------
     InputError
-        If one of its keys is wrong, or the file is.
+        If one of its keys is wrong, or the file is, or `[lens]` has a key that the file has a column for.
     """
     array = data.get("array")
     if not isinstance(array, dict):
@@ -89,9 +93,10 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
         raise InputError(f"{path}: found both `array.centers_file` and `array.centers_mm`, allowed: one of them.")
     sensor = data.get("sensor")
     sensor = sensor if isinstance(sensor, dict) else {}
+    file = path.parent / keys.centers_file
     try:
         rows = read_centers(
-            path.parent / keys.centers_file,
+            file,
             columns=keys.centers_columns,
             unit=keys.centers_unit,
             origin=keys.centers_origin,
@@ -100,9 +105,22 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
             shape=_numbers(sensor.get("shape")),
             pixel_pitch=_numbers([sensor.get("pixel_pitch_um")] * 2)[0] / 1000,
         )
+        columns = lens_columns(file, keys.centers_columns)
     except InputError as error:
         raise InputError(f"{path}: `array.centers_file`: {error}") from error
     array["centers_mm"] = rows.tolist()
+    if not columns or not isinstance(lens := data.setdefault("lens", {}), dict):
+        return
+    if both := next((name for name in columns if name in lens), None):
+        found = f"found `lens.{both}` and a column of that name in `array.centers_file`"
+        raise InputError(f"{path}: {found}, allowed: one of them.")
+    lens |= columns
+
+
+def lens_columns(path: str | os.PathLike[str], columns: tuple[str, str] | None = None) -> dict[str, list[float]]:
+    """What a file of lens centres says of each lens besides, by `LENS_KEYS`. `InputError` as `read_columns`."""
+    more = read_columns(Path(path), columns, most=MAX_LENSES, also=LENS_KEYS).more
+    return {name: numbers.tolist() for name, numbers in more.items()}
 
 
 def read_centers(
@@ -133,7 +151,7 @@ def read_centers(
         As `read_columns`, or if the unit is not that of the header.
     """
     path = Path(path)
-    numbers, names = read_columns(path, columns, most=MAX_LENSES)
+    numbers, names, _ = read_columns(path, columns, most=MAX_LENSES)
     unit = _unit(path, names, unit)
     # A division is exact to the last digit, which a product with 0.001 is not.
     centers = numbers / {"mm": 1.0, "um": 1000.0, "px": 1 / pixel_pitch}[unit]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..lenses import steepness
-from .centers import other_reading
+from .centers import LENS_KEYS, other_reading
 
 MIN_SPACING_MM = 1e-3
 # Radii at which a lens is asked whether it falls.
@@ -18,7 +18,7 @@ _RADII = 64
 
 def check_whole(design) -> None:
     """Raises `ValueError` unless the numbers, the plate, the lenses and the sensor of a design fit together."""
-    for check in (_check_numbers, _check_plate, _check_spacing, _check_reach):
+    for check in (_check_numbers, _check_lenses, _check_plate, _check_spacing, _check_reach):
         check(design)
 
 
@@ -26,16 +26,34 @@ def _check_numbers(design) -> None:
     near, far = design.imaging.working_distance_mm
     if not near < far:
         raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
-    lens = design.lens
-    aperture, end = lens.aperture_diameter_mm, widest_diameter(lens.radius_of_curvature_mm, lens.conic_constant)
-    if aperture > end:
-        where = "twice `lens.radius_of_curvature_mm`" if not lens.conic_constant else "where the conic ends"
-        raise ValueError(f"`lens.aperture_diameter_mm`: found {aperture}, allowed: at most {round(end, 6)} mm, {where}")
-    radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
-    rising = steepness(radii**2, lens.radius_of_curvature_mm, lens.conic_constant, lens.aspheric_terms) <= 0
-    if rising.any():
-        found = f"found {list(lens.aspheric_terms)}, with which lenses rise at {radii[np.argmax(rising)]:.3g} mm"
-        raise ValueError(f"`lens.aspheric_terms`: {found}, allowed: lenses that fall from the vertex to the rim")
+
+
+def of_each(design, key: str) -> tuple[float, ...]:
+    """The number that each lens has, of one of `LENS_KEYS`."""
+    value = getattr(design.lens, key)
+    return value if isinstance(value, tuple) else (value,) * len(design.array.centers_mm)
+
+
+def _check_lenses(design) -> None:
+    lens, count = design.lens, len(design.array.centers_mm)
+    for key in LENS_KEYS:
+        if (found := len(of_each(design, key))) != count:
+            raise ValueError(f"`lens.{key}`: found {found} numbers, allowed: one, or {count}, as there are lenses")
+    first: dict[tuple[float, ...], int] = {}
+    for number, one in enumerate(zip(*(of_each(design, key) for key in LENS_KEYS), strict=True), 1):
+        first.setdefault(one, number)
+    for (radius, aperture, conic), number in first.items():
+        of_lens = f" of lens {number}" if len(first) > 1 else ""
+        if aperture > (end := widest_diameter(radius, conic)):
+            where = "twice `lens.radius_of_curvature_mm`" if not conic else "where the conic ends"
+            found = f"`lens.aperture_diameter_mm`: found {aperture}{of_lens}"
+            raise ValueError(f"{found}, allowed: at most {round(end, 6)} mm, {where}")
+        radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
+        rising = steepness(radii**2, radius, conic, lens.aspheric_terms) <= 0
+        if rising.any():
+            which = f"lens {number} rises" if of_lens else "lenses rise"
+            found = f"found {list(lens.aspheric_terms)}, with which {which} at {radii[np.argmax(rising)]:.3g} mm"
+            raise ValueError(f"`lens.aspheric_terms`: {found}, allowed: lenses that fall from the vertex to the rim")
 
 
 def widest_diameter(radius: float, conic_constant: float) -> float:

@@ -13,15 +13,15 @@ from typing import Annotated, Any
 
 import numpy as np
 import tomli_w
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, Tag, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
 from ..geometry import LONGEST, SHORTEST, Imager, Sensor
 from ..io.disk import read_text, write_text
-from ..io.tables import Table, one_line
+from ..io.tables import EACH, ONE, Table, one_line, one_or_each
 from ..lenses import MicrolensArray, Orientation
-from .centers import MAX_LENSES, CentersTable, inline_centers
-from .checks import check_whole
+from .centers import LENS_KEYS, MAX_LENSES, CentersTable, inline_centers
+from .checks import check_whole, of_each
 from .plausible import doubts, slips
 
 # Every description is what the error message says is allowed, every title what the key means: comments in files, the
@@ -43,6 +43,12 @@ Terms = Annotated[
     tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...],
     Field(strict=False, max_length=6, description="up to 6 numbers from -1e12 to 1e12"),
 ]
+Conic = Annotated[float, Field(ge=-100, le=100)]
+_ForEach = Field(strict=False, min_length=1, max_length=MAX_LENSES)
+# Of all lenses, or of each.
+Lengths = Annotated[Annotated[Length, Tag(ONE)] | Annotated[tuple[Length, ...], _ForEach, Tag(EACH)], one_or_each]
+Conics = Annotated[Annotated[Conic, Tag(ONE)] | Annotated[tuple[Conic, ...], _ForEach, Tag(EACH)], one_or_each]
+_ONE_EACH = "or a list with one for each lens, in the order of the centres"
 Slope = Annotated[float, Field(ge=-10, le=10)]
 Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
 Centers = Annotated[
@@ -77,14 +83,16 @@ class SensorTable(Table):
 
 
 class LensTable(Table):
-    """`[lens]`: one plano-convex microlens. `focal_length_mm` overrides the radius, for a thin-lens study.
+    """`[lens]`: plano-convex microlenses. `focal_length_mm` overrides the radius, for a thin-lens study.
 
+    What may be a list is a number of each lens; columns of these names in the `centers_file` are read into it.
     At the radius r the curved side is `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A4 r^4 + A6 r^6 + ...` below its
     vertex, with `c = 1/R` and all lengths in mm.
     """
 
-    radius_of_curvature_mm: Length = Field(
-        title="R of the curved side at its vertex, positive; a focal length f in air is R = f (n - 1)"
+    radius_of_curvature_mm: Lengths = Field(
+        title="R of the curved side at its vertex, positive; a focal length f in air is R = f (n - 1)",
+        description=f"a number of mm from 1e-6 to 1e4, {_ONE_EACH}",
     )
     refractive_index: float = Field(
         gt=1,
@@ -92,16 +100,17 @@ class LensTable(Table):
         title="n of lenses and plate at the wavelength: PDMS 1.43, fused silica 1.46, acrylic 1.49, BK7 1.52",
         description="a number above 1, up to 5",
     )
-    aperture_diameter_mm: Length = Field(title="D of each lens, before neighbours clip it; at most 2 R of a sphere")
+    aperture_diameter_mm: Lengths = Field(
+        title="D of each lens, before neighbours clip it; at most 2 R of a sphere",
+        description=f"a number of mm from 1e-6 to 1e4, {_ONE_EACH}",
+    )
     orientation: Orientation = Field(
         default="plano", title="side of the lenses that faces the object", description='"plano" or "curved"'
     )
-    conic_constant: float = Field(
+    conic_constant: Conics = Field(
         default=0.0,
-        ge=-100,
-        le=100,
         title="k of the curved side: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid",
-        description="a number from -100 to 100",
+        description=f"a number from -100 to 100, {_ONE_EACH}",
     )
     aspheric_terms: Terms = Field(
         default=(),
@@ -166,11 +175,20 @@ class CalibrationTable(Table):
 
 
 class Design(Table):
-    """A microscope, with the tables and keys of its file."""
+    """A microscope, with the tables and keys of its file.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> design = gs.geomscope()
+    >>> design.imaging.sensor_distance_mm, design.lens.refractive_index, len(design.array.centers_mm)
+    (5.8, 1.43, 200)
+    >>> scope = design.imager()  # in mm and radians
+    """
 
     name: str = Field(title="what reports call it", description="a string")
     sensor: SensorTable = Field(title="the camera", description="a table")
-    lens: LensTable = Field(title="one plano-convex microlens; all are alike", description="a table")
+    lens: LensTable = Field(title="plano-convex microlenses, alike or not", description="a table")
     array: ArrayTable = Field(title="the plate, and where its lenses are", description="a table")
     imaging: ImagingTable = Field(title="where the sensor and the object are, and the light", description="a table")
     calibration: CalibrationTable = Field(
@@ -190,13 +208,17 @@ class Design(Table):
     def __repr__(self) -> str:
         sensor, lens, array, imaging = self.sensor, self.lens, self.array, self.imaging
         focal = (
-            f"f = {lens.focal_length_mm:g} mm" if lens.focal_length_mm else f"R = {lens.radius_of_curvature_mm:g} mm"
+            f"f = {lens.focal_length_mm:g} mm"
+            if lens.focal_length_mm
+            else f"R = {span_of(lens.radius_of_curvature_mm)} mm"
         )
+        count = len(set(zip(*(of_each(self, key) for key in LENS_KEYS), strict=True)))
+        of_kinds = f" of {count} kinds" if count > 1 else ""
         return "\n".join(
             [
                 f"Design {self.name!r}",
-                f"  {len(array.centers_mm)} lenses, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
-                f"D = {lens.aperture_diameter_mm:g} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
+                f"  {len(array.centers_mm)} lenses{of_kinds}, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
+                f"D = {span_of(lens.aperture_diameter_mm)} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
                 f"{array.substrate_thickness_mm:g} mm thick",
                 f"  sensor of {sensor.shape[0]} x {sensor.shape[1]} pixels of {sensor.pixel_pitch_um:g} um "
                 f"at v = {imaging.sensor_distance_mm:g} mm",
@@ -212,14 +234,14 @@ class Design(Table):
         lens, imaging, calibration = self.lens, self.imaging, self.calibration
         array = MicrolensArray(
             np.array(self.array.centers_mm),
-            radius_of_curvature=lens.radius_of_curvature_mm,
+            radius_of_curvature=_one_if_alike(lens.radius_of_curvature_mm),
             refractive_index=lens.refractive_index,
-            aperture_diameter=lens.aperture_diameter_mm,
+            aperture_diameter=_one_if_alike(lens.aperture_diameter_mm),
             substrate_thickness=self.array.substrate_thickness_mm,
             thin_lens_focal_length=lens.focal_length_mm,
             size=self.array.size_mm,
             orientation=lens.orientation,
-            conic_constant=lens.conic_constant,
+            conic_constant=_one_if_alike(lens.conic_constant),
             aspheric_terms=lens.aspheric_terms,
         )
         return Imager(
@@ -234,9 +256,20 @@ class Design(Table):
         )
 
 
+def _one_if_alike(numbers: float | tuple[float, ...]) -> float | tuple[float, ...]:
+    return numbers[0] if isinstance(numbers, tuple) and len(set(numbers)) == 1 else numbers
+
+
+def span_of(numbers: float | tuple[float, ...]) -> str:
+    """A number, or the least and the greatest of the lenses', to read."""
+    ends = (min(numbers), max(numbers)) if isinstance(numbers, tuple) else (numbers, numbers)
+    low, high = (f"{end:g}" for end in ends)
+    return low if low == high else f"{low} to {high}"
+
+
 def _shape(lens: LensTable) -> str:
     """What is not a sphere with its plano side to the object, in words."""
-    conic = f", k = {lens.conic_constant:g}" if lens.conic_constant else ""
+    conic = f", k = {span_of(lens.conic_constant)}" if lens.conic_constant else ""
     terms = f", {len(lens.aspheric_terms)} aspheric terms" if lens.aspheric_terms else ""
     return conic + terms + (", curved side to the object" if lens.orientation == "curved" else "")
 
@@ -254,6 +287,12 @@ def read_design(path: str | os.PathLike[str]) -> Design:
     -----
     InputWarning
         For each number that is possible but hardly meant, such as a sensor distance of 5800 mm.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> gs.write_design("mine.toml", gs.geomscope())
+    >>> scope = gs.read_design("mine.toml").imager()
     """
     text = read_text(path)
     try:
@@ -285,6 +324,13 @@ def write_design(path: str | os.PathLike[str], design: Design) -> None:
     ------
     InputError
         As `check_output`, for `.toml`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> gs.write_design("mine.toml", gs.geomscope())
+    >>> gs.read_design("mine.toml") == gs.geomscope()
+    True
     """
     write_text(path, design_text(design), [".toml"])
 

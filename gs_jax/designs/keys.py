@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
-from .centers import CentersTable
+from .centers import LENS_KEYS, CentersTable
 from .design import Design, as_toml
 from .plausible import USUAL, unit_of
 
@@ -78,6 +78,9 @@ def schema() -> dict[str, Any]:
     array["properties"] |= more["properties"]
     array["required"].remove("centers_mm")
     array["oneOf"] = [{"required": [name]} for name in ("centers_mm", "centers_file")]
+    # That file may hold these.
+    lens = made["$defs"]["LensTable"]
+    lens["required"] = [name for name in lens["required"] if name not in LENS_KEYS]
     for table, model in _models().items():
         where = made["$defs"][model.__name__] if table else made
         for name, field in where["properties"].items():

@@ -34,6 +34,8 @@ class Microscope(eqx.Module):
         The plate's size over that of the imager's array, which cannot be traced.
     largest_magnification
         What magnifications stay below whatever is free, for windows that have to hold all images.
+    exposure
+        Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class Microscope(eqx.Module):
     confusion: Float[Array, ""]
     plate_scale: Float[Array, ""]
     largest_magnification: float = eqx.field(static=True, default=math.inf)
+    exposure: float = eqx.field(static=True, default=1e4)
 
     def __check_init__(self):
         if not math.isfinite(math.prod(self.imager.array.size)):

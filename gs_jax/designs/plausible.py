@@ -103,7 +103,10 @@ def _other(key: str, numbers: list[float]) -> tuple[list[float], str | None] | N
 def _value(data: Mapping[str, Any], key: str) -> Any:
     table, _, name = key.partition(".")
     inner = data.get(table)
-    return inner.get(name) if isinstance(inner, Mapping) else None
+    found = inner.get(name) if isinstance(inner, Mapping) else None
+    if table == "lens" and (numbers := sorted(set(_positive(found)))):
+        return [numbers[0], numbers[-1]] if len(numbers) > 1 else numbers[0]  # of each lens: the extremes tell
+    return found
 
 
 def _numbers(values: list[float]) -> str:
@@ -117,19 +120,23 @@ def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
     kind = lens.get("orientation", "plano")
     front, back = plate_as_air(array["substrate_thickness_mm"], lens["refractive_index"], kind)
     v = imaging["sensor_distance_mm"]
-    f = lens.get("focal_length_mm") or lens["radius_of_curvature_mm"] / (lens["refractive_index"] - 1)
+    radius, diameters = (np.array(lens[key], float) for key in ("radius_of_curvature_mm", "aperture_diameter_mm"))
+    f = np.array(lens.get("focal_length_mm") or radius / (lens["refractive_index"] - 1))
+    least, most = float(f.min()), float(f.max())
+    focal = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
     depths = f"{near:g} to {far:g} mm"
-    if near + front <= f:
+    if near + front <= least:
         said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
-        yield f"{said} Nearer than the focal length, {f:.4g} mm, no real image forms."
+        yield f"{said} Nearer than the focal length, {focal} mm, no real image forms."
     else:
-        longest, shortest = (1 / (1 / f - 1 / (depth + front)) - back for depth in (near, far))
+        image = lambda f, depth: 1 / (1 / f - 1 / (depth + front)) - back if depth + front > f else math.inf
+        longest, shortest = image(most, near), image(least, far)
         if not shortest / _OFF <= v <= longest * _OFF:
             said = f"imaging.sensor_distance_mm = {v:g}: is it meant?"
-            yield f"{said} Lenses of f = {f:.4g} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
+            yield f"{said} Lenses of f = {focal} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
     if (field := imaging["field_radius_mm"]) > _WIDEST * far:
         yield f"imaging.field_radius_mm = {field:g}: is it meant? A lens sees so far beside its axis at {depths}."
-    if (diameter := lens["aperture_diameter_mm"]) > 2 * (plate_size := max(array["size_mm"])):
+    if (diameter := float(diameters.max())) > 2 * (plate_size := max(array["size_mm"])):
         yield f"lens.aperture_diameter_mm = {diameter:g}: is it meant? The whole plate is {plate_size:g} mm."
     pitch = _pitch(np.array(array["centers_mm"], float))
     if pitch < diameter / _CLOSEST:
@@ -137,8 +144,8 @@ def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
             f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; did you mean "
             f"{pitch * 1000:.3g} mm, a list in another unit?"
         )
-    radius, half = lens["radius_of_curvature_mm"], min(diameter, pitch) / 2
-    height = radius - math.sqrt(radius**2 - min(half, radius) ** 2)  # of a sphere, which others are not far from
+    half = np.minimum(np.minimum(diameters, pitch) / 2, radius)
+    height = float(np.max(radius - np.sqrt(radius**2 - half**2)))  # of spheres, which others are not far from
     if 0 < (thickness := array["substrate_thickness_mm"]) < height and not lens.get("focal_length_mm"):
         said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
         yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."

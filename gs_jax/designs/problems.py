@@ -12,7 +12,7 @@ from ..optics import aberrations, theory
 from ..optics.unit import unit_rays
 from .design import Design
 from .microscope import Microscope
-from .sheet import confusion_of, microscope_of
+from .sheet import microscopes_of
 
 # Spots so many times wider than promised are said to be.
 _FAR = 2.0
@@ -39,9 +39,11 @@ def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None =
     InputError
         As `datasheet`.
     """
-    confusion = confusion_of(design, confusion)
-    m = microscope_of(design, sheet["depth_mm"], confusion=confusion, coverage=sheet["coverage"])
-    checks = (_rays(sheet), _focus(design, sheet, m), _strehl(design, sheet, m), _pixels(design, sheet))
+    kinds = microscopes_of(design, sheet["depth_mm"], confusion=confusion, covered=sheet["coverage"])
+    focus = _focus(design, sheet, kinds)
+    # What a wavefront error does is said of lenses that are alike: each kind has its own.
+    strehl = _strehl(design, sheet, kinds[0]) if len(kinds) == 1 else []
+    checks = (_rays(sheet), focus, strehl, _pixels(design, sheet))
     return [sentence for check in (*checks, _pitch(sheet), _occupancy(sheet), _mask(sheet)) for sentence in check]
 
 
@@ -76,8 +78,8 @@ def _light_within(m: Microscope, depths, radius):
     return jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
 
 
-def _focus(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
-    v, blurs, confusion = design.imaging.sensor_distance_mm, sheet["blur_um"], float(m.confusion)
+def _focus(design: Design, sheet: dict[str, Any], kinds: list[Microscope]) -> list[str]:
+    v, blurs, confusion = design.imaging.sensor_distance_mm, sheet["blur_um"], float(kinds[0].confusion)
     outside = [i for i, blur in enumerate(blurs) if blur > confusion * 1000]
     if not outside:
         return []
@@ -85,9 +87,13 @@ def _focus(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
     return [
         *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
         f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
-        _sharp_range(design, m),
-        *_sharp_cores(m),
+        *(_of(m, kinds, said) for m in kinds for said in (_sharp_range(design, m), *_sharp_cores(m))),
     ]
+
+
+def _of(m: Microscope, kinds: list[Microscope], said: str) -> str:
+    """Of which lenses something is said, where there are several kinds."""
+    return said if len(kinds) == 1 else f"Lenses of f = {float(m.focal_length):.4g} mm: {said[:1].lower()}{said[1:]}"
 
 
 def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:

@@ -13,6 +13,9 @@ from ..base.converters import as_float
 from ..base.errors import InputError, short_repr
 from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
 from ..optics import aberrations
+from ..optics.aperture import clear_diameter
+from ..optics.kinds import lenses_by_kind, of_kinds
+from .checks import of_each
 from .design import Design
 from .microscope import Microscope
 from .spots import encircled_radius, psf_width
@@ -22,18 +25,54 @@ _DEPTHS = 7
 
 
 def microscope_of(
-    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float, coverage: float
+    design: Design,
+    depths: Sequence[float] | np.ndarray,
+    *,
+    confusion: float | None = None,
+    covered: float | None = None,
 ) -> Microscope:
-    """A design as it is judged at these depths, mm; `coverage` of its plate says how wide a lens is."""
+    """A design as it is judged at these depths, mm, with `datasheet`'s circle of confusion.
+
+    `covered` is the share of the plate that its lenses' discs cover, which says how wide a lens is, if it is known.
+    """
+    imager = design.imager()
+    if not imager.array.alike:
+        raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
+    if covered is None:
+        centers = np.array(design.array.centers_mm)
+        covered = coverage(centers, design.array.size_mm, diameter=of_each(design, "aperture_diameter_mm")[0])
     count, area = len(design.array.centers_mm), math.prod(design.array.size_mm)
     return Microscope(
-        design.imager(),
+        imager,
         as_float(depths),
-        clear_diameter=as_float(math.sqrt(4 / math.pi * coverage * area / count)),
+        clear_diameter=as_float(math.sqrt(4 / math.pi * covered * area / count)),
         field_radius=as_float(design.imaging.field_radius_mm),
-        confusion=as_float(confusion),
+        confusion=as_float(confusion_of(design, confusion)),
         plate_scale=as_float(1.0),
     )
+
+
+def microscopes_of(
+    design: Design,
+    depths: Sequence[float] | np.ndarray,
+    *,
+    confusion: float | None = None,
+    covered: float | None = None,
+) -> list[Microscope]:
+    """`microscope_of` with the lenses of each kind alone, in the order of their first lenses."""
+    imager = design.imager()
+    if imager.array.alike:
+        return [microscope_of(design, depths, confusion=confusion, covered=covered)]
+    shared: dict[str, Any] = {
+        "depths": as_float(depths),
+        "field_radius": as_float(design.imaging.field_radius_mm),
+        "confusion": as_float(confusion_of(design, confusion)),
+        "plate_scale": as_float(1.0),
+    }
+    return [
+        Microscope(one, clear_diameter=clear_diameter(one.array), **shared)
+        for one in of_kinds(imager, lenses_by_kind(imager))
+    ]
 
 
 def datasheet(
@@ -45,7 +84,9 @@ def datasheet(
     ----------
     design
         The microscope. Its clear diameter is that of a disc as large as a lens's mean clear aperture: what the lenses'
-        discs cover of the plate, by their number.
+        discs cover of the plate, by their number. If lenses differ, `kinds` holds spots of each kind, and the lists
+        are of the kind with the narrowest spot at each depth (`sharpest_kind`, from 1); scalars are means of the
+        lenses.
     depths
         From the plate, mm; by default seven over the working distance.
     confusion
@@ -62,12 +103,49 @@ def datasheet(
         If a depth or the confusion is not positive and finite, or there is no depth.
     """
     depths = _checked(design, depths)
-    centers, size = np.array(design.array.centers_mm), design.array.size_mm
-    covered = coverage(centers, size, diameter=design.lens.aperture_diameter_mm)
-    m = microscope_of(design, depths, confusion=confusion_of(design, confusion), coverage=covered)
-    distances, axis = nearest_neighbour_distances(centers), jnp.zeros(1)
+    centers, kinds = np.array(design.array.centers_mm), microscopes_of(design, depths, confusion=confusion)
+    distances = nearest_neighbour_distances(centers)
+    columns = [_columns(m) for m in kinds]
+    best = np.argmin([column["spot_width_um"] for column in columns], 0)
+    shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
+    for name in ("lenses_per_point", "occupancy"):
+        shown[name] = np.sum([column[name] for column in columns], 0).tolist()
+    lenses = [len(m.imager.array.centers) for m in kinds]
+    mean = lambda values: _round(float(np.average(values, weights=lenses)))
+    return {
+        "depth_mm": depths,
+        **{name: [_round(value) for value in values] for name, values in shown.items()},
+        "f_number": mean([float(m.f_number) for m in kinds]),
+        "numerical_aperture": mean([float(m.numerical_aperture) for m in kinds]),
+        "focal_length_mm": mean([float(m.focal_length) for m in kinds]),
+        "pitch_mm": _round(float(distances.mean())),
+        "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
+        "field_radius_mm": design.imaging.field_radius_mm,
+        "coverage": _round(sum(float(m.coverage) for m in kinds)),
+        **({"sharpest_kind": (best + 1).tolist(), "kinds": _kinds(kinds, columns)} if len(kinds) > 1 else {}),
+    }
+
+
+def _kinds(kinds: Sequence[Microscope], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    found = []
+    for m, column in zip(kinds, columns, strict=True):
+        array = m.imager.array
+        numbers = {
+            "radius_of_curvature_mm": array.radius_of_curvature,
+            "aperture_diameter_mm": array.aperture_diameter,
+            "conic_constant": array.conic_constant,
+            "focal_length_mm": m.focal_length,
+            "clear_diameter_mm": m.clear_diameter,
+        }
+        spots = {name: [_round(float(x)) for x in column[name]] for name in ("spot_width_um", "spot_radius_um")}
+        found.append({"lenses": len(array.centers), **{k: _round(float(x)) for k, x in numbers.items()}, **spots})
+    return found
+
+
+def _columns(m: Microscope) -> dict[str, Any]:
+    axis = jnp.zeros(1)
     width, radius = eqx.filter_jit(lambda m: (psf_width(m), encircled_radius(m)))(m)
-    columns = {
+    return {
         "magnification": m.magnification,
         "scale": m.scale,
         "lateral_resolution_um": m.lateral_resolution * 1000,
@@ -75,7 +153,7 @@ def datasheet(
         "depth_of_field_mm": m.depth_of_field,
         "near_limit_mm": m.near_limit,
         "far_limit_mm": m.far_limit,
-        "lenses_per_point": jnp.broadcast_to(m.lenses_per_point, len(depths)),
+        "lenses_per_point": jnp.broadcast_to(m.lenses_per_point, m.depths.shape),
         "occupancy": m.occupancy,
         "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(m.wavefront(axis))[:, 0], m.imager.wavelength),
         "focus_distance_mm": m.focus_distance,
@@ -83,22 +161,12 @@ def datasheet(
         "spot_width_um": width * 1000,
         "spot_radius_um": radius * 1000,
     }
-    return {
-        "depth_mm": depths,
-        **{name: [_round(value) for value in column.tolist()] for name, column in columns.items()},
-        "f_number": _round(float(m.f_number)),
-        "numerical_aperture": _round(float(m.numerical_aperture)),
-        "focal_length_mm": _round(float(m.focal_length)),
-        "pitch_mm": _round(float(distances.mean())),
-        "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
-        "field_radius_mm": design.imaging.field_radius_mm,
-        "coverage": _round(covered),
-    }
 
 
 def tables(sheet: dict[str, Any]) -> list[Table]:
     """A datasheet to read: an image in focus, how far out of focus it is, and what to expect. All fit 80 columns."""
-    return [_table(title, columns, sheet) for title, columns in _TABLES.items()]
+    made = [_table(title, columns, sheet) for title, columns in _TABLES.items()]
+    return made + ([_table_of_kinds(sheet)] if len(sheet.get("kinds", ())) in range(2, _COLUMNS + 1) else [])
 
 
 def summary(design: Design, sheet: dict[str, Any]) -> str:
@@ -107,8 +175,16 @@ def summary(design: Design, sheet: dict[str, Any]) -> str:
         f"{design.name}: f = {_plain(sheet['focal_length_mm'])} mm, F/{_plain(sheet['f_number'])}, "
         f"NA {_plain(sheet['numerical_aperture'])}, pitch {_plain(sheet['pitch_mm'])} mm "
         f"(SD {_plain(sheet['pitch_sd_mm'])} mm), field radius {_plain(sheet['field_radius_mm'])} mm, "
-        f"{100 * sheet['coverage']:.1f} % of the plate covered"
+        f"{100 * sheet['coverage']:.1f} % of the plate covered{_kinds_in_words(sheet)}"
     )
+
+
+def _kinds_in_words(sheet: dict[str, Any]) -> str:
+    if not (kinds := sheet.get("kinds")):
+        return ""
+    focal = [kind["focal_length_mm"] for kind in kinds]
+    ends = f"f = {_plain(min(focal))} to {_plain(max(focal))} mm"
+    return f"; {len(kinds)} kinds of lenses, {ends}: means above, the sharpest kind at each depth below"
 
 
 _TABLES = {
@@ -136,6 +212,8 @@ _TABLES = {
         "spot_radius_um": "radius of\n80 % of the light",
     },
 }
+# Kinds that a table has room for.
+_COLUMNS = 6
 # Below it a Strehl ratio only says that diffraction does not limit the image.
 _LEAST_STREHL = 0.01
 
@@ -146,6 +224,17 @@ def _table(title: str, columns: dict[str, str], sheet: dict[str, Any]) -> Table:
         table.add_column(header, justify="right")
     for row in zip(*(sheet[key] for key in columns), strict=True):
         table.add_row(*(_cell(key, value) for key, value in zip(columns, row, strict=True)))
+    return table
+
+
+def _table_of_kinds(sheet: dict[str, Any]) -> Table:
+    title = "Width at half height by each kind of lens: in the object, um"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    table.add_column("depth\nmm", justify="right")
+    for kind in sheet["kinds"]:
+        table.add_column(f"{kind['lenses']} of f =\n{_plain(kind['focal_length_mm'])} mm", justify="right")
+    for i, depth in enumerate(sheet["depth_mm"]):
+        table.add_row(_plain(depth), *(_plain(kind["spot_width_um"][i]) for kind in sheet["kinds"]))
     return table
 
 

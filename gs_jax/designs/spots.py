@@ -72,7 +72,7 @@ def _spots(c: Microscope):
     rays = jax.vmap(jax.vmap(trace, (None, 0)), (0, None))(c.depths, heights)
     lit = jnp.where(rays.valid, weights[None, None], 0)
     total = jnp.sum(lit, -1, keepdims=True)
-    weight = envelope(heights[None] ** 2, c.reduced[:, None], c.imager.field_radius)
+    weight = envelope(heights[None] ** 2, c.reduced[:, None], c.field_radius)
     return rays.landing, weight / jnp.sum(weight, -1, keepdims=True), lit / jnp.where(total > 0, total, 1)
 
 
@@ -83,4 +83,4 @@ def _centroid(landing, lit):
 def field_heights(c: Microscope) -> Float[Array, " field"]:
     """Heights at which a lens is judged over its field, mm: the middles of rings of equal area."""
     rings = (np.arange(_FIELDS) + 0.5) / _FIELDS
-    return c.imager.field_radius * jnp.sqrt(jnp.asarray(rings, c.depths.dtype))
+    return c.field_radius * jnp.sqrt(jnp.asarray(rings, c.depths.dtype))

@@ -1,4 +1,4 @@
-"""Two columns of numbers, out of tables as other programs and people write them."""
+"""Columns of numbers, two or more, out of tables as other programs and people write them."""
 
 import contextlib
 import csv
@@ -21,13 +21,14 @@ _SEPARATORS = ";\t,"
 
 
 class Columns(NamedTuple):
-    """The numbers `(row, 2)`, and what the header calls them; None without a header."""
+    """The numbers `(row, 2)`, and what the header calls them, None without a header; further columns by their names."""
 
     numbers: Float64[np.ndarray, "row 2"]
     names: tuple[str, str] | None
+    more: dict[str, Float64[np.ndarray, " row"]]
 
 
-def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) -> Columns:
+def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, also: Sequence[str] = ()) -> Columns:
     """x and y of a table of text, with a header or without.
 
     Values are separated by semicolons, tabs, commas or blanks, the first of these that the first line has. Blanks
@@ -41,12 +42,14 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
         two.
     most
         Rows that are allowed.
+    also
+        Names of further columns, which are read if the header has them.
 
     Raises
     ------
     InputError
         If it cannot be read, has no two columns or not the wanted ones, lines of different length, a value of x or y
-        that is not a finite number, or too many rows.
+        that is not a finite number, or too many rows. So it is with further columns, of which there is one of a name.
     """
     lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), 1) if line.strip()]
     body = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
@@ -67,16 +70,21 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int) 
     if names and any(_is_number(name, separator) for name in names):
         raise InputError(f"{path}: found the first line {short_repr(','.join(first))}, allowed: names, or numbers.")
     if (plain := _plain_numbers(body, len(first), separator)) is not None:
-        return Columns(plain[:, at], names)
+        return Columns(plain[:, at], names, {})
+    further = {name: header.index(name) for name in also if header and name in header}
+    if twice := next((name for name in further if (header or []).count(name) > 1), None):
+        raise InputError(f"{path}: found {short_repr(twice)} more than once in the header, allowed: one such column.")
+    called, places = [*(names or "xy"), *further], [*at, *further.values()]
     rows = []
     for number, line in body:
         values = _values(path, number, line, separator)
         if len(values) != len(first):
             expected = f"{len(first)} ({','.join(header)})" if header else f"{len(first)}, as in the first line"
             raise InputError(f"{path}: line {number}: found {len(values)} values, allowed: {expected}.")
-        cells = zip((values[i] for i in at), names or "xy", strict=True)
+        cells = zip((values[i] for i in places), called, strict=True)
         rows.append([finite_number(f"{path}: line {number}, {name}", _point(cell, separator)) for cell, name in cells])
-    return Columns(np.array(rows, dtype=float).reshape(-1, 2), names)
+    table = np.array(rows, dtype=float).reshape(-1, len(places))
+    return Columns(table[:, :2], names, dict(zip(further, table[:, 2:].T, strict=True)))
 
 
 def _plain_numbers(body: Sequence[tuple[int, str]], count: int, separator: str) -> np.ndarray | None:

@@ -4,11 +4,14 @@ import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, ValidationError
 
 from ..base.errors import short_repr
 
 Place = tuple[int | str, ...]
+# Of a value that is one number or several: pydantic's names for which of the two it is, which are no keys.
+ONE, EACH = "one number", "one for each"
+one_or_each = Discriminator(lambda value: EACH if isinstance(value, list | tuple) else ONE)
 
 
 class Table(BaseModel):
@@ -49,7 +52,8 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
 
 
 def _dotted(place: Place) -> str:
-    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in place).removeprefix(".")
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place if step not in (ONE, EACH))
+    return "".join(steps).removeprefix(".")
 
 
 def _table(annotation: Any) -> type[BaseModel] | None:

@@ -17,6 +17,8 @@ from scipy.spatial import Delaunay, KDTree, Voronoi
 from ..base.errors import InputError
 
 Number = float | int
+# Of a place in single precision: a lens on the plate's edge is on the plate.
+ROUNDING = 1e-6
 
 
 def nearest_neighbour_distances(centers: Float[np.ndarray, "lens 2"]) -> Float[np.ndarray, " lens"]:
@@ -130,7 +132,7 @@ def check_positive(name, value):
 
 
 def _check_inside(centers, half):
-    outside = (np.abs(centers) > half * (1 + 1e-9)).any(axis=1) | ~np.isfinite(centers).all(axis=1)
+    outside = (np.abs(centers) > half * (1 + ROUNDING)).any(axis=1) | ~np.isfinite(centers).all(axis=1)
     if outside.any() or len(centers) == 0:
         raise InputError(
             f"`centers` must be one or more points on a plate of {in_mm(half)}, got {outside.sum()} outside."

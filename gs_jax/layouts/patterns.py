@@ -78,6 +78,14 @@ def random_layout(
         If an argument is out of range, if lenses so few and small cannot cover the plate, if the pitch is
         larger than in a hexagonal layout, or if the search fails; then it says how close it came (after about
         4 s for 200 lenses).
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> centers = gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1)
+    >>> centers.shape
+    (20, 2)
+    >>> array = gs.MicrolensArray(centers, size=(6.0, 6.0))
     """
     half = half_size(size)
     if count < 1:

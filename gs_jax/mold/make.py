@@ -82,6 +82,16 @@ def make_mold(
         If a file cannot be read or written, or the design cannot be made, before anything is written.
     RuntimeError
         If the solid, or what was read back, is not the design: a fault of the program.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gs_jax as gs
+    >>> design = gs.geomscope()
+    >>> few = design.array.model_copy(update={"centers_mm": ((-0.5, 0.1), (0.6, 0.0)), "size_mm": (3.0, 3.0)})
+    >>> report = gs.make_mold(design.model_copy(update={"array": few}), "mold.stl", chord=0.002)
+    >>> sorted(path.name for path in Path().glob("mold.*"))
+    ['mold.json', 'mold.png', 'mold.stl', 'mold.txt']
     """
     progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)

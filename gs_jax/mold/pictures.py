@@ -34,7 +34,7 @@ def preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> Figure
     heights = figure.add_subplot(1, 2, 1)
     _draw_heights(figure, heights, array, "array" if shape is None else "cavity of the mold, before shrinkage")
     view = figure.add_subplot(1, 2, 2, projection="3d")
-    draw_solid(view, _coarse(array, shape), from_below=shape is None)
+    draw_solid(view, coarse_solid(array, shape), from_below=shape is None)
     figure.suptitle(f"{_printable(name)}: {'array' if shape is None else 'negative mold'}, {len(array.centers)} lenses")
     return figure
 
@@ -55,7 +55,8 @@ def _draw_heights(figure, axes, array, what):
     figure.colorbar(image, ax=axes, label="height over the plate, um", shrink=0.85)
 
 
-def _coarse(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold:
+def coarse_solid(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold:
+    """The mold of a shape, or the array, in no more facets than a picture shows."""
     caps = caps_of(array)
     # Equilateral facets of a sphere: a depth of `side^2 / (6 R)` below it.
     chord = math.prod(array.size) / (_FACETS * 1.5 * math.sqrt(3) * min(cap.radius for cap in caps))
@@ -71,7 +72,8 @@ def draw_solid(axes, solid: m3.Manifold, *, from_below: bool) -> None:
     corners = mesh.vert_properties[:, :3][mesh.tri_verts.astype(int)]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    toward = np.array([0.35, -0.55, -0.75 if from_below else 0.75])
+    # From the upper left of the picture, where eyes expect it: else cavities look like bumps.
+    toward = np.array([0.0, -0.94, -0.33] if from_below else [-0.58, 0.0, 0.81])
     light = 0.25 + 0.75 * np.clip(normal @ toward, 0, 1)
     color = np.column_stack([light[:, None] * np.array([[0.78, 0.86, 0.95]]), np.ones(len(light))])
     axes.add_collection3d(Poly3DCollection(corners, facecolors=color, edgecolors=color, linewidths=0.3))

@@ -23,7 +23,7 @@ from matplotlib.textpath import TextPath
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..layouts.cells import half_size, in_mm, nearest_neighbour_distances
+from ..layouts.cells import ROUNDING, half_size, in_mm, nearest_neighbour_distances
 from ..lenses import MicrolensArray
 from .caps import DRAFT, Cap, cap_sag, caps_of, visible_reaches
 from .facets import estimated_facets, facet_cap
@@ -165,7 +165,7 @@ def check_array(array: MicrolensArray) -> None:
     centers, half = np.asarray(array.centers, float), half_size(array.size)
     if not np.isfinite(centers).all():
         raise ValueError("`centers` must be finite.")
-    if outside := int((np.abs(centers) > half * (1 + 1e-9)).any(axis=1).sum()):
+    if outside := int((np.abs(centers) > half * (1 + ROUNDING)).any(axis=1).sum()):
         raise InputError(f"`centers` must be points on a plate of {in_mm(half)}, got {outside} outside.")
     if fault := too_wide(caps_of(array)):
         raise ValueError(f"`aperture_diameter` must be positive and at most {fault.allowed}, got {fault.found}.")

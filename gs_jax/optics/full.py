@@ -132,8 +132,9 @@ class _Wanted:
     progress: Progress | None = dataclasses.field(compare=False)
 
 
-# Capture after capture of a microscope has the same tables; these are kept, some 80 MiB each at full scale.
-@lru_cache(maxsize=2)
+# Capture after capture of a microscope has the same tables, one for each kind of lens; these are kept, some 80 MiB each
+# at full scale.
+@lru_cache(maxsize=4)
 def _tables(wanted):
     imager, depths, grid, progress = wanted.imager, wanted.depths, wanted.grid, wanted.progress
     cores = core_tables(imager, depths, CORE_REACH * grid.pixel, wanted.rings, progress)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from ..geometry import Imager
-from ..lenses import MicrolensArray
+from ..lenses import EACH, MicrolensArray, sag
 from .aperture import aperture_area
 from .psf import GOLDEN_ANGLE
 from .refraction import on_host, passed, refracted, solid_angle
@@ -68,18 +68,46 @@ def zones(array: MicrolensArray) -> Zones:
 
 def _open_shares(array):
     """Radii, and the share of each lens's circle that is open there."""
+    array.check_alike()
     centers = np.asarray(array.centers, np.float64)
     diameter = float(array.aperture_diameter)
     radius = (np.arange(_RADII) + 0.5) * diameter / 2 / _RADII
     angle = 2 * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
     points = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     shares = np.empty((len(centers), _RADII))
-    for lens, center in enumerate(centers):
-        offsets = np.delete(centers, lens, 0) - center
-        offsets = offsets[(offsets**2).sum(1) <= diameter**2]
-        beyond = points @ offsets.T > (offsets**2).sum(1) / 2
-        shares[lens] = 1 - beyond.any(-1).mean(1)
+    covered = _covered_by_alike(centers, diameter) if array.others is None else _covered_by_any(array)
+    for lens in range(len(centers)):
+        shares[lens] = 1 - covered(lens, points).mean(1)
     return radius, shares
+
+
+def _covered_by_alike(centers, diameter):
+    """Half-way to a neighbour and beyond."""
+
+    def covered(lens, points):
+        offsets = np.delete(centers, lens, 0) - centers[lens]
+        offsets = offsets[(offsets**2).sum(1) <= diameter**2]
+        return (points @ offsets.T > (offsets**2).sum(1) / 2).any(-1)
+
+    return covered
+
+
+def _covered_by_any(array):
+    """Within the disc of a neighbour that is less below the plane of the vertices."""
+    whole, mine = on_host(array.whole), on_host(array)
+    radius, diameter, conic = (getattr(whole, name) for name in EACH)
+    rim, own = diameter / 2, float(mine.aperture_diameter) / 2
+
+    def covered(lens, points):
+        offsets, squared = whole.centers - whole.centers[lens], (points**2).sum(-1)
+        here, found = mine.sag(np.minimum(squared, own**2)), np.zeros(squared.shape, bool)
+        for j in np.flatnonzero(np.hypot(*offsets.T) <= rim + own):
+            apart = ((points - offsets[j]) ** 2).sum(-1)
+            its = sag(np.minimum(apart, rim[j] ** 2), radius[j], conic[j], mine.aspheric_terms)
+            found |= (j != lens) & (apart <= rim[j] ** 2) & (its < here)
+        return found
+
+    return covered
 
 
 def spot_rays(

@@ -5,17 +5,18 @@ the field broadcast. All arrays of a call, those of the imager too, are JAX's (t
 what is traced once and is a constant to derivatives needs no compiler, which takes as long as a hundred times the rays.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
 from ..base.arrays import library_of
 from ..geometry import Imager, chief_ray
+from ..lenses import MicrolensArray, Scalars
 
-# Of either library, as all of a call are; `Coordinates` are `(2, ...)`.
-Scalars = Any
+# `(2, ...)`, of either library, as all of a call are.
 Coordinates = Any
+Module = TypeVar("Module", Imager, MicrolensArray)
 
 # Newton's steps for the height of refraction at the plane. Each squares an error that starts at 1e-3.
 _STEPS = 3
@@ -44,9 +45,9 @@ class Refraction(NamedTuple):
     valid: Any
 
 
-def on_host(imager: Imager) -> Imager:
-    """The same imager with NumPy's arrays, in float64."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), imager)
+def on_host(module: Module) -> Module:
+    """The same imager, or array, with NumPy's arrays, in float64."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), module)
 
 
 def dot(a: Coordinates, b: Coordinates) -> Scalars:
@@ -64,7 +65,7 @@ def refracted(imager: Imager, depth: Scalars, point: Coordinates, field: Coordin
 
     Raises
     ------
-    ValueError
+    InputError
         If the imager's lenses differ.
     """
     imager.array.check_alike()

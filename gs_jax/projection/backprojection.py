@@ -53,6 +53,20 @@ def backproject(
     ------
     ValueError
         If the image is not `sensor.shape`, or `method` is neither of the two.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import jax, jax.numpy as jnp, numpy as np
+    >>> image = np.random.default_rng(0).random((200, 200))
+    >>> gs.backproject(image, scope, grid).shape
+    (3, 41, 41)
+    >>> slope = jax.grad(lambda s: jnp.sum(gs.backproject(image, s, grid) ** 2))(scope)
+    >>> slope.array.centers.shape
+    (3, 2)
     """
     if image.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
@@ -97,6 +111,20 @@ def backproject_adjoint(
     ------
     ValueError
         If the volume is not of the grid's shape, or `method` is neither of the two.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> random = np.random.default_rng(0)
+    >>> image, volume = random.random((200, 200)), random.random(grid.volume_shape)
+    >>> there = np.vdot(gs.backproject(image, scope, grid), volume)
+    >>> back = np.vdot(image, gs.backproject_adjoint(volume, scope, grid))
+    >>> print(round(float(there / back), 4))
+    1.0
     """
     if volume.shape != grid.volume_shape:
         raise ValueError(f"`volume` must be of the grid's shape {grid.volume_shape}, got {volume.shape}.")

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
 from ..optics.full import FullOptics
+from ..optics.kinds import KindOptics, of_kinds
 from ..voxels import Grid
 from .backprojection import as_volume, backproject_adjoint
 from .convolve import convolved, image_in_groups, with_margin
@@ -15,7 +16,7 @@ from .full import full_image
 # Depths that share a transform back, for the memory of as many sharp images.
 _TOGETHER = 2
 
-Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | None
+Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | KindOptics | None
 
 
 @jax.jit
@@ -47,7 +48,7 @@ def forward(
     optics
         `gs_jax.optics_of` makes it by name. None: points, which makes this the adjoint of `backproject`. An array:
         PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size.
-        `FullOptics`: all light, by tables for these depths.
+        `FullOptics`: all light, by tables for these depths. `KindOptics`: either of these for each kind of lens.
 
     Returns
     -------
@@ -60,10 +61,28 @@ def forward(
     ------
     ValueError
         If the volume is not of the grid's shape, or there is not one PSF of odd size, or table, for each depth.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> scene = np.zeros(grid.volume_shape)
+    >>> scene[1, 20, 20] = 1.0
+    >>> image = gs.forward(scene, scope, grid)  # by pinholes
+    >>> sharp = gs.forward(scene, scope, grid, gs.optics_of(scope, grid.depths, "near"))  # Eq. (2)
+    >>> image.shape, sharp.shape
+    ((200, 200), (200, 200))
     """
     volume = as_volume(volume, imager)
     if optics is None:
         return backproject_adjoint(volume, imager, grid)
+    if isinstance(optics, KindOptics):
+        each = zip(of_kinds(imager, optics.lenses), optics.optics, strict=True)
+        images = [forward(volume, one, grid, its) for one, its in each]
+        return sum(images[1:], images[0])
     if isinstance(optics, FullOptics):
         if len(optics.kernel) != grid.depths.size:
             raise ValueError(

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.full import full_optics
+from ..optics.full import full_optics, halo_nodes
+from ..optics.kinds import KindOptics, lenses_by_kind, of_kinds, relative_areas
 from ..optics.window import psf_of_depth
 from .forward_model import Optics
 
@@ -37,8 +38,8 @@ def optics_of(
 
     Returns
     -------
-    None, Array or FullOptics
-        Tables for these depths, in their order.
+    None, Array, FullOptics or KindOptics
+        Tables for these depths, in their order; of lenses that differ, for each kind.
 
     Raises
     ------
@@ -47,14 +48,29 @@ def optics_of(
 
     Examples
     --------
-    >>> image = forward(volume, imager, grid, optics_of(imager, grid.depths, "full"))
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> spots = gs.optics_of(scope, grid.depths, "near")
+    >>> print(spots.shape[0], gs.optics_of(scope, grid.depths, "pinhole"))
+    3 None
     """
     if level not in LEVELS:
         raise InputError(f"optics: found {short_repr(level)}, allowed: {', '.join(LEVELS)}.")
     if level == "pinhole":
         return None
     depths = np.asarray(depths)
-    if level == "full":
-        return full_optics(imager, depths, progress=progress)
+    if not imager.array.alike:
+        each = of_kinds(imager, lenses := lenses_by_kind(imager))
+        if level == "full":
+            nodes = halo_nodes(imager, depths)
+            return KindOptics(lenses, tuple(full_optics(one, depths, nodes=nodes, progress=progress) for one in each))
+        light = zip(each, relative_areas(each).tolist(), strict=True)
+        return KindOptics(lenses, tuple(share * _near(one, depths, progress) for one, share in light))
+    return full_optics(imager, depths, progress=progress) if level == "full" else _near(imager, depths, progress)
+
+
+def _near(imager, depths, progress):
     kernel = psf_of_depth(imager, depths, "geometric")
     return jnp.stack([kernel(z) for z in (progress or Progress()).track(depths, "Point spread functions")])

@@ -51,6 +51,17 @@ def deconvolve(
     ------
     InputError
         If the PSF is dark.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> psf = np.zeros((33, 33))
+    >>> psf[16, [8, 16, 26]] = 1.0  # three spots for each point
+    >>> image = np.zeros((64, 64))
+    >>> image[30, [22, 30, 40]] = 1.0  # of a point at row 30, column 30
+    >>> scene = gs.deconvolve(image, psf, gs.FISTA(steps=50))
+    >>> print(*divmod(int(scene.argmax()), 64))
+    30 30
     """
     progress = progress or Progress()
     light, spot = (above_offset(np.asarray(part, np.float32)) for part in (image, psf))

@@ -14,6 +14,7 @@ from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..optics.cores import apparent_depths
+from ..optics.kinds import kind_weights, lenses_by_kind, of_kinds
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS
@@ -117,7 +118,20 @@ def reconstruct(
 
     Examples
     --------
-    >>> volume = reconstruct(image, imager, grid, RichardsonLucy(steps=20))
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> volume = gs.reconstruct(image, scope, grid)
+    >>> better = gs.reconstruct(image, scope, grid, gs.RichardsonLucy(steps=5), optics="near")
+    >>> volume.shape
+    (3, 41, 41)
+    >>> peak = np.array(np.unravel_index(better.argmax(), better.shape))
+    >>> print(grid.to_mm(peak).round(6))  # the point's place, mm
+    [ 0.2 -0.1 20. ]
     """
     if image.shape != imager.sensor.shape:
         raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
@@ -152,11 +166,20 @@ def reconstructor(
     Raises
     ------
     InputError
-        If `method` is no method, there is no such optics, or a depth is blurred over more than 128 pixels ("near").
+        If `method` is no method, or none for lenses that differ, there is no such optics, or a depth is blurred over
+        more than 128 pixels ("near").
     """
     by_name = isinstance(optics, str)
     _check(method, optics)
     on_cores = by_name and optics != "pinhole"
+    if on_cores and not imager.array.alike:
+        if isinstance(method, BackProjection):
+            return _back_projector_of_kinds(imager, grid, method)
+        if isinstance(method, ListRichardsonLucy | Unrolled):
+            allowed = "a method that uses the adjoint, such as RichardsonLucy or FISTA"
+            raise InputError(f"method: found {type(method).__name__} and lenses that differ, allowed: {allowed}.")
+        # Others use the operator's own adjoint: no depth is the apparent one of all lenses.
+        on_cores = False
     seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
     if isinstance(method, BackProjection):
         return lambda image, progress: _back_projected(image, imager, seen, method, progress)
@@ -190,6 +213,26 @@ def _explained(image, model, system, method, stop_at_noise, progress):
         # Its steps were trained together.
         return iterated(method, progress, light, system)
     return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
+
+
+def _back_projector_of_kinds(imager, grid, method):
+    """Each kind of lens is read where its own cores land, and counts as it is bright and sharp at each depth."""
+    depths = np.asarray(grid.depths, np.float64)
+    each = of_kinds(imager, lenses_by_kind(imager))
+    side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
+    weights = kind_weights(each, depths, side)[..., None, None].astype(np.float32)
+    parts = [(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in zip(each, weights, strict=True)]
+    plain = dataclasses.replace(method, normalize=False)
+
+    def volume_of(image, progress):
+        total = lambda image: sum(w * _back_projected(image, one, seen, plain, progress) for one, seen, w in parts)
+        volume = np.asarray(total(image), np.float32)
+        if not method.normalize:
+            return volume
+        light = total(np.ones_like(image, np.float32))
+        return np.divide(volume, light, out=np.zeros_like(volume), where=light > 0)
+
+    return volume_of
 
 
 def _back_projected(image, imager, grid, method, progress):

@@ -55,6 +55,20 @@ def reproject(
         `grid.volume_shape`, of any method.
     image, imager, grid, optics, progress
         As for `reconstruct`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> volume = gs.reconstruct(image, scope, grid, gs.RichardsonLucy(steps=10), optics="near")
+    >>> found = gs.reproject(volume, image, scope, grid, optics="near")
+    >>> print(found.error < 0.5, found.correlation > 0.9, found.regions.shape)
+    True True (16, 16)
     """
     model = model_of(imager, grid, optics, progress or Progress())
     light, background = explainable(image, model)

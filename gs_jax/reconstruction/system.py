@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Num
 from ..base.progress import Progress
 from ..geometry import Imager, Sensor
 from ..optics.full import FullOptics
+from ..optics.kinds import KindOptics
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import forward_operator
@@ -124,6 +125,8 @@ def _coarser(imager, grid):
 
 def slow_waves(imager: Imager, optics: Optics) -> int:
     """Of the image's longest cosine waves each way, those that a background makes which `optics` holds all of."""
+    if isinstance(optics, KindOptics):
+        optics = optics.optics[0]
     if not isinstance(optics, FullOptics):
         return 0
     return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.halo.grid.pixel))

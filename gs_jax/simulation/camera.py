@@ -41,6 +41,11 @@ class Camera(eqx.Module):
     ------
     ValueError
         If a number is out of range (values that JAX traces are not looked at).
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> camera = gs.Camera(gain=2.5, offset=100.0, read_noise=1.6, full_well=10_000.0, bits=12)
     """
 
     gain: Float[Array, ""] = eqx.field(converter=as_float, default=10.0)
@@ -93,6 +98,13 @@ def expose(
     ValueError
         If the image is negative somewhere, NaN or infinite, or `peak_electrons` is not positive and finite
         (values that JAX traces are not looked at).
+
+    Examples
+    --------
+    >>> import gs_jax as gs, jax, numpy as np
+    >>> counts = gs.expose(np.eye(64), gs.Camera(), jax.random.key(0), peak_electrons=10_000)
+    >>> print(counts.dtype, round(float(np.median(counts))))  # dark pixels: the offset
+    uint16 16
     """
     image = jnp.asarray(image)
     peak = jnp.asarray(peak_electrons, image.dtype)

@@ -16,6 +16,7 @@ from ..geometry import Imager, Sensor
 from ..io.points import read_points
 from ..io.volumes import read_volume
 from ..optics.full import full_optics, halo_nodes
+from ..optics.kinds import lenses_by_kind, of_kinds, relative_areas
 from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
@@ -65,8 +66,8 @@ def simulate(
         Of a volume.
     optics
         "full": all light of every lens, where it lands, by exact rays; intensities are what is sent out in all
-        directions. "near": Eq. (2), one PSF for all lenses within the field radius; intensities are what a lens on the
-        axis gets.
+        directions. "near": Eq. (2), one PSF for all lenses (of a kind) within the field radius; intensities are what
+        the mean lens on the axis gets.
     psf
         Of a lens, for "near": "diffraction" (the default), "geometric" (rays alone) or "gaussian"; the quicker ones
         last.
@@ -78,6 +79,18 @@ def simulate(
     InputError
         If there is no such optics or PSF, a voxel is negative, the work would not fit into the memory, or a depth is
         blurred over more than 128 pixels each way ("near").
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> image.shape
+    (200, 200)
     """
     if optics not in OPTICS:
         raise InputError(f"`optics`: found {short_repr(optics)}, allowed: {', '.join(OPTICS)}.")
@@ -86,9 +99,18 @@ def simulate(
     if psf not in (None, *PSFS):
         raise InputError(f"`psf`: found {short_repr(psf)}, allowed: {', '.join(PSFS)}.")
     kind = "full" if optics == "full" else psf or "diffraction"
-    if grid is None:
-        return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
-    return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
+
+    def image_of(imager):
+        if grid is None:
+            return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
+        return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
+
+    if imager.array.alike:
+        return image_of(imager)
+    each = of_kinds(imager, lenses_by_kind(imager))
+    light = np.ones(len(each)) if optics == "full" else relative_areas(each)
+    images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
+    return np.sum(images, 0)
 
 
 def simulate_volume(

@@ -90,6 +90,18 @@ def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> S
     ------
     InputError
         If the image is not of the operator's output shape.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> image = gs.forward(np.ones(grid.volume_shape), scope, grid)
+    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.RichardsonLucy(steps=5))
+    >>> found.x.shape, found.costs.shape
+    ((3, 41, 41), (5,))
     """
     state = solver.init(A, image)
     if not solver.tolerance:

@@ -70,6 +70,21 @@ class RichardsonLucy(eqx.Module):
     ------
     InputError
         If an option is negative, or a number of steps 0, or of tents 1.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> A = gs.forward_operator(scope, grid)
+    >>> scene = np.zeros(grid.volume_shape)
+    >>> scene[1, 19, 22] = 1.0
+    >>> image = gs.forward(scene, scope, grid)
+    >>> found = gs.solve(A, image, gs.RichardsonLucy(steps=30, accelerate=True))
+    >>> print(bool(found.costs[-1] < found.costs[0]), np.unravel_index(found.x.argmax(), grid.volume_shape)[0])
+    True 1
     """
 
     steps: int = eqx.field(static=True, default=20)

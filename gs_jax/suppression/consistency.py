@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Shaped
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
@@ -45,13 +45,17 @@ def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
 
 
 class Readings(NamedTuple):
-    """What lenses read of points, one row a point; where `seen` is false no lens sees it, and zeros fill the row."""
+    """What lenses read of points, one row a point; where `seen` is false no lens sees it, and zeros fill the row.
+
+    `kind` says of which kind a lens is, if lenses differ.
+    """
 
     pixels: Float64[np.ndarray, "point lens 2"]
     light: Float64[np.ndarray, "point lens"]
     noise: Float64[np.ndarray, "point lens"]
     field: Float64[np.ndarray, "point lens"]
     seen: Bool[np.ndarray, "point lens"]
+    kind: Int[np.ndarray, "point lens"] | None = None
 
 
 def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Imager) -> Readings:
@@ -87,7 +91,7 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
 
 def select_readings(readings: Readings, which) -> Readings:
     """The readings of some points, by index, slice or mask."""
-    return Readings(*(part[which] for part in readings))
+    return Readings(**{name: part[which] for name, part in readings._asdict().items() if part is not None})
 
 
 def agreed_level(

@@ -8,13 +8,17 @@ from jaxtyping import Array, Float, Float64, Int, Shaped
 
 from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
+from ..optics.kinds import lenses_by_kind, of_kinds
 from ..voxels import Grid
-from .consistency import Signal, agreed_level, log_false_alarms, readings, signal, survival
+from .consistency import Signal, agreed_level, log_false_alarms, signal, survival
+from .kinds import kinds_of, readings_of
 from .locate import APERTURE, FIELDS, LIT, SHARE, count_of, searched_voxels
 
 # Least part of a spot's light, of lenses within the field radius, that must fall into its core. The paper's microscope
 # has 21 to 51 % in focus, over 18 to 22 mm, and 1 % with its sensor at 4 mm.
 LEAST_SHARP = 0.05
+# Depths at which it is asked which kinds of lenses can see points.
+_DEPTHS = 9
 # What a file holds in the place of the logarithm of 0.
 _LEAST_LOG = -999.0
 
@@ -48,9 +52,13 @@ def point_evidence(
     light, places = image if isinstance(image, Signal) else signal(image), np.array(points[:, :3], np.float64)
     # Cores lie, and are looked for, where chief rays of other depths land.
     ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
-    apparent = np.asarray(apparent_depths(imager, np.concatenate([ends, points[:, 2]])), np.float64)
+    depths = np.concatenate([ends, points[:, 2]])
+    kinds = kinds_of(
+        imager, np.linspace(depths.min(), depths.max(), _DEPTHS), (2 * APERTURE + 1) * imager.sensor.pixel_pitch
+    )
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
     places[:, 2] = apparent[2:]
-    seen = readings(places, light, imager)
+    seen = readings_of(places, light, kinds)
     lenses, noise = seen.seen.sum(1), seen.noise.max(1, initial=0)
     level = agreed_level(seen.light, seen.seen, SHARE)
     tests = count_of(searched_voxels(imager, grid.at(apparent[:2])))
@@ -68,6 +76,8 @@ def sharpness(imager: Imager, grid: Grid) -> float:
     """
     depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
     fields = np.linspace(0, imager.field_radius, FIELDS)
-    in_square = lambda side: core_shares(imager, depths, fields, side) @ fields
     core = (2 * APERTURE + 1) * imager.sensor.pixel_pitch
-    return float((in_square(core) / in_square(math.inf)).min())
+    each = [imager] if imager.array.alike else of_kinds(imager, lenses_by_kind(imager))
+    in_square = lambda one, side: core_shares(one, depths, fields, side) @ fields
+    # At each depth the kind of lenses that is the sharpest.
+    return float(np.max([in_square(one, core) / in_square(one, math.inf) for one in each], 0).min())

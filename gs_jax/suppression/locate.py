@@ -6,8 +6,10 @@ are rows `(x, y, z, intensity)`, mm; `gs_jax.simulation.phantoms.rasterize` make
 """
 
 import math
+from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
 from scipy.ndimage import map_coordinates
@@ -25,13 +27,13 @@ from .consistency import (
     Signal,
     agreed_level,
     log_false_alarms,
-    readings,
     select_readings,
     signal,
     spot_profile,
     survival,
     without_spots,
 )
+from .kinds import Kind, kinds_of, readings_of
 
 Points = Float64[np.ndarray, "_ 4"]
 Places = Float64[np.ndarray, "_ 3"]
@@ -103,31 +105,45 @@ def find_points(
     ------
     ValueError
         If the image is not `sensor.shape`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
+    >>> scope = gs.Imager(array, gs.Sensor((900, 900), 0.009), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> truth = np.array([[0.5, -0.4, 19.5, 1.0], [-0.7, 0.2, 20.5, 0.8]])
+    >>> image = gs.simulate(truth, scope, optics="near", psf="geometric")
+    >>> found = gs.find_points(image, scope, grid)
+    >>> gs.localization(found, truth).f1
+    1.0
     """
     progress = progress or Progress()
     seen = image if isinstance(image, Signal) else signal(image)
     if seen.light.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {seen.light.shape}.")
     depths = _around(grid)
-    apparent = np.asarray(apparent_depths(imager, depths), np.float64)
+    kinds = kinds_of(imager, depths, (2 * APERTURE + 1) * imager.sensor.pixel_pitch)
+    # Of lenses that differ, each kind is read where its own cores land: points are at their depths all along.
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
     voxels = searched_voxels(imager, searched)
     # What is less is not lit.
     least = LIT * float(seen.noise.min())
     as_bright = survival(seen.light, least)
-    points, spots, own = _consistent(np.zeros((0, 3)), seen, as_bright, imager, voxels)
+    points, spots, own = _consistent(np.zeros((0, 3)), seen, as_bright, kinds, voxels)
     for _ in range(_SEARCHES):
         rest = seen._replace(light=without_spots(seen.light, spots, own))
         # A spot between two voxels must not be missed.
         wide = rest._replace(light=_brightest_neighbour(rest.light))
-        new = _candidates(wide, imager, voxels, progress)
+        new = _candidates(wide, kinds, voxels, progress)
         with progress.step("Comparing lenses"):
-            lit = _lit(readings(new, wide, imager), survival(wide.light, least), count_of(voxels))
-            new = _refined(new[lit], voxels, rest, imager)
-            points, spots, own = _consistent(np.concatenate([points, new]), seen, as_bright, imager, voxels)
+            lit = _lit(readings_of(new, wide, kinds), survival(wide.light, least), count_of(voxels))
+            new = _refined(new[lit], voxels, rest, kinds)
+            points, spots, own = _consistent(np.concatenate([points, new]), seen, as_bright, kinds, voxels)
     # Until here, depths were those of chief rays.
     points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
-    found = np.column_stack([points, _intensity(points, spots, own, seen, imager)])
+    found = np.column_stack([points, _intensity(points, spots, own, seen, kinds)])
     found = found[_inside(found, grid, float(voxels.depths[1] - voxels.depths[0]) / _COARSE)]
     return found[np.argsort(-found[:, 3], kind="stable")]
 
@@ -185,7 +201,7 @@ def _brightest_neighbour(light: Float32[np.ndarray, "row column"]) -> Float32[np
     return result
 
 
-def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) -> Places:
+def _candidates(rest: Signal, kinds: Sequence[Kind], voxels: Grid, progress: Progress) -> Places:
     """Local maxima of the summed logarithms, at voxels."""
     bright = np.empty_like(rest.light)
 
@@ -200,12 +216,22 @@ def _candidates(rest: Signal, imager: Imager, voxels: Grid, progress: Progress) 
     found = [np.zeros((0, 3))]
     for first in progress.track(range(0, last - 1, inner), "Searching for points"):
         some = np.minimum(first + np.arange(inner + 2), last)
-        volume = backproject(image, imager, voxels.at(voxels.depths[some]))
+        volume = _summed(image, kinds, voxels.at(voxels.depths[some]))
         is_maximum = np.asarray(_is_maximum(volume))
         # NumPy takes long to find them in three dimensions at once.
         maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
         found.append(voxels.to_mm(maxima[maxima[:, 0] < last]))
     return np.concatenate(found)
+
+
+def _summed(image, kinds: Sequence[Kind], voxels: Grid) -> Float[Array, "depth y x"]:
+    """`backproject` by all lenses that can see each plane."""
+    if len(kinds) == 1:
+        return backproject(image, kinds[0].imager, voxels)
+    depths = np.asarray(voxels.depths, np.float64)
+    light = [(kind.sees(depths), backproject(image, kind.imager, voxels.at(kind.place(depths)))) for kind in kinds]
+    parts = [jnp.where(seen[:, None, None], volume, 0) for seen, volume in light]
+    return sum(parts[1:], parts[0])
 
 
 @jax.jit
@@ -219,14 +245,14 @@ def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
     return highest
 
 
-def _refined(points: Places, voxels: Grid, rest: Signal, imager: Imager) -> Places:
+def _refined(points: Places, voxels: Grid, rest: Signal, kinds: Sequence[Kind]) -> Places:
     """Points moved uphill between the voxels: to the best of 27 places, twice as close each time."""
     step = float(voxels.depths[1] - voxels.depths[0])
     around = (np.array(list(np.ndindex(3, 3, 3))) - 1) * (voxels.pitch, voxels.pitch, step)
     each = np.arange(len(points))
     for part in 0.5 ** np.arange(1, _REFINEMENTS + 1):
         places = points[:, None] + part * around
-        seen = readings(places.reshape(-1, 3), rest, imager)
+        seen = readings_of(places.reshape(-1, 3), rest, kinds)
         brightness = _brightness(seen.light, seen.noise).sum(1).reshape(places.shape[:2])
         points = places[each, brightness.argmax(1)]
     return points
@@ -241,14 +267,14 @@ def _lit(seen: Readings, as_bright, tests: int) -> np.ndarray:
 
 
 def _consistent(
-    candidates: Places, signal: Signal, as_bright, imager: Imager, voxels: Grid
+    candidates: Places, signal: Signal, as_bright, kinds: Sequence[Kind], voxels: Grid
 ) -> tuple[Places, Readings, Float64[np.ndarray, "point lens"]]:
     """The points among the candidates, their readings, and their own part of what was read.
 
     Brightest first; from the readings of each, the light of the points before it is taken away. Nearer than a coarse
     voxel to one of them there is no other point, only the rim of its spot.
     """
-    seen = readings(candidates, signal, imager)
+    seen = readings_of(candidates, signal, kinds)
     order = np.argsort(-agreed_level(seen.light, seen.seen, SHARE), kind="stable")
     candidates, seen = candidates[order], select_readings(seen, order)
     tests = count_of(voxels)
@@ -274,7 +300,7 @@ def _consistent(
 
 
 def _intensity(
-    points: Places, seen: Readings, own: np.ndarray, signal: Signal, imager: Imager
+    points: Places, seen: Readings, own: np.ndarray, signal: Signal, kinds: Sequence[Kind]
 ) -> Float64[np.ndarray, " point"]:
     """What the points send out, the median of the lenses.
 
@@ -285,7 +311,9 @@ def _intensity(
     middle = np.floor(seen.pixels + 0.5).astype(int)
     row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
     total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
-    expected = _expected(points, seen, imager)
+    expected = _expected(points, seen, kinds[0].imager)
+    for number, kind in enumerate(kinds[1:], 1):
+        expected = np.where(seen.kind == number, _expected(points, seen, kind.imager), expected)
     use = seen.seen & (seen.light > 0) & (expected > 0)
     ratio = np.where(use, total * own / np.where(use, seen.light * expected, 1), 0)
     return np.array([np.median(some[which]) if which.any() else 0.0 for some, which in zip(ratio, use, strict=True)])

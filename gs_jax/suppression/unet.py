@@ -154,6 +154,14 @@ def suppress(
     -------
     ndarray
         Of the volume's shape, not negative.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> volume = np.random.default_rng(0).random((3, 64, 64)) + 5.0  # background alone
+    >>> clean = gs.suppress(volume)
+    >>> clean.shape, bool(clean.min() >= 0)
+    ((3, 64, 64), True)
     """
     network = pretrained() if network is None else network
     volume = np.asarray(volume, np.float32)

@@ -1,8 +1,16 @@
 """How far what is made may be from what is designed: a table of numbers, in options or a TOML file."""
 
+from typing import Any
+
 from pydantic import Field
 
 from ..io.tables import Table
+
+
+def _amount(default: float, most: float, unit: str, title: str, *, least: float = 0.0) -> Any:
+    """A field of a number within bounds, with what the help and the error message say of it."""
+    said = f"a number {f'of {unit} ' if unit else ''}from {least:g} to {most:g}"
+    return Field(default=default, ge=least, le=most, title=title, description=said)
 
 
 class Tolerances(Table):
@@ -22,48 +30,12 @@ class Tolerances(Table):
     - layers and pixels: of a two-photon printer with grey levels; see `gs_jax.tolerances.surface`.
     """
 
-    position_um: float = Field(
-        default=3.0,
-        ge=0,
-        le=1000,
-        title="each lens's place, along x and y",
-        description="a number of um from 0 to 1000",
-    )
-    radius_percent: float = Field(
-        default=1.0, ge=0, le=20, title="radius of curvature, of all lenses", description="a number of % from 0 to 20"
-    )
-    conic: float = Field(
-        default=0.05, ge=0, le=2, title="conic constant, of all lenses", description="a number from 0 to 2"
-    )
-    index: float = Field(default=0.002, ge=0, le=0.1, title="refractive index", description="a number from 0 to 0.1")
-    sensor_distance_um: float = Field(
-        default=50.0, ge=0, le=2000, title="sensor distance v", description="a number of um from 0 to 2000"
-    )
-    tilt_deg: float = Field(
-        default=0.2,
-        ge=0,
-        le=3,
-        title="tilt of the array against the sensor, about x and y",
-        description="a number of degrees from 0 to 3",
-    )
-    roughness_nm: float = Field(
-        default=20.0,
-        ge=0,
-        le=2000,
-        title="RMS roughness of the lenses, of every device",
-        description="a number of nm from 0 to 2000",
-    )
-    layer_um: float = Field(
-        default=0.1,
-        ge=0,
-        le=100,
-        title="height of the printer's layers, of every device; 0 without any",
-        description="a number of um from 0 to 100",
-    )
-    pixel_um: float = Field(
-        default=5.0,
-        ge=0.01,
-        le=1000,
-        title="width over which the printer smooths a layer's edge",
-        description="a number of um from 0.01 to 1000",
-    )
+    position_um: float = _amount(3.0, 1000.0, "um", "each lens's place, along x and y")
+    radius_percent: float = _amount(1.0, 20.0, "%", "radius of curvature, of all lenses")
+    conic: float = _amount(0.05, 2.0, "", "conic constant, of all lenses")
+    index: float = _amount(0.002, 0.1, "", "refractive index")
+    sensor_distance_um: float = _amount(50.0, 2000.0, "um", "sensor distance v")
+    tilt_deg: float = _amount(0.2, 3.0, "degrees", "tilt of the array against the sensor, about x and y")
+    roughness_nm: float = _amount(20.0, 2000.0, "nm", "RMS roughness of the lenses, of every device")
+    layer_um: float = _amount(0.1, 100.0, "um", "height of the printer's layers, of every device; 0 without any")
+    pixel_um: float = _amount(5.0, 1000.0, "um", "width over which the printer smooths a layer's edge", least=0.01)

@@ -14,8 +14,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import Design
 from ..designs.microscope import Microscope
-from ..designs.sheet import confusion_of, microscope_of
-from ..layouts.cells import check_positive, coverage
+from ..designs.sheet import microscope_of
+from ..layouts.cells import check_positive
 from .amounts import Tolerances
 from .devices import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
 from .images import log_sharpness
@@ -136,7 +136,7 @@ def tolerance(
     progress = progress or Progress()
     asked = np.linspace(*design.imaging.working_distance_mm, _DEPTHS) if depths is None else np.array(depths, float)
     _check(design, asked, draws, max_width, min_strehl, max_depth_error)
-    microscope = _judged(design, asked)
+    microscope = microscope_of(design, asked)
     with progress.step("Tracing cores"):
         bench = bench_of(microscope.imager, asked, sources)
     question = _Question(microscope, bench, jnp.asarray(tolerances.pixel_um / 1000))
@@ -171,12 +171,6 @@ def _check(design, depths, draws, *targets) -> None:
     for name, target in zip(("max_width", "min_strehl", "max_depth_error"), targets, strict=True):
         if target is not None:
             check_positive(name, target)
-
-
-def _judged(design: Design, depths) -> Microscope:
-    centers, size = np.array(design.array.centers_mm), design.array.size_mm
-    covered = coverage(centers, size, diameter=design.lens.aperture_diameter_mm)
-    return microscope_of(design, depths, confusion=confusion_of(design, None), coverage=covered)
 
 
 @eqx.filter_jit

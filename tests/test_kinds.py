@@ -1,0 +1,139 @@
+"""Images by lenses that differ, kind by kind."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax import Imager, MicrolensArray, Sensor, find_points, forward, forward_operator, optics_of, reconstruct
+from gs_jax.base.errors import InputError
+from gs_jax.optics.kinds import kind_weights, lenses_by_kind, of_kinds
+from gs_jax.projection.backprojection import backproject
+from gs_jax.reconstruction.methods import BackProjection, ListRichardsonLucy
+from gs_jax.simulation.phantoms import random_points
+from gs_jax.simulation.scene import simulate
+from gs_jax.solvers.richardson_lucy import RichardsonLucy
+from gs_jax.suppression.consistency import Signal, readings
+from gs_jax.suppression.evidence import point_evidence
+from gs_jax.suppression.kinds import Kind, readings_of
+
+from .test_full import grid, imager, volume
+from .test_locate import small
+
+# Radii of two kinds: f of 4.65 and 5.1 mm.
+RADII = np.array([2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0])
+
+
+def differing(scope: Imager, radii=RADII, **numbers) -> Imager:
+    array = dataclasses.replace(scope.array, radius_of_curvature=jnp.asarray(radii, scope.sensor_distance.dtype))
+    return eqx.tree_at(lambda i: i.array, scope, dataclasses.replace(array, **numbers))
+
+
+@pytest.mark.parametrize("level", ["near", "full"])
+def test_the_adjoint_is_exact(level):
+    scope, voxels = differing(imager()), grid(shape=(7, 6))
+    A = forward_operator(scope, voxels, optics_of(scope, voxels.depths, level))
+    x = volume(voxels.volume_shape)
+    y = jax.random.uniform(jax.random.key(1), scope.sensor.shape)
+    one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
+    np.testing.assert_allclose(one, other, rtol=1e-11)
+
+
+def test_the_image_is_the_sum_of_the_kinds():
+    """And of kinds with the same numbers nothing but what one kind is, up to the cores of a mean lens."""
+    scope, voxels = imager(), grid(shape=(7, 6))
+    x = volume(voxels.volume_shape)
+    whole = forward(x, scope, voxels, optics_of(scope, voxels.depths, "near"))
+    # A number that changes nothing, but is another.
+    almost = differing(scope, np.where(RADII > 2, 2.0 + 1e-9, 2.0))
+    assert len(lenses_by_kind(almost)) == 2
+    parts = forward(x, almost, voxels, optics_of(almost, voxels.depths, "near"))
+    # One PSF is of the mean clear area of all lenses, the other of each kind's own.
+    np.testing.assert_allclose(parts.sum(), whole.sum(), rtol=0.02)
+    np.testing.assert_allclose(parts, whole, atol=0.05 * float(whole.max()))
+
+
+@pytest.mark.slow
+def test_gradients():
+    scope, voxels = differing(imager()), grid(shape=(4, 5))
+    optics = optics_of(scope, voxels.depths, "full")
+    weights = jax.random.normal(jax.random.key(2), scope.sensor.shape)
+    x = volume(voxels.volume_shape)
+
+    def of(x, centers, distance):
+        moved = eqx.tree_at(lambda i: (i.array.centers, i.sensor_distance), scope, (centers, distance))
+        return jnp.vdot(weights, forward(x, moved, voxels, optics))
+
+    at = x, scope.array.centers, scope.sensor_distance
+    check_grads(jax.jit(of), at, 1, modes=["rev"], eps=1e-7, rtol=1e-3)
+
+
+def test_a_sharp_lens_counts_more():
+    """At 18 mm lenses of f = 4.65 mm are sharp at 5.75 mm, at 60 mm those of 5.1 mm; of equal lenses all count."""
+    scope = imager(pixels=(960, 810), pitch=0.006)
+    lenses = lenses_by_kind(differing(scope))
+    weights = kind_weights(of_kinds(differing(scope), lenses), np.array([18.0, 45.0]), 0.03)
+    assert weights[0, 0] > 1.2 > 0.8 > weights[1, 0] and weights[1, 1] > weights[0, 1]
+    np.testing.assert_allclose(np.array([5, 4]) @ weights / 9, 1)
+
+
+def test_back_projection_adds_kinds_by_weight():
+    scope, voxels = differing(imager()), grid(shape=(7, 6))
+    image = np.asarray(simulate(np.array([[0.2, -0.1, 20.0, 1.0]]), scope))
+    assert reconstruct(image, scope, voxels).shape == voxels.volume_shape
+    flat = reconstruct(np.ones_like(image), scope, voxels, BackProjection(normalize=True))
+    np.testing.assert_allclose(flat[flat > 0], 1, rtol=1e-5)
+    by_rays = reconstruct(image, scope, voxels, optics="pinhole")
+    np.testing.assert_array_equal(by_rays, np.asarray(backproject(image, imager(), voxels), np.float32))
+    found = reconstruct(image, scope, voxels, RichardsonLucy(steps=2), optics="near")
+    assert np.isfinite(found).all() and found.max() > 0
+    with pytest.raises(InputError, match="ListRichardsonLucy and lenses that differ, allowed"):
+        reconstruct(image, scope, voxels, ListRichardsonLucy())
+
+
+def test_points_of_lenses_with_several_apertures():
+    """Ideal lenses, a third of them wider: the points that are there, and nothing else."""
+    scope, voxels = small()
+    array = dataclasses.replace(scope.array, aperture_diameter=jnp.where(jnp.arange(49) % 3 == 0, 1.1, 0.9))
+    scope = eqx.tree_at(lambda i: i.array, scope, array)
+    points = random_points(8, (4.0, 4.0), (19.2, 20.8), seed=2)
+    image = simulate(points, scope, optics="near", psf="geometric")
+    found = find_points(image, scope, voxels)
+    apart = found[:, None, :3] - points[:, :3]
+    # Half a pixel in the object laterally. 0.1 mm axially moves no spot by more than a third of a pixel.
+    near = (np.hypot(apart[..., 0], apart[..., 1]) < 0.016) & (np.abs(apart[..., 2]) < 0.1)
+    assert len(found) == len(points) and (near.sum(0) == 1).all() and (near.sum(1) == 1).all()
+    evidence = point_evidence(found, image, scope, voxels)
+    assert (evidence.lit >= 0.7 * evidence.lenses).all() and (evidence.lenses > 6).all()
+
+
+def test_only_kinds_that_are_sharp_read_points():
+    scope, _ = small()
+    light = Signal(*np.ones((2, *scope.sensor.shape), np.float32))
+    ends, flat = np.array([19.0, 21.0]), np.ones(2)
+    one, other = of_kinds(scope, (tuple(range(20)), tuple(range(20, 49))))
+    kinds = [Kind(one, ends, ends, flat), Kind(other, ends, ends + 0.1, np.array([1.0, 0.0]))]
+    points = np.array([[0.1, 0.2, 19.2], [0.1, 0.2, 20.8]])
+    seen, all_, late = readings_of(points, light, kinds), readings(points, light, scope), points + [0, 0, 0.1]
+    assert seen.seen.sum(1).tolist()[0] == all_.seen.sum(1)[0] > seen.seen.sum(1)[1] > 0
+    assert seen.kind is not None and set(seen.kind[1][seen.seen[1]]) == {0}
+    second = readings(late, light, other)
+    np.testing.assert_allclose(seen.pixels[0][(seen.kind[0] == 1) & seen.seen[0]], second.pixels[0][second.seen[0]])
+
+
+@pytest.mark.slow
+def test_the_image_is_that_of_rays():
+    """Off by 0.20 of its norm, with the noise of the rays; of lenses that are alike by 0.18, taken as such by 0.77."""
+    from experiments.ray_tracer import traced
+
+    place = (np.argwhere(np.ones((5, 5))) - 2) * 1.3 + np.random.default_rng(0).uniform(-0.2, 0.2, (25, 2))
+    array = MicrolensArray(place, radius_of_curvature=np.array([2.0, 2.15])[np.arange(25) % 2])
+    scope = Imager(array, Sensor((640, 640), 0.0135), 5.8, 3.0)
+    points = np.array([[0.3, -0.4, 20.0, 1.0], [-1.2, 1.1, 24.0, 1.0], [1.4, 0.9, 17.0, 1.0]])
+    image, true = simulate(points, scope), traced(points, scope, 400_000)
+    assert np.linalg.norm(image - true) < 0.25 * np.linalg.norm(true)
+    np.testing.assert_allclose(image.sum(), true.sum(), rtol=0.01)

@@ -1,0 +1,108 @@
+"""Lenses that differ on one plate: where they end, and kinds of them."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gs_jax import MicrolensArray
+from gs_jax.lenses import kinds
+from gs_jax.optics.aperture import _DIRECTIONS, _edges, aperture_area
+from gs_jax.optics.light import zones
+
+from .test_aperture import layout
+
+SIZE = (4.0, 3.0)
+ANGLES = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+
+
+def unequal(count=9, size=SIZE, **numbers):
+    which = np.arange(count) % 3
+    given: dict[str, Any] = {
+        "radius_of_curvature": np.array([2.0, 1.7, 2.4])[which],
+        "conic_constant": np.array([0.0, -0.6, 0.0])[which],
+        "aperture_diameter": np.array([2.0, 2.0, 1.6])[which],
+    }
+    square = np.stack(np.meshgrid([-1.2, 0, 1.2], [-0.9, 0, 0.9][: count // 3]), -1).reshape(-1, 2)
+    return MicrolensArray(square + 0.2 * layout(count, (1.0, 1.0)), size=size, **(given | numbers))
+
+
+def test_two_spheres_meet_in_a_circle():
+    """Of `p^2 + (w - R)^2 = R^2` about both vertices: seen from above, a quadratic equation in each direction."""
+    first, second, apart = 2.0, 1.6, 1.1
+    array = MicrolensArray([[0.0, 0.0], [apart, 0.0]], radius_of_curvature=[first, second], aperture_diameter=2.0)
+    # The sag on both spheres is w = (2 p.d - d^2) / (2 (R_1 - R_2)) = b r - a in the direction of p.
+    a, b = apart**2 / 2 / (first - second), apart * np.cos(ANGLES) / (first - second)
+    # r^2 + (b r - a)^2 = 2 R_1 (b r - a)
+    p, q, s = 1 + b**2, -2 * b * (a + first), a**2 + 2 * first * a
+    with np.errstate(invalid="ignore"):
+        roots = (-q + np.sqrt(q**2 - 4 * p * s) * [[-1], [1]]) / (2 * p)
+    roots = np.where((roots > 0) & (b * roots >= a), roots, np.inf)
+    np.testing.assert_allclose(_edges(array)[0], np.minimum(roots.min(0), 1.0), rtol=1e-9)
+
+
+def test_alike_lenses_end_at_their_cells():
+    """A list of equal numbers is what one number is, but for the sum over directions: 3e-5."""
+    alike = MicrolensArray(layout(12, (5.0, 4.0)), size=(6.0, 5.0))
+    list_of_one = dataclasses.replace(alike, radius_of_curvature=np.full(12, 2.0))
+    np.testing.assert_allclose(aperture_area(list_of_one), aperture_area(alike), rtol=5e-5)
+
+
+def test_areas_are_those_of_a_raster():
+    """The highest cap at each place, steps of 4 um: an edge of 1 mm along a row of them is right to 2e-3 of a lens."""
+    array, step = unequal(), 0.004
+    axes = [np.arange(-side / 2 + step / 2, side / 2, step) for side in SIZE]
+    places, below = np.stack(np.meshgrid(*axes, indexing="ij"), -1), []
+    for lens in map(array.lens, range(9)):
+        apart = ((places - np.asarray(lens.centers)) ** 2).sum(-1)
+        rim = float(lens.aperture_diameter / 2) ** 2
+        below.append(np.where(apart < rim, lens.sag(np.minimum(apart, rim)), np.inf))
+    owner = np.argmin(below, 0)[np.isfinite(below).any(0)]
+    np.testing.assert_allclose(aperture_area(array), np.bincount(owner) * step**2, rtol=2e-3)
+
+
+def test_a_kind_keeps_its_neighbours():
+    array = unequal()
+    which = kinds(array)
+    assert [kind.tolist() for kind in which] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
+    parts = [array.some(kind) for kind in which]
+    assert all(part.alike and len(part.centers) == 3 and len(part.whole.centers) == 9 for part in parts)
+    areas = np.concatenate([aperture_area(part) for part in parts])
+    np.testing.assert_allclose(areas, aperture_area(array)[np.concatenate(which)], rtol=1e-12)
+
+
+def test_how_open_lenses_are_by_radius():
+    """The integral over the radii is the area; of the same lenses as two kinds the shares are those of one."""
+    disc = dataclasses.replace(unequal(), size=(np.inf, np.inf))
+    for kind in map(disc.some, kinds(disc)):
+        open_, step = zones(kind).open, zones(kind).radius[1] - zones(kind).radius[0]
+        area = (2 * np.pi * zones(kind).radius * step * open_).sum()
+        np.testing.assert_allclose(area, aperture_area(kind).mean(), rtol=2e-2)  # 64 radii and angles
+    alike = MicrolensArray(layout(12, (4.0, 4.0)))
+    halves = [zones(alike.some(np.arange(half, 12, 2))).open for half in (0, 1)]
+    np.testing.assert_allclose(np.mean(halves, 0), zones(alike).open, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [SIZE, (np.inf, np.inf)])
+def test_gradients_of_areas(size):
+    array = unequal(6, size)
+
+    def total(numbers):
+        return jnp.sum(aperture_area(dataclasses.replace(array, **numbers)) ** 2)
+
+    # Compiled as users compile it. Where XLA leaves out most optimisations, as it does for the other tests, this
+    # gradient is wrong (jax 0.10.2, processors), and without `jax.checkpoint` it is not a number.
+    as_users = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+    found = jax.jit(jax.value_and_grad(total), compiler_options=as_users)
+    names = ("centers", "radius_of_curvature", "aperture_diameter", "conic_constant")
+    at = {name: np.asarray(getattr(array, name)) for name in names}
+    slopes, rng = found(at)[1], np.random.default_rng(0)
+    for _ in range(3):
+        way = {name: rng.standard_normal(value.shape) for name, value in at.items()}
+        # Where an edge jumps between neighbours, at a corner, the sum over directions has kinks: 1e-6 meets few.
+        ends = [float(found({name: at[name] + s * 1e-6 * way[name] for name in names})[0]) for s in (1, -1)]
+        expected = sum(float(np.vdot(slopes[name], way[name])) for name in names)
+        assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(expected, rel=1e-4, abs=1e-4)
