@@ -11,7 +11,9 @@ from gs_jax.geometry import field_limit
 from gs_jax.layouts.patterns import hexagonal_layout
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um", "reconstruction_error")]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("localization_um", "reconstruction_error", "scene_error")
+]
 NAMES = ["ghosts", "lens_shortage", "spectral_flatness", "condition_number", *SLOW]
 
 

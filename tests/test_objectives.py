@@ -109,7 +109,8 @@ def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     above = np.interp(line.max() / 2, line[:16], np.arange(16))
     width = 2 * (15 - above) * 4.5 / float(lens.imager.magnification(20.5))
     axis = dataclasses.replace(lens.imager, field_radius=0.01)
-    middle = eqx.tree_at(lambda c: (c.imager, c.depths), lens, (axis, jnp.array([20.5])))
+    where = lambda c: (c.imager, c.depths, c.field_radius)
+    middle = eqx.tree_at(where, lens, (axis, jnp.array([20.5]), jnp.array(0.01)))
     np.testing.assert_allclose(jax.jit(TERMS["psf_width_um"].function)(middle)[0], width, rtol=0.15)
 
 
@@ -144,13 +145,30 @@ def test_manufacture_of_a_conic(focused):
     np.testing.assert_allclose(least[[0, -1]], [radius, min(profile, across)], rtol=1e-9)
 
 
+def test_manufacture_of_a_polynomial(focused):
+    """`sag = r^2 / (2 R) + ...` by finite differences: slope at the rim, and curvature along the profile."""
+    terms = (0.03, -0.01)
+    shaped = eqx.tree_at(lambda c: c.imager.array.aspheric_terms, focused, jnp.array(terms))
+    height = lambda r: 2 - np.sqrt(4 - r**2) + terms[0] * r**4 + terms[1] * r**6
+    np.testing.assert_allclose(TERMS["sag_mm"].function(shaped), height(1.0), rtol=1e-12)
+    half, step = float(focused.clear_diameter) / 2, 1e-4
+    slope = (height(half + step) - height(half - step)) / (2 * step)
+    np.testing.assert_allclose(TERMS["edge_slope_deg"].function(shaped), np.degrees(np.arctan(slope)), rtol=1e-6)
+    # At the middle of the radius, the 21st of 41 places.
+    r = half / 2
+    first, second = (height(r + step) - height(r - step)) / (2 * step), np.diff(height(r + step * np.arange(-1, 2)), 2)
+    along, across = second[0] / step**2 / (1 + first**2) ** 1.5, first / r / (1 + first**2) ** 0.5
+    np.testing.assert_allclose(TERMS["least_radius_mm"].function(shaped)[20], 1 / max(along, across), rtol=1e-5)
+
+
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 def test_widths_have_gradients_by_the_shape(orientation):
     design = small_design()
     design = design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": orientation})})
-    parent = parent_of(design, depths_mm=(18.0, 23.0), depth_count=2)
+    parent = parent_of(design, depths_mm=(18.0, 23.0), depth_count=2, free={"aspheric_terms": (-0.1, 0.1)})
     names = ("conic_constant", "radius_of_curvature_mm", "sensor_distance_mm")
     values = {name: start_values(parent)[name] for name in names} | {"aperture_diameter_mm": jnp.array(1.1)}
+    values["aspheric_terms"] = jnp.array([0.01, -0.02])
     shown = ("psf_width_um", "edge_slope_deg", "sag_mm", "least_radius_mm", "wavefront_waves", "light_percent")
     terms = jax.jit(lambda values: [TERMS[name].function(candidate(parent, values)) for name in shown])
     check_grads(terms, (values | {"conic_constant": jnp.array(-0.5)},), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)

@@ -116,6 +116,18 @@ def test_a_new_design_holds_the_values(design, parent):
     assert set(start_values(parent)) == set(NAMES)
 
 
+def test_aspheric_terms_of_a_lens_without_any(design):
+    """Where they are free there are two of them, zero at first; a file holds them to four digits."""
+    parent = parent_of(design, free={"aspheric_terms": (-0.1, 0.1)})
+    np.testing.assert_array_equal(start_values(parent)["aspheric_terms"], [0, 0])
+    values = {"aspheric_terms": jnp.array([0.012345, -0.03]), "pitch_mm": 1.1 * parent.pitch}
+    np.testing.assert_array_equal(candidate(parent, values).imager.array.aspheric_terms, values["aspheric_terms"])
+    found = new_design(design, parent, values)
+    assert found.lens.aspheric_terms == (0.0123, -0.03)
+    again = parent_of(found, free={"aspheric_terms": (-0.1, 0.1)})
+    np.testing.assert_array_equal(start_values(again)["aspheric_terms"], [0.0123, -0.03])
+
+
 def test_values_that_make_no_microscope(design, parent):
     with pytest.raises(InputError, match="make no microscope: `lens.aperture_diameter_mm`: found 3.0"):
         new_design(design, parent, {"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)})

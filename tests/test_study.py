@@ -57,7 +57,7 @@ def test_what_a_study_says(read):
         ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
         ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]`: found 0.0, allowed"),
         ("[18.0, 23.0]", "[18.0]", "`depths_mm"),
-        ('"occupancy"', '"ocupancy"', "`terms` 1: found the name 'ocupancy', allowed: occupancy or 28 others"),
+        ('"occupancy"', '"ocupancy"', "`terms` 1: found the name 'ocupancy', allowed: occupancy or 31 others"),
         ("at_most = 0.5", "", "found no kind, allowed: one of at_most"),
         ("at_most = 0.5", "at_most = 0.5\nat_least = 0.1", r"found \['at_most', 'at_least'\]"),
         ("at_most = 0.5", "at_most = -0.5", "found -0.5, allowed: a positive number"),

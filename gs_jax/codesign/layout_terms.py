@@ -5,6 +5,7 @@ What is chosen here follows from the candidate: places over the part of the plat
 lenses, the depths that are judged, and blobs and spots of a few pixels. Random terms draw anew from their key.
 """
 
+import dataclasses
 import math
 
 import jax
@@ -17,6 +18,7 @@ from ..voxels import Grid
 from .comb import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import localization_bound
+from .transfer import PLACE, lens_electrons, spots
 
 # Points whose ghosts are looked for, and places where; points that are located or whose combs are looked at; light of
 # one, electrons a lens.
@@ -27,6 +29,8 @@ _FREQUENCIES = 256
 _RASTER = 15
 # Voxels along a side of a random scene, blobs per voxel, each as wide as a voxel; scenes of a draw.
 _VOXELS, _DENSITY, _SCENES = 99, 0.008, 2
+# Side of a lens's own spot, pixels.
+_SPOT = 65
 
 
 def ghosts(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
@@ -77,11 +81,31 @@ def log_error(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
     """Logarithm of the relative error, `sqrt(1 - <a,b>^2 / (<a,a> <b,b>))`, of reconstructed random scenes.
 
     Three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate: sub-images overlap
-    as much as those of an object that fills the field.
+    as much as those of an object that fills the field. Spots are points, and light is the same for all lenses.
     """
+    return _log_error(c, key)
+
+
+def log_error_for_exposure(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
+    """The same with the lens's own spots and the light of the exposure, from a blob's lit voxels."""
+    at = dataclasses.replace(c, depths=_three(c))
+    # `forward` has no inverse square of the depth: the same light for all three, the mean.
+    electrons = jnp.mean(lens_electrons(at)) * (_pitch(c) / PLACE) ** 2
+    return _log_error(c, key, psf=spots(at, _SPOT), electrons=electrons)
+
+
+def _three(c: Microscope) -> Float[Array, "3"]:
+    return jnp.stack([c.depths[0], (c.depths[0] + c.depths[-1]) / 2, c.depths[-1]])
+
+
+def _pitch(c: Microscope) -> float:
+    """Of the voxels of a random scene, mm."""
+    return 2 * c.imager.field_radius / _VOXELS
+
+
+def _log_error(c: Microscope, key: PRNGKeyArray, **light) -> Float[Array, ""]:
     sensor, reach = c.imager.sensor, c.imager.field_radius
-    depths = jnp.stack([c.depths[0], (c.depths[0] + c.depths[-1]) / 2, c.depths[-1]])
-    pitch = 2 * reach / _VOXELS
+    depths, pitch = _three(c), _pitch(c)
     # A voxel is imaged up to this far beside it, by the lens that is as far away as one can be that sees it.
     beside = (1 + c.largest_magnification) * field_limit(reach)
     rows, columns = (math.ceil(min(n, 2 * (reach + beside) / sensor.pixel_pitch)) for n in sensor.shape)
@@ -96,6 +120,7 @@ def log_error(c: Microscope, key: PRNGKeyArray) -> Float[Array, ""]:
         background_width=4 * pitch,
         window=(rows, columns),
         field=(width, height),
+        **light,
     )
     return found * jnp.log(jnp.asarray(10.0, found.dtype)) / 20
 

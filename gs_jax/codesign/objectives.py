@@ -20,7 +20,16 @@ from ..base.safe import safe_sqrt
 from ..designs.microscope import Microscope
 from ..designs.spots import encircled_radius, field_heights, psf_width
 from ..optics import aberrations, theory
-from .layout_terms import conditioning, flatness, ghosts, localization, log_error, shortage
+from .exposure_terms import crowded, volume_error
+from .layout_terms import (
+    conditioning,
+    flatness,
+    ghosts,
+    localization,
+    log_error,
+    log_error_for_exposure,
+    shortage,
+)
 
 Result = Float[Array, "..."]
 
@@ -74,7 +83,7 @@ def field_of_view(c: Microscope) -> Float[Array, "depth axis"]:
     """Width of the object that is seen at all, along x and y."""
     sensor = c.imager.sensor
     widths = jnp.array(sensor.shape[::-1], c.plate.dtype) * sensor.pixel_pitch
-    return theory.field_of_view(c.plate[None], widths[None], c.magnification[:, None], c.imager.field_radius)
+    return theory.field_of_view(c.plate[None], widths[None], c.magnification[:, None], c.field_radius)
 
 
 def thickness(c: Microscope) -> Float[Array, ""]:
@@ -165,6 +174,11 @@ TERMS: dict[str, Term] = {
     "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
+    "scene_error": Term(
+        "relative error of reconstructed scenes, for an exposure", log_error_for_exposure, log=True, random=True
+    ),
+    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error),
+    "crowded_precision_um": Term("least error of locating a point in a scene, x, y, z, for an exposure", crowded),
     "edge_slope_deg": Term("slope at the clear aperture's rim", edge_slope),
     "least_radius_mm": Term("least radius of curvature of a lens's surface", least_radius),
 }

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
+from ..base.style import PALETTE
+from ..designs.checks import of_each
 from ..designs.design import Design, write_design
 from ..io.disk import check_output, write_json
 from ..io.figures import write_figure
@@ -108,21 +110,23 @@ def _plain(record: dict[str, Any]) -> dict[str, Any]:
 
 def picture(outcome: Outcome) -> Figure:
     """The layout with its clear apertures, the cost, and the terms on their way to the targets, of the best start."""
-    figure = Figure(figsize=(12.5, 4.2), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13.5, 4.6), dpi=110, layout="constrained")
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     _draw_layout(layout, outcome.design)
     asked = outcome.study.terms
     steps = [step for step in outcome.log.steps if _is_best(step, outcome)]
     places = np.arange(1, len(steps) + 1)
     cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
-    cost.set(xlabel="step", ylabel="cost", title="best start")
+    cost.set(xlabel="step", ylabel="cost", title="cost of the best start")
     for number, (term, label) in enumerate(zip(asked, labels(asked, outcome.study), strict=True)):
         values = np.array([step.get(label, np.nan) for step in steps], float)
-        style = "-" if term.is_goal else ("--", ":")[number >= 10]
-        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=f"C{number % 10}", label=label)
+        style = "-" if term.is_goal else ("--", ":")[number >= len(PALETTE)]
+        said = f"{TERMS[term.name].meaning}\n{wanted(term)} {unit_of(term.name)}"
+        color = PALETTE[number % len(PALETTE)]
+        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=color, label=said)
     terms.axhline(1, color="0.6", lw=0.8)
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
-    terms.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    terms.legend(fontsize=7.5, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 
@@ -133,20 +137,20 @@ def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
 
 def _draw_layout(axes: Axes, design: Design) -> None:
     """Lenses on the plate, each with its disc, and the sensor."""
-    radius = design.lens.aperture_diameter_mm / 2
-    discs = [Circle(center, radius) for center in design.array.centers_mm]
-    axes.add_collection(PatchCollection(discs, facecolor="C0", alpha=0.35, edgecolor="C0", linewidth=0.5))
+    diameters = of_each(design, "aperture_diameter_mm")
+    discs = [Circle(center, d / 2) for center, d in zip(design.array.centers_mm, diameters, strict=True)]
+    axes.add_collection(PatchCollection(discs, facecolor=PALETTE[0], alpha=0.35, edgecolor=PALETTE[0], linewidth=0.5))
     sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
     for size, middle, color, name in (
         (design.array.size_mm, (0.0, 0.0), "k", "plate"),
-        (sensor, design.sensor.origin_mm or (0.0, 0.0), "C3", "sensor"),
+        (sensor, design.sensor.origin_mm or (0.0, 0.0), PALETTE[2], "sensor"),
     ):
         corner = (middle[0] - size[0] / 2, middle[1] - size[1] / 2)
         axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=color, label=name))
     reach = 0.55 * max(*design.array.size_mm, *sensor)
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel="x, mm", ylabel="y, mm")
-    axes.set_title(f"{len(discs)} lenses, D = {2 * radius:.3g} mm")
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+    axes.set_title(f"{len(discs)} lenses, D = {max(diameters):.3g} mm")
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
 
 
 def check_outputs(path: Path) -> None:

@@ -2,8 +2,8 @@
 
 A `Parent` is the design that an optimisation starts from, `start_values` are its parameters by name, and `candidate`
 is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
-goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index and
-the conic constant.
+goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index, the
+conic constant and the aspheric terms A_4, A_6, ..., in mm^-3, mm^-5, ....
 Solvers do not see units: `Bounds` maps a value to a number of order one without any bound, and back; `Box`, for the one
 solver that keeps bounds by itself, to its share of the way between them.
 """
@@ -37,13 +37,18 @@ NAMES = (
     "aperture_diameter_mm",
     "refractive_index",
     "conic_constant",
+    "aspheric_terms",
     "pitch_mm",
     "centers_mm",
     "depth_span_mm",
 )
 
+# What a pitch leaves as it is, beside radius and aperture.
+_UNSCALED = ("refractive_index", "conic_constant", "aspheric_terms", "sensor_distance_mm")
 # How near to a bound a start may be, as a fraction of the range: on the bound the map has no slope, and no way back.
 _NEAREST = 0.01
+# Aspheric terms of a lens without any, where they are free.
+_TERMS = 2
 # Digits of a written length: 0.1 um is finer than a printer, and than a camera's mount.
 _DIGITS = 4
 
@@ -100,7 +105,7 @@ class Parent(eqx.Module):
 
     `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm; 1 for one lens.
     `middle`, `span`: of the depths that count, from the plate, mm. `depth_count`: how many they are. `confusion`:
-    mm.
+    mm. `exposure`: as of a `Microscope`.
     """
 
     imager: Imager
@@ -111,6 +116,7 @@ class Parent(eqx.Module):
     confusion: Float[Array, ""] = eqx.field(converter=as_float)
     depth_count: int = eqx.field(static=True)
     largest_magnification: float = eqx.field(static=True)
+    exposure: float = eqx.field(static=True)
 
 
 def parent_of(
@@ -119,6 +125,7 @@ def parent_of(
     depths_mm: tuple[float, float] | None = None,
     confusion: float | None = None,
     depth_count: int = 6,
+    exposure: float = 1e4,
     free: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Parent:
     """A design as an optimisation sees it.
@@ -131,11 +138,16 @@ def parent_of(
         Diameter of the circle of confusion, mm; by default two pixels.
     depth_count
         Depths between them, both included.
+    exposure
+        Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
     free
         Between which bounds parameters will be replaced. Lens centres that may move take longer.
     """
     near, far = depths_mm or design.imaging.working_distance_mm
     imager = design.imager()
+    if "aspheric_terms" in free and not imager.array.aspheric_terms.size:
+        none = jnp.zeros(_TERMS, imager.sensor_distance.dtype)
+        imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, none)
     return Parent(
         imager,
         None if "centers_mm" in free else _cells(design),
@@ -145,6 +157,7 @@ def parent_of(
         2 * imager.sensor.pixel_pitch if confusion is None else confusion,
         depth_count,
         _largest_magnification(design, near, far, free),
+        exposure,
     )
 
 
@@ -183,6 +196,7 @@ def start_values(parent: Parent) -> Values:
         "aperture_diameter_mm": array.aperture_diameter,
         "refractive_index": array.refractive_index,
         "conic_constant": array.conic_constant,
+        "aspheric_terms": array.aspheric_terms,
         "pitch_mm": parent.pitch,
         "centers_mm": array.centers,
         "depth_span_mm": parent.span,
@@ -206,11 +220,12 @@ def candidate(parent: Parent, values: Values) -> Microscope:
         i.array.aperture_diameter,
         i.array.refractive_index,
         i.array.conic_constant,
+        i.array.aspheric_terms,
         i.sensor_distance,
     )
     # Areas before scaling, on the plate as it is: its size cannot be traced.
     radius, diameter = values["radius_of_curvature_mm"], values["aperture_diameter_mm"]
-    others = tuple(values[name] for name in ("refractive_index", "conic_constant", "sensor_distance_mm"))
+    others = tuple(values[name] for name in _UNSCALED)
     unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, *others))
     area, count = _clear_area(parent.cells, unscaled.array), parent.imager.array.centers.shape[0]
     imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, *others))
@@ -223,6 +238,7 @@ def candidate(parent: Parent, values: Values) -> Microscope:
         confusion=parent.confusion,
         plate_scale=scale,
         largest_magnification=parent.largest_magnification,
+        exposure=parent.exposure,
     )
 
 
@@ -235,7 +251,7 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
         If the values make no microscope.
     """
     values = start_values(parent) | values
-    numbers = {name: round(float(values[name]), _DIGITS) for name in NAMES if name != "centers_mm"}
+    numbers = {name: round(float(values[name]), _DIGITS) for name in NAMES if values[name].ndim == 0}
     scale = float(values["pitch_mm"] / parent.pitch)
     size = [round(scale * side, _DIGITS) for side in design.array.size_mm]
     # Rounding may not push a lens off the plate.
@@ -246,6 +262,7 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
     data = design.model_dump()
     of_lens = ("radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "conic_constant")
     data["lens"] |= {name: numbers[name] for name in of_lens}
+    data["lens"] |= {"aspheric_terms": np.round(np.asarray(values["aspheric_terms"], float), _DIGITS).tolist()}
     data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
     data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}
     try:

@@ -87,6 +87,8 @@ def optimize(
         To start from, or its file.
     study
         What is free and what is wanted, or its file. Its own `design` is not looked at.
+    progress
+        Shows how far it is; nothing by default.
     checkpoint
         A file to keep the state in; none by default.
     resume
@@ -101,6 +103,25 @@ def optimize(
     InputError
         If a file cannot be read, the study does not fit the design, the checkpoint is missing or another study's, or
         nothing was found.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gs_jax as gs
+    >>> _ = Path("study.toml").write_text('''
+    ... depths_mm = [18.0, 22.0]
+    ... [free]
+    ... sensor_distance_mm = [4.0, 8.0]
+    ... [[terms]]
+    ... name = "focus_offset"
+    ... minimise = 1.0
+    ... [[stages]]
+    ... solver = "levenberg-marquardt"
+    ... steps = 20
+    ... ''')
+    >>> outcome = gs.optimize(gs.geomscope(), "study.toml")
+    >>> print(round(outcome.design.imaging.sensor_distance_mm, 1))  # where a thin lens images the middle
+    6.0
     """
     with opened(design, study) as (parent, question):
         path = None if checkpoint is None else Path(checkpoint)

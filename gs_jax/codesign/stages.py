@@ -60,20 +60,21 @@ def problem_of(design: Design, study: Study) -> Problem:
     """
     _check_free(design, study)
     confusion = None if study.confusion_um is None else study.confusion_um / 1000
-    parent = parent_of(
-        design, depths_mm=study.depths_mm, confusion=confusion, depth_count=study.depth_count, free=study.free
-    )
+    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "confusion": confusion}
+    parent = parent_of(design, **where, exposure=study.exposure, free=study.free)
     return Problem(parent, study)
 
 
 def _check_free(design: Design, study: Study) -> None:
+    if not design.imager().array.alike:
+        raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
     twice = sum(study.depths_mm or design.imaging.working_distance_mm)
     if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
         found = f"`free.depth_span_mm`: found {list(study.free['depth_span_mm'])}"
         raise InputError(f"{found}, allowed: below {twice:g}, twice the middle of the depths.")
-    of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant"} & set(study.free)
+    of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant", "aspheric_terms"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
         raise InputError(
             f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
@@ -156,7 +157,8 @@ def random_start(problem: Problem, values: Values, start: int) -> Values:
     if start == 0:
         return values
     rng = np.random.default_rng([problem.study.seed, start])
-    drawn = {name: rng.uniform(*limits) for name, limits in problem.study.free.items() if name != "centers_mm"}
+    free = {name: limits for name, limits in problem.study.free.items() if name != "centers_mm"}
+    drawn = {name: rng.uniform(*limits, values[name].shape) for name, limits in free.items()}
     return values | {name: jnp.asarray(x, values[name].dtype) for name, x in drawn.items()}
 
 

@@ -36,7 +36,7 @@ Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
 # Of what may be free, but lengths.
-_LEAST = {"refractive_index": 1, "centers_mm": -math.inf, "conic_constant": -math.inf}
+_LEAST = {"refractive_index": 1, "centers_mm": -math.inf, "conic_constant": -math.inf, "aspheric_terms": -math.inf}
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
@@ -124,9 +124,10 @@ class Study(Table):
     """A study, with the tables and keys of its file; the module's docstring has one.
 
     `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.
-    `orientation`: the side of the lenses toward the object, if it is not to be the design's; which is better, two
-    studies tell. `starts`: the first stage also starts from this many points at random between the bounds less one, and
-    the best goes on; `seed` says which.
+    `exposure`: electrons that each mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um, for the
+    terms that count light. `orientation`: the side of the lenses toward the object, if it is not to be the design's;
+    which is better, two studies tell. `starts`: the first stage also starts from this many points at random between
+    the bounds less one, and the best goes on; `seed` says which.
     """
 
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
@@ -135,6 +136,7 @@ class Study(Table):
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")
+    exposure: Positive = Field(default=1e4, description="a positive number of electrons")
     margin: float = Field(default=0.005, ge=0, le=0.5, description="a number from 0 to 0.5")
     starts: int = Field(default=1, ge=1, le=10_000, description="a whole number from 1 to 10000")
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="a whole number from 0 to 2147483647")
@@ -163,6 +165,25 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     ------
     InputError
         If the file cannot be read, or a key is missing, extra, of the wrong type or out of its range.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gs_jax as gs
+    >>> _ = Path("study.toml").write_text('''
+    ... depths_mm = [18.0, 22.0]
+    ... [free]
+    ... sensor_distance_mm = [4.0, 8.0]
+    ... [[terms]]
+    ... name = "focus_offset"
+    ... minimise = 1.0
+    ... [[stages]]
+    ... solver = "levenberg-marquardt"
+    ... steps = 20
+    ... ''')
+    >>> study = gs.read_study("study.toml")
+    >>> study.free, study.terms[0].name
+    ({'sensor_distance_mm': (4.0, 8.0)}, 'focus_offset')
     """
     text = read_text(path)
     try:
