@@ -36,6 +36,8 @@ COMMANDS = (
     "mold",
     "mask",
     "train",
+    "report",
+    "explore",
     "demo",
     "info",
 )

@@ -41,6 +41,16 @@ def quality(estimate: Volume, truth: Volume) -> Quality:
     ------
     ValueError
         If the shapes differ, or the truth is nowhere positive.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> truth = np.zeros((3, 32, 32))
+    >>> truth[1, 10:20, 12:15] = 1.0
+    >>> noisy = 5 * truth + np.random.default_rng(0).normal(0, 0.1, truth.shape)
+    >>> empty = 0 * truth
+    >>> print(round(gs.quality(noisy, truth).psnr_db), round(gs.quality(empty, truth).psnr_db))
+    34 20
     """
     a, b = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if a.shape != b.shape:
@@ -80,6 +90,17 @@ def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: f
     ----------
     found, truth
         `(point, 3 or more)`, x, y, z first, mm; either may be empty. Nothing found where nothing is scores 1.
+    lateral, axial
+        How far apart a pair may be, mm.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> truth = np.array([[0.0, 0.0, 20.0], [1.0, 0.0, 20.0]])
+    >>> found = np.array([[0.003, 0.004, 20.02], [5.0, 5.0, 20.0]])  # one is near, one is a ghost
+    >>> score = gs.localization(found, truth)
+    >>> print(score.precision, score.recall, round(score.lateral_rmse, 4))
+    0.5 0.5 0.005
     """
     a, b = (np.asarray(p, np.float64)[:, :3] for p in (found, truth))
     pairs = _matching(a, b, lateral, axial)

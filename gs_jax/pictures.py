@@ -35,6 +35,13 @@ def show(
     ------
     ValueError
         If the volume is not of the grid's shape.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> grid = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
+    >>> figure = gs.show(np.random.default_rng(0).random(grid.volume_shape), grid)
+    >>> figure.savefig("volume.png")
     """
     volume = np.asarray(volume)
     if volume.shape != grid.volume_shape:

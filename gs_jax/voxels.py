@@ -28,6 +28,15 @@ class Grid(eqx.Module):
     ------
     ValueError
         If there is no depth, no voxel, or the pitch is not positive.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> grid = gs.Grid.over(gs.Sensor((200, 200), 0.02), depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> grid.volume_shape
+    (3, 41, 41)
+    >>> grid.at([19.0, 21.0]).volume_shape
+    (2, 41, 41)
     """
 
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)

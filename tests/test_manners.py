@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from contextlib import contextmanager
 from errno import ENOSPC
 from pathlib import Path
@@ -28,6 +29,7 @@ from gs_jax.simulation.scene import OPTICS
 from .test_cli import RECONSTRUCT, folder, run
 
 __all__ = ["folder"]
+ROOT = Path(__file__).parents[1]
 
 
 def test_names_are_those_of_the_library():
@@ -259,6 +261,14 @@ def test_a_design_is_found_by_its_name(folder, monkeypatch, capsys):
     assert status == 0 and out.startswith("endoscope: ")
     status, _, err = run(monkeypatch, capsys, "metrics", "endoskop")
     assert status == 2 and "endoskop: the file cannot be read" in err
+    status, out, _ = run(monkeypatch, capsys, "info", "--designs")
+    assert status == 0 and {line.split()[0] for line in out.splitlines()} == {p.stem for p in options.shipped_designs()}
+
+
+def test_the_wheel_has_every_design():
+    """What a checkout finds in its folder, an installed package finds inside."""
+    inside = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert sorted(inside["force-include"]) == sorted(f"design/{path.name}" for path in options.shipped_designs())
 
 
 def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):

@@ -19,6 +19,15 @@ class InputError(ValueError):
     ----------
     message
         The explanation. Line ends and other control characters in it become blanks.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> try:
+    ...     gs.read_design("missing.toml")
+    ... except gs.InputError as error:
+    ...     print(error)
+    missing.toml: ...
     """
 
     def __init__(self, message: str):

@@ -32,6 +32,13 @@ class Progress:
     """How far long work is, on standard error: bars on a terminal, else a line every ten seconds.
 
     As much as `shown` says, within `with Progress() as progress:`; one that is not entered shows nothing.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> with gs.Progress() as progress:  # prints to standard error while work takes long
+    ...     for _ in progress.track(range(3), "Counting"):
+    ...         pass
     """
 
     _bars: Bars | None = None

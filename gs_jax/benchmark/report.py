@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..base.info import describe
+from ..base.style import line_of
 from ..io.disk import atomic_write, write_json, write_text
 from ..io.figures import write_figure
 from ..io.provenance import KEY, Provenance
@@ -105,20 +106,14 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def picture(records: Records) -> Figure:
     """The panels of Fig. 9 and two more; lines through the means, bars for the standard deviation."""
     figure = Figure(figsize=(12, 8), dpi=100, layout="constrained")
-    colours = {m: f"C{number % 10}" for number, m in enumerate(m for m in _unique(records, "method") if m != "zeros")}
     for axes, (key, label) in zip(figure.subplots(2, 3).flat, _PANELS.items(), strict=True):
         for method in _unique(records, "method"):
             if method == "zeros" and key in ("seconds", "peak_mib"):
                 continue
             pairs = sorted({r["pairs"] for r in records if r["method"] == method})
             values = [_of(records, method, p, key) for p in pairs]
-            style = (
-                {"color": "k", "ls": ":"} if method == "zeros" else {"color": colours[method], "marker": "o", "ms": 4}
-            )
-            if "dense" in method:
-                style |= {"ls": "--", "marker": "s"}
             errors = [np.std(v) for v in values] if key not in ("seconds", "peak_mib") else None
-            axes.errorbar(pairs, [np.mean(v) for v in values], errors, label=method, **style)
+            axes.errorbar(pairs, [np.mean(v) for v in values], errors, **line_of(method))
         axes.set(xscale="log", xlabel="pixel-voxel pairs", ylabel=label)
         if key in ("seconds", "peak_mib", "mse"):
             axes.set_yscale("log")

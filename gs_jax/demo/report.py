@@ -11,6 +11,15 @@ from ..geometry import Sensor
 from ..layouts.cells import nearest_neighbour_distances
 from ..metrics import Localization, Quality
 
+# What the page says of its parts.
+NOTES = {
+    "page": "What gs-jax demo made, on captures that it simulated; report.md has the scores, the optimised design and "
+    "the times.",
+    "capture": "words.tif: three words at 18, 20 and 22 mm, simulated with noise.",
+    "volume": "words.ome.tif: back-projection, then the network that suppresses the background.",
+    "points": "points-found.csv: found in points.tif, another capture.",
+}
+
 
 class Views(NamedTuple):
     """A capture, and of each volume the planes at some depths (mm), the truth's first."""

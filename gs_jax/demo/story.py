@@ -25,6 +25,7 @@ from ..io.volumes import write_volume
 from ..metrics import localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
+from ..report.page import write_report
 from ..simulation.camera import Camera, expose
 from ..simulation.phantoms import random_points, rasterize
 from ..simulation.scene import simulate
@@ -32,7 +33,7 @@ from ..solvers.richardson_lucy import RichardsonLucy
 from ..suppression.locate import find_points
 from ..suppression.unet import pretrained, suppress
 from ..voxels import Grid
-from .report import Views, points_picture, report_text, template, views_picture
+from .report import NOTES, Views, points_picture, report_text, template, views_picture
 from .scene import WORDS, words
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
@@ -45,12 +46,12 @@ _COARSE, _STEPS = slice(None, None, 2), 8
 
 
 def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-    """Run the pipeline and write a folder: designs, captures, volume, points, mold, pictures, report.
+    """Run the pipeline and write a folder: designs, captures, volume, points, mold, pictures, reports.
 
     Returns
     -------
     Path
-        Of the report, in Markdown.
+        Of the report, in Markdown. `report.html` beside it shows the microscope and what it showed.
 
     Raises
     ------
@@ -66,13 +67,15 @@ def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Pat
         write_json(folder / "metrics.json", sheet)
     with _timed(seconds, "optimisation"):
         targets = _optimise(folder, progress)
-    scores, views = _words(folder, design, seconds, progress)
+    scores, views, shown = _words(folder, design, seconds, progress)
     with progress.step("Drawing"):
         write_figure(folder / "words.png", views_picture(views, design))
-    found = _points(folder, design, seconds, progress)
+    found, score = _points(folder, design, seconds, progress)
     with _timed(seconds, "mold"):
         mold = make_mold(design, folder / "mold.stl", progress=progress)
-    text = report_text(design, findings(design, sheet), targets, scores, found, mold, seconds)
+    with _timed(seconds, "report"):
+        write_report(folder / "report.html", design, **shown, points=found, notes=NOTES, progress=progress)
+    text = report_text(design, findings(design, sheet), targets, scores, score, mold, seconds)
     write_text(folder / "report.md", text, [".md"])
     return folder / "report.md"
 
@@ -87,8 +90,8 @@ def _optimise(folder: Path, progress: Progress) -> list[dict]:
     return as_records(outcome)
 
 
-def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict, Views]:
-    """Three words at three depths: reconstructed in three ways, each against the truth."""
+def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> tuple[dict, Views, dict]:
+    """Three words at three depths: reconstructed in three ways, each against the truth; and what the page shows."""
     imager = design.imager()
     scene_grid = Grid.over(imager.sensor, depths=[z for z, _, _ in WORDS], pitch=_SCENE_MM)
     emitters = words(_SCENE_MM)
@@ -116,7 +119,8 @@ def _words(folder: Path, design: Design, seconds: dict, progress: Progress) -> t
     scores = {name: quality(volume, truth) for name, volume in volumes.items()}
     planes = [int(np.abs(np.asarray(coarse.depths) - z).argmin()) for z, _, _ in WORDS]
     shown = {"truth": truth} | dict(list(volumes.items())[1:])
-    return scores, Views(image, [z for z, _, _ in WORDS], {name: v[planes] for name, v in shown.items()})
+    views = Views(image, [z for z, _, _ in WORDS], {name: v[planes] for name, v in shown.items()})
+    return scores, views, {"image": image, "volume": clean, "grid": grid}
 
 
 def _points(folder: Path, design: Design, seconds: dict, progress: Progress):
@@ -133,7 +137,7 @@ def _points(folder: Path, design: Design, seconds: dict, progress: Progress):
     write_points(folder / "points-found.csv", found)
     score = localization(found, truth)
     write_figure(folder / "points.png", points_picture(found, truth, score))
-    return score
+    return found, score
 
 
 def _exposed(light: np.ndarray, path: Path, seed: int) -> np.ndarray:

@@ -72,6 +72,13 @@ def read_capture(
     InputError
         If the file cannot be read, is none of these, is damaged, of another size than `shape` or over 1e9 pixels, of
         another type, holds a NaN or an infinity, or is in colour or has several pages and it is not said which to take.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> gs.write_capture("capture.tif", np.zeros((200, 300), np.uint16))
+    >>> gs.read_capture("capture.tif").shape
+    (200, 300)
     """
     image = averaged(frames(path, shape, page=page, channel=channel, bayer=bayer))
     return channel_of(image, bayer, channel) if bayer else image
@@ -134,6 +141,8 @@ def write_capture(
 
     Parameters
     ----------
+    path
+        Ends in `.tif`, `.tiff`, `.png` or `.npy`.
     image
         `(row, column)` of uint8, uint16 or float32.
     provenance
@@ -145,6 +154,11 @@ def write_capture(
         As `check_output`, and for float32 in PNG, which cannot hold it.
     ValueError
         If the image has another type.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> gs.write_capture("capture.png", np.full((200, 300), 16, np.uint16))
     """
     path = check_output(path, CAPTURE_SUFFIXES)
     pixels = np.asarray(image)

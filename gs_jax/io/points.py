@@ -25,6 +25,13 @@ def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
     ------
     InputError
         As `read_table`, and if a depth is not above 0 or an intensity is below 0.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> gs.write_points("points.csv", np.array([[0.5, -0.4, 19.5, 1.0]]))
+    >>> gs.read_points("points.csv")
+    array([[ 0.5, -0.4, 19.5,  1. ]])
     """
     with check_input(path).open("rb") as file:
         first = file.readline(_LONGEST).decode("utf-8-sig", "replace").rstrip("\r\n")
@@ -61,6 +68,15 @@ def write_points(
     ------
     InputError
         As `check_output`, for `.csv`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import gs_jax as gs, numpy as np
+    >>> gs.write_points("points.csv", np.array([[0.5, -0.4, 19.5, 1.0]]))
+    >>> print(Path("points.csv").read_text(), end="")
+    x_mm,y_mm,z_mm,intensity
+    0.5,-0.4,19.5,1.0
     """
     rows, more = np.asarray(points), more or {}
     # `str` of the array's own scalars: the shortest digits that read back as the same float32 or float64.

@@ -67,6 +67,12 @@ def write_volume(
         path is `.zarr`, which has one step only.
     ValueError
         If the volume has not the grid's shape, or holds a NaN or an infinity.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> grid = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
+    >>> gs.write_volume("volume.ome.tif", np.zeros(grid.volume_shape, np.float32), grid)
     """
     path = check_output(path, VOLUME_SUFFIXES)
     voxels = _as_float32(path, np.asarray(volume))
@@ -86,6 +92,15 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "dept
     InputError
         If it cannot be read, is damaged, is not one image with the axes z, y, x, has values that float32 cannot
         hold or that are not finite, or lacks the metadata: pitch, a depth above 0 for each plane.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> grid = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
+    >>> gs.write_volume("volume.ome.tif", np.zeros(grid.volume_shape, np.float32), grid)
+    >>> volume, same = gs.read_volume("volume.ome.tif")
+    >>> volume.shape, same.pitch
+    ((3, 41, 41), 0.1)
     """
     suffix = Path(path).suffix.lower()
     if suffix not in VOLUME_SUFFIXES:

@@ -1,0 +1,281 @@
+"""The page of a design and what it showed: what it says, how large it is, and that a browser shows it."""
+
+import base64
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import tifffile
+
+from gs_jax import Grid
+from gs_jax.__main__ import main
+from gs_jax.base.errors import InputError
+from gs_jax.designs.builtin import geomscope
+from gs_jax.designs.design import read_design
+from gs_jax.io.points import write_points
+from gs_jax.io.volumes import write_volume
+from gs_jax.report import device, facts, spots, views
+from gs_jax.report.chart import line_chart
+from gs_jax.report.encode import thinned
+from gs_jax.report.page import write_report
+
+from .browser import browser, watched
+from .test_cli import DESIGN, run
+
+__all__ = ["browser"]
+
+CALIBRATED = """
+[provenance]
+parent = "/home/somebody/designs/first.toml"
+calibrated_rms_pixels = 0.031
+calibrated_spots = 12
+calibrated_captures = 3
+mirrored = false
+[provenance.calibrated_values]
+sensor_distance_mm = 5.8123
+[provenance.standard_deviations]
+sensor_distance_mm = 0.0021
+"""
+# As `gs-jax tolerance -o` writes it; `test_tolerances` holds that it does.
+TOLERANCE = {
+    "depth_mm": [18.0, 30.0],
+    "yield": 0.5,
+    "over_depths": {"position": {"a": 1.0, "b": None, "c": 2.0, "d": 0.0}},
+    "yield_without": {"position": 0.75},
+    "drawn": {"devices": 8, "spot_width_um": {"p5": [1.0, 2.0], "p50": [2.0, 3.0], "p95": [3.0, 4.0]}},
+    "nominal": {"spot_width_um": [2.0, 3.0]},
+    "targets": {"max_width_um": [2.4, 3.6]},
+}
+GRID = Grid(np.array([18.0, 18.5, 19.0, 20.0, 21.0]), (33, 29), 0.05)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a page of all that a page can have, made by the command with absolute paths."""
+    folder = tmp_path_factory.mktemp("private-folder")
+    rng = np.random.default_rng(0)
+    name = DESIGN.replace('"small"', '"small </script><b>&"')
+    (folder / "design.toml").write_text(name + CALIBRATED)
+    volume = rng.uniform(0, 1, GRID.volume_shape).astype(np.float32)
+    volume[3, 10:14, 10:14] = 9
+    write_volume(folder / "volume.ome.tif", volume, GRID, {"command": f"gs-jax reconstruct {folder}/capture.tif"})
+    write_points(folder / "points.csv", np.column_stack([rng.uniform(-0.5, 0.5, (7, 2)), rng.uniform(18, 21, (7, 2))]))
+    tifffile.imwrite(folder / "capture.tif", rng.integers(0, 900, (96, 80), np.uint16))
+    (folder / "tolerance.json").write_text(json.dumps(TOLERANCE))
+    words = [folder / "design.toml", folder / "volume.ome.tif", "--points", folder / "points.csv"]
+    words += ["--capture", folder / "capture.tif", "--tolerance", folder / "tolerance.json", "--bad-pixels", "none"]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stop:
+        patch.setattr(sys, "argv", ["gs-jax", "report", *map(str, words), "-q", "-o", str(folder / "report.html")])
+        main()
+    assert stop.value.code == 0
+    return folder
+
+
+def test_the_page_has_all_parts_and_no_path(made):
+    text = (made / "report.html").read_text()
+    parts = re.findall(r'<section id="(\w+)">', text)
+    first = ["device", "datasheet", "psf", "mtf", "layout", "capture", "volume", "points"]
+    assert parts == [*first, "mold", "calibration", "tolerance", "origin", "cite"]
+    assert set(re.findall(r'href="#(\w+)"', text)) == {*parts, "main"}
+    assert str(made) not in text and "private-folder" not in text and "/home/" not in text
+    assert "input volume.ome.tif" in text and "gs-jax reconstruct capture.tif" in text and "first.toml" in text
+    assert "small &lt;/script&gt;&lt;b&gt;&amp;" in text and "<b>" not in text
+    assert "10.1002/lpor.202100072" in text and "5.8123" in text and "50 % of 8 devices" in text
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "@import" not in text
+
+
+def test_a_page_of_a_design_alone(tmp_path):
+    """Nothing was imaged; an ideal lens has no surface, so no mold."""
+    (tmp_path / "design.toml").write_text(DESIGN.replace("[array]", "focal_length_mm = 4.6\n[array]"))
+    write_report(tmp_path / "r.html", read_design(tmp_path / "design.toml"))
+    text = (tmp_path / "r.html").read_text()
+    parts = re.findall(r'<section id="(\w+)">', text)
+    assert parts == ["device", "datasheet", "psf", "mtf", "layout", "mold", "origin", "cite"]
+    assert "None is shown: an ideal lens" in text and "<canvas" not in text
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_browser_shows_it_as_it_is(made, browser, width, scheme):
+    """From the file, without an error or a request, no wider than the screen, in the colours that are asked for."""
+    with watched(browser, (made / "report.html").as_uri(), width, color_scheme=scheme, offline=True) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        paper = re.findall(r"\d+", page.evaluate("getComputedStyle(document.body).backgroundColor"))
+        assert (int(paper[0]) > 200) == (scheme == "light")
+        broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
+        assert page.evaluate(broken) == 0 and page.locator("img").count() > 15
+
+
+def test_keys_move_the_slider_and_the_slice(made, browser):
+    with watched(browser, (made / "report.html").as_uri()) as page:
+        slider, image, said = (page.locator(name) for name in ("#depth", "#slice", "#depth-said"))
+        assert said.inner_text() == "19 mm"
+        before = image.get_attribute("src")
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        assert said.inner_text() == "20 mm" and image.get_attribute("src") != before
+        assert slider.get_attribute("aria-valuetext") == "20 mm"
+        page.keyboard.press("Home")
+        assert said.inner_text() == "18 mm"
+
+
+@pytest.mark.parametrize("name, fewest", [("volume", 60), ("points", 20), ("mold", 20)])
+def test_views_in_space_are_drawn_and_turn(made, browser, name, fewest):
+    """Of many colours, others when a key, then the mouse turns them, and as at first after 0."""
+    colours = """c => { const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        return new Set(new Uint32Array(d.buffer)).size; }"""
+    with watched(browser, (made / "report.html").as_uri()) as page:
+        canvas = page.locator(f"#view-{name}")
+        canvas.focus()
+        look = lambda: canvas.evaluate("c => new Promise(r => requestAnimationFrame(() => r(c.toDataURL())))")
+        assert canvas.evaluate(colours) >= fewest
+        first = look()
+        page.keyboard.press("ArrowLeft")
+        turned = look()
+        canvas.hover(position={"x": 300, "y": 200})
+        box = canvas.bounding_box()
+        assert box
+        page.mouse.down()
+        page.mouse.move(box["x"] + 340, box["y"] + 210)
+        page.mouse.up()
+        dragged = look()
+        page.keyboard.press("0")
+        assert first != turned and dragged not in (first, turned) and look() == first
+
+
+def test_the_floor_takes_voxels_away(made, browser):
+    # Dim voxels are violet.
+    lit = """c => { const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        let n = 0; for (let i = 0; i < d.length; i += 4) n += d[i + 2] > d[i] + 4; return n; }"""
+    with watched(browser, (made / "report.html").as_uri()) as page:
+        canvas, floor = page.locator("#view-volume"), page.locator("#floor")
+        floor.fill("1")
+        many = canvas.evaluate(lit)
+        floor.fill("250")
+        assert canvas.evaluate(lit) < many / 2 > 100
+
+
+def test_it_prints(made, browser):
+    """On white paper from a dark screen, without what only a screen has."""
+    with watched(browser, (made / "report.html").as_uri(), color_scheme="dark") as page:
+        page.emulate_media(media="print")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        assert not page.locator("nav").is_visible() and page.locator("#slice").is_visible()
+        corner = "c => [...c.getContext('2d').getImageData(c.width - 3, 3, 1, 1).data]"
+        assert min(page.locator("#view-mold").evaluate(corner)) > 200
+        assert page.pdf()[:4] == b"%PDF"
+
+
+def test_the_first_key_skips_to_the_content(made, browser):
+    with watched(browser, (made / "report.html").as_uri()) as page:
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.getAttribute('href')") == "#main"
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("design.toml", "-o", "r.txt"), "allowed: .html"),
+        (("design.toml", "points.csv", "-o", "r.html"), "points by --points"),
+        (("design.toml", "-o", "r.html", "--tolerance", "capture.tif"), "capture.tif: "),
+        (("design.toml", "-o", "r.html", "--tolerance", "other.json"), "other.json: found no 'depth_mm'"),
+        (("design.toml", "-o", "r.html", "--capture", "small.tif"), "small.tif: found"),
+        (("none.toml", "-o", "r.html"), "none.toml: "),
+    ],
+)
+def test_wrong_input_is_one_line(made, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    for name in ("design.toml", "capture.tif", "points.csv"):
+        (tmp_path / name).write_bytes((made / name).read_bytes())
+    (tmp_path / "other.json").write_text("{}")
+    tifffile.imwrite(tmp_path / "small.tif", np.zeros((5, 5), np.uint16))
+    status, out, err = run(monkeypatch, capsys, "report", *arguments)
+    assert (status, out, err.count("\n")) == (2, "", 1) and message in err
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_tolerances_of_another_kind_are_refused():
+    with pytest.raises(InputError, match="gs-jax tolerance"):
+        facts.tolerance_facts(TOLERANCE | {"drawn": {}})
+
+
+@pytest.mark.parametrize(
+    "text, kept",
+    [
+        ("gs-jax report '/home/me/my files/d.toml' -o /tmp/r.html", "gs-jax report d.toml -o r.html"),
+        ("gs-jax simulate a.csv b.toml --psf=/x/y.tif", "gs-jax simulate a.csv b.toml --psf=y.tif"),
+        (r"made of C:\Users\me\d.toml", "made of d.toml"),
+        ('source = "/srv/lab/d.toml"', 'source = "d.toml"'),
+        ("1/z' and 4.5 um / pixel of https://example.org/a/b", "1/z' and 4.5 um / pixel of https://example.org/a/b"),
+    ],
+)
+def test_folders_are_left_out(text, kept):
+    assert facts.without_folders(text) == kept
+
+
+def test_the_largest_volumes_stay_small():
+    """Noise, which nothing compresses, with as many bytes as slices may have; and a view in space."""
+    side = int(np.sqrt(views._SLICE_BYTES / 100))
+    for shape in ((100, side, side), (3, 1500, 1400)):
+        volume = np.random.default_rng(0).random(shape, np.float32)
+        grid = Grid(np.linspace(18, 22, shape[0]), shape[1:], 0.01)
+        shown = views.slices(volume, grid)
+        drawn = [p.picture for p in views.projections(volume, grid)]
+        cloud = views.cloud(volume, grid)
+        assert cloud["count"] <= 60_000 and len(shown.pictures) == shape[0]
+        assert sum(map(len, [*shown.pictures, *drawn, cloud["voxels"]])) < 11e6
+
+
+def test_the_cloud_is_where_the_voxels_are():
+    """The brightest voxel, binned, is within a bin of its place."""
+    grid = Grid(np.linspace(18, 22, 7), (501, 401), 0.02, (1.0, -2.0))
+    volume = np.zeros(grid.volume_shape, np.float32)
+    volume[4, 300, 123] = 1
+    cloud = views.cloud(volume, grid)
+    x, y, z, value = np.frombuffer(base64.b64decode(cloud["voxels"]), np.uint8)
+    assert cloud["count"] == 1 and value == 255
+    place = [cloud["first"][0] + x * cloud["pitch"][0], cloud["first"][1] + y * cloud["pitch"][1], cloud["depths"][z]]
+    np.testing.assert_allclose(place, grid.to_mm(np.array([4, 300, 123])), atol=0.03)
+
+
+def test_lenses_that_see_a_point():
+    """Counted one by one, at some points."""
+    imager = geomscope().imager()
+    seen = device.lenses_seen(imager, 20.0)
+    left, top, right, bottom = seen.box
+    rows, columns = seen.lenses.shape
+    for row, column in ((0, 0), (60, 60), (100, 17)):
+        x, y = left + (column + 0.5) * (right - left) / columns, top + (row + 0.5) * (bottom - top) / rows
+        landing = np.asarray(imager.project(np.array([[x, y, 20.0]])))[:, 0]
+        near = np.hypot(*(np.asarray(imager.centers) - (x, y)).T) <= imager.field_radius
+        assert seen.lenses[row, column] == (near & (np.abs(landing) <= 5120 * 0.0045 / 2).all(1)).sum()
+
+
+def test_the_contrast_of_a_perfect_lens():
+    """A lens without errors in focus has the closed form, where pixels are fine enough for all that it resolves."""
+    design = geomscope()
+    data = design.model_dump()
+    data["lens"] |= {"focal_length_mm": 4.6, "aperture_diameter_mm": 0.3}
+    imager = type(design).model_validate(data).imager()
+    depth = 1 / (1 / 4.6 - 1 / 5.8) - 1 / 1.43
+    found = spots.spots_of(imager, np.array([depth]), 0.3, 0.05)
+    curve = spots.contrast(found.images[0, 0], float(found.caught[0, 0]), 0.0045, float(imager.magnification(depth)))
+    ideal = spots.perfect(curve.frequency, imager, depth, 0.3)
+    # Light beside the window, and a pupil of squares.
+    np.testing.assert_allclose(curve.contrast, ideal.contrast, atol=0.02)
+
+
+def test_charts_draw_what_is_finite():
+    drawn = line_chart({"a <b>": ([1.0, 2.0, 3.0], [1.0, None, 3.0])}, x="x", y="y", title="t")
+    assert drawn.count("<polyline") == 1 and "a &lt;b&gt;" in drawn and "nan" not in drawn
+    assert "no finite number" in line_chart({"a": ([1.0], [None])}, x="x", y="y", title="t")
+    for log in (False, True):
+        assert "nan" not in line_chart({"a": ([1.0], [2.0])}, x="x", y="y", title="t", log=log)
+
+
+def test_thinning_is_the_mean_of_squares():
+    image = np.arange(36.0).reshape(6, 6)
+    np.testing.assert_allclose(thinned(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))
+    assert thinned(np.ones((1, 9)), 3).shape == (1, 3)
