@@ -13,11 +13,17 @@ SHORT := -n auto --maxprocesses 4 --dist loadfile -o filterwarnings=default \
 LOWEST := .venv-lowest/bin/python
 NEWEST := .venv-newest/bin/python
 
-.PHONY: demo test test-all test-lowest test-newest lint
+# Ray-traced captures, if they are at hand.
+DATA ?= $(wildcard ../shared/data/oracle/dev)
+
+.PHONY: demo test test-all test-lowest test-newest lint figures docs dist
 .DELETE_ON_ERROR:
 
 demo: .venv/core
 	$(BIN)/gs-jax demo --out $(OUT)
+
+figures: .venv/dev
+	$(BIN)/python -m experiments.gallery $(DATA) --out out/figures
 
 test: .venv/dev
 	$(BIN)/python -m pytest $(PARALLEL)
@@ -42,6 +48,19 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# Strict: a broken link, a public name without words or example, or a tutorial that fails ends it.
+docs: .venv/docs
+	$(BIN)/mkdocs build --strict --quiet --config-file docs/mkdocs.yml
+	@echo "out/docs/site/index.html"
+
+# The wheel is tried where nothing else is: not the checkout, not its environment.
+dist: .venv/dist
+	rm -rf dist .venv-wheel
+	$(BIN)/python -m build --outdir dist
+	$(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/python -m pip install --quiet dist/*.whl
+	cd / && $(CURDIR)/.venv-wheel/bin/gs-jax demo --out $(CURDIR)/out/wheel
+
 .venv/core: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --editable .
@@ -49,6 +68,14 @@ lint: .venv/dev
 
 .venv/dev: .venv/core
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+.venv/docs: .venv/core
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	touch $@
+
+.venv/dist: .venv/core
+	$(BIN)/python -m pip install --quiet build
 	touch $@
 
 .venv-lowest/test: pyproject.toml

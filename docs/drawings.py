@@ -1,0 +1,206 @@
+"""Drawings of these pages as SVG: `python docs/drawings.py` writes them anew."""
+
+import ast
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDER = Path(__file__).parent / "drawings"
+INK, FAINT, LIGHT, GLASS, RAY = "#263238", "#90a4ae", "#eceff1", "#cfe8f3", "#e64a19"
+# What the drawing of imports leaves out: the version, and how the command is started.
+_LEFT_OUT = {"_version", "__main__", "__init__"}
+
+
+def svg(width: float, height: float, parts: list[str]) -> str:
+    """A drawing on white."""
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
+        f'font-family="Helvetica, Arial, sans-serif" font-size="13" fill="{INK}">'
+    )
+    return "\n".join([head, f'<rect width="{width:g}" height="{height:g}" fill="white"/>', *parts, "</svg>", ""])
+
+
+def text(x: float, y: float, words: str, *, anchor: str = "start", italic: bool = False, color: str = INK) -> str:
+    """Words at a place."""
+    style = ' font-style="italic"' if italic else ""
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}"{style}>{words}</text>'
+
+
+def line(x1: float, y1: float, x2: float, y2: float, color: str = INK, width: float = 1.2, dashes: str = "") -> str:
+    """A straight line."""
+    more = f' stroke-dasharray="{dashes}"' if dashes else ""
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="{color}" stroke-width="{width:g}"{more}/>'
+
+
+def dot(x: float, y: float, radius: float = 4, color: str = RAY) -> str:
+    """A filled circle."""
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{color}"/>'
+
+
+def measure(x1: float, x2: float, y: float, words: str) -> list[str]:
+    """A length along x, with its name."""
+    ends = [line(x, y - 5, x, y + 5) for x in (x1, x2)]
+    return [line(x1, y, x2, y), *ends, text((x1 + x2) / 2, y + 19, words, anchor="middle", italic=True)]
+
+
+def chief_ray() -> str:
+    """The side view, z to the right as on the page of keys: the sensor, the plate, an object, a lens's chief ray."""
+    axis, sensor, vertex, front, point = 150.0, 80.0, 268.0, 310.0, 580.0
+    lens, q = axis - 40, axis + 55
+    m = (vertex - sensor) / (point - vertex)
+    image = lens + (lens - q) * m
+    caps = [
+        f'<path d="M {vertex} {y - 20} Q {vertex - 22} {y} {vertex} {y + 20} Z" fill="{GLASS}" stroke="{FAINT}"/>'
+        for y in (axis - 80, lens, axis, axis + 40, axis + 80)
+    ]
+    parts = [
+        line(30, axis, 610, axis, FAINT, 1, "6 4"),
+        f'<rect x="{vertex}" y="40" width="{front - vertex}" height="220" fill="{GLASS}" stroke="{FAINT}"/>',
+        *caps,
+        f'<rect x="{sensor - 8}" y="30" width="8" height="240" fill="{INK}"/>',
+        line(point, q, sensor, image, RAY, 1.8),
+        dot(point, q),
+        dot(sensor, image),
+        dot(vertex - 10, lens, 3, INK),
+        line(point, 40, point, 270, FAINT, 1, "2 4"),
+        text(point + 8, q + 20, "q", italic=True),
+        text(sensor - 16, image + 4, "p", anchor="end", italic=True),
+        text(vertex - 26, lens - 8, "c", anchor="end", italic=True),
+        text(point, 28, "object", anchor="middle"),
+        text((front + vertex) / 2, 28, "plate, n", anchor="middle"),
+        text(sensor - 4, 22, "sensor", anchor="middle"),
+        *measure(front, point, 288, "z"),
+        *measure(vertex, front, 288, "t"),
+        *measure(sensor, vertex, 288, "v"),
+        text(sensor, 330, "z' = z + t/n: the plate counts as t/n of air. p = c + (c - q) v/z'."),
+    ]
+    return svg(640, 345, parts)
+
+
+def field() -> str:
+    """A point from above: the lenses within the field radius, and its image: their pattern, s times as wide."""
+    random, centers = 7, []
+    # A pattern that is the same everywhere, of no library: points of a lattice, moved.
+    for row, column in itertools.product(range(6), range(6)):
+        random = (random * 1103515245 + 12345) % 2**31
+        angle = 2 * math.pi * random / 2**31
+        centers.append((60 + 38 * column + 9 * math.cos(angle), 70 + 38 * row + 9 * math.sin(angle)))
+    q, radius, m = (145.0, 175.0), 72.0, 0.3
+    sees = [c for c in centers if math.dist(c, q) < radius]
+    move = 330
+    parts = [
+        text(155, 25, "plate, seen along the axis", anchor="middle"),
+        text(155 + move, 25, "sensor", anchor="middle"),
+        f'<rect x="35" y="40" width="240" height="250" fill="{LIGHT}" stroke="{FAINT}"/>',
+        f'<rect x="{35 + move}" y="40" width="240" height="250" fill="{INK}"/>',
+        f'<circle cx="{q[0]}" cy="{q[1]}" r="{radius}" fill="{GLASS}" stroke="{RAY}" stroke-dasharray="5 4"/>',
+        *(dot(x, y, 3, INK if (x, y) in sees else FAINT) for x, y in centers),
+        dot(q[0], q[1], 4.5),
+        line(q[0], q[1], q[0] + radius, q[1], RAY),
+        text(q[0] + radius / 2, q[1] - 6, "field radius", anchor="middle", color=RAY),
+    ]
+    for c in sees:
+        x, y = c[0] + m * (c[0] - q[0]), c[1] + m * (c[1] - q[1])
+        parts.append(dot(x + move, y, 3, "#ffcc80"))
+    parts += [
+        text(155, 312, "dark: the lenses that see the point", anchor="middle"),
+        text(155 + move, 312, "its image: their pattern, s times as large", anchor="middle"),
+    ]
+    return svg(620, 330, parts)
+
+
+def core_halo() -> str:
+    """A spot: the chief ray's place, the core beside it, and the halo around and behind."""
+    x, y = 320.0, 120.0
+    shades = [
+        f'<ellipse cx="{x + 26 * s:.0f}" cy="{y}" rx="{100 * s:.0f}" ry="{78 * s:.0f}" fill="{GLASS}" opacity="0.45"/>'
+        for s in (1.0, 0.8, 0.6, 0.4)
+    ]
+    parts = [
+        line(40, y, 560, y, FAINT, 1, "6 4"),
+        *shades,
+        dot(x - 26, y, 6),
+        line(x - 46, y - 10, x - 46, y + 10),
+        line(x - 56, y, x - 36, y),
+        dot(70, y, 4, INK),
+        text(70, y + 24, "the lens's axis", anchor="middle"),
+        text(x - 52, y - 64, "chief ray", anchor="end"),
+        line(x - 54, y - 58, x - 47, y - 14, FAINT),
+        text(x - 20, y - 90, "core: a few pixels, the bright part"),
+        line(x - 12, y - 84, x - 24, y - 8, FAINT),
+        text(x + 110, y + 70, "halo: more than half of the light"),
+        *measure(70, x - 26, y + 100, "M (1 + e) times the field"),
+    ]
+    return svg(640, 250, parts)
+
+
+def imports() -> dict[str, set[str]]:
+    """Which folder or module of the package imports which."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "gs_jax").rglob("*.py")):
+        parts = path.relative_to(ROOT / "gs_jax").with_suffix("").parts
+        if parts[0] not in _LEFT_OUT:
+            found.setdefault(parts[0], set()).update(_imported(path, parts))
+    return {name: {other for other in others if other in found and other != name} for name, others in found.items()}
+
+
+def _imported(path: Path, parts: tuple[str, ...]) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level == len(parts):
+            yield from [node.module.split(".")[0]] if node.module else [each.name for each in node.names]
+
+
+def layers(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Names in layers: each imports from those before it alone."""
+    done: list[list[str]] = []
+    while left := sorted(set(graph) - {name for layer in done for name in layer}):
+        known = {name for layer in done for name in layer}
+        done.append([name for name in left if graph[name] <= known])
+    return done
+
+
+def imports_drawing() -> str:
+    """The direction of imports; an import that another one implies is not drawn."""
+    graph = imports()
+    rows, place = layers(graph), {}
+    high, wide = 62, 720
+    for number, row in enumerate(rows):
+        for index, name in enumerate(row):
+            place[name] = (wide * (index + 0.5) / len(row), 40 + high * number)
+    reach: dict[str, set[str]] = {}
+    for name in itertools.chain(*rows):
+        reach[name] = graph[name].union(*(reach[other] for other in graph[name]))
+    parts = []
+    for name, others in graph.items():
+        for other in sorted(others):
+            if not any(other in reach[third] for third in others - {other}):
+                (x1, y1), (x2, y2) = place[name], place[other]
+                parts.append(line(x1, y1 - 13, x2, y2 + 13, FAINT, 1.2))
+                angle = math.atan2(y2 + 13 - (y1 - 13), x2 - x1)
+                tips = [(x2 - 7 * math.cos(angle + turn), y2 + 13 - 7 * math.sin(angle + turn)) for turn in (-0.4, 0.4)]
+                parts += [line(x2, y2 + 13, x, y, FAINT, 1.2) for x, y in tips]
+    for name, (x, y) in place.items():
+        half = 5 + 3.9 * len(name)
+        parts.append(
+            f'<rect x="{x - half:.1f}" y="{y - 13:.1f}" width="{2 * half:.1f}" height="26" rx="4" '
+            f'fill="{LIGHT}" stroke="{FAINT}"/>'
+        )
+        parts.append(text(x, y + 4.5, name, anchor="middle"))
+    return svg(wide, 40 + high * len(rows) - 10, parts)
+
+
+DRAWINGS = {"chief-ray": chief_ray, "field": field, "core-halo": core_halo, "imports": imports_drawing}
+
+
+def main() -> None:
+    """Writes all of them."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, draw in DRAWINGS.items():
+        (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Pages of the site that the package itself says: its public names in their groups, its modules, its pictures."""
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import gs_jax
+from gs_jax.solvers.iteration import Solver
+
+PACKAGE = Path(gs_jax.__file__).parent
+_GROUP = re.compile(r"^(\w[^\n]+):\n\n((?:    .+\n)+)", re.MULTILINE)
+
+
+class Group(NamedTuple):
+    """A group of `help(gs_jax)`."""
+
+    title: str
+    names: list[str]
+
+    @property
+    def page(self) -> str:
+        """The page's path."""
+        return f"docs/api/{re.sub(r'[^a-z]+', '-', self.title.lower())}.md"
+
+    @property
+    def text(self) -> str:
+        """The page, for mkdocstrings."""
+        names = "\n\n".join(f"::: gs_jax.{name}" for name in self.names)
+        return f"# {self.title}\n\n{names}\n"
+
+
+def groups() -> list[Group]:
+    """All public names, in the order and the groups of the package's docstring."""
+    found = _GROUP.findall(gs_jax.__doc__ or "")
+    return [Group(title, [line.split()[0] for line in lines.splitlines()]) for title, lines in found]
+
+
+def public() -> Iterator[tuple[str, object]]:
+    """Public names and the public members of classes among them; what `Solver` says of solvers is said once."""
+    for group in groups():
+        for name in group.names:
+            value = getattr(gs_jax, name)
+            yield name, value
+            members = vars(value) if inspect.isclass(value) else {}
+            for member, what in members.items():
+                is_public = not member.startswith("_") and not hasattr(Solver, member)
+                if is_public and (isinstance(what, property | classmethod) or inspect.isfunction(what)):
+                    yield f"{name}.{member}", getattr(value, member)
+
+
+def missing() -> Iterator[str]:
+    """What a public name, or one of its parameters, has no words for; and names without an example."""
+    for name, value in public():
+        text = inspect.getdoc(value) or ""
+        if not text:
+            yield f"{name} has no docstring."
+        if "." in name:
+            continue
+        if ">>> " not in text:
+            yield f"{name} has no example."
+        if "Parameters\n---" in text:
+            listed = re.findall(r"^([\w, ]+)$\n    ", text.split("Parameters\n")[1], re.MULTILINE)
+            said = {each.strip() for line in listed for each in line.split(",")}
+            for parameter in inspect.signature(value).parameters:  # type: ignore[arg-type]
+                if parameter not in said:
+                    yield f"{name} does not say what its parameter {parameter} is."
+
+
+def modules() -> str:
+    """A table of the package's folders and modules with their first lines."""
+    rows = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        private = any(part.startswith("_") and part != "__init__" for part in parts)
+        text = re.match(r'"""(.+?)(?:\n\n|""")', path.read_text(encoding="utf-8"), re.DOTALL)
+        if parts != ("__init__",) and not private and text:
+            name = ".".join(part for part in ("gs_jax", *parts) if part != "__init__")
+            bold = "**" if parts[-1] == "__init__" else ""
+            rows.append(f"| {bold}`{name}`{bold} | {' '.join(text[1].split())} |")
+    return "\n\n| module | |\n|---|---|\n" + "\n".join(rows) + "\n"
+
+
+def gallery(page: Path) -> str:
+    """Every picture of a page of results, with its words and a link to its section."""
+    found, heading = [], ""
+    for line in page.read_text(encoding="utf-8").splitlines():
+        if line.startswith("## "):
+            heading = line[3:]
+        if match := re.match(r"!\[(.+)\]\((.+)\)", line):
+            anchor = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+            where = f"../{page.parent.name}"
+            found.append(f"![{match[1]}]({where}/{match[2]})\n\n{match[1]}: [{heading}]({where}/{page.name}#{anchor}).")
+    return "\n\n" + "\n\n".join(found) + "\n"
