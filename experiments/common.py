@@ -11,18 +11,23 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
+from cycler import cycler
 from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 from rich.table import Table
 
 from gs_jax.base.progress import Progress
+from gs_jax.base.style import PALETTE
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import Design, read_design
 from gs_jax.io.disk import make_folder, write_json, write_text
 from gs_jax.io.figures import write_figure
 
 OPTIONAL_PATH = {"type": Path, "nargs": "?"}
+# Of every picture of an experiment.
+matplotlib.rcParams.update({"axes.prop_cycle": cycler(color=PALETTE), "font.size": 9.5, "legend.frameon": False})
 
 
 class Report(NamedTuple):

@@ -135,17 +135,16 @@ def _rounds(call, peer, psf, image, steps, count):
 
 def picture(pictures: dict[str, np.ndarray]) -> Figure:
     """The hand as each sees it, from zero to its 99.9th percentile."""
-    columns = min(4, len(pictures))
+    columns = min(5, len(pictures))
     rows = -(-len(pictures) // columns)
     figure = Figure(figsize=(3.2 * columns, 2.7 * rows), dpi=90, layout="constrained")
     for axis in (axes := figure.subplots(rows, columns, squeeze=False)).flat[len(pictures) :]:
         axis.set_axis_off()
     for axis, (title, image) in zip(axes.flat, pictures.items(), strict=False):
         axis.imshow(image, cmap="gray", vmin=0, vmax=np.percentile(image, 99.9))
+        axis.set(xticks=[], yticks=[])
         axis.set_title(title, fontsize=9)
-        axis.tick_params(labelsize=7)
-    figure.supxlabel("column, pixels", fontsize=9)
-    figure.supylabel("row, pixels", fontsize=9)
+    figure.supxlabel("Each from zero to its 99.9th percentile; full size is 1200 x 1600 pixels", fontsize=9)
     return figure
 
 

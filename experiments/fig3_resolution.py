@@ -66,7 +66,12 @@ def picture(found: dict) -> Figure:
             coordinate, profile = result["profiles"][scene][axis]
             axes.plot(coordinate * (1000 if axis == "x" else 1), profile, style, label=source)
         axes.axhline(0.5 if scene == "a" else 0.85, color="gray", lw=0.8, ls=":")
-        axes.set(title=title, xlabel="x, um" if axis == "x" else "z, mm", ylabel="back-projection", ylim=(0, 1.05))
+        axes.set(
+            title=title,
+            xlabel="x, um" if axis == "x" else "z, mm",
+            ylabel="back-projection, of its peak",
+            ylim=(0, 1.05),
+        )
     figure.axes[0].legend()
     return figure
 

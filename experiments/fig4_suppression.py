@@ -22,6 +22,7 @@ from experiments.point_density import scene
 from experiments.profiles import local_maxima
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
+from gs_jax.base.style import draw_image, label_of
 from gs_jax.benchmark.measure import timed
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
@@ -32,6 +33,8 @@ from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.locate import find_points
 
 SHOWN = (18.0, 20.0, 22.0)  # mm
+# How wide a point is drawn.
+_POINT_MM = 0.6
 # Parts of the maximum. Peaks and clustering get the best of these as their lowest threshold, knowing the truth.
 THRESHOLDS = (0.08, 0.1, 0.12, 0.15, 0.2)
 # How often the search is timed after the first.
@@ -102,21 +105,22 @@ def _scores(found, truth, expected, grid) -> dict:
 
 
 def picture(result: dict) -> Figure:
-    """Rows are depths; columns the stack, the points and the truth. Points are shown a third of a mm wide."""
+    """Rows are depths; columns the stack, the points and the truth."""
     planes, pitch = result["planes"], result["pitch"]
     half = planes["truth"].shape[1] * pitch / 2
-    figure = Figure(figsize=(9, 9.2), dpi=90, layout="constrained")
-    wide = 2 * round(0.15 / pitch) + 1
-    for row, (depth, axes) in enumerate(zip(SHOWN, figure.subplots(3, 3, sharex=True, sharey=True), strict=True)):
+    figure = Figure(figsize=(9, 9.4), dpi=90, layout="constrained")
+    wide = 2 * round(_POINT_MM / 2 / pitch) + 1
+    extent = (-half, half, half, -half)
+    for row, (depth, axes) in enumerate(zip(SHOWN, figure.subplots(3, 3), strict=True)):
         for axis, (name, stack) in zip(axes, planes.items(), strict=True):
             plane = stack[row] if name == "back-projection" else maximum_filter(stack[row], wide)
-            low = np.median(plane)
-            extent = (-half, half, half, -half)
-            axis.imshow(plane, cmap="magma", extent=extent, vmin=low, vmax=max(np.quantile(plane, 0.9995), low + 1e-6))
-            axis.set_title(f"{name}, {depth:g} mm" if row == 0 else f"{depth:g} mm")
-        axes[0].set_ylabel("y, mm")
-    for axis in figure.axes[-3:]:
-        axis.set_xlabel("x, mm")
+            draw_image(axis, plane, extent, low=float(np.median(plane)), high=float(np.quantile(plane, 0.9995)))
+            if row == 0:
+                axis.set_title(label_of(name))
+        axes[0].set_ylabel(f"{depth:g} mm")
+    figure.supxlabel(
+        f"Each plane from its median to its 99.95th percentile; points and truth drawn {_POINT_MM} mm wide", fontsize=8
+    )
     return figure
 
 

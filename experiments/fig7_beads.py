@@ -10,6 +10,7 @@ DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is ta
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,6 +21,7 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.point_density import scores
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
+from gs_jax.base.style import draw_image
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
 from gs_jax.simulation.camera import Camera, expose
@@ -45,6 +47,7 @@ def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> 
         found = find_points(capture, design.imager(), grid, progress=progress)
         score = {"points": len(truth), "found": len(found)} | scores([(found, truth)])
         results[name] = {"truth": truth, "capture": capture, "found": found, "scores": score}
+        results[name]["extent"] = design.imager().sensor.extent
     return results
 
 
@@ -60,24 +63,29 @@ def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, 
 
 def picture(results: dict) -> Figure:
     """A row for each scene: the capture, and the points found (dots) and true (rings) from the front and the side."""
-    figure = Figure(figsize=(11, 3.6 * len(results)), dpi=66, layout="constrained")
+    figure = Figure(figsize=(11.5, 3.6 * len(results)), dpi=80, layout="constrained")
     rows = figure.subplots(len(results), 3, squeeze=False)
+    depths = np.concatenate([result["truth"][:, 2] for result in results.values()])
+    shades: dict[str, Any] = {"cmap": "viridis", "vmin": depths.min(), "vmax": depths.max()}
     for axes, (name, result) in zip(rows, results.items(), strict=True):
         capture, found, truth = result["capture"], result["found"], result["truth"]
         brightest = block_reduce(capture, SHOWN, np.max)
-        extent = (0, SHOWN * brightest.shape[1], SHOWN * len(brightest), 0)
-        axes[0].imshow(brightest, cmap="magma", extent=extent, vmin=capture.min(), vmax=np.quantile(brightest, 0.99))
-        axes[0].set(title=f"{name}: capture", xlabel="column", ylabel="row")
+        draw_image(
+            axes[0], brightest, result["extent"], low=float(capture.min()), high=float(np.quantile(brightest, 0.99))
+        )
+        axes[0].set_title(f"{name}: capture")
         for axis, (i, j) in zip(axes[1:], ((0, 1), (0, 2)), strict=True):
             rings = dict(facecolors="none", edgecolors="tab:gray", lw=0.7)
             axis.scatter(truth[:, i], truth[:, j], s=40, label="truth", **rings)
-            dots = axis.scatter(found[:, i], found[:, j], s=6, c=found[:, 2], cmap="viridis", label="found")
+            axis.scatter(found[:, i], found[:, j], s=7, c=found[:, 2], label="found", **shades)
             axis.set(xlabel="x, mm", ylabel="xyz"[j] + ", mm")
             axis.invert_yaxis()
-            figure.colorbar(dots, ax=axis, label="depth, mm")
         axes[1].set_aspect("equal")
         axes[1].set_title(f"{len(found)} found of {len(truth)}, F1 {result['scores']['f1']:.3f}")
-        axes[2].legend(loc="upper right")
+    figure.colorbar(rows[0, 2].collections[1], ax=rows[:, 2], label="depth, mm")
+    handles, labels = rows[0, 2].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower right", ncols=2)
+    figure.supxlabel("Captures: the brightest pixel of each 40 x 40, up to the 99th percentile", fontsize=8, x=0.2)
     return figure
 
 

@@ -28,6 +28,7 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
+from gs_jax.base.style import draw_image, label_of
 from gs_jax.demo.scene import words
 from gs_jax.designs.design import Design
 from gs_jax.io.captures import read_capture
@@ -136,8 +137,8 @@ def numbers(found: dict) -> dict:
     return found | {"scenes": {name: scene["scores"] for name, scene in found["scenes"].items()}}
 
 
-def picture(scene: dict, depths: tuple[float, ...] = DEPTHS, shown: tuple[float, ...] = (18.0, 20.0, 22.0)) -> Figure:
-    """Planes of the truth and of what each method makes, each from zero to its own brightest."""
+def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upward: bool = False) -> Figure:
+    """Planes of the truth and of what each method makes, each volume from zero to its 99.99th percentile."""
     columns = {"truth": scene["truth"]} | {
         k: v for k, v in scene["volumes"].items() if k in ("back-projection", *NETWORKS)
     }
@@ -150,10 +151,13 @@ def picture(scene: dict, depths: tuple[float, ...] = DEPTHS, shown: tuple[float,
     figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(shown)), dpi=90, layout="constrained")
     for line, depth in zip(figure.subplots(len(shown), len(columns), squeeze=False), shown, strict=True):
         for axes, (name, volume) in zip(line, columns.items(), strict=True):
-            plane = volume[int(np.argmin(np.abs(np.array(depths) - depth)))][crop]
-            axes.imshow(plane, cmap="magma", vmin=0, vmax=np.quantile(volume, 0.9999), extent=extent)
-            axes.set(title=f"{name}, {depth:g} mm", xlabel="x, mm", ylabel="y, mm")
-            axes.label_outer()
+            plane = volume[int(np.argmin(np.abs(np.array(DEPTHS) - depth)))][crop]
+            draw_image(axes, plane, extent, high=float(np.quantile(volume, 0.9999)), upward=upward)
+            if depth == shown[0]:
+                axes.set_title(label_of(name))
+        line[0].set_ylabel(f"{depth:g} mm")
+    drawn = ", +y upwards, as the scene was drawn" if upward else ""
+    figure.supxlabel(f"Each volume from zero to its 99.99th percentile{drawn}", fontsize=8)
     return figure
 
 
@@ -163,7 +167,7 @@ def report(data: Path | None, progress: Progress) -> Report:
     tables = []
     for name, scene in found["scenes"].items():
         shown = (18.0,) if "USAF" in name else (18.0, 20.0, 22.0)
-        files[f"{name.replace(', ', '_').replace(' ', '_')}.png"] = picture(scene, shown=shown)
+        files[f"{name.replace(', ', '_').replace(' ', '_')}.png"] = picture(scene, shown, upward="ray-traced" in name)
         base = scene["scores"]["back-projection"]["mse"]
         rows = [
             [method, f"{s['psnr_db']:.2f}", f"{s['ssim']:.4f}", f"{s['mse']:.3g}", f"{s['mse'] / base:.3f}"]

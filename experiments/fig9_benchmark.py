@@ -32,6 +32,7 @@ from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, reproject
 from gs_jax.base.progress import Progress
+from gs_jax.base.style import draw_image, label_of
 from gs_jax.benchmark.measure import timed
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.benchmark.scenes import spots
@@ -116,6 +117,17 @@ SCENES: dict[str, Callable[[Path], Scene]] = {
 }
 
 
+# Drawn by others with +y upwards.
+_UPWARD = ("letters",)
+
+
+class View(NamedTuple):
+    """Maxima over the depths, and `(left, right, bottom, top)`, mm."""
+
+    maxima: np.ndarray
+    extent: tuple[float, float, float, float]
+
+
 class Result(NamedTuple):
     """A volume, and the points `(x, y, z, intensity)` that it was made of, if it was."""
 
@@ -154,8 +166,8 @@ def best_f1(result: Result, s: Scene) -> float | None:
 
 def run(
     data: Path, scenes: Sequence[str] = tuple(SCENES), *, steps: int = STEPS, progress: Progress
-) -> tuple[dict, dict[str, np.ndarray]]:
-    """What `captures.json` holds, and maxima over the depths by title."""
+) -> tuple[dict, dict[tuple[str, str], View]]:
+    """What `captures.json` holds, and maxima over the depths by scene and method."""
     rows, pictures = [], {}
     for name in scenes:
         s = SCENES[name](data)
@@ -165,7 +177,7 @@ def run(
             scores = {"psnr_db": q.psnr_db, "ssim": q.ssim, "mse": q.mse, "f1": best_f1(result, s)}
             again = reproject(result.volume, s.image, s.imager, s.grid, progress=progress).error
             rows.append({"scene": name, "method": method, "seconds": seconds} | scores | {"reprojection": again})
-            pictures[f"{name}: {method}"] = result.volume.max(0)
+            pictures[name, method] = View(result.volume.max(0), s.grid.extent)
     return {"rows": rows}, pictures
 
 
@@ -177,20 +189,22 @@ def markdown(found: dict) -> str:
     return markdown_table(head, rows) + "\n"
 
 
-def picture(pictures: dict[str, np.ndarray]) -> Figure:
-    """Maxima over the depths, each up to its 99.9th percentile, in voxels."""
+def picture(pictures: dict[tuple[str, str], View]) -> Figure:
+    """Maxima over the depths, each up to its 99.9th percentile."""
     columns = 4
     rows = -(-len(pictures) // columns)
-    figure = Figure(figsize=(12, 3.1 * rows), dpi=66, layout="constrained")
+    figure = Figure(figsize=(12, 3.2 * rows), dpi=66, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat[len(pictures) :]:
         axis.set_axis_off()
-    for axis, (title, image) in zip(axes.flat, pictures.items(), strict=False):
-        axis.imshow(image, cmap="magma", vmin=0, vmax=np.percentile(image, 99.9) or None)
-        axis.set_title(title, fontsize=9)
-        axis.tick_params(labelsize=7)
-    figure.supxlabel("x, voxels", fontsize=9)
-    figure.supylabel("y, voxels", fontsize=9)
+    for axis, ((scene, method), view) in zip(axes.flat, pictures.items(), strict=False):
+        draw_image(
+            axis, view.maxima, view.extent, high=float(np.percentile(view.maxima, 99.9)), upward=scene in _UPWARD
+        )
+        axis.set_title(f"{scene}: {label_of(method)}", fontsize=11)
+    said = "Maxima over the depths, each from zero to its 99.9th percentile"
+    drawn = "; +y upwards, as the scene was drawn" if any(scene in _UPWARD for scene, _ in pictures) else ""
+    figure.supxlabel(said + drawn, fontsize=10)
     return figure
 
 

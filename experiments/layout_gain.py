@@ -204,7 +204,7 @@ def picture(found: dict) -> Figure:
     """Losses of the random layouts, the controls and ours; one seed's layouts."""
     figure = Figure(figsize=(17, 3.8), dpi=100, layout="constrained")
     left, *right = figure.subplots(1, 6, width_ratios=(1.6, 1, 1, 1, 1, 1))
-    colors = "C0", "C3", "C1", "C2", "C4"
+    colors = "C0", "C2", "C1", "#009e73", "C4"
     titles = "best of the random", "optimised", "best of uneven rows", "hexagonal", "hexagonal, spread"
     for row in found["seeds"]:
         random, at = row["random_loss_db"], row["seed"]
@@ -212,7 +212,11 @@ def picture(found: dict) -> Figure:
         losses = min(random), row["ours_loss_db"], min(row["rows_loss_db"]), *row["hexagonal_loss_db"]
         for x, color, marker, title in zip(losses, colors, "oDshH", titles, strict=True):
             left.plot(x, at, marker, color=color, label=title)
-    left.set(xlabel="loss, dB (better to the left)", ylabel="seed", yticks=[row["seed"] for row in found["seeds"]])
+    left.set(
+        xlabel="loss of the search, dB (better to the left)",
+        ylabel="seed",
+        yticks=[row["seed"] for row in found["seeds"]],
+    )
     left.set_ylim(-0.5, len(found["seeds"]) + 0.8)  # room for the legend
     left.legend(*[x[:5] for x in left.get_legend_handles_labels()], loc="upper center", ncols=2, fontsize=8)
     half, row = found["study"]["field"] / 2, found["seeds"][0]
@@ -221,9 +225,10 @@ def picture(found: dict) -> Figure:
         axes.plot(*np.transpose(row["centers_mm"][name]), "o", color=color)
         axes.plot(*np.array([(-1, -1, 1, 1, -1), (-1, 1, 1, -1, -1)]) * half, "k:")
         x, y = (side / 2 for side in found["study"]["plate"])
-        axes.set(xlabel="x, mm", ylabel="y, mm", title=f"{title}\n{score:.2f} dB", aspect="equal")
+        axes.set(xlabel="x, mm", ylabel="y, mm", title=f"{title}\nPSNR {score:.2f} dB", aspect="equal")
         axes.set(xlim=(-1.05 * x, 1.05 * x), ylim=(-1.05 * y, 1.05 * y))
-    figure.supxlabel("dotted: the object", fontsize=9, x=0.65)
+    said = "Layouts of the first seed, lenses as dots, the object dotted; PSNR of back-projection, mean over the scenes"
+    figure.supxlabel(said, fontsize=9, x=0.65)
     return figure
 
 

@@ -119,13 +119,13 @@ def _draw_facets(axes, array: MicrolensArray) -> None:
 def _draw_cost(axes, records: list[dict]) -> None:
     chord = [record["chord_um"] for record in records]
     strehl = [record["strehl_of_facets_median"] for record in records]
-    axes.semilogx(chord, strehl, "o-", color="tab:blue")
+    axes.semilogx(chord, strehl, "o-")
     axes.axhline(0.8, color="gray", linewidth=0.8, linestyle="--")
     axes.set(xlabel="chord error, um", ylabel="Strehl ratio of the facets alone", ylim=(0, 1.02))
     axes.set_title("what facets cost")
     right = axes.twinx()
-    right.semilogy(chord, [record["facets"] for record in records], "s--", color="tab:orange")
-    right.set_ylabel("facets", color="tab:orange")
+    right.semilogy(chord, [record["facets"] for record in records], "s--", color="C6")
+    right.set_ylabel("facets", color="C6")
     axes.set_xticks(chord, [f"{value:g}" for value in chord])
     axes.set_xticks([], minor=True)
 

@@ -20,36 +20,40 @@ NEIGHBOURS = 16
 def traced(emitters: np.ndarray, imager: Imager, rays: int) -> np.ndarray:
     """The image of `(x, y, z, intensity)`: the part of each intensity that a pixel gets.
 
-    `rays` go from each emitter toward each lens, at random but always the same. Apertures end at the disc and half-way
-    to the neighbours.
+    `rays` go from each emitter toward each lens, at random but always the same. Apertures end at the disc and where a
+    neighbour's surface is higher, which is half-way if lenses are alike.
     """
     centers = np.asarray(imager.centers, np.float64)
     near = np.argsort(np.linalg.norm(centers[:, None] - centers, axis=-1))[:, 1 : NEIGHBOURS + 1]
     a = imager.array
-    lens = a.radius_of_curvature, a.conic_constant, a.refractive_index, a.substrate_thickness, a.aperture_diameter / 2
+    each = a.radius_of_curvature, a.conic_constant, a.aperture_diameter / 2
+    lenses = np.column_stack([centers, *(np.broadcast_to(np.asarray(x, np.float64), len(centers)) for x in each)])
     curve_first = a.orientation == "curved"
-    numbers = tuple(float(x) for x in (*lens, imager.sensor_distance, imager.sensor.pixel_pitch))
+    shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
+    numbers = tuple(float(x) for x in shared)
     images = np.zeros((PARTS, *imager.sensor.shape))
-    _traced(np.asarray(emitters, np.float64), centers, near, numbers, curve_first, images, rays)
+    _traced(np.asarray(emitters, np.float64), lenses, near, numbers, curve_first, images, rays)
     return images.sum(0)
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
-def _traced(emitters, centers, near, numbers, curve_first, images, rays):
+def _traced(emitters, lenses, near, numbers, curve_first, images, rays):
     for part in prange(PARTS):
         np.random.seed(part)
         for number in range(part, len(emitters), PARTS):
-            for lens in range(len(centers)):
-                others = centers[near[lens]] - centers[lens]
-                _add_spot(images[part], emitters[number], centers[lens], others, numbers, curve_first, rays)
+            for lens in range(len(lenses)):
+                others = lenses[near[lens]]
+                others[:, :2] -= lenses[lens, :2]
+                _add_spot(images[part], emitters[number], lenses[lens], others, numbers, curve_first, rays)
 
 
 @njit(fastmath=True, error_model="numpy")
-def _add_spot(image, emitter, center, others, numbers, curve_first, rays):
-    radius, conic, n, t, aperture, v, pixel = numbers
+def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
+    n, t, v, pixel = numbers
+    radius, conic, aperture = lens[2:]
     x, y, z, intensity = emitter
-    x, y = x - center[0], y - center[1]
-    sag = aperture**2 / (radius + math.sqrt(radius**2 - (1 + conic) * aperture**2))
+    x, y = x - lens[0], y - lens[1]
+    sag = _sag(aperture**2, radius, conic)
     # The part of the front plane, a disc, that light of the whole aperture can come through.
     if curve_first:
         air = math.hypot(x, y) / z
@@ -81,8 +85,8 @@ def _add_spot(image, emitter, center, others, numbers, curve_first, rays):
         if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
         way = to_sensor / ray[2]
-        row = math.floor((center[1] + last[1] + way * ray[1]) / pixel + image.shape[0] / 2)
-        column = math.floor((center[0] + last[0] + way * ray[0]) / pixel + image.shape[1] / 2)
+        row = math.floor((lens[1] + last[1] + way * ray[1]) / pixel + image.shape[0] / 2)
+        column = math.floor((lens[0] + last[0] + way * ray[0]) / pixel + image.shape[1] / 2)
         if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
             image[row, column] += light * passed * again * z / length**3
 
@@ -112,9 +116,15 @@ def _met(start, ray, below, toward, radius, conic):
 def _covered(cap, others):
     """Whether a neighbour's surface is above a point of the lens."""
     for other in others:
-        if cap[0] * other[0] + cap[1] * other[1] > (other[0] ** 2 + other[1] ** 2) / 2:
+        apart = (cap[0] - other[0]) ** 2 + (cap[1] - other[1]) ** 2
+        if apart < other[4] ** 2 and _sag(apart, other[2], other[3]) < cap[2]:
             return True
     return False
+
+
+@njit(fastmath=True, error_model="numpy")
+def _sag(squared, radius, conic):
+    return squared / (radius + math.sqrt(radius**2 - (1 + conic) * squared))
 
 
 @njit(fastmath=True, error_model="numpy")

@@ -111,7 +111,7 @@ def _diameters(design: Design) -> dict[str, float]:
     sheet = datasheet(design, [20.0])
     clear, pitch = sheet["focal_length_mm"] / sheet["f_number"], sheet["pitch_mm"]
     return {
-        "D = 2 mm as printed": design.lens.aperture_diameter_mm,
+        "D = 2 mm as printed": float(design.imager().array.aperture_diameter),
         f"D = {clear:.2f} mm, clear": clear,
         f"D = {pitch:.2f} mm, pitch": pitch,
     }
