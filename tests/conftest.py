@@ -1,3 +1,4 @@
+import math
 import os
 from pathlib import Path
 
@@ -26,3 +27,10 @@ def _compiled_code_is_dropped():
     """Programs take memory maps, of which Linux gives a process 65,530: too few for those of all tests."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _no_machine_is_slow(monkeypatch):
+    """What a test reads on standard error is what it asked for, not that a slow machine took ten seconds."""
+    monkeypatch.setattr("gs_jax.base.progress._EVERY", math.inf)
+    monkeypatch.setattr("gs_jax.base.progress._TELLING", math.inf)

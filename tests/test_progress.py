@@ -16,7 +16,9 @@ __all__ = ["folder"]
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Four seconds pass each time that it is read."""
+    """Four seconds pass each time that it is read; lines come as a user gets them."""
+    monkeypatch.setattr(module, "_EVERY", 10.0)
+    monkeypatch.setattr(module, "_TELLING", 3.0)
     times = map(float, range(0, 10_000, 4))
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
 
