@@ -345,9 +345,11 @@ def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys
 @pytest.mark.slow
 def test_demo(tmp_path, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, "demo", "--out", tmp_path / "demo")
-    assert (status, err) == (0, "") and "report.md" in out
+    assert (status, err) == (0, "") and "report.md" in out and "report.html" in out
     made = {p.name for p in (tmp_path / "demo").iterdir()}
     assert made >= {"design.toml", "optimized.toml", "words.tif", "words.ome.tif", "points-found.csv", "mold.stl"}
+    page = (tmp_path / "demo" / "report.html").read_text()
+    assert 1e6 < len(page) < 15e6 and str(tmp_path) not in page
     assert len(read_points(tmp_path / "demo" / "points-found.csv")) == pytest.approx(60, abs=2)
     report = (tmp_path / "demo" / "report.md").read_text()
     assert all(name in made for name in re.findall(r"!\[.*\]\((.*)\)", report)) and "NO" not in report

@@ -31,6 +31,8 @@ ORDER = [
     "codesign",
     "mold",
     "tolerances",
+    "report",
+    "explore",
     "benchmark",
     "demo",
     "cli",
