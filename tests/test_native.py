@@ -1,5 +1,6 @@
 """The kernels that numba compiles: the same numbers as XLA's, from any thread, and only where they are at hand."""
 
+import os
 import re
 import subprocess
 import sys
@@ -21,8 +22,10 @@ from .helpers import scene
 
 pytest.importorskip("numba")
 
-# Voxels of all sizes; volumes that are narrower than sixteen; rays off the sensor; a sensor of odd shape.
-GRIDS = [((21, 17), 0.05), ((9, 8), 0.21), ((40, 33), 0.006), ((5, 3), 0.02), ((30, 70), 0.02)]
+# Voxels of all sizes, whose rays are 0.4 to 14 pixels apart: sixteen meet up to 32, 48, 64 or more pixels, and a pixel
+# is reached by two, four or more. Volumes that are narrower than sixteen; rays off the sensor; a sensor of odd shape.
+GRIDS = [((21, 17), 0.05), ((9, 8), 0.21), ((40, 33), 0.006), ((5, 3), 0.02), ((30, 70), 0.02), ((20, 50), 0.04)]
+GRIDS += [((40, 66), 0.011)]
 WEIGHTS = [Envelope(0.45), RingLight(0.0, 0.4), RingLight(0.3, 0.5)]
 
 
@@ -152,6 +155,15 @@ def test_without_numba(monkeypatch):
         np.testing.assert_allclose(found(image), expected, rtol=1e-5, atol=1e-5)
     finally:
         native._load.cache_clear()
+
+
+@pytest.mark.slow
+def test_processors_that_do_not_pick():
+    """Without AVX-512 the same numbers, by other ways."""
+    chosen = "other_types or test_adjoint or (all_three and 0.05)"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__]
+    done = subprocess.run(command, env=os.environ | {"NUMBA_CPU_NAME": "generic"}, capture_output=True, text=True)
+    assert done.returncode == 0 and "passed" in done.stdout, done.stdout
 
 
 def test_numba_is_not_imported_before_it_is_needed():

@@ -14,11 +14,15 @@ from .test_cli import RECONSTRUCT, folder
 __all__ = ["folder"]
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Four seconds pass each time that it is read; lines come as a user gets them."""
+@pytest.fixture(autouse=True)
+def _lines_come_as_a_user_gets_them(monkeypatch):
     monkeypatch.setattr(module, "_EVERY", 10.0)
     monkeypatch.setattr(module, "_TELLING", 3.0)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Four seconds pass each time that it is read."""
     times = map(float, range(0, 10_000, 4))
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
 

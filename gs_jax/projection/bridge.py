@@ -231,5 +231,5 @@ def _compile(function, result, arguments) -> int:
 @cache
 def _sources() -> int:
     folder = Path(__file__).parent
-    names = ("bridge", "kernels", "rows", "tiles", "vectors")
+    names = ("bridge", "kernels", "picks", "rows", "shuffles", "tiles", "vectors")
     return crc32(b"".join((folder / f"{name}.py").read_bytes() for name in names))

@@ -1,5 +1,6 @@
 """On a processor by compiled kernels, where these are at hand; by XLA everywhere else."""
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -15,7 +16,7 @@ from ..geometry import FALLOFF, field_limit
 from .rays import Envelope, Rays
 
 # Parts of a kernel's work, for threads to share: the more, the more evenly, and the more is done twice at their edges.
-_PARTS = 32
+_PARTS = min(max(8 * (os.cpu_count() or 1), 16), 64)
 # Numbers that kernels handle at once.
 WIDTH = 16
 # As which XLA knows the handler.

@@ -11,8 +11,6 @@ from .vectors import WIDTH, carray, inline
 PARTS, BUFFERS, PER_BUFFER = 3, 8, 5
 # Buffers: numbers of the weight, its parameters, start, pixel, fraction and distance2 of y and of x, and what follows.
 FIRST = 10
-# What XLA calls the types of pixels; an image of ones is a bool.
-BOOL, UINT8, UINT16 = 1, 6, 7
 ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3, 6, 1e8))
 
 
@@ -51,6 +49,12 @@ def numbers(job, buffer):
 def integers(job, buffer):
     shape = (size(job, buffer, 0), size(job, buffer, 1), size(job, buffer, 2))
     return carray(v.pointer(address(job, buffer)), shape, np.int32)
+
+
+@inline
+def tables_of_columns(job):
+    """Addresses of the pixels, fractions and squared distances of x."""
+    return address(job, 7), address(job, 8), address(job, 9)
 
 
 @inline
@@ -158,7 +162,7 @@ def chord(x2, y2, limit2, begin, end):
 
 
 @inline
-def _pixel_and_fraction(pixel, fraction, pixels):
+def pixel_and_fraction(pixel, fraction, pixels):
     """The pixel below a ray, with a neighbour above it also at the sensor's edge."""
     low = min(max(np.int64(pixel), 0), pixels - 2)
     return low, fraction + np.float32(np.int64(pixel) - low)
@@ -167,15 +171,7 @@ def _pixel_and_fraction(pixel, fraction, pixels):
 @inline
 def line(tables, lens, d, k, pixels):
     """The row of pixels that a row of voxels meets, and how far it is to the next."""
-    return _pixel_and_fraction(tables.y_pixel[lens, d, k], tables.y_fraction[lens, d, k], pixels)
-
-
-@inline
-def columns(tables, lens, d, pixels, low, right, x2):
-    """The same of all columns of voxels, and their squared distances."""
-    for c in range(low.size):
-        x2[c] = tables.x_distance2[lens, d, c]
-        low[c], right[c] = _pixel_and_fraction(tables.x_pixel[lens, d, c], tables.x_fraction[lens, d, c], pixels)
+    return pixel_and_fraction(tables.y_pixel[lens, d, k], tables.y_fraction[lens, d, k], pixels)
 
 
 @inline
@@ -183,22 +179,16 @@ def blend(job, buffer, row, first, last, above, below, target):
     """Two neighbouring rows of the image, weighted, sixteen pixels a time; the last begin before their place."""
     columns, kind = size(job, buffer, 1), job[BUFFERS + PER_BUFFER * buffer + 1]
     start = row * columns
-    if kind == UINT8:
-        for block in range(first, last):
-            j = min(WIDTH * block, columns - WIDTH)
-            here = address(job, buffer) + start + j
-            v.store(target + 4 * j, above * v.load_uint8(here) + below * v.load_uint8(here + columns))
-    elif kind == UINT16:
-        for block in range(first, last):
-            j = min(WIDTH * block, columns - WIDTH)
-            here = address(job, buffer) + 2 * (start + j)
-            v.store(target + 4 * j, above * v.load_uint16(here) + below * v.load_uint16(here + 2 * columns))
-    else:
-        upper = address(job, buffer) + 4 * start
-        lower = upper + 4 * columns
-        for block in range(first, last):
-            j = 4 * min(WIDTH * block, columns - WIDTH)
-            v.store(target + j, above * v.load(upper + j) + below * v.load(lower + j))
+    for block in range(first, last):
+        j = min(WIDTH * block, columns - WIDTH)
+        upper = v.load_pixels(kind, address(job, buffer), start + j)
+        lower = v.load_pixels(kind, address(job, buffer), start + columns + j)
+        v.store(target + 4 * j, above * upper + below * lower)
+
+
+@inline
+def bytes_of(kind):
+    return 1 if kind == v.UINT8 else 2 if kind == v.UINT16 else 4
 
 
 @inline

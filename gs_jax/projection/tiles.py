@@ -11,6 +11,7 @@ import numpy as np
 
 from . import rows as r, vectors as v
 from .rows import BUFFERS, PARTS, PER_BUFFER, ZERO
+from .shuffles import transpose
 from .vectors import WIDTH, carray, function, inline
 
 # Buffers: a plan, cosines and sines, spectra; images follow, and sums of them.
@@ -131,8 +132,8 @@ def _turn(at_strip, at_tile, number, side):
     plane = _plane(side)
     for block in range(side // WIDTH):
         source, target = at_strip + _STEP * WIDTH * block, at_tile + 2 * plane * block + _STEP * WIDTH * number
-        v.transpose(source, target)
-        v.transpose(source + plane, target + plane)
+        transpose(source, target)
+        transpose(source + plane, target + plane)
 
 
 @function

@@ -14,11 +14,14 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 
 from .native import WIDTH
 
+# What XLA calls the types of pixels; an image of ones is a bool.
+BOOL, UINT8, UINT16 = 1, 6, 7
 # Any order of sums, but NaN stays NaN.
 FLAGS = ("reassoc", "nsz", "arcp", "contract", "afn")
 FAST = {"fastmath": set(FLAGS), "error_model": "numpy"}
-_FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
-_I32 = ir.IntType(32)
+FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
+I32 = ir.IntType(32)
+INTEGERS = ir.VectorType(I32, WIDTH)
 # What it makes of a function takes one argument less, which type checkers cannot know.
 intrinsic: Any = extending.intrinsic
 carray: Any = _carray
@@ -47,12 +50,12 @@ VECTOR = Vector()
 @register_model(Vector)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _FLOATS)
+        super().__init__(manager, kind, FLOATS)
 
 
-def _splat(builder, number):
-    first = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), number, _I32(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH))
+def splat(builder, number):
+    first = builder.insert_element(ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined), number, I32(0))
+    return builder.shuffle_vector(first, first, ir.Constant(INTEGERS, [0] * WIDTH))
 
 
 def _arithmetic(operation, instruction):
@@ -65,7 +68,7 @@ def _arithmetic(operation, instruction):
         return of
 
     def code(context, builder, signature, arguments):
-        both = [a if kind == VECTOR else _splat(builder, a) for a, kind in zip(arguments, signature.args, strict=True)]
+        both = [a if kind == VECTOR else splat(builder, a) for a, kind in zip(arguments, signature.args, strict=True)]
         return getattr(builder, instruction)(*both, flags=FLAGS)
 
     for pair in ((VECTOR, VECTOR), (VECTOR, types.float32), (types.float32, VECTOR)):
@@ -81,7 +84,7 @@ for _operation, _instruction in (
     _arithmetic(_operation, _instruction)
 
 
-def _pointer(builder, address, kind):
+def pointer_to(builder, address, kind):
     return builder.inttoptr(address, kind.as_pointer())
 
 
@@ -89,23 +92,37 @@ def _pointer(builder, address, kind):
 def load(_, address):
     """From an address that is a multiple of four."""
     return VECTOR(address), lambda context, builder, signature, arguments: builder.load(
-        _pointer(builder, arguments[0], _FLOATS), align=4
+        pointer_to(builder, arguments[0], FLOATS), align=4
     )
 
 
-def _loads_integers(bits):
-    @intrinsic
-    def load_integers(_, address):
-        def code(context, builder, signature, arguments):
-            kind = ir.VectorType(ir.IntType(bits), WIDTH)
-            return builder.uitofp(builder.load(_pointer(builder, arguments[0], kind), align=1), _FLOATS)
+@intrinsic
+def load_pixels(_, kind, address, number):
+    """Sixteen pixels from a number on, of the types that XLA numbers so: bytes, words of 16 bits, or else float32."""
 
-        return VECTOR(address), code
+    def code(context, builder, signature, arguments):
+        kind, address, number = arguments
+        values = []
+        found = builder.append_basic_block("found")
+        for wanted, bits in ((UINT8, 8), (UINT16, 16)):
+            here, elsewhere = builder.append_basic_block(), builder.append_basic_block()
+            builder.cbranch(builder.icmp_signed("==", kind, kind.type(wanted)), here, elsewhere)
+            builder.position_at_end(here)
+            place = builder.add(address, builder.mul(number, number.type(bits // 8)))
+            integers = builder.load(pointer_to(builder, place, ir.VectorType(ir.IntType(bits), WIDTH)), align=1)
+            values.append((builder.uitofp(integers, FLOATS), here))
+            builder.branch(found)
+            builder.position_at_end(elsewhere)
+        place = builder.add(address, builder.mul(number, number.type(4)))
+        values.append((builder.load(pointer_to(builder, place, FLOATS), align=4), elsewhere))
+        builder.branch(found)
+        builder.position_at_end(found)
+        value = builder.phi(FLOATS)
+        for pixels, block in values:
+            value.add_incoming(pixels, block)
+        return value
 
-    return load_integers
-
-
-load_uint8, load_uint16 = _loads_integers(8), _loads_integers(16)
+    return VECTOR(types.int64, types.int64, types.int64), code
 
 
 @intrinsic
@@ -113,27 +130,10 @@ def store(_, address, vector):
     """To an address that is a multiple of four."""
 
     def code(context, builder, signature, arguments):
-        builder.store(arguments[1], _pointer(builder, arguments[0], _FLOATS), align=4)
+        builder.store(arguments[1], pointer_to(builder, arguments[0], FLOATS), align=4)
         return context.get_dummy_value()
 
     return types.none(address, vector), code
-
-
-def _loads_every_second(first):
-    @intrinsic
-    def load_some(_, address):
-        def code(context, builder, signature, arguments):
-            both = builder.load(_pointer(builder, arguments[0], ir.VectorType(ir.FloatType(), 2 * WIDTH)), align=4)
-            mask = ir.Constant(ir.VectorType(_I32, WIDTH), list(range(first, 2 * WIDTH, 2)))
-            return builder.shuffle_vector(both, both, mask)
-
-        return VECTOR(address), code
-
-    return load_some
-
-
-# Of 32 numbers.
-load_even, load_odd = _loads_every_second(0), _loads_every_second(1)
 
 
 @intrinsic
@@ -142,7 +142,7 @@ def clipped(_, vector):
 
     def code(context, builder, signature, arguments):
         (value,) = arguments
-        zero, one = (_splat(builder, ir.Constant(ir.FloatType(), number)) for number in (0.0, 1.0))
+        zero, one = (splat(builder, ir.Constant(ir.FloatType(), number)) for number in (0.0, 1.0))
         value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
         return builder.select(builder.fcmp_ordered("<", value, one), value, one)
 
@@ -158,19 +158,17 @@ def total(_, vector):
         count = WIDTH
         while count > 1:
             count //= 2
-            halves = (
-                ir.Constant(ir.VectorType(_I32, count), list(range(start, start + count))) for start in (0, count)
-            )
+            halves = (ir.Constant(ir.VectorType(I32, count), list(range(start, start + count))) for start in (0, count))
             low, high = (builder.shuffle_vector(value, value, half) for half in halves)
             value = builder.fadd(low, high)
-        return builder.extract_element(value, _I32(0))
+        return builder.extract_element(value, I32(0))
 
     return types.float32(vector), code
 
 
 @intrinsic
 def zeros(_):
-    return VECTOR(), lambda context, builder, signature, arguments: ir.Constant(_FLOATS, [0.0] * WIDTH)
+    return VECTOR(), lambda context, builder, signature, arguments: ir.Constant(FLOATS, [0.0] * WIDTH)
 
 
 @intrinsic
@@ -179,8 +177,8 @@ def copy_two(_, source, target):
 
     def code(context, builder, signature, arguments):
         both = ir.IntType(64)
-        value = builder.load(_pointer(builder, arguments[0], both), align=4)
-        builder.store(value, _pointer(builder, arguments[1], both), align=4)
+        value = builder.load(pointer_to(builder, arguments[0], both), align=4)
+        builder.store(value, pointer_to(builder, arguments[1], both), align=4)
         return context.get_dummy_value()
 
     return types.none(source, target), code
@@ -200,8 +198,8 @@ def add_two(_, source, target):
 
     def code(context, builder, signature, arguments):
         both = ir.VectorType(ir.FloatType(), 2)
-        there = _pointer(builder, arguments[1], both)
-        value = builder.load(_pointer(builder, arguments[0], both), align=4)
+        there = pointer_to(builder, arguments[1], both)
+        value = builder.load(pointer_to(builder, arguments[0], both), align=4)
         builder.store(builder.fadd(builder.load(there, align=4), value), there, align=4)
         return context.get_dummy_value()
 
@@ -209,30 +207,24 @@ def add_two(_, source, target):
 
 
 @intrinsic
-def store_pairs(_, address, even, odd):
-    """32 numbers, in turns from the one and the other."""
-
-    def code(context, builder, signature, arguments):
-        kind = ir.VectorType(ir.FloatType(), 2 * WIDTH)
-        order = [i // 2 + WIDTH * (i % 2) for i in range(2 * WIDTH)]
-        both = builder.shuffle_vector(*arguments[1:], ir.Constant(ir.VectorType(_I32, 2 * WIDTH), order))
-        builder.store(both, _pointer(builder, arguments[0], kind), align=4)
-        return context.get_dummy_value()
-
-    return types.none(address, even, odd), code
+def load_one(_, address):
+    return types.float32(address), lambda context, builder, signature, arguments: builder.load(
+        pointer_to(builder, arguments[0], ir.FloatType())
+    )
 
 
 @intrinsic
-def load_one(_, address):
-    return types.float32(address), lambda context, builder, signature, arguments: builder.load(
-        _pointer(builder, arguments[0], ir.FloatType())
+def load_int(_, address):
+    """An int32."""
+    return types.int32(address), lambda context, builder, signature, arguments: builder.load(
+        pointer_to(builder, arguments[0], I32)
     )
 
 
 @intrinsic
 def store_one(_, address, number):
     def code(context, builder, signature, arguments):
-        builder.store(arguments[1], _pointer(builder, arguments[0], ir.FloatType()))
+        builder.store(arguments[1], pointer_to(builder, arguments[0], ir.FloatType()))
         return context.get_dummy_value()
 
     return types.none(address, number), code
@@ -243,8 +235,8 @@ def either(_, first, second):
     """All bits of both: zero where both are."""
 
     def code(context, builder, signature, arguments):
-        bits = [builder.bitcast(value, ir.VectorType(_I32, WIDTH)) for value in arguments]
-        return builder.bitcast(builder.or_(*bits), _FLOATS)
+        bits = [builder.bitcast(value, INTEGERS) for value in arguments]
+        return builder.bitcast(builder.or_(*bits), FLOATS)
 
     return VECTOR(first, second), code
 
@@ -254,35 +246,42 @@ def any_light(_, vector):
     """Whether one of the sixteen is not zero."""
 
     def code(context, builder, signature, arguments):
-        lit = builder.fcmp_unordered("!=", arguments[0], ir.Constant(_FLOATS, [0.0] * WIDTH))
+        lit = builder.fcmp_unordered("!=", arguments[0], ir.Constant(FLOATS, [0.0] * WIDTH))
         return builder.icmp_unsigned("!=", builder.bitcast(lit, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
 
     return types.boolean(vector), code
 
 
 @intrinsic
-def transpose(_, source, target):
-    """Sixteen rows of sixteen numbers to columns."""
+def split(_, pixel, fraction, top, low, right):
+    """Sixteen pixels (int32) and fractions of the way to the next, to pixels from zero to a top and their fractions."""
 
     def code(context, builder, signature, arguments):
-        place = lambda address, number: builder.add(address, ir.IntType(64)(4 * WIDTH * number))
-        row = lambda address, number: _pointer(builder, place(address, number), _FLOATS)
-        rows = [builder.load(row(arguments[0], number), align=4) for number in range(WIDTH)]
-        # Squares of 1, 2, 4 and 8 a side change places across the diagonal.
-        size = 1
-        while size < WIDTH:
-            upper = [i if i & size == 0 else WIDTH + i - size for i in range(WIDTH)]
-            lower = [i + size if i & size == 0 else WIDTH + i for i in range(WIDTH)]
-            for one in (i for i in range(WIDTH) if i & size == 0):
-                pair = rows[one], rows[one + size]
-                for number, order in ((one, upper), (one + size, lower)):
-                    rows[number] = builder.shuffle_vector(*pair, ir.Constant(ir.VectorType(_I32, WIDTH), order))
-            size *= 2
-        for number, value in enumerate(rows):
-            builder.store(value, row(arguments[1], number), align=4)
+        pixel, fraction, top, low, right = arguments
+        pixel = builder.load(pointer_to(builder, pixel, INTEGERS), align=4)
+        fraction = builder.load(pointer_to(builder, fraction, FLOATS), align=4)
+        zero, top = ir.Constant(INTEGERS, [0] * WIDTH), splat(builder, builder.trunc(top, I32))
+        inside = builder.select(builder.icmp_signed(">", pixel, zero), pixel, zero)
+        inside = builder.select(builder.icmp_signed("<", inside, top), inside, top)
+        builder.store(inside, pointer_to(builder, low, INTEGERS), align=4)
+        beyond = builder.sitofp(builder.sub(pixel, inside), FLOATS)
+        builder.store(builder.fadd(fraction, beyond, flags=FLAGS), pointer_to(builder, right, FLOATS), align=4)
         return context.get_dummy_value()
 
-    return types.none(source, target), code
+    return types.none(pixel, fraction, top, low, right), code
+
+
+@intrinsic
+def subtract(_, address, number):
+    """A number from sixteen integers (int32)."""
+
+    def code(context, builder, signature, arguments):
+        there = pointer_to(builder, arguments[0], INTEGERS)
+        less = builder.sub(builder.load(there, align=4), splat(builder, builder.trunc(arguments[1], I32)))
+        builder.store(less, there, align=4)
+        return context.get_dummy_value()
+
+    return types.none(address, number), code
 
 
 @intrinsic
@@ -291,9 +290,9 @@ def fetch(_, address):
 
     def code(context, builder, signature, arguments):
         byte = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
+        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
         prefetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        builder.call(prefetch, [_pointer(builder, arguments[0], ir.IntType(8)), _I32(0), _I32(3), _I32(1)])
+        builder.call(prefetch, [pointer_to(builder, arguments[0], ir.IntType(8)), I32(0), I32(3), I32(1)])
         return context.get_dummy_value()
 
     return types.none(address), code
