@@ -121,7 +121,8 @@ def test_napari_shows_volume_and_points_in_one_place(tmp_path):
             read(str(tmp_path / each))[0] for each in (name, "p.csv") if (read := reader(str(tmp_path / each)))
         )
         assert (kind, other) == ("image", "points") and image["units"] == marks["units"]
-        np.testing.assert_allclose((points[0] - image["translate"]) / image["scale"], [1, 3, 2], atol=1e-9)
+        place = points[0] * marks["scale"]
+        np.testing.assert_allclose((place - image["translate"]) / image["scale"], [1, 3, 2], atol=1e-9)
         np.testing.assert_array_equal(voxels, VOXELS)
     (tmp_path / "other.csv").write_text("index,axis-0\n")
     assert reader(str(tmp_path / "other.csv")) is None and reader("a.png") is None and reader(["a.zarr"]) is None
