@@ -166,7 +166,7 @@ class Reconstruct(Container):
             event.connect(lambda _: self.layer.reset_choices())
         self.worker: Any = None
         self.progress = Watched(lambda: self.worker.abort_requested)
-        self.native.destroyed.connect(self._leave)
+        self.native.destroyed.connect(lambda: self._leave())
         self._timer = QTimer(self.native)
         self._timer.setInterval(_LOOK)
         self._timer.timeout.connect(self._look)

@@ -4,8 +4,10 @@ Drawing needs OpenGL, which Qt has not got without a screen; layers, fields and 
 """
 
 import re
+import sys
 import threading
 import time
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,8 @@ _LONGEST = 300
 def napari(tmp_path_factory):
     """napari and Qt, or skip and say what is missing."""
     with pytest.MonkeyPatch.context() as patch:
+        # Python's own, PyQt ends the process after.
+        patch.setattr(sys, "excepthook", lambda *found: traceback.print_exception(*found))
         patch.setenv("QT_QPA_PLATFORM", "offscreen")
         patch.setenv("NAPARI_CONFIG", str(tmp_path_factory.mktemp("napari") / "settings.yaml"))
         found = pytest.importorskip("napari", reason="no napari: pip install 'gs-jax[napari]'")
