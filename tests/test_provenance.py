@@ -98,6 +98,8 @@ def test_imagej_reads_the_scale(tmp_path):
         per_um = [first.tags[name].value for name in ("XResolution", "YResolution")]
         assert first.tags["ResolutionUnit"].value == 1 and all(n / d == pytest.approx(1 / 40) for n, d in per_um)
     assert list(said)[0] == "ImageJ" and (said["unit"], float(said["spacing"]), said["images"]) == ("um", 500, "3")
+    # Where zero is, in voxels: the grid is centred.
+    assert [float(said[f"{axis}origin"]) for axis in "xyz"] == [1.5, 2, -36]
     assert VOXELS.min() <= float(said["min"]) < float(said["max"]) <= VOXELS.max()
 
 
