@@ -72,7 +72,12 @@ def points_layer(points: Float[Array | np.ndarray, "point 4"], name: str, thickn
     # A plane shows what is within half a unit of the data's.
     scale = np.array([_UM * thickness, 1.0, 1.0])
     options = {"features": {"intensity": points[:, 3]}, "size": _SIZE, "scale": scale, "name": name}
-    marks = {"face_color": "transparent", "border_color": "cyan", "border_width": 0.15}
+    marks = {
+        "face_color": "transparent",
+        "border_color": "cyan",
+        "border_width": 0.15,
+        "blending": "translucent_no_depth",
+    }
     return _UM * points[:, 2::-1] / scale, options | marks | _AXES, "points"
 
 
