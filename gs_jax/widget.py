@@ -139,7 +139,7 @@ class Reconstruct(Container):
             layer for layer in napari_viewer.layers if isinstance(layer, Image) and layer.ndim == 2 and not layer.rgb
         ]
         names = sorted((path.stem for path in shipped_designs()), key=lambda name: name != "geomscope")
-        self.layer = ComboBox(label="Capture", choices=captures, nullable=True, tooltip="A layer that is open, or:")
+        self.layer = ComboBox(label="Capture", choices=captures, tooltip="A grey layer that is open, or:")
         self.file = FileEdit(label="or a file", nullable=True, filter="*.tif *.tiff *.png *.npy")
         self.design = ComboBox(label="Design", choices=names, tooltip="One that comes with gs-jax, or:")
         self.design_file = FileEdit(label="or a file", nullable=True, filter="*.toml")
@@ -165,6 +165,7 @@ class Reconstruct(Container):
         for event in (napari_viewer.layers.events.inserted, napari_viewer.layers.events.removed):
             event.connect(lambda _: self.layer.reset_choices())
         self.worker: Any = None
+        self._found = ""
         self.progress = Watched(lambda: self.worker.abort_requested)
         self.native.destroyed.connect(lambda: self._leave())
         self._timer = QTimer(self.native)
@@ -197,6 +198,7 @@ class Reconstruct(Container):
         self.worker = create_worker(work, asked, _start_thread=False)
         self.worker.returned.connect(lambda found: self._show(found, layer))
         self.worker.finished.connect(self._finish)
+        self._found = ""
         self._set_running(True)
         self.worker.start()
 
@@ -226,7 +228,6 @@ class Reconstruct(Container):
 
     def _show(self, found: Found | str, capture: Layer | None) -> None:
         if isinstance(found, str):
-            self.said.value = ""
             show_error(found)
             return
         for warning in found.warnings:
@@ -243,11 +244,10 @@ class Reconstruct(Container):
             self.viewer.dims.set_point(0, float(np.mean(self.viewer.dims.range[0][:2])))
         if moved:
             self.viewer.reset_view()
-        self.said.value = found.words
+        self._found = found.words
 
     def _finish(self) -> None:
-        if self.worker.abort_requested:
-            self.said.value = "Cancelled."
+        self.said.value = "Cancelled." if self.worker.abort_requested else self._found
         self._set_running(False)
 
     def _leave(self) -> None:

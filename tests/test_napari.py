@@ -137,8 +137,8 @@ def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
     viewer.add_image(np.zeros((3, 96, 80)), name="a stack")
     viewer.layers.clear()
     capture = viewer.add_image(pixels, name="seen")
-    assert widget.layer.choices == (None, capture)
-    widget.layer.value, widget.suppress.value, widget.points.value = capture, "clusters", True
+    assert widget.layer.choices == (capture,) and widget.layer.value is capture
+    widget.suppress.value, widget.points.value = "clusters", True
     widget.run.clicked.emit(True)
     until(widget)
     assert errors() == []
@@ -224,7 +224,7 @@ def test_what_is_wrong_is_one_line(widget, viewer, folder, field, value, message
 def test_a_layer_that_is_no_capture_is_refused(widget, viewer):
     widget.run.clicked.emit(True)
     assert errors() == ["Capture: found none, allowed: a layer, or a file."]
-    widget.layer.value = viewer.add_image(np.zeros((96, 80)), name="double")
+    viewer.add_image(np.zeros((96, 80)), name="double")
     widget.run.clicked.emit(True)
     until(widget)
     (found,) = errors()
