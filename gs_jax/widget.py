@@ -5,6 +5,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Any, NamedTuple
 
 import click
@@ -135,6 +136,7 @@ class Reconstruct(Container):
 
     def __init__(self, napari_viewer):
         self.viewer = napari_viewer
+        # Asked for anew by napari when layers come and go.
         captures: Callable = lambda _: [
             layer for layer in napari_viewer.layers if isinstance(layer, Image) and layer.ndim == 2 and not layer.rgb
         ]
@@ -162,23 +164,24 @@ class Reconstruct(Container):
         self.said.native.setWordWrap(True)
         self.run.clicked.connect(self.start)
         self.cancel.clicked.connect(self.end)
-        for event in (napari_viewer.layers.events.inserted, napari_viewer.layers.events.removed):
-            event.connect(lambda _: self.layer.reset_choices())
         self.worker: Any = None
-        self._found = ""
-        self.progress = Watched(lambda: self.worker.abort_requested)
-        self.native.destroyed.connect(lambda: self._leave())
+        self._capture: Any = None
+        self._found: Found | str | None = None
+        # Set in the other thread, and looked at in this one, by a timer that is gone when the widget is.
+        self._done, closed = Event(), Event()
+        self.native.destroyed.connect(lambda: closed.set())
+        self.progress = Watched(lambda: closed.is_set() or self.worker.abort_requested)
         self._timer = QTimer(self.native)
         self._timer.setInterval(_LOOK)
         self._timer.timeout.connect(self._look)
 
     def start(self) -> None:
         """Reconstructs in another thread."""
-        layer: Any = self.layer.value
         file: Any = self.file.value
+        layer: Any = self.layer.value if file is None else None
         design: Any = self.design_file.value or DESIGN.convert(self.design.value, None, None)
         if file is not None:
-            name, capture, layer = file.name, file, None
+            name, capture = file.name, file
         elif layer is not None:
             name, capture = layer.name, layer.data
         else:
@@ -194,11 +197,10 @@ class Reconstruct(Container):
             self.suppress.value,
             self.points.value,
         )
+        self._capture, self._found = layer, None
+        self._done.clear()
         work: Any = self._work
         self.worker = create_worker(work, asked, _start_thread=False)
-        self.worker.returned.connect(lambda found: self._show(found, layer))
-        self.worker.finished.connect(self._finish)
-        self._found = ""
         self._set_running(True)
         self.worker.start()
 
@@ -208,16 +210,18 @@ class Reconstruct(Container):
         self.cancel.enabled = False
         self.said.value = "Ends after this step."
 
-    def _work(self, asked: Asked) -> Found | str | None:
-        """What was found, or what is wrong, in words."""
+    def _work(self, asked: Asked) -> None:
+        """Finds what there is, or what is wrong, in words; anything else is a fault of ours, which napari shows."""
         try:
-            return reconstructed(asked, self.progress)
+            self._found = reconstructed(asked, self.progress)
         except Ended:
-            return None
+            pass
         except InputError as error:
-            return str(error)
+            self._found = str(error)
         except OSError as error:
-            return f"{asked.name}: {error.strerror or error}"
+            self._found = f"{asked.name}: {error.strerror or error}"
+        finally:
+            self._done.set()
 
     def _look(self) -> None:
         words, done, total = self.progress.now
@@ -225,11 +229,20 @@ class Reconstruct(Container):
         self.bar.native.setValue(done)
         if words and self.cancel.enabled:
             self.said.value = words
+        if self._done.is_set():
+            self._finish()
 
-    def _show(self, found: Found | str, capture: Layer | None) -> None:
-        if isinstance(found, str):
+    def _finish(self) -> None:
+        self._set_running(False)
+        found, self._found, self.said.value = self._found, None, ""
+        if self.worker.abort_requested:
+            self.said.value = "Cancelled."
+        elif isinstance(found, str):
             show_error(found)
-            return
+        elif found is not None:
+            self._show(found, self._capture)
+
+    def _show(self, found: Found, capture: Layer | None) -> None:
         for warning in found.warnings:
             show_warning(warning)
         flat = self.viewer.dims.ndim < 3
@@ -244,18 +257,7 @@ class Reconstruct(Container):
             self.viewer.dims.set_point(0, float(np.mean(self.viewer.dims.range[0][:2])))
         if moved:
             self.viewer.reset_view()
-        self._found = found.words
-
-    def _finish(self) -> None:
-        self.said.value = "Cancelled." if self.worker.abort_requested else self._found
-        self._set_running(False)
-
-    def _leave(self) -> None:
-        """Closed: what is being done ends, and nobody waits for it."""
-        if self.worker is not None and self.worker.is_running:
-            self.worker.returned.disconnect()
-            self.worker.finished.disconnect()
-            self.worker.quit()
+        self.said.value = found.words
 
     def _set_running(self, running: bool) -> None:
         self.run.enabled, self.cancel.enabled = not running, running

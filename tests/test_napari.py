@@ -137,6 +137,7 @@ def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
     viewer.add_image(np.zeros((3, 96, 80)), name="a stack")
     viewer.layers.clear()
     capture = viewer.add_image(pixels, name="seen")
+    widget.reset_choices()
     assert widget.layer.choices == (capture,) and widget.layer.value is capture
     widget.suppress.value, widget.points.value = "clusters", True
     widget.run.clicked.emit(True)
@@ -191,7 +192,7 @@ def test_a_widget_that_is_closed_ends_its_work(widget, viewer, fourth_step):
 
     taken, goes_on = fourth_step
     widget.native.deleteLater()
-    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete.value)
+    QApplication.sendPostedEvents(widget.native, QEvent.Type.DeferredDelete.value)
     goes_on.set()
     WorkerBase.await_workers(1000 * _LONGEST)
     QApplication.processEvents()
@@ -225,6 +226,7 @@ def test_a_layer_that_is_no_capture_is_refused(widget, viewer):
     widget.run.clicked.emit(True)
     assert errors() == ["Capture: found none, allowed: a layer, or a file."]
     viewer.add_image(np.zeros((96, 80)), name="double")
+    widget.reset_choices()
     widget.run.clicked.emit(True)
     until(widget)
     (found,) = errors()
