@@ -76,7 +76,7 @@ def slider(shown: Slices, marks: Sequence[str] = ()) -> str:
     said += f"; means of {shown.step} x {shown.step} voxels" if shown.step > 1 else ""
     said += f"; {len(words)} of {shown.of} depths" if len(words) < shown.of else ""
     return (
-        f'<figure class="slices" style="max-width:640px;margin:0">{planes}'
+        f'<figure class="slices" style="width:100%;max-width:640px;margin:0">{planes}'
         '<label class="row" style="display:flex;gap:.6em;align-items:center;margin:.5em 0">depth '
         f'<input type="range" min="0" max="{len(words) - 1}" step="1" value="{start}" autocomplete="off" '
         f'aria-valuetext="{words[start]}" oninput="{_MOVE}" style="flex:1"> <output>{words[start]}</output></label>'
