@@ -18,7 +18,7 @@ PUBLISHED = (
     *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "CITATION.cff"),
     *("design/*.md", "design/*.toml", "design/*.svg", "design/studies/*.toml"),
     *("experiments/README.md", "experiments/figures/*.png", "gs_jax/weights/*.md"),
-    *("docs/**/*.md", "docs/**/*.svg", "docs/tutorials/*.py"),
+    *("docs/**/*.md", "docs/**/*.svg", "docs/howto/*.png", "docs/tutorials/*.py"),
 )
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 _SCRIPT = re.compile(r"(\]\((?:[^)\s]*tutorials/)?\w+)\.py\)")

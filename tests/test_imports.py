@@ -36,6 +36,7 @@ ORDER = [
     "benchmark",
     "demo",
     "cli",
+    "widget",
     "__main__",
 ]
 

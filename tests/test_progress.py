@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from gs_jax.base import progress as module
-from gs_jax.base.progress import QUIET, VERBOSE, Progress, shown
+from gs_jax.base.progress import QUIET, VERBOSE, Ended, Progress, Watched, shown
 
 from .test_cli import RECONSTRUCT, folder
 
@@ -81,6 +81,8 @@ def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
 def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):
     """As of a recording: the first frame compiles for 20 s, the second waits a second for the first to be written."""
     times = iter([0.0, 20.0, 21.0, *(21.0 + 0.1 * n for n in range(1, 5000))])
+    monkeypatch.setattr(module, "_EVERY", 10.0)
+    monkeypatch.setattr(module, "_TELLING", 3.0)
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
     monkeypatch.setattr(module, "most_memory", lambda: 2**30)
     with Progress() as progress:
@@ -90,6 +92,30 @@ def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys)
     assert said == ["gs-jax: Reconstructing: about 80 s in all, 1 GiB of memory"]
     # After the line for the first frame, which knows no better.
     assert all(int(left) <= 80 for left in re.findall(r"about (\d+) s left", "\n".join(lines[1:])))
+
+
+def test_another_thread_sees_it_and_ends_it(monkeypatch, capsys):
+    """The innermost piece of work; after a part, or before the next piece."""
+    times = map(float, range(0, 100, 2))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
+    seen, ends = [], False
+    progress = Watched(lambda: ends)
+    assert progress.now == ("", 0, None)
+    with pytest.raises(Ended), progress.step("Reconstructing"):
+        seen.append(progress.now)
+        for number in progress.track(range(5), "Iterating"):
+            seen.append(progress.now)
+            ends = number == 2
+    assert seen == [
+        ("Reconstructing", 0, None),
+        ("Iterating: 0 of 5", 0, 5),
+        ("Iterating: 1 of 5", 1, 5),
+        ("Iterating: 2 of 5, about 6 s left", 2, 5),
+    ]
+    assert progress.now == ("", 0, None) and capsys.readouterr().err == ""
+    with pytest.raises(Ended), progress.step("Writing"):
+        seen.append("not reached")
+    assert "not reached" not in seen
 
 
 def test_the_terminal_announces_it_too(monkeypatch, capsys):

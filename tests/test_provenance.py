@@ -98,6 +98,8 @@ def test_imagej_reads_the_scale(tmp_path):
         per_um = [first.tags[name].value for name in ("XResolution", "YResolution")]
         assert first.tags["ResolutionUnit"].value == 1 and all(n / d == pytest.approx(1 / 40) for n, d in per_um)
     assert list(said)[0] == "ImageJ" and (said["unit"], float(said["spacing"]), said["images"]) == ("um", 500, "3")
+    # Where zero is, in voxels: the grid is centred.
+    assert [float(said[f"{axis}origin"]) for axis in "xyz"] == [1.5, 2, -36]
     assert VOXELS.min() <= float(said["min"]) < float(said["max"]) <= VOXELS.max()
 
 
@@ -121,7 +123,8 @@ def test_napari_shows_volume_and_points_in_one_place(tmp_path):
             read(str(tmp_path / each))[0] for each in (name, "p.csv") if (read := reader(str(tmp_path / each)))
         )
         assert (kind, other) == ("image", "points") and image["units"] == marks["units"]
-        np.testing.assert_allclose((points[0] - image["translate"]) / image["scale"], [1, 3, 2], atol=1e-9)
+        place = points[0] * marks["scale"]
+        np.testing.assert_allclose((place - image["translate"]) / image["scale"], [1, 3, 2], atol=1e-9)
         np.testing.assert_array_equal(voxels, VOXELS)
     (tmp_path / "other.csv").write_text("index,axis-0\n")
     assert reader(str(tmp_path / "other.csv")) is None and reader("a.png") is None and reader(["a.zarr"]) is None

@@ -16,9 +16,10 @@ from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import read_design
 from gs_jax.io.points import write_points
 from gs_jax.io.volumes import write_volume
+from gs_jax.pictures.encode import thinned
+from gs_jax.pictures.planes import slices
 from gs_jax.report import device, facts, spots, views
 from gs_jax.report.chart import line_chart
-from gs_jax.report.encode import thinned
 from gs_jax.report.page import write_report
 
 from .browser import browser, watched
@@ -110,7 +111,7 @@ def test_a_browser_shows_it_as_it_is(made, browser, width, scheme):
 
 def test_keys_move_the_slider_and_the_slice(made, browser):
     with watched(browser, (made / "report.html").as_uri()) as page:
-        slider, image, said = (page.locator(name) for name in ("#depth", "#slice", "#depth-said"))
+        slider, image, said = (page.locator(f"#volume .slices {name}") for name in ("input", "img:visible", "output"))
         assert said.inner_text() == "19 mm"
         before = image.get_attribute("src")
         slider.focus()
@@ -162,7 +163,7 @@ def test_it_prints(made, browser):
     with watched(browser, (made / "report.html").as_uri(), color_scheme="dark") as page:
         page.emulate_media(media="print")
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        assert not page.locator("nav").is_visible() and page.locator("#slice").is_visible()
+        assert not page.locator("nav").is_visible() and page.locator(".slices img:visible").count() == 1
         corner = "c => [...c.getContext('2d').getImageData(c.width - 3, 3, 1, 1).data]"
         assert min(page.locator("#view-mold").evaluate(corner)) > 200
         assert page.pdf()[:4] == b"%PDF"
@@ -217,11 +218,11 @@ def test_folders_are_left_out(text, kept):
 
 def test_the_largest_volumes_stay_small():
     """Noise, which nothing compresses, with as many bytes as slices may have; and a view in space."""
-    side = int(np.sqrt(views._SLICE_BYTES / 100))
+    side = int(np.sqrt(views.SLICE_BYTES / 100))
     for shape in ((100, side, side), (3, 1500, 1400)):
         volume = np.random.default_rng(0).random(shape, np.float32)
         grid = Grid(np.linspace(18, 22, shape[0]), shape[1:], 0.01)
-        shown = views.slices(volume, grid)
+        shown = slices(volume, grid, views.SLICE_BYTES)
         drawn = [p.picture for p in views.projections(volume, grid)]
         cloud = views.cloud(volume, grid)
         assert cloud["count"] <= 60_000 and len(shown.pictures) == shape[0]

@@ -173,3 +173,55 @@ class _Lines:
         rate = f", {self.done / taken:.3g} {self.rate}/s" if self.rate and taken > 0 else ""
         line = f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{rate}{time_left}"
         print(line, file=sys.stderr, flush=True)
+
+
+class Ended(Exception):
+    """Work was ended between two of its parts, as somebody asked for."""
+
+
+class Watched(Progress):
+    """How far work is, for another thread that shows it, and may end it.
+
+    Parameters
+    ----------
+    ended
+        Asked before each piece of work and after each part of it: if so, `Ended` is raised there.
+    """
+
+    def __init__(self, ended: Callable[[], bool]):
+        self._ended = ended
+        self._pieces: list[_Forecast] = []
+
+    @contextmanager
+    def counter(
+        self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
+    ) -> Iterator[Callable[[], None]]:
+        """As that of `Progress`; of pieces within each other the innermost is seen."""
+        self.go_on()
+        piece = _Forecast(description, total, lambda _: None, quarter)
+
+        def advance():
+            piece(time.monotonic())
+            self.go_on()
+
+        self._pieces.append(piece)
+        try:
+            yield advance
+        finally:
+            self._pieces.remove(piece)
+
+    def go_on(self) -> None:
+        """Raises `Ended` if it is to end."""
+        if self._ended():
+            raise Ended
+
+    @property
+    def now(self) -> tuple[str, int, int | None]:
+        """What is being done, how many parts of it are, and of how many, if that is known."""
+        piece = self._pieces[-1:]
+        if not piece:
+            return "", 0, None
+        one = piece[0]
+        left = one.each * (one.total - one.done) if one.total and one.done > 1 else 0.0
+        words = f"{one.description}: {one.done} of {one.total}" if one.total else one.description
+        return words + (f", about {_in_words(left)} left" if left else ""), one.done, one.total

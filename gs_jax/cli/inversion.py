@@ -1,4 +1,4 @@
-"""What the options of `gs-jax reconstruct` make of an image: a volume, and points."""
+"""What the options of `gs-jax reconstruct`, and of napari's widget, make of an image: a volume, and points."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,6 +16,45 @@ class Made(NamedTuple):
     points: Any = None
     evidence: Any = None
     warning: str | None = None
+
+
+def plan(
+    imager,
+    depths: list[float],
+    pitch: float | None = None,
+    *,
+    method: str,
+    steps: int = 20,
+    optics: str = "full",
+    tv: float | None = None,
+    sparsity: float | None = None,
+    stop_at_noise: bool = False,
+    suppress: str = "none",
+    points: bool = False,
+    weights: Path | None = None,
+) -> tuple[Any, Callable]:
+    """The voxels, and from what shows how far it is to a `maker`'s function.
+
+    Raises
+    ------
+    InputError
+        Where options do not go together, or the volume does not fit into the memory.
+    """
+    from ..reconstruction.pipeline import COARSE, voxel_grid
+
+    if suppress != "none" and method != "backproject":
+        raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
+    if suppress == "points" and optics != "full":
+        raise InputError(f"--optics {optics}: found --suppress points, allowed: full, which finds points.")
+    if weights and suppress != "unet" and method != "unrolled":
+        found = f"--method {method} and --suppress {suppress}"
+        raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
+    if stop_at_noise and method in ("backproject", "unrolled"):
+        raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
+    inversion = method_of(method, steps, weights, tv=tv, sparsity=sparsity)
+    grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else COARSE)
+    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points}
+    return grid, partial(maker, imager, grid, inversion, **options, weights=weights)
 
 
 def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress, points, weights) -> Callable:

@@ -19,6 +19,7 @@ _NEAREST = 1e-6
 
 
 METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
+SUPPRESSIONS = ("none", "points", "clusters", "unet")
 LEVELS = ("full", "near", "pinhole")
 SIMULATED = ("full", "near")
 PSFS = ("diffraction", "geometric", "gaussian")

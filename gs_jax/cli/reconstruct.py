@@ -12,7 +12,7 @@ from ..base.workers import Workers
 from ..io.disk import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
-from .options import DESIGN, LEVELS, METHODS, UM, Depths, Number, depth_range, worker_options
+from .options import DESIGN, LEVELS, METHODS, SUPPRESSIONS, UM, Depths, Number, depth_range, worker_options
 from .recording import check_recording, in_words, reconstruct_recording, recording_options
 
 
@@ -57,7 +57,7 @@ from .recording import check_recording, in_words, reconstruct_recording, recordi
 )
 @click.option(
     "--suppress",
-    type=click.Choice(["none", "points", "clusters", "unet"]),
+    type=click.Choice(SUPPRESSIONS),
     default="none",
     show_default=True,
     help="Background suppression: points that their lenses agree on, the paper's clusters, or a network for anything.",
@@ -122,8 +122,7 @@ def command(
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.native import once
-    from ..reconstruction.pipeline import COARSE, voxel_grid
-    from .inversion import imaged_again, maker, method_of
+    from .inversion import imaged_again, plan
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
@@ -137,22 +136,22 @@ def command(
     check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
-    if suppress != "none" and method != "backproject":
-        raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
-    if suppress == "points" and optics != "full":
-        raise InputError(f"--optics {optics}: found --suppress points, allowed: full, which finds points.")
-    if weights and suppress != "unet" and method != "unrolled":
-        found = f"--method {method} and --suppress {suppress}"
-        raise InputError(f"--weights: found {found}, allowed: --method unrolled or --suppress unet.")
-    if stop_at_noise and method in ("backproject", "unrolled"):
-        raise InputError(f"--stop-at-noise: found --method {method}, allowed: list-rl, richardson-lucy, fista, admm.")
-    inversion = method_of(method, steps, weights, tv=tv, sparsity=sparsity)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
-    pixels = 1 if method == "backproject" else COARSE
-    grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=pixels)
-    options = {"optics": optics, "stop_at_noise": stop_at_noise, "suppress": suppress, "points": points is not None}
-    making = partial(maker, imager, grid, inversion, **options, weights=weights)
+    grid, making = plan(
+        imager,
+        depths,
+        voxel_um and voxel_um / 1000,
+        method=method,
+        steps=steps,
+        optics=optics,
+        tv=tv,
+        sparsity=sparsity,
+        stop_at_noise=stop_at_noise,
+        suppress=suppress,
+        points=points is not None,
+        weights=weights,
+    )
     again = partial(imaged_again, imager, grid, optics) if method == "unrolled" or suppress == "unet" else None
     with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}

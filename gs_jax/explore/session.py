@@ -10,9 +10,9 @@ import numpy as np
 from ..base.errors import InputError
 from ..codesign.study import Study
 from ..designs.design import Design, write_design
+from ..pictures.encode import in_range, png
 from ..report.chart import line_chart
 from ..report.device import layout
-from ..report.encode import in_range, png
 from ..report.page import render
 from .judging import (
     SPOT_DEPTHS,

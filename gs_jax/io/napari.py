@@ -1,4 +1,6 @@
-"""A reader for napari: volumes, in time too, and points to scale and in one place, in um; `napari.yaml` names it.
+"""Layers of napari: volumes, in time too, and points to scale and in one place, in um; and a reader that makes them.
+
+`napari.yaml` names the reader.
 
 napari's other readers of OME-TIFF leave out where the first voxel is, and those of CSV know pixels alone.
 """
@@ -8,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array, Float, Num
 
 from ..base.errors import InputError
+from ..voxels import Grid
 from .points import POINTS_HEADER, read_points
 from .viewers import display_range
 from .volume_series import Series, read_series
@@ -46,12 +50,35 @@ def _volume(path) -> list[Layer]:
         voxels, grid = read_volume(path)
     except InputError as error:
         raise ValueError(f"not a volume of gs_jax: {error}") from error
-    depths = np.asarray(grid.depths, np.float64)
-    step = float(np.diff(depths).mean()) if depths.size > 1 else grid.pitch
-    scale = _UM * np.array([step, grid.pitch, grid.pitch])
-    first = _UM * np.array([depths[0], float(grid.y[0]), float(grid.x[0])])
-    options = {"scale": scale, "translate": first, "contrast_limits": display_range(voxels), "name": Path(path).name}
-    return [(voxels, options | _AXES, "image")]
+    return [volume_layer(voxels, grid, Path(path).name)]
+
+
+def volume_layer(volume: Num[np.ndarray, "depth y x"], grid: Grid, name: str) -> Layer:
+    """A volume, with the range of values that files of it have too."""
+    first = _UM * np.array([float(grid.depths[0]), float(grid.y[0]), float(grid.x[0])])
+    scale = _UM * np.array([step_of(grid), grid.pitch, grid.pitch])
+    options = {"scale": scale, "translate": first, "contrast_limits": display_range(volume), "name": name}
+    return volume, options | _AXES, "image"
+
+
+def step_of(grid: Grid) -> float:
+    """From plane to plane in the mean, mm; a single plane is as thick as a voxel is wide."""
+    return float(np.diff(np.asarray(grid.depths, np.float64)).mean()) if grid.depths.size > 1 else grid.pitch
+
+
+def points_layer(points: Float[Array | np.ndarray, "point 4"], name: str, thickness: float = 0.25) -> Layer:
+    """Points, each shown in the planes that are less than half of `thickness` from it, mm."""
+    points = np.asarray(points, np.float64)
+    # A plane shows what is within half a unit of the data's.
+    scale = np.array([_UM * thickness, 1.0, 1.0])
+    options = {"features": {"intensity": points[:, 3]}, "size": _SIZE, "scale": scale, "name": name}
+    marks = {
+        "face_color": "transparent",
+        "border_color": "cyan",
+        "border_width": 0.15,
+        "blending": "translucent_no_depth",
+    }
+    return _UM * points[:, 2::-1] / scale, options | marks | _AXES, "points"
 
 
 def _in_time(path, series: Series) -> Layer:
@@ -70,10 +97,8 @@ def _in_time(path, series: Series) -> Layer:
 
 
 def _points(path) -> list[Layer]:
-    points = read_points(path)
-    options = {"features": {"intensity": points[:, 3]}, "size": _SIZE, "name": Path(path).name}
-    return [(_UM * points[:, 2::-1], options | _AXES, "points")]
+    return [points_layer(read_points(path), Path(path).name)]
 
 
-# Of a point's marker, um: about what the microscope resolves.
-_SIZE = 40.0
+# Of a ring around a point, um: it leaves what is in it to be seen.
+_SIZE = 300.0

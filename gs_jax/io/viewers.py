@@ -22,9 +22,12 @@ def display_range(voxels: np.ndarray) -> tuple[float, float]:
     return float(low), float(low) + 1
 
 
-def imagej_description(voxels: np.ndarray, step_um: float) -> str:
-    """ImageJ's description of a stack; without a step it is one plane, or has no one step."""
+def imagej_description(voxels: np.ndarray, pitch_um: float, step_um: float, first_um: tuple[float, ...]) -> str:
+    """ImageJ's description of a stack whose first voxel is at `(x, y, z)`; without a step it is one plane."""
     low, high = display_range(voxels)
     stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
     spacing = f"spacing={step_um}\n" if step_um > 0 else ""
-    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}loop=false\nmin={low}\nmax={high}\n"
+    # Where zero is, counted in voxels.
+    sides = {"x": pitch_um, "y": pitch_um, "z": step_um}
+    zero = "".join(f"{a}origin={-at / sides[a]:.6f}\n" for a, at in zip("xyz", first_um, strict=True) if sides[a])
+    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}{zero}loop=false\nmin={low}\nmax={high}\n"

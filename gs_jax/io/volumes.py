@@ -172,6 +172,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     plane |= {f"{name}Unit": ["µm"] * planes for name in list(plane)}
     if provenance:
         metadata["MapAnnotation"] = {"Namespace": NAMESPACE, **provenance}
+    described = imagej_description(voxels, um(pitch), um(step), (first_x, first_y, um(depths[0])))
     per_um = 1 / um(pitch)  # the unit is in ImageJ's description: TIFF knows inches and centimetres alone
     with atomic_write(path) as temporary:
         tifffile.imwrite(
@@ -182,7 +183,7 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
             metadata=metadata,
             resolution=(per_um, per_um),
             resolutionunit="NONE",
-            extratags=[place_for_description(imagej_description(voxels, um(step)))],
+            extratags=[place_for_description(described)],
         )
         take_place(temporary)
 

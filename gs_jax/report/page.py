@@ -17,10 +17,11 @@ from ..designs.sheet import datasheet
 from ..geometry import Imager
 from ..io.disk import check_output, write_text
 from ..io.provenance import Provenance
+from ..pictures.encode import in_range, palette, png
+from ..pictures.planes import slices, slider
 from ..voxels import Grid
 from . import device, facts, spots, views
 from .chart import line_chart
-from .encode import in_range, palette, png
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
@@ -253,11 +254,9 @@ def _mold(design: Design) -> dict[str, Any]:
 
 
 def _add_volume(context: dict[str, Any], volume: np.ndarray, grid: Grid) -> None:
-    made = views.slices(volume, grid)
     depths, pitch = np.asarray(grid.depths, float), grid.pitch
     context["volume"] = {
-        "shape": volume.shape,
-        "slices": made,
+        "slider": slider(slices(volume, grid, views.SLICE_BYTES)),
         "projections": views.projections(volume, grid),
         "said": f"{' x '.join(map(str, volume.shape))} voxels (z, y, x), {1000 * pitch:.4g} um laterally, "
         f"{len(depths)} depth{'s' * (len(depths) != 1)} from {depths.min():g} to {depths.max():g} mm",

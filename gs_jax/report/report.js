@@ -1,4 +1,4 @@
-// Slices by a slider, and volumes, points and parts in space: drawn by the processor, so that any browser shows them.
+// Volumes, points and parts in space: drawn by the processor, so that any browser shows them.
 "use strict";
 (() => {
 const data = JSON.parse(document.getElementById("data").textContent);
@@ -13,21 +13,6 @@ const colour = (name, share) => {
   const i = 3 * Math.max(0, Math.min(255, Math.round(share * 255))), p = data.colours[name];
   return [p[i], p[i + 1], p[i + 2]];
 };
-
-const slider = document.getElementById("depth");
-if (slider) {
-  const image = document.getElementById("slice"), said = document.getElementById("depth-said");
-  const show = () => {
-    const k = Number(slider.value), text = `${Number(data.depths[k].toPrecision(5))} mm`;
-    image.src = data.slices[k];
-    image.alt = `The volume at ${text}`;
-    said.textContent = text;
-    slider.setAttribute("aria-valuetext", text);
-  };
-  slider.addEventListener("input", show);
-  slider.value = String(Math.floor(data.depths.length / 2));
-  show();
-}
 
 // What a scene has to say: its box, how it starts, and what it draws with the rotation r, pixels a millimetre and the middle.
 const scenes = {

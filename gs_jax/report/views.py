@@ -1,4 +1,4 @@
-"""Volumes, points and parts, small enough for a page: slices, projections, and what the browser turns."""
+"""Volumes, points and parts, small enough for a page: projections, and what the browser turns."""
 
 from typing import Any, NamedTuple
 
@@ -8,46 +8,14 @@ from jaxtyping import Float, Num
 from ..lenses import MicrolensArray
 from ..mold.pictures import coarse_solid
 from ..mold.solids import MoldShape
+from ..pictures.encode import in_range, packed, png, thinned
+from ..pictures.planes import brightness
 from ..voxels import Grid
-from .encode import in_range, packed, png, thinned
 
-# Bytes of all slices before they are compressed, and their number; pixels of a side; voxels in space, and a side's.
-_SLICE_BYTES, _SLICES, _SIDE, _VOXELS, _CUBE = 6_000_000, 100, 720, 60_000, 200
-# Darkest and brightest that are told apart, percentiles: back-projection has a pedestal, which is no object.
-_DARKEST, _BRIGHTEST = 50, 99.95
-# Voxels that tell.
-_LOOKED_AT = 20_000_000
+# Bytes of all slices before they are compressed; pixels of a projection's side; voxels in space, and a side's.
+SLICE_BYTES, _SIDE, _VOXELS, _CUBE = 6_000_000, 720, 60_000, 200
 # Points that a table lists, and that space shows.
 LISTED, _DRAWN = 300, 5000
-
-
-class Slices(NamedTuple):
-    """Planes of a volume as pictures with their depths, mm, and the values that are black and white."""
-
-    pictures: list[str]
-    depths: list[float]
-    low: float
-    high: float
-    step: int
-
-
-def brightness(volume: Num[np.ndarray, "*shape"]) -> tuple[float, float]:
-    """The values that are shown as black and as white."""
-    some = np.asarray(volume).ravel()[:: -(-np.size(volume) // _LOOKED_AT)]
-    low, high = (float(v) for v in np.percentile(some, (_DARKEST, _BRIGHTEST)))
-    if high <= low:  # nearly all of it is dark
-        high = float(volume.max())
-    return low, high
-
-
-def slices(volume: Float[np.ndarray, "depth row column"], grid: Grid) -> Slices:
-    """At most a hundred planes, evenly chosen; large ones are binned."""
-    kept = np.unique(np.linspace(0, len(volume) - 1, min(_SLICES, len(volume))).round().astype(int))
-    most = max(min(_SIDE, int(np.sqrt(_SLICE_BYTES / len(kept)))), 64)
-    low, high = brightness(volume)
-    step = -(-max(volume.shape[1:]) // most)
-    made = [png(in_range(thinned(volume[k], most), low, high), "magma") for k in kept]
-    return Slices(made, [float(grid.depths[k]) for k in kept], low, high, step)
 
 
 class Projection(NamedTuple):

@@ -1,0 +1,233 @@
+"""napari's widget, without a window: what it makes of a toy capture, how far it says it is, and what it says is wrong.
+
+Drawing needs OpenGL, which Qt has not got without a screen; layers, fields and threads do not.
+"""
+
+import re
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs_jax import Grid
+from gs_jax.io.points import write_points
+from gs_jax.io.volumes import read_volume, write_volume
+from gs_jax.reconstruction import pipeline
+
+from .test_cli import DESIGN, folder, run
+
+__all__ = ["folder"]
+
+MANIFEST = Path(__file__).parents[1] / "gs_jax" / "napari.yaml"
+# What napari and its libraries use of each other is theirs to renew.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+# Of a test that hangs, seconds.
+_LONGEST = 300
+
+
+@pytest.fixture(scope="module")
+def napari(tmp_path_factory):
+    """napari and Qt, or skip and say what is missing."""
+    with pytest.MonkeyPatch.context() as patch:
+        # Python's own, PyQt ends the process after.
+        patch.setattr(sys, "excepthook", lambda *found: traceback.print_exception(*found))
+        patch.setenv("QT_QPA_PLATFORM", "offscreen")
+        patch.setenv("NAPARI_CONFIG", str(tmp_path_factory.mktemp("napari") / "settings.yaml"))
+        found = pytest.importorskip("napari", reason="no napari: pip install 'gs-jax[napari]'")
+        widgets = pytest.importorskip(
+            "qtpy.QtWidgets", reason="Qt does not start: apt-get install libegl1", exc_type=ImportError
+        )
+        kept = widgets.QApplication.instance() or widgets.QApplication([])
+        yield found
+        del kept
+
+
+@pytest.fixture
+def viewer(napari):
+    from napari.components import ViewerModel
+
+    return ViewerModel()
+
+
+@pytest.fixture
+def widget(viewer, folder):
+    """The widget of a viewer, with the toy's design and depths."""
+    from gs_jax.widget import Reconstruct
+
+    made = Reconstruct(viewer)
+    made.design_file.value, made.depths.value, made.voxel.value = folder / "design.toml", "18:22:1", 50.0
+    return made
+
+
+def until(widget, what=lambda: False) -> None:
+    """Lets Qt work until the widget is done, or `what` is so."""
+    from qtpy.QtWidgets import QApplication
+
+    began = time.monotonic()
+    while not (widget.run.enabled or what()):
+        QApplication.processEvents()
+        assert time.monotonic() - began < _LONGEST
+        time.sleep(0.001)
+
+
+def errors() -> list[str]:
+    """What napari has shown as wrong, and forgets now."""
+    from napari.utils.notifications import notification_manager
+
+    found = [note.message for note in notification_manager.records if str(note.severity) != "info"]
+    notification_manager.records.clear()
+    return found
+
+
+def test_the_manifest_is_valid(napari):
+    from npe2 import PluginManifest
+
+    manifest = PluginManifest.from_file(MANIFEST)
+    manifest.validate_imports()
+    made = manifest.contributions
+    assert [len(each or []) for each in (made.readers, made.widgets, made.sample_data)] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("name", ["v.ome.tif", "v.zarr"])
+def test_napari_opens_files_to_scale(viewer, tmp_path, name):
+    """Through the readers that napari finds by itself; a point is shown in the plane that it is next to."""
+    from npe2 import PluginManager
+
+    PluginManager.instance().discover()
+    grid = Grid([18.0, 18.5, 19.0], (5, 4), 0.04, (1.0, -2.0))
+    write_volume(tmp_path / name, np.random.default_rng(0).random(grid.volume_shape, np.float32), grid)
+    write_points(tmp_path / "p.csv", np.array([[1.0, -2.0, 18.6, 1.0]]))
+    (volume,) = viewer.open(tmp_path / name, plugin="gs-jax")
+    (points,) = viewer.open(tmp_path / "p.csv", plugin="gs-jax")
+    np.testing.assert_allclose(volume.extent.world, [[18000, -2080, 940], [19000, -1920, 1060]])
+    assert {str(unit) for unit in viewer.layers.extent.units} == {"micrometer"}
+    np.testing.assert_allclose(points.data_to_world(points.data[0]), [18600, -2000, 1000])
+    for depth, shown in ((18000, 0), (18500, 1), (19000, 0)):
+        viewer.dims.set_point(0, depth)
+        assert len(points._view_data) == shown
+
+
+def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, monkeypatch, capsys):
+    widget.file.value = folder / "capture.tif"
+    widget.run.clicked.emit(True)
+    assert widget.cancel.enabled and not widget.run.enabled
+    until(widget)
+    assert errors() == []
+    words = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:1", "--voxel-um", "50", "-o", "v.tif")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    volume, grid = read_volume(folder / "v.tif")
+    (layer,) = viewer.layers
+    assert layer.name == "capture.tif, backproject" and not widget.cancel.enabled
+    np.testing.assert_allclose(layer.data, volume, rtol=1e-5)
+    np.testing.assert_allclose(layer.scale, [1000, 50, 50])
+    first = [18000, 1000 * float(grid.y[0]), 1000 * float(grid.x[0])]
+    np.testing.assert_allclose(layer.translate, first)
+    low, high = layer.contrast_limits
+    assert volume.min() <= low < high <= volume.max()
+    assert widget.said.value == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
+
+
+def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
+    """The capture is put where the sensor is, so that all layers are in um, and the middle depth is shown."""
+    pixels = np.random.default_rng(0).integers(90, 110, (96, 80)).astype(np.uint16)
+    viewer.add_image(np.zeros((3, 96, 80)), name="a stack")
+    viewer.layers.clear()
+    capture = viewer.add_image(pixels, name="seen")
+    widget.reset_choices()
+    assert widget.layer.choices == (capture,) and widget.layer.value is capture
+    widget.suppress.value, widget.points.value = "clusters", True
+    widget.run.clicked.emit(True)
+    until(widget)
+    assert errors() == []
+    _, volume, points = viewer.layers
+    assert volume.name == "seen, clusters" and points.name == f"seen, {len(points.data)} points"
+    np.testing.assert_allclose(capture.extent.world, [[-950, -790], [950, 790]])
+    assert {str(unit) for unit in viewer.layers.extent.units} == {"micrometer"}
+    assert viewer.dims.point[0] == 20000
+
+
+@pytest.fixture
+def fourth_step(widget, folder, monkeypatch):
+    """A run that waits in its fourth step, in another thread, while this one is free: the threads of steps, and what
+    lets it go on."""
+    step, taken, goes_on = pipeline._step, [], threading.Event()
+
+    def slow(*arguments):
+        taken.append(threading.current_thread())
+        if len(taken) == 4:
+            assert goes_on.wait(_LONGEST)
+        return step(*arguments)
+
+    monkeypatch.setattr(pipeline, "_step", slow)
+    widget.file.value, widget.method.value = folder / "capture.tif", "list-rl"
+    widget.run.clicked.emit(True)
+    until(widget, lambda: widget.said.value.startswith("Iterating: 3 of 20, about "))
+    yield taken, goes_on
+    goes_on.set()
+
+
+def test_progress_is_shown_and_cancel_ends_between_two_steps(widget, viewer, fourth_step):
+    taken, goes_on = fourth_step
+    assert (widget.bar.native.value(), widget.bar.native.maximum()) == (3, 20)
+    widget.cancel.clicked.emit(True)
+    assert widget.said.value == "Ends after this step."
+    goes_on.set()
+    until(widget)
+    assert widget.said.value == "Cancelled." and len(taken) == 4 and not viewer.layers and errors() == []
+    assert threading.main_thread() not in taken
+    widget.method.value = "backproject"
+    widget.run.clicked.emit(True)
+    until(widget)
+    assert len(viewer.layers) == 1
+
+
+def test_a_widget_that_is_closed_ends_its_work(widget, viewer, fourth_step):
+    from napari.qt.threading import WorkerBase
+    from qtpy.QtCore import QEvent
+    from qtpy.QtWidgets import QApplication
+
+    taken, goes_on = fourth_step
+    widget.native.deleteLater()
+    QApplication.sendPostedEvents(widget.native, QEvent.Type.DeferredDelete.value)
+    goes_on.set()
+    WorkerBase.await_workers(1000 * _LONGEST)
+    QApplication.processEvents()
+    assert len(taken) == 4 and not viewer.layers and errors() == []
+
+
+@pytest.mark.parametrize(
+    "field, value, message",
+    [
+        ("design_file", "wrong.toml", "wrong.toml: `lens.refractive_index`: found -1"),
+        ("design_file", "none.toml", "none.toml: "),
+        ("depths", "18:17:1", "Depths: found '18:17:1', allowed: "),
+        ("voxel", 0.01, "allowed: .* GiB of the memory"),
+        ("suppress", "unet", "--suppress unet: found --method fista, allowed: backproject"),
+        ("file", "small.npy", "small.npy: "),
+    ],
+)
+def test_what_is_wrong_is_one_line(widget, viewer, folder, field, value, message):
+    (folder / "wrong.toml").write_text(DESIGN.replace("refractive_index = 1.43", "refractive_index = -1"))
+    np.save(folder / "small.npy", np.zeros((5, 4), np.uint16))
+    widget.file.value, widget.method.value = folder / "capture.tif", "fista" if field == "suppress" else "backproject"
+    getattr(widget, field).value = value
+    widget.run.clicked.emit(True)
+    until(widget)
+    (found,) = errors()
+    assert "\n" not in found and not viewer.layers and widget.run.enabled
+    assert re.search(message, found), found
+
+
+def test_a_layer_that_is_no_capture_is_refused(widget, viewer):
+    widget.run.clicked.emit(True)
+    assert errors() == ["Capture: found none, allowed: a layer, or a file."]
+    viewer.add_image(np.zeros((96, 80)), name="double")
+    widget.reset_choices()
+    widget.run.clicked.emit(True)
+    until(widget)
+    (found,) = errors()
+    assert found.startswith("double: found 96 x 80 pixels of float64, allowed: 96 x 80 (rows x columns")
