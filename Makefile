@@ -16,7 +16,7 @@ NEWEST := .venv-newest/bin/python
 # Ray-traced captures, if they are at hand.
 DATA ?= $(wildcard ../shared/data/oracle/dev)
 
-.PHONY: demo test test-all test-lowest test-newest lint figures docs dist
+.PHONY: demo test test-all test-napari test-lowest test-newest lint figures docs dist
 .DELETE_ON_ERROR:
 
 demo: .venv/core
@@ -30,6 +30,10 @@ test: .venv/dev
 
 test-all: .venv/dev
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest $(PARALLEL) -m ""
+
+# Half a gigabyte of napari and Qt, in an environment of their own.
+test-napari: .venv-napari/test
+	.venv-napari/bin/python -m pytest tests/test_napari.py
 
 test-lowest: .venv-lowest/test
 	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(LOWEST) -m pytest $(SHORT)
@@ -76,6 +80,11 @@ dist: .venv/dist
 
 .venv/dist: .venv/core
 	$(BIN)/python -m pip install --quiet build
+	touch $@
+
+.venv-napari/test: pyproject.toml
+	$(PYTHON) -m venv .venv-napari
+	.venv-napari/bin/python -m pip install --quiet --editable '.[napari,test]'
 	touch $@
 
 .venv-lowest/test: pyproject.toml

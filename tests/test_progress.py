@@ -81,8 +81,6 @@ def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
 def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):
     """As of a recording: the first frame compiles for 20 s, the second waits a second for the first to be written."""
     times = iter([0.0, 20.0, 21.0, *(21.0 + 0.1 * n for n in range(1, 5000))])
-    monkeypatch.setattr(module, "_EVERY", 10.0)
-    monkeypatch.setattr(module, "_TELLING", 3.0)
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
     monkeypatch.setattr(module, "most_memory", lambda: 2**30)
     with Progress() as progress:
