@@ -185,41 +185,78 @@ def reached(reaches, columns, begin, end, pixels):
 
     That is zero where voxels cannot be picked.
     """
-    low, right = integers(columns.pixel, columns.length), floats(columns.right, columns.length)
-    voxel, count = integers(reaches.voxel, reaches.length), integers(reaches.number, reaches.length)
-    share, window = floats(reaches.share, REACHES * reaches.length), integers(reaches.window, reaches.length)
+    low = integers(columns.pixel, columns.length)
     start = np.int64(low[end - 1]) // WIDTH * WIDTH
     size = r.padded(np.int64(low[begin]) + 2 - start)
     start = min(start, pixels - size)
     if not s.PICKS or start < 0:
         return start, 0
+    most = _reached_by_two(reaches, columns, begin, end, start, size)
+    return start, most if most > 0 else _reached_by_more(reaches, columns, begin, end, start, size)
+
+
+@inline
+def _reached_by_two(reaches, columns, begin, end, start, size):
+    """Where rays are a pixel apart or more; zero where they are not."""
+    low, right = integers(columns.pixel, columns.length), floats(columns.right, columns.length)
+    voxel, window = integers(reaches.voxel, reaches.length), integers(reaches.window, reaches.length)
+    share, second = floats(reaches.share, 2 * reaches.length), reaches.length
+    for pixel in range(0, size, WIDTH):
+        window[pixel // WIDTH] = 0
+        v.store(reaches.share + 4 * pixel, v.zeros())
+        v.store(reaches.share + 4 * (second + pixel), v.zeros())
+    block, last = size, size + 1
+    for c in range(begin, end):
+        pixel = np.int64(low[c]) - start
+        if pixel == last:
+            return 0
+        # The pixel above may be the one below the last ray.
+        if pixel + 1 == last:
+            share[second + last] = right[c]
+        else:
+            if (pixel + 1) // WIDTH != block:
+                block = (pixel + 1) // WIDTH
+                window[block] = c
+            voxel[pixel + 1], share[pixel + 1] = c - window[block], right[c]
+        if pixel // WIDTH != block:
+            block = pixel // WIDTH
+            window[block] = c
+        voxel[pixel], share[pixel], last = c - window[block], ONE - right[c], pixel
+    return 2
+
+
+@inline
+def _reached_by_more(reaches, columns, begin, end, start, size):
+    low, right = integers(columns.pixel, columns.length), floats(columns.right, columns.length)
+    voxel, number = integers(reaches.voxel, reaches.length), integers(reaches.number, reaches.length)
+    share, window = floats(reaches.share, REACHES * reaches.length), integers(reaches.window, reaches.length)
     for pixel in range(0, size, WIDTH):
         v.store(reaches.number + 4 * pixel, v.zeros())
-        for number in range(REACHES):
-            v.store(reaches.share + 4 * (number * reaches.length + pixel), v.zeros())
+        for each in range(REACHES):
+            v.store(reaches.share + 4 * (each * reaches.length + pixel), v.zeros())
     most = 0
     for c in range(begin, end):
         for beside in range(2):
             pixel = np.int64(low[c]) + 1 - beside - start
-            number = np.int64(count[pixel])
-            if number == 0:
+            others = np.int64(number[pixel])
+            if others == 0:
                 voxel[pixel] = c
-            if number == REACHES or np.int64(voxel[pixel]) + number != c:
-                return start, 0
-            share[number * reaches.length + pixel] = ONE - right[c] if beside else right[c]
-            count[pixel], most = number + 1, max(most, number + 1)
+            if others == REACHES or np.int64(voxel[pixel]) + others != c:
+                return 0
+            share[others * reaches.length + pixel] = ONE - right[c] if beside else right[c]
+            number[pixel], most = others + 1, max(most, others + 1)
     for block in range(size // WIDTH):
         # Voxels fall as pixels rise.
-        low_pixel, high_pixel = WIDTH * block, WIDTH * block + WIDTH - 1
-        while low_pixel < high_pixel and count[low_pixel] == 0:
-            low_pixel += 1
-        while low_pixel < high_pixel and count[high_pixel] == 0:
-            high_pixel -= 1
-        window[block] = voxel[high_pixel] if count[high_pixel] > 0 else 0
-        if voxel[low_pixel] + count[low_pixel] - voxel[high_pixel] > 2 * WIDTH:
-            return start, 0
+        lowest, highest = WIDTH * block, WIDTH * block + WIDTH - 1
+        while lowest < highest and number[lowest] == 0:
+            lowest += 1
+        while lowest < highest and number[highest] == 0:
+            highest -= 1
+        window[block] = voxel[highest] if number[highest] > 0 else 0
+        if voxel[lowest] + number[lowest] - voxel[highest] > 2 * WIDTH:
+            return 0
         v.subtract(reaches.voxel + 4 * WIDTH * block, np.int64(window[block]))
-    return start, most
+    return most
 
 
 @inline
