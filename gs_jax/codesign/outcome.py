@@ -140,7 +140,7 @@ def _draw_layout(axes: Axes, design: Design) -> None:
     """Lenses on the plate, each with its disc in the colour of its kind, and the sensor."""
     diameters = of_each(design, "aperture_diameter_mm")
     discs = [Circle(center, d / 2) for center, d in zip(design.array.centers_mm, diameters, strict=True)]
-    for colour, which in zip(PALETTE, kinds(design.imager().array)):
+    for colour, which in zip(PALETTE, kinds(design.imager().array), strict=False):
         some = [discs[lens] for lens in which]
         axes.add_collection(PatchCollection(some, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.5))
     sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
