@@ -35,8 +35,7 @@ from gs_jax.designs.checks import plate_as_air
 from gs_jax.designs.design import Design, read_design
 
 FOLDER = Path(__file__).parents[1] / "design"
-# Foci that are tried at most, by span: three pay over long ones alone (`many_foci.py`).
-SPANS = {(18.0, 23.0): 2, (17.0, 25.0): 2, (15.0, 30.0): 3}
+SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))
 # Shares of the light of a point 20.5 mm away, %, and how much more it may be.
 LIGHTS, MIDDLE, MORE = (0.05, 0.1, 0.2, 0.4), 20.5, 1.02
 PLANES, STEPS = 4, 30
@@ -159,7 +158,7 @@ def decibels(error: float) -> float:
 def run(spans=SPANS, lights=LIGHTS, kinds=tuple(KINDS), steps: int = STEPS, *, progress: Progress) -> list[dict]:
     """For each span the fronts by kind; a record a share of the light."""
     found = [{"span_mm": span, "fronts": {}} for span in spans]
-    cases = [(row, name) for row in found for name in kinds if KINDS[name].foci <= spans[row["span_mm"]]]
+    cases = [(row, name) for row in found for name in kinds]
     for row, name in progress.track(cases, "Fronts"):
         kind = KINDS[name]
         followed = row["fronts"].get(kind.follows)

@@ -60,13 +60,13 @@ def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     which = dealt(np.array(design.array.centers_mm), 3)
     np.testing.assert_array_equal(radii, np.unique(radii)[which])
     assert np.ptp(np.bincount(which)) <= 2
-    middle = np.sort(radii)[1]
-    focal, behind = np.sort(radii) / middle, 1 / (2.95 + 1 / 1.43)
+    middle = np.unique(radii)[1]
+    focal, behind = np.unique(radii) / middle, 1 / (2.95 + 1 / 1.43)
     vergence = (0.05 + behind) / focal - behind  # 1/f - 1/v', for the middle kind in focus at 1/20
     np.testing.assert_allclose(vergence, [11 / 180, 0.05, 7 / 180], rtol=1e-9)
     assert middle == pytest.approx(1.34)
     assert started(design, study(kinds=3)) is design and started(design, study()) is design
-    assert started(conics(), study(kinds=1)).lens.radius_of_curvature_mm == (1.34,) * 12
+    assert started(conics(), study(kinds=1)) == conics()
 
 
 def test_kinds_that_cannot_be():
