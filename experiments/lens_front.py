@@ -3,10 +3,10 @@
 For each span of depths, share of a point's light and kind of lens the search of `geomscope-exposure` (in
 `design/studies`) for the least `volume_error`: the error of the best linear estimate of a volume at equal exposure, in
 which a lens out of focus is blur and its light noise, so that it is fair to lenses of one focus and of several. Four
-planes over the span are searched with; what is shown is judged at the three depths halfway between them, so that foci
-that lie on the planes and nowhere else do not pay. Light is held within 2 % and given for 20.5 mm; there is no mask
-between the apertures. With the plano side in front conics start from what was found of spheres with the same light,
-several foci from that of one focus, and these two from what was found with less light.
+planes over the span are searched with; what is shown is judged with the three halfway between them besides, so that
+foci that lie on the planes and nowhere else do not pay. Light is held within 2 % and given for 20.5 mm; there is no
+mask between the apertures. With the plano side in front conics start from what was found of spheres with the same
+light, several foci from that of one focus, and these two from what was found with less light.
 
     python -m experiments.lens_front [--out DIR]
 
@@ -27,7 +27,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.base.style import PALETTE
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.codesign.objectives import TERMS
-from gs_jax.codesign.parameters import Parent, candidate, parent_of, start_values
+from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
 from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study, read_study
@@ -90,10 +90,7 @@ def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[
 
 def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | None, steps: int) -> list[dict]:
     """A record for each share of the light."""
-    design = read_design(FOLDER / f"{kind.design}.toml")
-    lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
-    study = study_of(kind, span, steps)
-    design = started(design.model_copy(update={"lens": lens}), study)
+    design, study = posed(kind, span, steps)
     sweep = sweep_of(design, study)
     search, judge = searcher(sweep), judge_of(design, study)
     first, found = start_values(sweep.problem.parent), []
@@ -101,11 +98,18 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
         limits = limits_of(light, span, design)
         start = found[-1]["values"] if found else first
         if followed:
-            start = spread(followed[number]["values"], first, design)
+            start = spread(followed[number]["values"], first)
         point = search((number, limits, start))
         found.append({"light_percent": light, "values": point.values, "searched_db": decibels(point.rows[0].high)})
         found[-1] |= {"off_target": off_target(point, sweep, limits)} | judge(point.values)
     return found
+
+
+def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, Study]:
+    """The design that a kind starts from, and its study."""
+    design, study = read_design(FOLDER / f"{kind.design}.toml"), study_of(kind, span, steps)
+    lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
+    return started(design.model_copy(update={"lens": lens}), study), study
 
 
 def off_target(point, sweep, limits) -> float:
@@ -120,7 +124,7 @@ def off_target(point, sweep, limits) -> float:
     return max(0.0, *missed) if max(missed) > 0.01 else 0.0
 
 
-def spread(values: dict, first: dict, design: Design) -> dict:
+def spread(values: dict, first: dict) -> dict:
     """What was found of lenses that are alike, for the kinds of a design: radii in the ratios of its own."""
     moved = {name: values[name] for name in ("sensor_distance_mm", "pitch_mm")}
     for name in ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant"):
@@ -130,19 +134,14 @@ def spread(values: dict, first: dict, design: Design) -> dict:
 
 
 def judge_of(design: Design, study: Study):
-    """From parameters to what is shown: the error halfway between the search's planes, and the kind in focus' width."""
-    near, far = study.depths_mm or (0.0, 0.0)
-    half = (far - near) / (PLANES - 1) / 2
-    inner: Parent = parent_of(
-        design, depths_mm=(near + half, far - half), depth_count=PLANES - 1, exposure=study.exposure
-    )
-    whole = parent_of(design, depths_mm=(near, far), depth_count=2 * PLANES - 1, exposure=study.exposure)
+    """From parameters to what is shown: the error, and at the worst depth the width by the kind that is in focus."""
+    where = {"depths_mm": study.depths_mm, "depth_count": 2 * PLANES - 1, "exposure": study.exposure}
+    parent = parent_of(design, **where)
 
     @jax.jit
     def judged(values):
-        values = {name: x for name, x in values.items() if name not in ("depth_span_mm", "centers_mm")}
-        error = TERMS["volume_error"].function(candidate(inner, values))
-        return error, TERMS["psf_width_um"].function(candidate(whole, values))
+        found = candidate(parent, {name: x for name, x in values.items() if name != "centers_mm"})
+        return [TERMS[name].function(found) for name in ("volume_error", "psf_width_um")]
 
     def judge(values) -> dict[str, float]:
         error, widths = judged(values)
