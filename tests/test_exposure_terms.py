@@ -70,7 +70,7 @@ def test_a_lens_and_a_plane_are_wieners_filter():
     nodes = (np.arange(4000) + 0.5) / 4000 * 12.5
     spectrum = linear_error._spectrum(nodes)
     power = transfer_power(c, jnp.array(nodes / float(c.magnification[0])))[0]
-    signal = spectrum * power * (lit_density(c)[0] * c.magnification[0]) ** 2 / noise_density(c, c.occupancy)
+    signal = spectrum * power * (lit_density(c)[0] * c.magnification[0]) ** 2 / noise_density(c, [c])
     expected = np.sum(nodes * spectrum / (1 + signal)) / np.sum(nodes * spectrum)
     # The lens is above the object, so that the envelope is 1; 16 nodes against 4000 are good to 2e-3.
     np.testing.assert_allclose(jax.jit(lost_power)([c], jnp.zeros((1, 2)))[0], expected, rtol=3e-3)
@@ -109,12 +109,12 @@ def test_the_bound_is_that_of_the_pixels():
     then, and differ by what is beyond the pixels' highest frequency and by the mean over the field."""
     c = candidate(parent(exposure=3e3), {"aperture_diameter_mm": jnp.array(0.3)})
     c = dataclasses.replace(c, depths=jnp.array([20.0]))
-    background = float(noise_density(c, c.occupancy) * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
+    background = float(noise_density(c, [c]) * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
     psf = diffraction_psf(c.imager, 20.0, size=65, radius=c.clear_diameter / 2, field=(1.5, 0.0), samples=6)
     points = jnp.array([[0.1, -0.2, 20.0]])
     light = {"photons": lens_electrons(c)[0], "background": background, "read_noise": linear_error.READ_NOISE}
     pixels = localization_bound(c.imager, points, spot=psf, size=65, **light)
-    np.testing.assert_allclose(jax.jit(crowded_bound)(c, PLACES)[0], pixels, rtol=0.15)
+    np.testing.assert_allclose(jax.jit(crowded_bound)([c], PLACES)[0], pixels, rtol=0.15)
 
 
 def test_spots_have_the_transfer_function():

@@ -18,12 +18,12 @@ _PLACES = 2
 
 def volume_error(c: Microscope) -> Float[Array, ""]:
     """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
-    return jnp.sqrt(jnp.mean(lost_power([c], places_of(c))))
+    return jnp.sqrt(jnp.mean(lost_power(c.each, places_of(c))))
 
 
 def crowded(c: Microscope) -> Float[Array, "depth 3"]:
     """`crowded_bound` of x, y, z at each depth, um."""
-    return 1000 * crowded_bound(c, places_of(c))
+    return 1000 * crowded_bound(c.each, places_of(c))
 
 
 def places_of(c: Microscope) -> Float[Array, "place 2"]:

@@ -30,7 +30,6 @@ from jaxtyping import Array, Float
 from ..base.safe import safe_sqrt
 from ..designs.microscope import Microscope
 from ..geometry import envelope
-from ..optics.theory import Real
 from .transfer import PLACE, directions, lit_density, transfer_power
 
 # Of a scene: lit part of a plane, and the distance over which its correlation falls to 1/e, mm.
@@ -60,8 +59,7 @@ def lost_power(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> 
     ring = jnp.asarray(weights, dtype) * object_frequency
     frequency = object_frequency / jnp.mean(c.magnification)
     spectrum = _spectrum(c.magnification[:, None] * frequency[None])
-    overlap = sum(one.occupancy for one in kinds)
-    amplitudes = [_amplitude(one, frequency, spectrum, overlap) for one in kinds]
+    amplitudes = [_amplitude(one, kinds, frequency, spectrum) for one in kinds]
     ways, planes = directions(dtype), jnp.eye(c.depths.size, dtype=dtype)
 
     def at_place(place):
@@ -88,9 +86,9 @@ def lost_power(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> 
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
 
-def _amplitude(c: Microscope, frequency, spectrum, overlap) -> Float[Array, "depth frequency"]:
+def _amplitude(c: Microscope, kinds, frequency, spectrum) -> Float[Array, "depth frequency"]:
     """What a lens passes on of each plane, over the noise."""
-    amplitude = lit_density(c) * c.magnification / jnp.sqrt(noise_density(c, overlap))
+    amplitude = lit_density(c) * c.magnification / jnp.sqrt(noise_density(c, kinds))
     return amplitude[:, None] * safe_sqrt(transfer_power(c, frequency) * spectrum)
 
 
@@ -102,9 +100,13 @@ def _view(c: Microscope, place, ways):
     return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * c.magnification[None, None]
 
 
-def noise_density(c: Microscope, overlap: Real) -> Float[Array, ""]:
-    """Electrons^2 per mm^2 of a sub-image: shot noise of all planes and of the sub-images over it, and read noise."""
-    shot = jnp.sum(FILL * lit_density(c) * (1 + overlap))
+def noise_density(c: Microscope, kinds: Sequence[Microscope]) -> Float[Array, ""]:
+    """Electrons^2 per mm^2 of a sub-image: shot noise of all planes and of the sub-images over it, and read noise.
+
+    `c` is the kind of lens whose sub-image it is, `kinds` are all: each as bright as its aperture is large.
+    """
+    over = sum(one.occupancy * lit_density(one) for one in kinds)
+    shot = FILL * jnp.sum(lit_density(c) + over)
     return shot + (READ_NOISE / c.imager.sensor.pixel_pitch) ** 2
 
 

@@ -1,6 +1,7 @@
 """What a design is wanted to do: named terms, each a pure function of a `Microscope`.
 
-A term has a name with its unit, and gives a number or an array of them (over depths, lenses, places) in that unit.
+A term has a name with its unit, and gives a number or an array of them (over depths, lenses, places) in that unit. If
+lenses differ it is of the whole plate, of each kind (`of_each`), or of the best kind (`of_best`).
 Lengths are mm everywhere else in the package; here they are what a study file says. All are differentiable in
 everything that may be free, and finite where lenses coincide or rays do not get through.
 Bare equation numbers mean the GEOMScope paper.
@@ -45,13 +46,34 @@ _FLAT = 1e-6
 class Term(NamedTuple):
     """A term: what it says in words, and its function.
 
-    With `log` the function gives the value's logarithm; with `random` it takes a key after the candidate.
+    With `log` the function gives the value's logarithm; with `random` it takes a key after the candidate; with `kinds`
+    it also takes microscopes whose lenses differ.
     """
 
     meaning: str
     function: Callable[..., Result]
     log: bool = False
     random: bool = False
+    kinds: bool = False
+
+
+def of_each(function: Callable[[Microscope], Result]) -> Callable[[Microscope], Result]:
+    """A function of lenses that are alike, of each kind: all of its entries count."""
+    return lambda c: jnp.stack([function(kind) for kind in c.kinds]) if c.kinds else function(c)
+
+
+def of_best(
+    function: Callable[[Microscope], Result], best: Callable[..., Result] = jnp.argmin
+) -> Callable[[Microscope], Result]:
+    """A function of lenses that are alike, of the kind that is best at each depth: the one in focus there."""
+
+    def at_best(c: Microscope) -> Result:
+        if not c.kinds:
+            return function(c)
+        found = jnp.stack([function(kind) for kind in c.kinds])
+        return jnp.take_along_axis(found, best(found, axis=0, keepdims=True), 0)[0]
+
+    return at_best
 
 
 def focus_offset(c: Microscope) -> Float[Array, ""]:
@@ -100,11 +122,14 @@ def spacing(c: Microscope) -> Float[Array, " lens"]:
 
 
 def web(c: Microscope) -> Float[Array, " lens"]:
-    """What is left between apertures that do not touch, `nearest neighbour - D`; negative where they overlap.
+    """What is left between a lens's aperture and the nearest, `nearest neighbour - D`; negative where they overlap.
 
     The least feature of a mask that stops the light between the lenses.
     """
-    return spacing(c) - c.imager.array.aperture_diameter
+    centers = c.imager.array.centers
+    radius = jnp.broadcast_to(c.imager.array.aperture_diameter, len(centers)) / 2
+    apart = safe_sqrt(jnp.sum((centers[:, None] - centers[None]) ** 2, -1))
+    return jnp.min(jnp.where(jnp.eye(len(centers), dtype=bool), jnp.inf, apart - radius[:, None] - radius[None]), 1)
 
 
 def hole(c: Microscope) -> Float[Array, " place"]:
@@ -147,40 +172,54 @@ def _within(c: Microscope, squared_radius: Float[Array, "*shape"]) -> Float[Arra
 
 
 TERMS: dict[str, Term] = {
-    "lateral_resolution_um": Term("lateral resolution in focus (Eq. 5)", lambda c: UM * c.lateral_resolution),
-    "axial_resolution_um": Term("axial resolution in focus (Eq. 6)", lambda c: UM * c.axial_resolution),
-    "depth_of_field_mm": Term("depth of field (Eq. 8)", lambda c: c.middle.depth_of_field[0]),
-    "depth_of_field_eq7_mm": Term("depth of field (Eq. 7)", lambda c: c.middle.approximate_depth_of_field[0]),
-    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", focus_offset),
-    "blur_um": Term("diameter of the thin lens's blur, in the object", lambda c: UM * c.object_blur),
-    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", log_strehl, log=True),
-    "wavefront_waves": Term("RMS wavefront error over the field", wavefront),
-    "lenses_per_point": Term("lenses that see a point, N_e", lambda c: c.lenses_per_point),
-    "occupancy": Term("occupancy V (Eq. 11)", lambda c: c.occupancy),
-    "light_percent": Term("share of a point's light that is used", light),
-    "field_of_view_mm": Term("width of the field of view", field_of_view),
-    "thickness_mm": Term("thickness, plate and sensor distance", thickness),
-    "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", lambda c: UM * psf_width(c)),
-    "encircled_radius_um": Term("radius of 80 % of the rays, in the object", lambda c: UM * encircled_radius(c)),
-    "depth_span_mm": Term("span of the depths", lambda c: c.depths[-1] - c.depths[0]),
-    "spacing_mm": Term("distance of nearest lenses", spacing),
-    "web_mm": Term("mask left between neighbouring apertures", web),
-    "hole_mm": Term("distance of a place on the plate from a lens", hole),
-    "coverage": Term("share of the plate that is clear aperture", lambda c: c.coverage),
-    "sag_mm": Term("height of a whole lens", sag),
-    "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True),
-    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage),
-    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True),
-    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True),
+    "lateral_resolution_um": Term(
+        "lateral resolution in focus (Eq. 5)", of_each(lambda c: UM * c.lateral_resolution), kinds=True
+    ),
+    "axial_resolution_um": Term(
+        "axial resolution in focus (Eq. 6)", of_each(lambda c: UM * c.axial_resolution), kinds=True
+    ),
+    "depth_of_field_mm": Term("depth of field (Eq. 8)", of_each(lambda c: c.middle.depth_of_field[0]), kinds=True),
+    "depth_of_field_eq7_mm": Term(
+        "depth of field (Eq. 7)", of_each(lambda c: c.middle.approximate_depth_of_field[0]), kinds=True
+    ),
+    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", of_each(focus_offset), kinds=True),
+    "blur_um": Term(
+        "diameter of the thin lens's blur, in the object", of_best(lambda c: UM * c.object_blur), kinds=True
+    ),
+    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", of_best(log_strehl, jnp.argmax), log=True, kinds=True),
+    "wavefront_waves": Term("RMS wavefront error over the field", of_best(wavefront), kinds=True),
+    "lenses_per_point": Term("lenses that see a point, N_e", lambda c: c.lenses_per_point, kinds=True),
+    "occupancy": Term("occupancy V (Eq. 11)", lambda c: c.occupancy, kinds=True),
+    "light_percent": Term("share of a point's light that is used", light, kinds=True),
+    "field_of_view_mm": Term("width of the field of view", field_of_view, kinds=True),
+    "thickness_mm": Term("thickness, plate and sensor distance", thickness, kinds=True),
+    "psf_width_um": Term(
+        "width of the spot (FWHM of its variance), in the object", of_best(lambda c: UM * psf_width(c)), kinds=True
+    ),
+    "encircled_radius_um": Term(
+        "radius of 80 % of the rays, in the object", of_best(lambda c: UM * encircled_radius(c)), kinds=True
+    ),
+    "depth_span_mm": Term("span of the depths", lambda c: c.depths[-1] - c.depths[0], kinds=True),
+    "spacing_mm": Term("distance of nearest lenses", spacing, kinds=True),
+    "web_mm": Term("mask left between neighbouring apertures", web, kinds=True),
+    "hole_mm": Term("distance of a place on the plate from a lens", hole, kinds=True),
+    "coverage": Term("share of the plate that is clear aperture", lambda c: c.coverage, kinds=True),
+    "sag_mm": Term("height of a whole lens", of_each(sag), kinds=True),
+    "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True, kinds=True),
+    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage, kinds=True),
+    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True, kinds=True),
+    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True, kinds=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
     "scene_error": Term(
         "relative error of reconstructed scenes, for an exposure", log_error_for_exposure, log=True, random=True
     ),
-    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error),
-    "crowded_precision_um": Term("least error of locating a point in a scene, x, y, z, for an exposure", crowded),
-    "edge_slope_deg": Term("slope at the clear aperture's rim", edge_slope),
-    "least_radius_mm": Term("least radius of curvature of a lens's surface", least_radius),
+    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error, kinds=True),
+    "crowded_precision_um": Term(
+        "least error of locating a point in a scene, x, y, z, for an exposure", crowded, kinds=True
+    ),
+    "edge_slope_deg": Term("slope at the clear aperture's rim", of_each(edge_slope), kinds=True),
+    "least_radius_mm": Term("least radius of curvature of a lens's surface", of_each(least_radius), kinds=True),
 }
 
 _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}

@@ -18,6 +18,7 @@ from ..designs.design import Design, write_design
 from ..io.disk import check_output, write_json
 from ..io.figures import write_figure
 from ..io.provenance import Provenance
+from ..lenses import kinds
 from .objectives import TERMS, unit_of
 from .search import Outcome, PathLike
 from .stages import best_end
@@ -136,10 +137,12 @@ def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
 
 
 def _draw_layout(axes: Axes, design: Design) -> None:
-    """Lenses on the plate, each with its disc, and the sensor."""
+    """Lenses on the plate, each with its disc in the colour of its kind, and the sensor."""
     diameters = of_each(design, "aperture_diameter_mm")
     discs = [Circle(center, d / 2) for center, d in zip(design.array.centers_mm, diameters, strict=True)]
-    axes.add_collection(PatchCollection(discs, facecolor=PALETTE[0], alpha=0.35, edgecolor=PALETTE[0], linewidth=0.5))
+    for colour, which in zip(PALETTE, kinds(design.imager().array), strict=False):
+        some = [discs[lens] for lens in which]
+        axes.add_collection(PatchCollection(some, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.5))
     sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
     for size, middle, color, name in (
         (design.array.size_mm, (0.0, 0.0), "k", "plate"),

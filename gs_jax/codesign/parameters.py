@@ -3,11 +3,11 @@
 A `Parent` is the design that an optimisation starts from, `start_values` are its parameters by name, and `candidate`
 is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
 goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index, the
-conic constant and the aspheric terms A_4, A_6, ..., in mm^-3, mm^-5, ....
-Solvers do not see units: `Bounds` maps a value to a number of order one without any bound, and back; `Box`, for the one
-solver that keeps bounds by itself, to its share of the way between them.
+conic constant and the aspheric terms A_4, A_6, ..., in mm^-3, mm^-5, .... Of lenses that differ, radius, aperture and
+conic constant are a value for each kind, in the order of their first lenses; which lens is of which kind stays.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -20,14 +20,16 @@ from pydantic import ValidationError
 
 from ..base.converters import as_float
 from ..base.errors import InputError
+from ..designs.centers import LENS_KEYS
 from ..designs.checks import plate_as_air
 from ..designs.design import Design
 from ..designs.microscope import Microscope
 from ..geometry import Imager
 from ..io.tables import one_line
 from ..layouts.cells import cell_edges
-from ..lenses import MicrolensArray
+from ..lenses import EACH, MicrolensArray
 from ..optics.aperture import aperture_area, pitch, wedge
+from ..optics.kinds import lenses_by_kind, of_kinds
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -43,50 +45,12 @@ NAMES = (
     "depth_span_mm",
 )
 
-# What a pitch leaves as it is, beside radius and aperture.
-_UNSCALED = ("refractive_index", "conic_constant", "aspheric_terms", "sensor_distance_mm")
-# How near to a bound a start may be, as a fraction of the range: on the bound the map has no slope, and no way back.
-_NEAREST = 0.01
 # Aspheric terms of a lens without any, where they are free.
 _TERMS = 2
 # Digits of a written length: 0.1 um is finer than a printer, and than a camera's mount.
 _DIGITS = 4
-
-
-class Bounds(eqx.Module):
-    """The values between two bounds as a smooth, invertible image of all numbers `x`: `(1 + x / sqrt(1 + x^2)) / 2` of
-    the way from the lowest to the highest.
-
-    A logistic curve would do as well but for its ends, so flat that a search that comes there does not come back.
-    Bounds may be arrays that broadcast against the value, in its unit.
-    """
-
-    low: Float[Array, "..."] = eqx.field(converter=as_float)
-    high: Float[Array, "..."] = eqx.field(converter=as_float)
-
-    def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The value of a number of order one."""
-        return self.low + (self.high - self.low) * (1 + free / jnp.sqrt(1 + free**2)) / 2
-
-    def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The inverse of `value`. Values at a bound or beyond it are first taken within, by 1 % of the range."""
-        share = jnp.clip((value - self.low) / (self.high - self.low), _NEAREST, 1 - _NEAREST)
-        return (2 * share - 1) / (2 * jnp.sqrt(share * (1 - share)))
-
-
-class Box(eqx.Module):
-    """The values between two bounds by their share of the way from the lowest to the highest, 0 to 1."""
-
-    low: Float[Array, "..."] = eqx.field(converter=as_float)
-    high: Float[Array, "..."] = eqx.field(converter=as_float)
-
-    def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The value of a share."""
-        return self.low + (self.high - self.low) * free
-
-    def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The inverse of `value`. Values beyond a bound are first taken to it."""
-        return jnp.clip((value - self.low) / (self.high - self.low), 0, 1)
+# Of lenses that differ: enough for the mean clear aperture of a kind to 1e-3, an eighth of the work of all.
+_EDGES = 64
 
 
 class Cells(eqx.Module):
@@ -103,9 +67,9 @@ class Cells(eqx.Module):
 class Parent(eqx.Module):
     """A design with what its file does not say: where it is judged.
 
-    `cells`: of its lenses, None if they may move. `pitch`: mean distance of nearest neighbours, mm; 1 for one lens.
-    `middle`, `span`: of the depths that count, from the plate, mm. `depth_count`: how many they are. `confusion`:
-    mm. `exposure`: as of a `Microscope`.
+    `cells`: of its lenses, None if they may move or differ. `lenses`: which are of each kind. `pitch`: mean distance
+    of nearest neighbours, mm; 1 for one lens. `middle`, `span`: of the depths that count, from the plate, mm.
+    `depth_count`: how many they are. `confusion`: mm. `exposure`: as of a `Microscope`.
     """
 
     imager: Imager
@@ -117,6 +81,7 @@ class Parent(eqx.Module):
     depth_count: int = eqx.field(static=True)
     largest_magnification: float = eqx.field(static=True)
     exposure: float = eqx.field(static=True)
+    lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
 
 def parent_of(
@@ -150,7 +115,7 @@ def parent_of(
         imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, none)
     return Parent(
         imager,
-        None if "centers_mm" in free else _cells(design),
+        _cells(design) if imager.array.alike and "centers_mm" not in free else None,
         pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
@@ -158,6 +123,7 @@ def parent_of(
         depth_count,
         _largest_magnification(design, near, far, free),
         exposure,
+        lenses_by_kind(imager),
     )
 
 
@@ -179,17 +145,27 @@ def _cells(design: Design) -> Cells:
     return Cells(edges.height, edges.low, edges.high)
 
 
-def _clear_area(cells: Cells | None, array: MicrolensArray) -> Float[Array, ""]:
-    """Of all lenses together, mm^2."""
+def _clear_diameters(parent: Parent, array: MicrolensArray) -> list[Float[Array, ""]]:
+    """Of the mean lens, and of the mean lens of each kind if there are several, mm: of discs of the same area."""
+    count, cells = len(array.centers), parent.cells
     if cells is None:
-        return jnp.sum(aperture_area(array))
-    radius = array.aperture_diameter / 2
-    return jnp.sum(wedge(cells.high, cells.height, radius) - wedge(cells.low, cells.height, radius))
+        areas = aperture_area(array, directions=_EDGES)
+        several = parent.lenses if len(parent.lenses) > 1 else ()
+        means = [jnp.sum(areas) / count, *(jnp.mean(areas[np.array(which)]) for which in several)]
+    else:
+        radius = array.aperture_diameter / 2
+        within = wedge(cells.high, cells.height, radius) - wedge(cells.low, cells.height, radius)
+        means = [jnp.sum(within) / count]
+    return [jnp.sqrt(4 / math.pi * mean) for mean in means]
 
 
 def start_values(parent: Parent) -> Values:
     """Every parameter of the parent, by name."""
     array = parent.imager.array
+    if len(parent.lenses) > 1:
+        first, count = np.array([which[0] for which in parent.lenses]), len(array.centers)
+        numbers = {name: jnp.broadcast_to(getattr(array, name), count)[first] for name in EACH}
+        array = dataclasses.replace(array, centers=array.centers[first], **numbers)
     return {
         "sensor_distance_mm": parent.imager.sensor_distance,
         "radius_of_curvature_mm": array.radius_of_curvature,
@@ -198,7 +174,7 @@ def start_values(parent: Parent) -> Values:
         "conic_constant": array.conic_constant,
         "aspheric_terms": array.aspheric_terms,
         "pitch_mm": parent.pitch,
-        "centers_mm": array.centers,
+        "centers_mm": parent.imager.array.centers,
         "depth_span_mm": parent.span,
     }
 
@@ -218,28 +194,45 @@ def candidate(parent: Parent, values: Values) -> Microscope:
         i.array.centers,
         i.array.radius_of_curvature,
         i.array.aperture_diameter,
-        i.array.refractive_index,
         i.array.conic_constant,
+        i.array.refractive_index,
         i.array.aspheric_terms,
         i.sensor_distance,
     )
+    radius, diameter, conic = (of_lenses(parent, values[name]) for name in LENS_KEYS)
+    terms, others = values["aspheric_terms"], (values["refractive_index"], values["sensor_distance_mm"])
     # Areas before scaling, on the plate as it is: its size cannot be traced.
-    radius, diameter = values["radius_of_curvature_mm"], values["aperture_diameter_mm"]
-    others = tuple(values[name] for name in _UNSCALED)
-    unscaled = eqx.tree_at(where, parent.imager, (values["centers_mm"], radius, diameter / scale, *others))
-    area, count = _clear_area(parent.cells, unscaled.array), parent.imager.array.centers.shape[0]
-    imager = eqx.tree_at(where, parent.imager, (scale * values["centers_mm"], radius, diameter, *others))
+    smaller = terms * scale ** jnp.arange(3, 2 * terms.size + 3, 2, dtype=scale.dtype)
+    numbers = (values["centers_mm"], radius / scale, diameter / scale, conic, others[0], smaller, others[1])
+    mean, *clear = _clear_diameters(parent, eqx.tree_at(where, parent.imager, numbers).array)
+    numbers = (scale * values["centers_mm"], radius, diameter, conic, others[0], terms, others[1])
+    imager = eqx.tree_at(where, parent.imager, numbers)
     offsets = jnp.linspace(-0.5, 0.5, parent.depth_count, dtype=scale.dtype)
-    return Microscope(
+    whole = Microscope(
         imager,
         parent.middle + values["depth_span_mm"] * offsets,
-        clear_diameter=scale * jnp.sqrt(4 / math.pi / count * area),
+        clear_diameter=scale * mean,
         field_radius=jnp.array(imager.field_radius, scale.dtype),
         confusion=parent.confusion,
         plate_scale=scale,
         largest_magnification=parent.largest_magnification,
         exposure=parent.exposure,
     )
+    if not clear:
+        return whole
+    each = zip(of_kinds(imager, parent.lenses), clear, strict=True)
+    kinds = (dataclasses.replace(whole, imager=one, clear_diameter=scale * own) for one, own in each)
+    return dataclasses.replace(whole, kinds=tuple(kinds))
+
+
+def of_lenses(parent: Parent, value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A value for each lens, of one for each kind; one of all lenses stays."""
+    if value.ndim == 0:
+        return value
+    kind = np.zeros(len(parent.imager.array.centers), int)
+    for number, which in enumerate(parent.lenses):
+        kind[list(which)] = number
+    return value[kind]
 
 
 def new_design(design: Design, parent: Parent, values: Values) -> Design:
@@ -251,7 +244,8 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
         If the values make no microscope.
     """
     values = start_values(parent) | values
-    numbers = {name: round(float(values[name]), _DIGITS) for name in NAMES if values[name].ndim == 0}
+    shared = ("sensor_distance_mm", "refractive_index", "depth_span_mm")
+    numbers = {name: round(float(values[name]), _DIGITS) for name in shared}
     scale = float(values["pitch_mm"] / parent.pitch)
     size = [round(scale * side, _DIGITS) for side in design.array.size_mm]
     # Rounding may not push a lens off the plate.
@@ -260,8 +254,8 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
     middle = float(parent.middle)
     working = [round(middle + sign * numbers["depth_span_mm"] / 2, _DIGITS) for sign in (-1, 1)]
     data = design.model_dump()
-    of_lens = ("radius_of_curvature_mm", "aperture_diameter_mm", "refractive_index", "conic_constant")
-    data["lens"] |= {name: numbers[name] for name in of_lens}
+    data["lens"] |= {name: _of_lenses_rounded(parent, values[name]) for name in LENS_KEYS}
+    data["lens"] |= {"refractive_index": numbers["refractive_index"]}
     data["lens"] |= {"aspheric_terms": np.round(np.asarray(values["aspheric_terms"], float), _DIGITS).tolist()}
     data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
     data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}
@@ -269,3 +263,9 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
         return Design.model_validate(data)
     except ValidationError as error:
         raise InputError(f"the values found make no microscope: {one_line(error, Design, {})}.") from error
+
+
+def _of_lenses_rounded(parent: Parent, value: Float[Array, "..."]) -> float | list[float]:
+    """One number if all kinds come to the same."""
+    numbers = np.round(np.asarray(of_lenses(parent, value), float), _DIGITS)
+    return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

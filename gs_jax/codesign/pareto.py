@@ -115,7 +115,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     problem, kept, moving = sweep
     objectives = [next(term for term in kept if term.is_goal), *moving]
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
-    stream, points = workers.stream_of(partial(_searcher, sweep)), {}
+    stream, points = workers.stream_of(partial(searcher, sweep)), {}
     front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
     with progress.counter("Trade-off", len(combinations)) as advance:
         values = start_values(problem.parent)
@@ -129,7 +129,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     return front()
 
 
-def _searcher(sweep: Sweep):
+def searcher(sweep: Sweep):
     """From the number of a point, its limits and where to start, to the point."""
     problem, kept, moving = sweep
     entries = entries_of(problem.parent, [*kept, *moving])

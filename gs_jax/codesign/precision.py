@@ -12,6 +12,8 @@ of its variance would make no difference between a sharp core in a halo and no c
 scene (`linear_error.noise_density`) and the point's own, at the mean density that its light is in itself.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,39 +29,52 @@ from .transfer import lens_electrons, transfer_power
 _NODES = 24
 
 
-def crowded_bound(c: Microscope, places: Float[Array, "place 2"]) -> Float[Array, "depth 3"]:
+def crowded_bound(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, "depth 3"]:
     """The least standard deviations of x, y, z of points as bright as a lit place of 40 um x 40 um, mm.
 
     Parameters
     ----------
-    c
-        Its depths are those of the points.
+    kinds
+        The lenses of each kind, with depths, sensor and sensor distance in common; one if all lenses are alike. The
+        depths are those of the points.
     places
         `(x, y)` of points, mm. Root mean squares over them are given.
     """
+    spots = [_spot(one, kinds) for one in kinds]
+    prior = jnp.asarray(PRIOR[:3], kinds[0].depths.dtype)
+
+    def at(place):
+        told = sum(_told(one, spot, place) for one, spot in zip(kinds, spots, strict=True))
+        return jnp.diagonal(jnp.linalg.inv(told + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
+
+    return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
+
+
+def _spot(c: Microscope, kinds: Sequence[Microscope]):
+    """At each depth of the spot of a lens its squared light, 1/mm^2, and of its derivative by x or y; and its noise."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     dtype, highest = c.depths.dtype, 1 / (2 * c.imager.sensor.pixel_pitch)
     frequency = highest * jnp.asarray((nodes + 1) / 2, dtype)
     ring = jnp.asarray(np.pi * weights, dtype) * highest * frequency
     power = transfer_power(c, frequency)
-    energy = jnp.sum(ring[None] * power, 1)  # of the spot, squared, 1/mm^2
-    slope = jnp.sum(ring[None] * power * (2 * jnp.pi * frequency[None]) ** 2, 1) / 2  # of its derivative by x or y
-    electrons, prior = lens_electrons(c), jnp.asarray(PRIOR[:3], dtype)
+    energy = jnp.sum(ring[None] * power, 1)
+    slope = jnp.sum(ring[None] * power * (2 * jnp.pi * frequency[None]) ** 2, 1) / 2
+    return energy, slope, noise_density(c, kinds)
 
-    def at(place):
-        beside = c.imager.array.centers - place[None]
-        weight = envelope(jnp.sum(beside**2, 1)[None], c.reduced[:, None], c.field_radius)
-        light = electrons[:, None] * weight
-        told = light**2 * slope[:, None] / (noise_density(c, c.occupancy) + light * energy[:, None])
-        # How far images move, over the magnification: with the point, and with its depth.
-        moved = jnp.concatenate(
-            [
-                jnp.broadcast_to(jnp.eye(2, dtype=dtype), (c.depths.size, len(beside), 2, 2)),
-                (beside[None] / c.reduced[:, None, None])[..., None],
-            ],
-            -1,
-        )
-        information = jnp.einsum("dl,dlai,dlaj->dij", told * c.magnification[:, None] ** 2, moved, moved)
-        return jnp.diagonal(jnp.linalg.inv(information + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
 
-    return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
+def _told(c: Microscope, spot, place) -> Float[Array, "depth 3 3"]:
+    """Information about `x, y, z` of a point at a place by these lenses."""
+    energy, slope, noise = spot
+    beside = c.imager.array.centers - place[None]
+    weight = envelope(jnp.sum(beside**2, 1)[None], c.reduced[:, None], c.field_radius)
+    light = lens_electrons(c)[:, None] * weight
+    told = light**2 * slope[:, None] / (noise + light * energy[:, None])
+    # How far images move, over the magnification: with the point, and with its depth.
+    moved = jnp.concatenate(
+        [
+            jnp.broadcast_to(jnp.eye(2, dtype=c.depths.dtype), (c.depths.size, len(beside), 2, 2)),
+            (beside[None] / c.reduced[:, None, None])[..., None],
+        ],
+        -1,
+    )
+    return jnp.einsum("dl,dlai,dlaj->dij", told * c.magnification[:, None] ** 2, moved, moved)

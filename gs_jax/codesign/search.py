@@ -21,6 +21,7 @@ from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values
 from .solve import State
 from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
+from .start import started
 from .study import Study, read_study
 from .targets import Row
 
@@ -48,23 +49,17 @@ class Outcome(NamedTuple):
 
 @contextlib.contextmanager
 def opened(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[Design, Study]]:
-    """A design, turned as the study wants it, and a study, read where they are files.
+    """A design as the study wants it to start, and a study, read where they are files.
 
     An `InputError` within names the study's file.
     """
     found = design if isinstance(design, Design) else read_design(design)
     if isinstance(study, Study):
-        yield _turned(found, study), study
+        yield started(found, study), study
         return
     question = read_study(study)
     with errors_name_file(study):
-        yield _turned(found, question), question
-
-
-def _turned(design: Design, study: Study) -> Design:
-    if study.orientation is None:
-        return design
-    return design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": study.orientation})})
+        yield started(found, question), question
 
 
 def optimize(

@@ -18,10 +18,13 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..designs.design import Design
+from ..lenses import kinds
+from .bounds import Bounds, Box
 from .checkpoint import Log, restored
-from .parameters import Bounds, Box, Parent, Values, candidate, parent_of, start_values
+from .objectives import TERMS
+from .parameters import Parent, Values, candidate, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, stepper
-from .study import StageTable, Study, TermTable, labels
+from .study import MOST_KINDS, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
 
 
@@ -66,8 +69,7 @@ def problem_of(design: Design, study: Study) -> Problem:
 
 
 def _check_free(design: Design, study: Study) -> None:
-    if not design.imager().array.alike:
-        raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
+    _check_kinds(len(kinds(design.imager().array)), study)
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
     twice = sum(study.depths_mm or design.imaging.working_distance_mm)
@@ -79,6 +81,14 @@ def _check_free(design: Design, study: Study) -> None:
         raise InputError(
             f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
         )
+
+
+def _check_kinds(count: int, study: Study) -> None:
+    if count > MOST_KINDS:
+        raise InputError(f"`lens`: found lenses of {count} kinds, allowed: lenses of up to {MOST_KINDS}.")
+    named = [*(term.name for term in study.terms), *(limit.name for limit in study.pareto)]
+    if alike := [name for name in named if count > 1 and not TERMS[name].kinds]:
+        raise InputError(f"`terms`: found {alike[0]} for lenses that differ, allowed: for lenses that are alike.")
 
 
 def make_stage(problem: Problem, index: int) -> Stage:

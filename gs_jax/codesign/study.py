@@ -4,6 +4,7 @@ design = "../geomscope-table1.toml"     # to start from; `gs-jax optimize` takes
 name = "geomscope-optimized"
 depths_mm = [18.0, 23.0]
 confusion_um = 36.0
+kinds = 1                               # of lenses: 2 for two foci on one plate
 
 [free]                                  # name = [lowest, highest]; see gs_jax.codesign.parameters
 sensor_distance_mm = [2.0, 6.0]
@@ -33,6 +34,8 @@ from .objectives import check_term
 from .parameters import NAMES
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
+# Of lenses: each is traced for itself.
+MOST_KINDS = 8
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
 # Of what may be free, but lengths.
@@ -126,13 +129,16 @@ class Study(Table):
     `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.
     `exposure`: electrons that each mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um, for the
     terms that count light. `orientation`: the side of the lenses toward the object, if it is not to be the design's;
-    which is better, two studies tell. `starts`: the first stage also starts from this many points at random between
+    which is better, two studies tell. `kinds`: lenses that are alike are dealt to so many kinds, whose radii are spread
+    over the depths, if the design has not as many; then each kind has its own radius, aperture and conic constant.
+    `starts`: the first stage also starts from this many points at random between
     the bounds less one, and the best goes on; `seed` says which.
     """
 
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
     name: str = Field(default="optimized", description="a string")
     orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
+    kinds: int | None = Field(default=None, ge=1, le=MOST_KINDS, description=f"a whole number from 1 to {MOST_KINDS}")
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")

@@ -36,6 +36,9 @@ class Microscope(eqx.Module):
         What magnifications stay below whatever is free, for windows that have to hold all images.
     exposure
         Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
+    kinds
+        The lenses of each kind alone, where they differ; none if all are alike. What follows from a lens's shape is
+        theirs then, the rest also that of the whole, whose clear diameter is the mean lens's.
 
     Raises
     ------
@@ -51,6 +54,7 @@ class Microscope(eqx.Module):
     plate_scale: Float[Array, ""]
     largest_magnification: float = eqx.field(static=True, default=math.inf)
     exposure: float = eqx.field(static=True, default=1e4)
+    kinds: tuple["Microscope", ...] = ()
 
     def __check_init__(self):
         if not math.isfinite(math.prod(self.imager.array.size)):
@@ -62,9 +66,15 @@ class Microscope(eqx.Module):
         return self.plate_scale * jnp.array(self.imager.array.size, self.plate_scale.dtype)
 
     @property
+    def each(self) -> tuple["Microscope", ...]:
+        """Of each kind of lens; of lenses that are alike this itself."""
+        return self.kinds or (self,)
+
+    @property
     def middle(self) -> "Microscope":
         """The same at the middle of the depths alone."""
-        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2)
+        kinds = tuple(kind.middle for kind in self.kinds)
+        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2, kinds=kinds)
 
     @property
     def focal_length(self) -> Float[Array, ""]:

@@ -10,6 +10,7 @@ reappear behind a steep neighbour; what does is not counted.
 """
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -24,21 +25,21 @@ from ..lenses import EACH, MicrolensArray, sag
 _LENSES = 16
 # Neighbours that may bound a lens's area. A cell of a random layout has six on average.
 _NEIGHBOURS = 64
-# Of lenses that differ: neighbours, directions, radii in each at which the edge is looked for, and halvings.
-_NEAREST, _DIRECTIONS, _RADII, _HALVINGS = 32, 512, 24, 20
+# Of lenses that differ: neighbours, radii in each direction at which the edge is looked for, and halvings.
+_NEAREST, _RADII, _HALVINGS = 32, 24, 20
 
 
-@jax.jit
-def aperture_area(array: MicrolensArray) -> Float[Array, " lens"]:
+@partial(jax.jit, static_argnames="directions")
+def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Array, " lens"]:
     """Area of each lens's clear aperture, `1/2 int r^2 dphi` over its edge `r(phi)`, mm^2.
 
     Of lenses that are alike the integral is exact, a sum over the straight edges; so are its derivatives, which a
-    quadrature in angle gets wrong at the corners. Of lenses that differ it is a sum over 512 directions, right to 3e-5
-    unless the vertex is on the plate's edge. Only the 64 nearest lenses count as neighbours, 32 where lenses differ:
-    enough unless the lenses are in heaps of more than that.
+    quadrature in angle gets wrong at the corners. Of lenses that differ it is a sum over the directions, of 512 right
+    to 3e-5 unless the vertex is on the plate's edge; it is fast where no discs overlap. Only the 64 nearest lenses
+    count as neighbours, 32 where lenses differ: enough unless the lenses are in heaps of more than that.
     """
     if not array.alike or array.others is not None:
-        return jnp.sum(_edges(array) ** 2, 1) * (math.pi / _DIRECTIONS)
+        return jnp.sum(_edges(array, directions) ** 2, 1) * (math.pi / directions)
     count = min(_NEIGHBOURS, array.centers.shape[0] - 1)
     radius = array.aperture_diameter / 2
     sides = jnp.array([[1, 0], [-1, 0], [0, 1], [0, -1]], array.centers.dtype)
@@ -55,70 +56,111 @@ def aperture_area(array: MicrolensArray) -> Float[Array, " lens"]:
     return _for_each_lens(area, array.centers)
 
 
-def _edges(array: MicrolensArray) -> Float[Array, "lens direction"]:
-    """How far from its vertex each lens ends, mm, in directions that are evenly spread.
+def _edges(array: MicrolensArray, count: int) -> Float[Array, "lens direction"]:
+    """How far from its vertex each lens ends, mm, in directions that are evenly spread."""
+    whole = array.whole
+    angle = 2 * math.pi * (np.arange(count) + 0.5) / count
+    directions = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], -1), whole.centers.dtype)
+    own = jnp.broadcast_to(whole.aperture_diameter, len(whole.centers)) / 2
+
+    def gap(lens):
+        between = safe_sqrt(jnp.sum((whole.centers - whole.centers[lens][None]) ** 2, 1)) - own - own[lens]
+        return jnp.min(jnp.where(jnp.arange(len(own)) == lens, jnp.inf, between))
+
+    gaps = _for_each_lens(gap, lax.stop_gradient(whole).centers) if len(own) > 1 else jnp.inf
+    alone = lambda: _edges_of_discs(array.centers, own[: len(array.centers)], whole.size, directions)
+    return lax.cond(jnp.min(gaps) >= 0, alone, lambda: _edges_of_neighbours(whole, len(array.centers), directions))
+
+
+def _edges_of_discs(centers, radius, size, directions):
+    """Where each disc ends, or the plate."""
+    edges = jnp.broadcast_to(radius[:, None], (len(centers), len(directions)))
+    for axis, side in enumerate(size):
+        if math.isfinite(side):
+            along = directions[:, axis]
+            room = side / 2 - centers[:, axis, None] * jnp.sign(along)[None]
+            edges = jnp.minimum(edges, room / jnp.abs(along)[None])
+    return edges
+
+
+def _edges_of_neighbours(whole: MicrolensArray, count: int, directions) -> Float[Array, "lens direction"]:
+    """Of the first lenses: where they are looked for, and then Newton's step.
+
+    The step has the derivatives of the implicit function; those of the search are not asked for.
+    """
+    lenses, still = jnp.arange(count), lax.stop_gradient(whole)
+
+    def search(lens):
+        place = _nearest(still, lens)
+        covered = lambda direction: lambda distance: _covered(still, place, direction, distance)
+        return jax.vmap(lambda direction: _first_root(covered(direction), place[3][0]))(directions)
+
+    def step(found):
+        lens, at, slope = found
+        place = _nearest(whole, lens)
+        off = jax.vmap(lambda direction, distance: _covered(whole, place, direction, distance))(directions, at)
+        return at - jnp.where(slope > 0, off / jnp.where(slope > 0, slope, 1), 0)
+
+    at, slope = lax.stop_gradient(lax.map(search, lenses, batch_size=_LENSES))
+    return lax.map(jax.checkpoint(step), (lenses, at, slope), batch_size=_LENSES)
+
+
+def _nearest(whole: MicrolensArray, lens):
+    """A lens's centre; of itself and its neighbours the offsets from it, radii, rims, conics, and whether it is it."""
+    lenses = len(whole.centers)
+    radius, diameter, conic = (jnp.broadcast_to(getattr(whole, name), lenses) for name in EACH)
+    offset = whole.centers - whole.centers[lens][None]
+    _, near = lax.top_k(-jnp.sum(offset**2, axis=1), min(_NEAREST + 1, lenses))
+    return (
+        whole.centers[lens],
+        offset[near],
+        radius[near],
+        diameter[near] / 2,
+        conic[near],
+        near == lens.astype(near.dtype),
+    )
+
+
+def _covered(whole: MicrolensArray, place, direction, distance):
+    """How much a point of a lens is covered or over, in squared mm; negative where it is clear.
 
     A neighbour covers a point of a lens within the neighbour's disc, where it is less below the plane of the vertices.
     """
-    whole = array.whole
-    lenses = len(whole.centers)
-    radius, diameter, conic = (jnp.broadcast_to(getattr(whole, name), lenses) for name in EACH)
-    angle = 2 * math.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    directions = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], -1), whole.centers.dtype)
-
-    def edge(lens):
-        offset = whole.centers - whole.centers[lens][None]
-        _, near = lax.top_k(-jnp.sum(offset**2, axis=1), min(_NEAREST + 1, lenses))
-        numbers = (
-            whole.centers[lens],
-            offset[near],
-            radius[near],
-            diameter[near] / 2,
-            conic[near],
-            near == lens.astype(near.dtype),
-        )
-        return jax.vmap(lambda direction: _first_root(covered, (direction, numbers), diameter[lens] / 2))(directions)
-
-    def covered(distance, place):
-        """How much a point of a lens is covered or over, in squared mm; negative where it is clear."""
-        direction, (center, offset, radius, rim, conic, own) = place
-        # Not quite the rim: that of a hemisphere has an infinite slope.
-        inner = rim**2 * (1 - 1e-9)
-        apart = jnp.sum((distance * direction[None] - offset) ** 2, -1)
-        surface = lambda squared, radius, conic: sag(squared, radius, conic, whole.aspheric_terms)
-        below = jax.vmap(surface)(jnp.minimum(apart, inner), radius, conic)
-        # The lens itself is the nearest.
-        others = jnp.where(own, -jnp.inf, jnp.minimum(2 * radius[0] * (below[0] - below), inner - apart))
-        most = jnp.maximum(jnp.max(others), distance**2 - rim[0] ** 2)
-        for axis, side in enumerate(whole.size):
-            if math.isfinite(side):
-                beyond = jnp.abs(center[axis] + distance * direction[axis]) - side / 2
-                most = jnp.maximum(most, rim[0] * beyond)
-        return most
-
-    return lax.map(jax.checkpoint(edge), jnp.arange(len(array.centers)), batch_size=_LENSES)
+    center, offset, radius, rim, conic, own = place
+    # Not quite the rim: that of a hemisphere has an infinite slope.
+    inner = rim**2 * (1 - 1e-9)
+    apart = jnp.sum((distance * direction[None] - offset) ** 2, -1)
+    surface = lambda squared, radius, conic: sag(squared, radius, conic, whole.aspheric_terms)
+    below = jax.vmap(surface)(jnp.minimum(apart, inner), radius, conic)
+    # The lens itself is the nearest.
+    others = jnp.where(own, -jnp.inf, jnp.minimum(2 * radius[0] * (below[0] - below), inner - apart))
+    # Not their maximum: where that is computed again for its derivatives, and rounds otherwise, none of them is it.
+    most = jnp.maximum(others[jnp.argmax(others)], distance**2 - rim[0] ** 2)
+    for axis, side in enumerate(whole.size):
+        if math.isfinite(side):
+            beyond = jnp.abs(center[axis] + distance * direction[axis]) - side / 2
+            most = jnp.maximum(most, rim[0] * beyond)
+    return most
 
 
-def _first_root(function, parameters, end):
-    """Where a function first rises through zero between 0 and an end at which it is not negative.
+def _first_root(function, end):
+    """Where a function first rises through zero between 0 and an end at which it is not negative, and its slope there.
 
-    Bisection, then Newton's step, which has the derivatives of the implicit function.
+    By bisection.
     """
-    fixed_end, fixed = lax.stop_gradient((end, parameters))
-    step = fixed_end / _RADII
-    positive = jax.vmap(lambda at: function(at, fixed))(step * jnp.arange(1, _RADII + 1, dtype=step.dtype)) > 0
+    step = end / _RADII
+    positive = jax.vmap(function)(step * jnp.arange(1, _RADII + 1, dtype=step.dtype)) > 0
     first = jnp.where(jnp.any(positive), jnp.argmax(positive), _RADII - 1).astype(step.dtype)
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        under = function(middle, fixed) <= 0
+        under = function(middle) <= 0
         return jnp.where(under, middle, low), jnp.where(under, high, middle)
 
     low, high = lax.fori_loop(0, _HALVINGS, halve, (first * step, (first + 1) * step))
     at = (low + high) / 2
-    slope = jax.grad(function)(at, fixed)
-    return at - jnp.where(slope > 0, function(at, parameters) / jnp.where(slope > 0, slope, 1), 0)
+    return at, jax.grad(function)(at)
 
 
 def clear_diameter(array: MicrolensArray) -> Float[Array, ""]:

@@ -1,0 +1,223 @@
+"""What light and a span of depths cost each kind of lens: spheres and conics, either side in front, one to three foci.
+
+For each span of depths, share of a point's light and kind of lens the search of `geomscope-exposure` (in
+`design/studies`) for the least `volume_error`: the error of the best linear estimate of a volume at equal exposure, in
+which a lens out of focus is blur and its light noise, so that it is fair to lenses of one focus and of several. Four
+planes over the span are searched with; what is shown is judged with the three halfway between them besides, so that
+foci that lie on the planes and nowhere else do not pay. Light is held within 2 % and given for 20.5 mm; there is no
+mask between the apertures. With the plano side in front conics start from what was found of spheres with the same
+light, several foci from that of one focus, and these two from what was found with less light.
+
+    python -m experiments.lens_front [--out DIR]
+
+Writes `lens_front.json`, `lens_front.md` and `lens_front.png`; about half an hour on a core.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
+
+from experiments.common import Report, main, table
+from gs_jax.base.progress import Progress
+from gs_jax.base.style import PALETTE
+from gs_jax.benchmark.report import markdown_table
+from gs_jax.codesign.objectives import TERMS
+from gs_jax.codesign.parameters import candidate, parent_of, start_values
+from gs_jax.codesign.pareto import searcher, sweep_of
+from gs_jax.codesign.start import started
+from gs_jax.codesign.study import Study, read_study
+from gs_jax.designs.checks import plate_as_air
+from gs_jax.designs.design import Design, read_design
+
+FOLDER = Path(__file__).parents[1] / "design"
+SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))
+# Shares of the light of a point 20.5 mm away, %, and how much more it may be.
+LIGHTS, MIDDLE, MORE = (0.05, 0.1, 0.2, 0.4), 20.5, 1.02
+PLANES, STEPS = 4, 30
+_TARGETS = ("light_percent", "occupancy", "lenses_per_point", "thickness_mm", "field_of_view_mm", "edge_slope_deg")
+
+
+class Kind(NamedTuple):
+    """A kind of lens: the design it starts from, whether it is a conic, its foci, and the kind whose end it goes on."""
+
+    design: str
+    conic: bool
+    foci: int = 1
+    follows: str | None = None
+
+
+KINDS = {
+    "plano side, sphere": Kind("geomscope-optimized", False),
+    "plano side, conic": Kind("geomscope-optimized", True, 1, "plano side, sphere"),
+    "curved side, conic": Kind("geomscope-exposure", True),
+    "curved side, conic, 2 foci": Kind("geomscope-exposure", True, 2, "curved side, conic"),
+    "curved side, conic, 3 foci": Kind("geomscope-exposure", True, 3, "curved side, conic"),
+}
+
+
+def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
+    """The study of a kind over a span, without a mask, and with limits of the light from both sides."""
+    data = read_study(FOLDER / "studies" / "geomscope-exposure.toml").model_dump()
+    kept = [term for term in data["terms"] if term["name"] in (*_TARGETS, "volume_error")]
+    sides = ("at_least", "at_most")
+    kept += [{"name": "light_percent", side: 1.0, "weight": 30.0} for side in sides]
+    free = {name: bounds for name, bounds in data["free"].items() if kind.conic or name != "conic_constant"}
+    return Study.model_validate(
+        data
+        | {"depths_mm": span, "depth_count": PLANES, "kinds": kind.foci, "orientation": None, "free": free, "starts": 1}
+        | {"terms": kept, "pareto": [{"name": "light_percent", side: [1.0]} for side in sides]}
+        | {
+            "stages": [
+                {"solver": "levenberg-marquardt", "steps": 100, "terms": _TARGETS},
+                {"solver": "bfgs", "steps": steps},
+            ]
+        }
+    )
+
+
+def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[float, float]:
+    """The least light, of the farthest depth, and the most, of the nearest, for a share at `MIDDLE`, %."""
+    lens = design.lens
+    front, _ = plate_as_air(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    near, far = (light * ((MIDDLE + front) / (depth + front)) ** 2 for depth in span)
+    return far, MORE * near
+
+
+def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | None, steps: int) -> list[dict]:
+    """A record for each share of the light."""
+    design, study = posed(kind, span, steps)
+    sweep = sweep_of(design, study)
+    search, judge = searcher(sweep), judge_of(design, study)
+    first, found = start_values(sweep.problem.parent), []
+    for number, light in enumerate(lights):
+        limits = limits_of(light, span, design)
+        start = found[-1]["values"] if found else first
+        if followed:
+            start = spread(followed[number]["values"], first)
+        point = search((number, limits, start))
+        found.append({"light_percent": light, "values": point.values, "searched_db": decibels(point.rows[0].high)})
+        found[-1] |= {"off_target": off_target(point, sweep, limits)} | judge(point.values)
+    return found
+
+
+def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, Study]:
+    """The design that a kind starts from, and its study."""
+    design, study = read_design(FOLDER / f"{kind.design}.toml"), study_of(kind, span, steps)
+    lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
+    return started(design.model_copy(update={"lens": lens}), study), study
+
+
+def off_target(point, sweep, limits) -> float:
+    """By how much the worst target is missed, relative to it; a per cent is none."""
+    moved = (term.model_copy(update={term.kind: limit}) for term, limit in zip(sweep.moving, limits, strict=True))
+    pairs = zip([*sweep.kept, *moved], point.rows, strict=True)
+    missed = [
+        row.high / term.target - 1 if term.kind == "at_most" else 1 - row.low / term.target
+        for term, row in pairs
+        if not term.is_goal
+    ]
+    return max(0.0, *missed) if max(missed) > 0.01 else 0.0
+
+
+def spread(values: dict, first: dict) -> dict:
+    """What was found of lenses that are alike, for the kinds of a design: radii in the ratios of its own."""
+    moved = {name: values[name] for name in ("sensor_distance_mm", "pitch_mm")}
+    for name in ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant"):
+        moved[name] = jnp.broadcast_to(values[name], first[name].shape)
+    radius = first["radius_of_curvature_mm"]
+    return first | moved | {"radius_of_curvature_mm": moved["radius_of_curvature_mm"] * radius / jnp.mean(radius)}
+
+
+def judge_of(design: Design, study: Study):
+    """From parameters to what is shown: the error, and at the worst depth the width by the kind that is in focus."""
+    where = {"depths_mm": study.depths_mm, "depth_count": 2 * PLANES - 1, "exposure": study.exposure}
+    parent = parent_of(design, **where)
+
+    @jax.jit
+    def judged(values):
+        found = candidate(parent, {name: x for name, x in values.items() if name != "centers_mm"})
+        return [TERMS[name].function(found) for name in ("volume_error", "psf_width_um")]
+
+    def judge(values) -> dict[str, float]:
+        error, widths = judged(values)
+        return {"error_db": decibels(float(error)), "width_um": float(widths.max())}
+
+    return judge
+
+
+def decibels(error: float) -> float:
+    return 20 * float(np.log10(error))
+
+
+def run(spans=SPANS, lights=LIGHTS, kinds=tuple(KINDS), steps: int = STEPS, *, progress: Progress) -> list[dict]:
+    """For each span the fronts by kind; a record a share of the light."""
+    found = [{"span_mm": span, "fronts": {}} for span in spans]
+    cases = [(row, name) for row in found for name in kinds]
+    for row, name in progress.track(cases, "Fronts"):
+        kind = KINDS[name]
+        followed = row["fronts"].get(kind.follows)
+        row["fronts"][name] = front(kind, row["span_mm"], lights, followed, steps)
+    return found
+
+
+def picture(found: list[dict]) -> Figure:
+    """Error against light, a panel for each span."""
+    figure = Figure(figsize=(3.6 * len(found) + 0.6, 4.2), dpi=100, layout="constrained")
+    panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
+    for axes, row in zip(panels, found, strict=True):
+        for (name, records), colour, marker in zip(row["fronts"].items(), PALETTE, "osDv^", strict=False):
+            light = [record["light_percent"] for record in records]
+            axes.plot(light, [record["error_db"] for record in records], color=colour, marker=marker, ms=5, label=name)
+        near, far = row["span_mm"]
+        axes.set(xscale="log", xlabel="light of a point at 20.5 mm, %", title=f"objects at {near:g} to {far:g} mm")
+        axes.xaxis.set_major_locator(FixedLocator(LIGHTS))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("error of the volume, dB (less is better)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def numbers_of(record: dict) -> dict[str, Any]:
+    """A record without what a file needs not."""
+    names = ("sensor_distance_mm", "pitch_mm", "radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
+    values = {name: np.round(np.asarray(record["values"][name], float), 4).tolist() for name in names}
+    return {key: value for key, value in record.items() if key != "values"} | values
+
+
+def report(progress: Progress) -> Report:
+    with jax.enable_x64(True):
+        return shown(run(progress=progress))
+
+
+def shown(found: list[dict]) -> Report:
+    """What there is to see of the fronts."""
+    plain = [
+        row | {"fronts": {name: [numbers_of(record) for record in records] for name, records in row["fronts"].items()}}
+        for row in found
+    ]
+    columns = ("depths", "lens", "light, %", "error, dB", "width, um", "v, mm", "pitch, mm", "R, mm", "D, mm", "k")
+    rows = []
+    for row in plain:
+        for name, records in row["fronts"].items():
+            for record in records:
+                each = lambda key, record=record: ", ".join(f"{x:.3g}" for x in np.ravel(record[key]))
+                ends = "{:g} to {:g} mm".format(*row["span_mm"])
+                missed = " (misses a target)" if record["off_target"] else ""
+                shown = [f"{record[key]:.3g}" for key in ("error_db", "width_um", "sensor_distance_mm", "pitch_mm")]
+                shown[0] = f"{record['error_db']:.1f}{missed}"
+                shapes = [each(key) for key in ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")]
+                rows.append([ends, name, f"{record['light_percent']:g}", *shown, *shapes])
+    files = {"lens_front.json": plain, "lens_front.md": markdown_table(columns, rows), "lens_front.png": picture(found)}
+    return Report(files, [table(columns, rows)])
+
+
+if __name__ == "__main__":
+    main(report)

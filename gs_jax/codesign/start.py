@@ -1,0 +1,51 @@
+"""The design that a search starts from: turned over, or with its lenses dealt to kinds, as the study wants it."""
+
+import numpy as np
+
+from ..base.errors import InputError
+from ..designs.checks import plate_as_air
+from ..designs.design import Design
+from ..layouts.dealing import dealt
+from ..lenses import kinds
+from .study import Study
+
+
+def started(design: Design, study: Study) -> Design:
+    """A design with the orientation and the kinds of lenses that a study asks for.
+
+    Raises
+    ------
+    InputError
+        If its lenses differ and are not of so many kinds, or are ideal thin lenses, which have no radii to spread.
+    """
+    if study.orientation is not None:
+        design = _with(design, orientation=study.orientation)
+    if study.kinds is None:
+        return design
+    found = len(kinds(design.imager().array))
+    if found == study.kinds:
+        return design
+    if found > 1:
+        raise InputError(f"`kinds`: found {study.kinds} for a design of {found} kinds, allowed: {found}, or none.")
+    if design.lens.focal_length_mm is not None:
+        raise InputError("`kinds`: found it for a design with `lens.focal_length_mm`, allowed: for one without it.")
+    if study.kinds > (count := len(design.array.centers_mm)):
+        raise InputError(f"`kinds`: found {study.kinds} for a design of {count} lenses, allowed: up to {count}.")
+    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _focal_lengths(design, study)
+    which = dealt(np.array(design.array.centers_mm), study.kinds)
+    return _with(design, radius_of_curvature_mm=tuple(radius[which].tolist()))
+
+
+def _focal_lengths(design: Design, study: Study) -> np.ndarray:
+    """Of thin lenses that image the middles of equal parts of the depths, in vergence, over that of their middle."""
+    near, far = study.depths_mm or design.imaging.working_distance_mm
+    lens, array = design.lens, design.array
+    front, back = plate_as_air(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    ends = 1 / (near + front), 1 / (far + front)
+    share = (np.arange(study.kinds or 1) + 0.5) / (study.kinds or 1)
+    behind = 1 / (design.imaging.sensor_distance_mm + back)
+    return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
+
+
+def _with(design: Design, **lens) -> Design:
+    return design.model_copy(update={"lens": design.lens.model_copy(update=lens)})
