@@ -3,10 +3,11 @@
 For each span of depths, share of a point's light and kind of lens the search of `geomscope-exposure` (in
 `design/studies`) for the least `volume_error`: the error of the best linear estimate of a volume at equal exposure, in
 which a lens out of focus is blur and its light noise, so that it is fair to lenses of one focus and of several. Four
-planes over the span are searched with; what is shown is judged with the three halfway between them besides, so that
-foci that lie on the planes and nowhere else do not pay. Light is held within 2 % and given for 20.5 mm; there is no
-mask between the apertures. With the plano side in front conics start from what was found of spheres with the same
-light, several foci from that of one focus, and these two from what was found with less light.
+planes over the span are searched with; what is shown is the mean over these and the three halfway between them, which
+are told apart for themselves, so that foci that lie on the planes and nowhere else do not pay. Light is held within 2 %
+and given for 20.5 mm; there is no mask between the apertures. With the plano side in front conics start from what was
+found of spheres with the same light, several foci from that of one focus, and these two from what was found with less
+light.
 
     python -m experiments.lens_front [--out DIR]
 
@@ -100,8 +101,10 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
         if followed:
             start = spread(followed[number]["values"], first)
         point = search((number, limits, start))
-        found.append({"light_percent": light, "values": point.values, "searched_db": decibels(point.rows[0].high)})
-        found[-1] |= {"off_target": off_target(point, sweep, limits)} | judge(point.values)
+        (between, width), searched = judge(point.values), decibels(point.rows[0].high)
+        errors = {"error_db": together(searched, between), "searched_db": searched, "between_db": between}
+        record = {"light_percent": light, "off_target": off_target(point, sweep, limits), "values": point.values}
+        found.append(record | errors | {"width_um": width})
     return found
 
 
@@ -134,20 +137,29 @@ def spread(values: dict, first: dict) -> dict:
 
 
 def judge_of(design: Design, study: Study):
-    """From parameters to what is shown: the error, and at the worst depth the width by the kind that is in focus."""
-    where = {"depths_mm": study.depths_mm, "depth_count": 2 * PLANES - 1, "exposure": study.exposure}
-    parent = parent_of(design, **where)
+    """From parameters to the error of the planes between, and the width by the kind in focus at the worst depth."""
+    near, far = study.depths_mm or design.imaging.working_distance_mm
+    half = (far - near) / (PLANES - 1) / 2
+    between = parent_of(design, depths_mm=(near + half, far - half), depth_count=PLANES - 1, exposure=study.exposure)
+    whole = parent_of(design, depths_mm=(near, far), depth_count=2 * PLANES - 1)
 
     @jax.jit
     def judged(values):
-        found = candidate(parent, {name: x for name, x in values.items() if name != "centers_mm"})
-        return [TERMS[name].function(found) for name in ("volume_error", "psf_width_um")]
+        values = {name: x for name, x in values.items() if name not in ("depth_span_mm", "centers_mm")}
+        error = TERMS["volume_error"].function(candidate(between, values))
+        return error, TERMS["psf_width_um"].function(candidate(whole, values))
 
-    def judge(values) -> dict[str, float]:
+    def judge(values) -> tuple[float, float]:
         error, widths = judged(values)
-        return {"error_db": decibels(float(error)), "width_um": float(widths.max())}
+        return decibels(float(error)), float(widths.max())
 
     return judge
+
+
+def together(searched: float, between: float) -> float:
+    """The error of all planes, dB, of those of both sets."""
+    power = PLANES * 10 ** (searched / 10) + (PLANES - 1) * 10 ** (between / 10)
+    return 10 * float(np.log10(power / (2 * PLANES - 1)))
 
 
 def decibels(error: float) -> float:
@@ -198,25 +210,25 @@ def report(progress: Progress) -> Report:
 
 
 def shown(found: list[dict]) -> Report:
-    """What there is to see of the fronts."""
+    """A table of errors and widths, and the picture; all numbers in a file."""
     plain = [
         row | {"fronts": {name: [numbers_of(record) for record in records] for name, records in row["fronts"].items()}}
         for row in found
     ]
-    columns = ("depths", "lens", "light, %", "error, dB", "width, um", "v, mm", "pitch, mm", "R, mm", "D, mm", "k")
-    rows = []
-    for row in plain:
-        for name, records in row["fronts"].items():
-            for record in records:
-                each = lambda key, record=record: ", ".join(f"{x:.3g}" for x in np.ravel(record[key]))
-                ends = "{:g} to {:g} mm".format(*row["span_mm"])
-                missed = " (misses a target)" if record["off_target"] else ""
-                shown = [f"{record[key]:.3g}" for key in ("error_db", "width_um", "sensor_distance_mm", "pitch_mm")]
-                shown[0] = f"{record['error_db']:.1f}{missed}"
-                shapes = [each(key) for key in ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")]
-                rows.append([ends, name, f"{record['light_percent']:g}", *shown, *shapes])
+    lights = [record["light_percent"] for record in next(iter(plain[0]["fronts"].values()))]
+    columns = ("depths", "lens", *(f"{light:g} %" for light in lights))
+    rows = [
+        ["{:g} to {:g} mm".format(*row["span_mm"]), name, *map(cell, records)]
+        for row in plain
+        for name, records in row["fronts"].items()
+    ]
     files = {"lens_front.json": plain, "lens_front.md": markdown_table(columns, rows), "lens_front.png": picture(found)}
-    return Report(files, [table(columns, rows)])
+    return Report(files, [table(columns, rows, title="error, dB / width at the worst depth, um")])
+
+
+def cell(record: dict) -> str:
+    """Error and width; `!` where a target is missed."""
+    return f"{record['error_db']:.1f} / {record['width_um']:.0f}{' !' if record['off_target'] else ''}"
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from gs_jax.base.errors import InputError
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.study import read_study
 from gs_jax.designs.design import read_design, write_design
@@ -95,11 +94,10 @@ def test_editors_know_lists_and_columns():
     assert "null" not in json.dumps(schema())
 
 
-def test_searches_refuse_lenses_that_differ(tmp_path):
+def test_searches_keep_which_lens_is_of_which_kind(tmp_path):
     design = read_design(written(tmp_path, LISTS))
     study = read_study("design/studies/geomscope-targets.toml")
-    with pytest.raises(InputError, match="found lenses that differ, allowed"):
-        problem_of(design, study)
+    assert problem_of(design, study).parent.lenses == ((0, 2), (1,))
 
 
 def test_a_datasheet_of_kinds(tmp_path):

@@ -23,6 +23,7 @@ def test_neighbours_are_of_other_kinds():
         assert (which[nearest] == which[:, None]).mean() < 0.8 / kinds
 
 
+@pytest.mark.slow
 def test_a_small_study_and_its_picture():
     spans = {"15 to 30 mm": ((15.0, 30.0), 2)}
     found = run(1, spans=spans, kinds=(1, 2), lenses=24, steps=2, progress=Progress())
