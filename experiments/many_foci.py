@@ -11,7 +11,7 @@ by `experiments/ray_tracer.py` with the camera's noise, and reconstructed by Ric
 
     python -m experiments.many_foci [--out DIR] [--layouts N]
 
-Writes `many_foci.json` and `many_foci.png`; about a quarter of an hour on two cores.
+Writes `many_foci.json` and `many_foci.png`; three quarters of an hour on a core, by what a part of it took.
 """
 
 from collections.abc import Sequence

@@ -29,5 +29,5 @@ def test_a_small_front_its_table_and_its_picture():
     assert two["searched_db"] < one["searched_db"] and not one["off_target"]
     assert np.shape(two["values"]["conic_constant"]) == (2,)
     report = shown(found)
-    assert report.files["lens_front.md"].count("\n") == 4 and len(report.files["lens_front.png"].axes) == 1
+    assert report.files["lens_front.md"].count("\n") == 3 and len(report.files["lens_front.png"].axes) == 1
     assert decibels(0.1) == pytest.approx(-20)
