@@ -72,7 +72,7 @@ def table_1(data: Path | None, progress: Progress) -> Page:
             row["what"],
             row["paper"],
             row["focused: v = 5.8 mm"],
-            "yes" if same(row) else f"differs: {row['why']}",
+            "yes" if same(row) or not row["why"] else f"differs: {row['why']}",
         )
         for row in rows
         if row["paper"] != "-"
