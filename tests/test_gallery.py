@@ -69,3 +69,6 @@ def test_table_1_says_what_differs():
     claims = gallery.table_1(None, Progress()).claims
     met = {claim.what: claim.met for claim in claims}
     assert met["focal length"] == "yes" and met["sensor distance v"].startswith("differs: ")
+    # 520 nm are within 500 to 530 nm; 14 lenses are not 15 to 20.
+    assert met["wavelength"] == "yes" and met["lenses per point N_e"].startswith("differs: ")
+    assert all(verdict == "yes" or verdict.removeprefix("differs:").strip() for verdict in met.values())

@@ -6,7 +6,7 @@ from ..base.errors import InputError
 from ..designs.checks import plate_as_air
 from ..designs.design import Design
 from ..layouts.dealing import dealt
-from ..lenses import kinds
+from ..lenses import kinds as kinds_of
 from .study import Study
 
 
@@ -22,7 +22,7 @@ def started(design: Design, study: Study) -> Design:
         design = _with(design, orientation=study.orientation)
     if study.kinds is None:
         return design
-    found = len(kinds(design.imager().array))
+    found = len(kinds_of(design.imager().array))
     if found == study.kinds:
         return design
     if found > 1:
@@ -31,18 +31,18 @@ def started(design: Design, study: Study) -> Design:
         raise InputError("`kinds`: found it for a design with `lens.focal_length_mm`, allowed: for one without it.")
     if study.kinds > (count := len(design.array.centers_mm)):
         raise InputError(f"`kinds`: found {study.kinds} for a design of {count} lenses, allowed: up to {count}.")
-    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _focal_lengths(design, study)
+    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.kinds)
     which = dealt(np.array(design.array.centers_mm), study.kinds)
     return _with(design, radius_of_curvature_mm=tuple(radius[which].tolist()))
 
 
-def _focal_lengths(design: Design, study: Study) -> np.ndarray:
+def _relative_focal_lengths(design: Design, study: Study, kinds: int) -> np.ndarray:
     """Of thin lenses that image the middles of equal parts of the depths, in vergence, over that of their middle."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
     lens, array = design.lens, design.array
     front, back = plate_as_air(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
     ends = 1 / (near + front), 1 / (far + front)
-    share = (np.arange(study.kinds or 1) + 0.5) / (study.kinds or 1)
+    share = (np.arange(kinds) + 0.5) / kinds
     behind = 1 / (design.imaging.sensor_distance_mm + back)
     return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
 

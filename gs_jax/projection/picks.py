@@ -208,7 +208,7 @@ def _reached_by_two(reaches, columns, begin, end, start, size):
     block, last = size, size + 1
     for c in range(begin, end):
         pixel = np.int64(low[c]) - start
-        if pixel == last:
+        if pixel >= last:
             return 0
         # The pixel above may be the one below the last ray.
         if pixel + 1 == last:
