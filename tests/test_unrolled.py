@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.ndimage import convolve1d
+from scipy.sparse.linalg import LinearOperator, cg
 
 from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
@@ -34,7 +36,7 @@ def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     system = System(scope, grid, None, grid)
     truth = jax.random.uniform(KEY, grid.volume_shape)
     light = system.operator.mv(truth)
-    networks = networks or untrained(1, 2, 1, 4, key=KEY)
+    networks = networks or untrained(1, 2, 3, 4, key=KEY)
     start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
     return networks, Case(np.asarray(light), system, np.asarray(truth), start)
 
@@ -60,6 +62,38 @@ def test_gradients_by_the_weights():
     networks, case = small()
     networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
     check_grads(jax.jit(lambda n: unrolled_loss(n, case)), (networks,), 1, modes=["rev"], rtol=2e-3)
+
+
+def test_gradients_by_the_image():
+    networks, case = small(untrained(1, 1, 2, 4, key=KEY))
+    networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
+    volume = jax.jit(lambda light: solve(case.system.operator, light, networks).x)
+    check_grads(volume, (jnp.asarray(case.light),), 1, modes=["rev"], rtol=2e-3)
+
+
+def test_the_last_steps_are_conjugate_gradients():
+    """SciPy's, with the same preconditioner and as many, where slow waves are left out of account."""
+    networks, case = small(untrained(1, 1, 4, 4, key=KEY))
+    scope, grid = case.system.imager, case.system.grid
+    A = System(scope, grid, None, case.system.seen, slow=2).operator
+    state = networks.init(A, case.light)
+    for _ in range(networks.steps):
+        state = networks.step(A, case.light, state)[0]
+    exact, shape, size = System(scope, grid, None, slow=2).operator, case.truth.shape, case.truth.size
+    back = lambda image: np.asarray(exact.T.mv(jnp.asarray(image))).ravel()
+    normal = lambda x: back(exact.mv(jnp.asarray(x, float).reshape(shape)))
+    variance = blurred(np.asarray(state.lucy.x)).ravel()
+    square, prior = (LinearOperator((size, size), product) for product in (normal, lambda x: variance * x))
+    found, _ = cg(square, back(case.light), maxiter=4, rtol=0, M=prior)
+    np.testing.assert_allclose(state.squares.x.ravel(), found, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(networks.estimate(state), np.maximum(state.squares.x, 0))
+
+
+def blurred(volume: np.ndarray) -> np.ndarray:
+    """Binomial weights along rows and columns, darkness beyond."""
+    for axis in (1, 2):
+        volume = convolve1d(volume, np.array([1, 4, 6, 4, 1]) / 16, axis, mode="constant")
+    return volume
 
 
 def test_bands_leave_no_seams(monkeypatch):
@@ -127,7 +161,7 @@ def test_a_volume_imaged_again():
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
     found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
-    assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 30
+    assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 33
 
 
 @pytest.mark.slow

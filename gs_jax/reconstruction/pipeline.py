@@ -186,7 +186,7 @@ def reconstructor(
     model = model_of(imager, grid, optics, progress or Progress())
     # Of these, back-projection stands for the adjoint.
     unmatched = isinstance(method, ListRichardsonLucy | Unrolled)
-    least_squares = not (unmatched or isinstance(method, RichardsonLucy))
+    least_squares = not isinstance(method, ListRichardsonLucy | RichardsonLucy)
     slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
     system = System(model.imager, grid, model.optics, seen if unmatched else None, slow)
     return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)

@@ -79,7 +79,8 @@ class System(eqx.Module):
     seen
         If given, back-projection from these voxels stands for the adjoint.
     slow
-        So many of the image's longest cosine waves each way are left out of account.
+        So many of the image's longest cosine waves each way are left out of account, with `seen` by least squares
+        alone.
     """
 
     imager: Imager
@@ -91,9 +92,10 @@ class System(eqx.Module):
     @property
     def operator(self) -> lx.AbstractLinearOperator | Unmatched:
         A = forward_operator(self.imager, self.grid, self.optics)
+        squares = lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
         if self.seen is not None:
-            return Unmatched(A, forward_operator(self.imager, self.seen).T)
-        return lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
+            return Unmatched(A, forward_operator(self.imager, self.seen).T, squares)
+        return squares
 
     def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
         """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""

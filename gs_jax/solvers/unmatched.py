@@ -9,10 +9,18 @@ class Unmatched(eqx.Module):
 
     Enough of an operator for Richardson-Lucy, which comes to its end in fewer steps if what goes back is sharper than
     the adjoint (Zeng and Gullberg, IEEE Trans. Med. Imaging 19, 548, 2000).
+
+    Parameters
+    ----------
+    forward, back
+        From volumes to images, and the other way.
+    squares
+        What least squares invert, with its own transpose, in the place of both; by default `forward`.
     """
 
     forward: lx.AbstractLinearOperator
     back: lx.AbstractLinearOperator
+    squares: lx.AbstractLinearOperator | None = None
 
     @property
     def T(self) -> "Unmatched":

@@ -3,7 +3,7 @@
 What a capture says of a volume is in the operators of its own microscope, which the networks do not hold: they are the
 same for every layout of lenses. The first steps are those of accelerated list-Richardson-Lucy. In each of the next its
 step is taken to a power that was learned, and a network then weighs each voxel by what it and its neighbours look like.
-The last have no networks again: in the voxels that were left, the capture says how bright they are.
+The last have no networks again: where light may be is known then, and least squares say how much of it there is.
 """
 
 import os
@@ -37,6 +37,8 @@ _DARK, _FAINT = 1e-2, 1e-3
 _MOST = 20.0
 # Rows of voxels at a time, which bounds the memory: what a network sees does not depend on them.
 _ROWS = 128
+# Binomial weights, whose standard deviation is one voxel: where light is likely, it is so beside it, too.
+_BESIDE = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 _MOST_STEPS, _MOST_WIDTH = 64, 1024
 _LUCY = RichardsonLucy(accelerate=True, tents=TENTS)
 
@@ -48,11 +50,27 @@ class Layer(eqx.Module):
     bias: Float[Array, "*step made"]
 
 
+class Squares(NamedTuple):
+    """Of conjugate gradients: the estimate, `A'` of what it leaves, the next direction, the variance that each voxel is
+    expected to have, the residual's square in its unit, and the cost.
+    """
+
+    x: Array
+    residual: Array
+    direction: Array
+    variance: Array
+    product: Array
+    cost: Array
+
+
 class State(NamedTuple):
-    """Of `Unrolled`: the state of Richardson-Lucy, how far the lenses agree, and the steps that are done."""
+    """Of `Unrolled`: the state of Richardson-Lucy, how far the lenses agree, that of conjugate gradients, and the steps
+    that are done.
+    """
 
     lucy: LucyState
     agreement: Array
+    squares: Squares
     number: Int[Array, ""]
 
 
@@ -61,8 +79,10 @@ class Unrolled(eqx.Module):
 
     `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
     power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
-    accelerated Richardson-Lucy with `A` and `B`, and after it the last, where `w = p = 1`. All fit a slow background,
-    too. A dark image gives zeros.
+    accelerated Richardson-Lucy with `A` and `B`. Both fit a slow background, too. After that come conjugate gradients
+    from darkness towards the least squares of `A x - image`, with the exact adjoint, preconditioned by the `x` before
+    them, blurred by a voxel: `x` is then the variance that each voxel is expected to have, and few steps are the prior
+    (Calvetti and Somersalo, Inverse Problems 21, 1397, 2005). A dark image gives zeros.
 
     Parameters
     ----------
@@ -70,10 +90,12 @@ class Unrolled(eqx.Module):
         Of the networks.
     power
         One for each step with a network.
-    first, last
-        Steps without, before and after those.
+    first
+        Steps before those with networks.
+    last
+        Conjugate gradients after them.
     steps, tolerance
-        As for `Solver`; `first`, one for each network, and `last`, or fewer.
+        As for `Solver`; `first`, one for each network, and `last`, or fewer. The cost of the last is half the squares.
 
     Raises
     ------
@@ -117,26 +139,37 @@ class Unrolled(eqx.Module):
         inverse = divide(jnp.ones_like(image), image + dark)
         # The harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
         agreement = jnp.maximum(divide(lucy.sensitivity, A.T.mv(inverse)) - dark, 0)
-        return State(lucy, agreement, jnp.zeros((), jnp.int32))
+        zeros, zero = jnp.zeros_like(lucy.x), jnp.zeros((), lucy.x.dtype)
+        return State(lucy, agreement, Squares(zeros, zeros, zeros, zeros, zero, zero), jnp.zeros((), jnp.int32))
 
     def step(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
-        image = jnp.maximum(as_image(A, image), 0)
-        kinds = (
-            lambda lucy: _LUCY.step(A, image, lucy),
-            lambda lucy: self.learned(A, image, state._replace(lucy=lucy)),
-            lambda lucy: self.plain(A, image, lucy),
-        )
+        light = as_image(A, image)
+        image = jnp.maximum(light, 0)
+
+        def lucy(state):
+            lucy, *told = _LUCY.step(A, image, state.lucy)
+            return state._replace(lucy=lucy), *told
+
+        def learned(state):
+            lucy, *told = self.learned(A, image, state)
+            return state._replace(lucy=lucy), *told
+
+        def squares(state):
+            begin = lambda: _squares(A, light, state.lucy.x)
+            squares, *told = _conjugate(A, lax.cond(state.number == ended[1], begin, lambda: state.squares))
+            return state._replace(squares=squares), *told
+
         ended = jnp.array([self.first, self.first + self.power.size], jnp.int32)
-        lucy, cost, residual = lax.switch(jnp.sum(state.number >= ended), kinds, state.lucy)
-        return State(lucy, state.agreement, state.number + 1), cost, residual
+        state, cost, residual = lax.switch(jnp.sum(state.number >= ended), (lucy, learned, squares), state)
+        return state._replace(number=state.number + 1), cost, residual
 
     def learned(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], state: State
     ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
         """A step with a network: the new estimate, the cost of the old one, and the relative change."""
-        (x, sensitivity, *_), number = state.lucy, state.number - self.first
+        (x, sensitivity, momentum, _), number = state.lucy, state.number - self.first
         expected, tents, asked = _asked(A, image, state.lucy)
         ahead = x * asked ** self.power[number].astype(x.dtype)
         unit = _rms(ahead)
@@ -153,17 +186,12 @@ class Unrolled(eqx.Module):
         ]
         layers = jax.tree.map(lambda part: part[number], self.layers)
         new = ahead * 2 * jax.nn.sigmoid(_weighed(layers, jnp.stack(seen, -1)))
-        return _moved(state.lucy, new, tents, divergence(image, expected))
-
-    def plain(
-        self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], lucy: LucyState
-    ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
-        """A step after the networks: as `learned`."""
-        expected, tents, asked = _asked(A, image, lucy)
-        return _moved(lucy, lucy.x * asked, tents, divergence(image, expected))
+        lucy = LucyState(new, sensitivity, momentum, tents)
+        return lucy, divergence(image, expected), divide(norm(new - x), norm(new))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
-        return state.lucy.x
+        squares = state.number > self.first + self.power.size
+        return jnp.where(squares, jnp.maximum(state.squares.x, 0), state.lucy.x)
 
     @staticmethod
     def pretrained() -> "Unrolled":
@@ -174,7 +202,7 @@ class Unrolled(eqx.Module):
 def write_unrolled(path: str | os.PathLike[str], networks: Unrolled, provenance: Provenance | None = None) -> None:
     """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
     width = networks.layers[0].bias.shape[-1]
-    about = {"first": networks.first, "networks": networks.power.size, "last": networks.last, "width": width}
+    about = {"first": networks.first, "networks": networks.power.size, "squares": networks.last, "width": width}
     weights.write_weights(path, networks, about, provenance)
 
 
@@ -189,13 +217,13 @@ def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:
     return weights.read_weights(path, _skeleton)
 
 
-def _skeleton(first: int, networks: int, last: int, width: int) -> Unrolled:
+def _skeleton(first: int, networks: int, squares: int, width: int) -> Unrolled:
     """The shapes of the networks, checked: what a file says decides how much memory is asked for."""
     whole = lambda n, least, most: type(n) is int and least <= n <= most
-    steps = whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(last, 0, _MOST_STEPS)
+    steps = whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(squares, 0, _MOST_STEPS)
     if not (steps and whole(width, 1, _MOST_WIDTH)):
         raise ValueError("its number of steps or its width is out of range")
-    return eqx.filter_eval_shape(lambda key: untrained(first, networks, last, width, key=key), jax.random.key(0))
+    return eqx.filter_eval_shape(lambda key: untrained(first, networks, squares, width, key=key), jax.random.key(0))
 
 
 def untrained(first: int = 15, networks: int = 3, last: int = 0, width: int = 16, *, key: PRNGKeyArray) -> Unrolled:
@@ -218,8 +246,40 @@ def _asked(A, image, lucy: LucyState):
     return expected, tent_step(lucy.tents, ratio), asked
 
 
-def _moved(lucy: LucyState, new, tents, cost):
-    return lucy._replace(x=new, tents=tents), cost, divide(norm(new - lucy.x), norm(new))
+def _squares(A, image, x) -> Squares:
+    """Before the first of the conjugate gradients, with the volume that says where light may be."""
+    A = _exact(A)
+    variance = _blurred(_blurred(x, 1), 2)
+    residual = A.T.mv(image)
+    direction = variance * residual
+    cost = jnp.vdot(image, image) / 2
+    return Squares(jnp.zeros_like(x), residual, direction, variance, jnp.vdot(residual, direction), cost)
+
+
+def _conjugate(A, squares: Squares):
+    """One of them: the next state, the cost of the last, and the relative change."""
+    A = _exact(A)
+    x, residual, direction, variance, product, cost = squares
+    image = A.mv(direction)
+    length = divide(product, jnp.vdot(image, image))
+    step = length * direction
+    residual = residual - length * A.T.mv(image)
+    ahead = variance * residual
+    new = jnp.vdot(residual, ahead)
+    direction = ahead + divide(new, product) * direction
+    after = Squares(x + step, residual, direction, variance, new, cost - length * product / 2)
+    return after, cost, divide(norm(step), norm(after.x))
+
+
+def _exact(A: lx.AbstractLinearOperator | Unmatched) -> lx.AbstractLinearOperator:
+    return (A.squares or A.forward) if isinstance(A, Unmatched) else A
+
+
+def _blurred(x, axis):
+    """By `_BESIDE`; beyond the volume it is dark."""
+    reach, size = len(_BESIDE) // 2, x.shape[axis]
+    wide = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
+    return sum(w * lax.slice_in_dim(wide, i, i + size, axis=axis) for i, w in enumerate(_BESIDE))
 
 
 def _rms(x):

@@ -26,8 +26,8 @@ from .slices import Batch, Stack, paper_batch, patches
 UNROLLED = Kind(288, 0.018, 0.064, 7, binning=4)
 # Of an empty scene errors are relative to this much of the start's squares.
 _OF_THE_START = 0.2
-# Steps before and after the networks, once they are trained.
-_FIRST, _LAST = 25, 2
+# Steps before the networks, and conjugate gradients after them, once they are trained.
+_FIRST, _LAST = 20, 10
 
 
 class Case(NamedTuple):
@@ -69,7 +69,7 @@ def unrolled_loss(network: Unrolled, case: Case) -> Float[Array, ""]:
     # Not `step`, which would keep what the gradient needs of its other kinds of step, too.
     def learned(state, _):
         lucy, cost, _ = network.learned(operator, light, state)
-        return State(lucy, state.agreement, state.number + 1), cost
+        return state._replace(lucy=lucy, number=state.number + 1), cost
 
     found = network.estimate(lax.scan(learned, case.start, length=network.power.size)[0])
     start = network.estimate(case.start)
