@@ -5,7 +5,8 @@ of PSNR over that of an empty volume, the mean over the scenes and its 95 % inte
 the light, misaligned microscopes and noise, on voxels half as large; what devices make is in `fig9_benchmark.py`.
 
 - The operator inside: our U-Net after back-projection against the unrolled inversion, and list-RL without networks.
-- The steps: the unrolled inversion without those after its networks.
+- The networks: the unrolled inversion with networks that leave every voxel as it is.
+- The last steps: the unrolled inversion without its conjugate gradients.
 - Noise alone: of captures that show nothing, the standard deviation of the volume imaged again over the image's.
 
     python -m experiments.learned [--scenes N] [--out DIR]
@@ -16,6 +17,9 @@ Writes `learned.json` and `learned.md`; about fifteen minutes on two cores.
 import dataclasses
 from collections.abc import Callable
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import Report, main, table
@@ -46,9 +50,16 @@ def methods(progress: Progress) -> dict[str, Callable[[Example], np.ndarray]]:
         f"list-RL, {networks.steps} steps": by(METHODS["list-rl"](networks.steps)),
         "FISTA": by(METHODS["fista"](STEPS)),
         "ADMM": by(METHODS["admm"](STEPS)),
-        "unrolled, no steps after the networks": by(without),
+        "unrolled, networks that change nothing": by(idle(networks)),
+        "unrolled, no conjugate gradients": by(without),
         "unrolled": by(networks),
     }
+
+
+def idle(networks: Unrolled) -> Unrolled:
+    """As many steps, of Richardson-Lucy alone where the networks were."""
+    zeros = jax.tree.map(jnp.zeros_like, networks.layers)
+    return eqx.tree_at(lambda n: (n.layers, n.power), networks, (zeros, jnp.ones_like(networks.power)))
 
 
 def solved(e: Example, method: Method, progress: Progress) -> np.ndarray:

@@ -3,7 +3,7 @@
 - Three planes, 30 plain steps of Richardson-Lucy: what the full model alone makes of it.
 - Background: the capture as it is, and under a wide glow that no voxel emits, by list-RL with and without tents.
 - Rims: the near model, whose light is a sixth of the capture's, with and without holding back what few lenses see.
-- Unrolled: with and without the steps after its networks.
+- Unrolled: with and without its conjugate gradients.
 
     python -m experiments.solver_options DATA [--out DIR]
 
@@ -56,7 +56,7 @@ def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
     networks = Unrolled.pretrained()
     found["unrolled"] = s, networks, "full"
     without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)
-    found["unrolled, no steps after the networks"] = s, without, "full"
+    found["unrolled, no conjugate gradients"] = s, without, "full"
     return found
 
 

@@ -120,7 +120,10 @@ def test_weights_come_back(tmp_path):
     assert (found.first, found.last, found.steps) == (3, 1, 6)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(made), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
-    np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "last": 1, "width": 4}'))
+    np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "squares": 1, "width": 4}'))
+    np.savez(tmp_path / "old.npz", about=np.array('{"first": 1, "networks": 1, "last": 2, "width": 4}'))
+    with pytest.raises(InputError, match="found 2 last steps of Richardson-Lucy, allowed: conjugate gradients"):
+        read_unrolled(tmp_path / "old.npz")
     for name in ("other", "missing"):
         with pytest.raises(InputError, match=name):
             read_unrolled(tmp_path / f"{name}.npz")

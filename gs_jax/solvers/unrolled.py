@@ -82,7 +82,7 @@ class Unrolled(eqx.Module):
     accelerated Richardson-Lucy with `A` and `B`. Both fit a slow background, too. After that come conjugate gradients
     from darkness towards the least squares of `A x - image`, with the exact adjoint, preconditioned by the `x` before
     them, blurred by a voxel: `x` is then the variance that each voxel is expected to have, and few steps are the prior
-    (Calvetti and Somersalo, Inverse Problems 21, 1397, 2005). A dark image gives zeros.
+    (Calvetti et al., "Bayes meets Krylov", arXiv:1503.06844). A dark image gives zeros.
 
     Parameters
     ----------
@@ -217,8 +217,10 @@ def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:
     return weights.read_weights(path, _skeleton)
 
 
-def _skeleton(first: int, networks: int, squares: int, width: int) -> Unrolled:
+def _skeleton(first: int, networks: int, width: int, squares: int | None = None, last: int = 0) -> Unrolled:
     """The shapes of the networks, checked: what a file says decides how much memory is asked for."""
+    if squares is None:
+        raise ValueError(f"found {last} last steps of Richardson-Lucy, allowed: conjugate gradients, by training again")
     whole = lambda n, least, most: type(n) is int and least <= n <= most
     steps = whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(squares, 0, _MOST_STEPS)
     if not (steps and whole(width, 1, _MOST_WIDTH)):

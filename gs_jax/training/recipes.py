@@ -77,9 +77,10 @@ def unrolled_loss(network: Unrolled, case: Case) -> Float[Array, ""]:
 
 
 def finished(network: Unrolled) -> Unrolled:
-    """Trained networks as they are used: whole captures need more steps before them, and some after them.
+    """Trained networks as they are used: with more steps before them, and conjugate gradients after them.
 
-    On ray-traced letters 25 steps before them give 30.5 dB, the 15 of training 29.8; 2 after them 3 dB more.
+    On simulated captures ten of these gain 1 dB, and more than twelve no more. On ray-traced letters, which are whole
+    captures, 20 steps before the networks give 15.2 dB above an empty volume, the 15 of training 12.2.
     """
     return dataclasses.replace(network, first=_FIRST, last=_LAST, steps=_FIRST + network.power.size + _LAST)
 
