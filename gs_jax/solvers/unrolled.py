@@ -51,14 +51,15 @@ class Layer(eqx.Module):
 
 
 class Squares(NamedTuple):
-    """Of conjugate gradients: the estimate, `A'` of what it leaves, the next direction, the variance that each voxel is
-    expected to have, the residual's square in its unit, and the cost.
+    """Of conjugate gradients: the estimate over the variance that each voxel is expected to have, the negative
+    gradient, the next direction, that variance, the variance of noise, the gradient's square in its unit, and the cost.
     """
 
-    x: Array
+    weights: Array
     residual: Array
     direction: Array
     variance: Array
+    noise: Array
     product: Array
     cost: Array
 
@@ -80,9 +81,10 @@ class Unrolled(eqx.Module):
     `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
     power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
     accelerated Richardson-Lucy with `A` and `B`. Both fit a slow background, too. After that come conjugate gradients
-    from darkness towards the least squares of `A x - image`, with the exact adjoint, preconditioned by the `x` before
-    them, blurred by a voxel: `x` is then the variance that each voxel is expected to have, and few steps are the prior
-    (Calvetti et al., "Bayes meets Krylov", arXiv:1503.06844). A dark image gives zeros.
+    from darkness towards the least `|A x - image|^2 / noise + |x|^2 / variance`, with the exact adjoint. The variance
+    that each voxel is expected to have is the `x` before them, blurred by a voxel, times its mean brightness; they are
+    preconditioned by it, and end early (Calvetti et al., "Bayes meets Krylov", arXiv:1503.06844). The noise is what
+    that `x` leaves of the image, so that nothing is made of noise alone. A dark image gives zeros.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ class Unrolled(eqx.Module):
         # The harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
         agreement = jnp.maximum(divide(lucy.sensitivity, A.T.mv(inverse)) - dark, 0)
         zeros, zero = jnp.zeros_like(lucy.x), jnp.zeros((), lucy.x.dtype)
-        return State(lucy, agreement, Squares(zeros, zeros, zeros, zeros, zero, zero), jnp.zeros((), jnp.int32))
+        return State(lucy, agreement, Squares(zeros, zeros, zeros, zeros, zero, zero, zero), jnp.zeros((), jnp.int32))
 
     def step(
         self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
@@ -157,7 +159,7 @@ class Unrolled(eqx.Module):
             return state._replace(lucy=lucy), *told
 
         def squares(state):
-            begin = lambda: _squares(A, light, state.lucy.x)
+            begin = lambda: _squares(A, light, state.lucy)
             squares, *told = _conjugate(A, lax.cond(state.number == ended[1], begin, lambda: state.squares))
             return state._replace(squares=squares), *told
 
@@ -191,7 +193,7 @@ class Unrolled(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         squares = state.number > self.first + self.power.size
-        return jnp.where(squares, jnp.maximum(state.squares.x, 0), state.lucy.x)
+        return jnp.where(squares, jnp.maximum(state.squares.variance * state.squares.weights, 0), state.lucy.x)
 
     @staticmethod
     def pretrained() -> "Unrolled":
@@ -248,29 +250,31 @@ def _asked(A, image, lucy: LucyState):
     return expected, tent_step(lucy.tents, ratio), asked
 
 
-def _squares(A, image, x) -> Squares:
+def _squares(A, image, lucy: LucyState) -> Squares:
     """Before the first of the conjugate gradients, with the volume that says where light may be."""
-    A = _exact(A)
-    variance = _blurred(_blurred(x, 1), 2)
-    residual = A.T.mv(image)
-    direction = variance * residual
+    x, forward = lucy.x, A.forward if isinstance(A, Unmatched) else A
+    left = image - forward.mv(x) - tent_background(lucy.tents, image)
+    # As bright as light is on average, where there is as much of it as there is.
+    variance = _blurred(_blurred(x, 1), 2) * divide(jnp.vdot(x, x), jnp.sum(x))
+    residual = _exact(A).T.mv(image)
+    product = jnp.vdot(residual, variance * residual)
     cost = jnp.vdot(image, image) / 2
-    return Squares(jnp.zeros_like(x), residual, direction, variance, jnp.vdot(residual, direction), cost)
+    return Squares(jnp.zeros_like(x), residual, residual, variance, jnp.mean(left**2), product, cost)
 
 
 def _conjugate(A, squares: Squares):
     """One of them: the next state, the cost of the last, and the relative change."""
     A = _exact(A)
-    x, residual, direction, variance, product, cost = squares
-    image = A.mv(direction)
-    length = divide(product, jnp.vdot(image, image))
-    step = length * direction
-    residual = residual - length * A.T.mv(image)
-    ahead = variance * residual
-    new = jnp.vdot(residual, ahead)
-    direction = ahead + divide(new, product) * direction
-    after = Squares(x + step, residual, direction, variance, new, cost - length * product / 2)
-    return after, cost, divide(norm(step), norm(after.x))
+    weights, residual, direction, variance, noise, product, cost = squares
+    step = variance * direction
+    image = A.mv(step)
+    length = divide(product, jnp.vdot(image, image) + noise * jnp.vdot(direction, step))
+    weights = weights + length * direction
+    residual = residual - length * (A.T.mv(image) + noise * direction)
+    new = jnp.vdot(residual, variance * residual)
+    direction = residual + divide(new, product) * direction
+    after = Squares(weights, residual, direction, variance, noise, new, cost - length * product / 2)
+    return after, cost, divide(norm(length * step), norm(variance * weights))
 
 
 def _exact(A: lx.AbstractLinearOperator | Unmatched) -> lx.AbstractLinearOperator:
