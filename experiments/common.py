@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import PALETTE
 from gs_jax.designs.builtin import geomscope
@@ -56,6 +57,8 @@ def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | N
         Of the script, beside `--out`: their name, and the options of `add_argument`.
     folder
         Below `out/`, by default the name of the script.
+
+    Wrong input is one line, and exit status 2.
     """
     explanation = inspect.getdoc(inspect.getmodule(report)) or ""
     parser = argparse.ArgumentParser(description=explanation.splitlines()[0])
@@ -63,10 +66,13 @@ def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | N
         parser.add_argument(name, **options)
     parser.add_argument("--out", type=Path, default=Path("out") / (folder or Path(inspect.getfile(report)).stem))
     values = vars(parser.parse_args())
-    out = make_folder(values.pop("out"))
-    with Progress() as progress:
-        found = report(**values, progress=progress)
-    write(out, found)
+    try:
+        out = make_folder(values.pop("out"))
+        with Progress() as progress:
+            found = report(**values, progress=progress)
+        write(out, found)
+    except InputError as error:
+        parser.error(str(error))
     Console(width=160).print(*found.shown, sep="\n")
 
 

@@ -10,10 +10,11 @@ as wide as the microscope resolves (Eq. 5: a voxel); zeros are the floor, the tr
 as many of the brightest peaks of a volume, or points found, as scores best: a threshold that no user has, and that
 favours the volumes. "Imaged again" is how far the volume's image is from the capture (`gs_jax.reproject`).
 
-    python -m experiments.fig9_benchmark DATA [--out DIR] [--scenes letters,points]
+    python -m experiments.fig9_benchmark DATA [--out DIR] [--scenes letters,points] [--weights FILE]
 
 DATA holds `P1.toml`, `P1_*.tif` and their truth, `*.json`. Points match within 0.1 mm laterally and 0.6 mm axially: the
-voxels are coarse. Writes `captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
+voxels are coarse. FILE is what `gs-jax train --network unrolled` wrote, in the place of what is shipped. Writes
+`captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
 """
 
 import json
@@ -30,7 +31,8 @@ from experiments.common import Report, main, points_of
 from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
-from gs_jax import Grid, Imager, reproject
+from gs_jax import Grid, Imager, Unrolled, reproject
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image, label_of
 from gs_jax.benchmark.measure import timed
@@ -44,6 +46,7 @@ from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, reconstruct, voxel_grid
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake
+from gs_jax.solvers.unrolled import read_unrolled
 from gs_jax.suppression.clustering import find_clusters
 from gs_jax.suppression.locate import find_points
 from gs_jax.suppression.unet import pretrained, suppress
@@ -135,9 +138,10 @@ class Result(NamedTuple):
     points: np.ndarray | None = None
 
 
-def methods(s: Scene, steps: int, progress: Progress) -> dict[str, Callable[[], Result]]:
+def methods(s: Scene, networks: Unrolled, steps: int, progress: Progress) -> dict[str, Callable[[], Result]]:
     """Every method, as a call without arguments."""
-    solve = lambda name: reconstruct(s.image, s.imager, s.grid, METHODS[name](steps), progress=progress)
+    by = lambda method: reconstruct(s.image, s.imager, s.grid, method, progress=progress)
+    solve = lambda name: by(METHODS[name](steps))
     of = lambda points: Result(spots(points, s.grid, float(s.grid.pitch) / FWHM), points)
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),
@@ -146,7 +150,7 @@ def methods(s: Scene, steps: int, progress: Progress) -> dict[str, Callable[[], 
         "backproject + clusters": lambda: of(find_clusters(solve("backproject"), s.grid)),
         "backproject + paper's U-Net": lambda: Result(suppress(solve("backproject"), pretrained("paper"))),
         "backproject + our U-Net": lambda: Result(suppress(solve("backproject"), pretrained())),
-        "unrolled": lambda: Result(solve("unrolled")),
+        "unrolled": lambda: Result(by(networks)),
         **{name: (lambda name=name: Result(solve(name))) for name in ITERATIVE},
         "truth": lambda: Result(s.truth),
     }
@@ -165,13 +169,13 @@ def best_f1(result: Result, s: Scene) -> float | None:
 
 
 def run(
-    data: Path, scenes: Sequence[str] = tuple(SCENES), *, steps: int = STEPS, progress: Progress
+    data: Path, networks: Unrolled, scenes: Sequence[str] = tuple(SCENES), *, steps: int = STEPS, progress: Progress
 ) -> tuple[dict, dict[tuple[str, str], View]]:
     """What `captures.json` holds, and maxima over the depths by scene and method."""
     rows, pictures = [], {}
     for name in scenes:
         s = SCENES[name](data)
-        for method, call in progress.track(methods(s, steps, progress).items(), name):
+        for method, call in progress.track(methods(s, networks, steps, progress).items(), name):
             seconds, result = timed(call)
             q = quality(result.volume, s.truth)
             scores = {"psnr_db": q.psnr_db, "ssim": q.ssim, "mse": q.mse, "f1": best_f1(result, s)}
@@ -208,11 +212,16 @@ def picture(pictures: dict[tuple[str, str], View]) -> Figure:
     return figure
 
 
-def report(data: Path, scenes: str, progress: Progress) -> Report:
-    found, pictures = run(data, scenes.split(","), progress=progress)
+def report(data: Path, scenes: str, weights: Path | None, progress: Progress) -> Report:
+    names = scenes.split(",")
+    if unknown := [name for name in names if name not in SCENES]:
+        raise InputError(f"--scenes: found {', '.join(unknown)}, allowed: {', '.join(SCENES)}.")
+    networks = read_unrolled(weights) if weights else Unrolled.pretrained()
+    found, pictures = run(data, networks, names, progress=progress)
     text = markdown(found)
     return Report({"captures.json": found, "captures.md": text, "captures.png": picture(pictures)}, [text])
 
 
 if __name__ == "__main__":
-    main(report, {"data": {"type": Path}, "--scenes": {"default": ",".join(SCENES)}}, folder="fig9")
+    arguments = {"data": {"type": Path}, "--scenes": {"default": ",".join(SCENES)}, "--weights": {"type": Path}}
+    main(report, arguments, folder="fig9")

@@ -9,13 +9,15 @@ the light, misaligned microscopes and noise, on voxels half as large; what devic
 - The last steps: the unrolled inversion without its conjugate gradients.
 - Noise alone: of captures that show nothing, the standard deviation of the volume imaged again over the image's.
 
-    python -m experiments.learned [--scenes N] [--out DIR]
+    python -m experiments.learned [--scenes N] [--weights FILE] [--out DIR]
 
-Writes `learned.json` and `learned.md`; about fifteen minutes on two cores.
+FILE is what `gs-jax train --network unrolled` wrote, in the place of what is shipped. Writes `learned.json` and
+`learned.md`; about fifteen minutes on two cores.
 """
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -24,10 +26,12 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from gs_jax import Unrolled, optics_of, quality, reconstruct, suppress
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.report import markdown_table
 from gs_jax.projection.forward_model import forward
 from gs_jax.reconstruction.methods import METHODS, Method
+from gs_jax.solvers.unrolled import read_unrolled
 from gs_jax.suppression.unet import pretrained
 from gs_jax.training.examples import Example, Kind, example
 from gs_jax.training.recipes import UNROLLED
@@ -38,9 +42,8 @@ STEPS = 20
 _DRAWS = 10_000
 
 
-def methods(progress: Progress) -> dict[str, Callable[[Example], np.ndarray]]:
+def methods(networks: Unrolled, progress: Progress) -> dict[str, Callable[[Example], np.ndarray]]:
     """Volumes of an example, by name."""
-    networks = Unrolled.pretrained()
     without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)
     by = lambda method: lambda e: solved(e, method, progress)
     cleaned = lambda name: lambda e: suppress(solved(e, METHODS["backproject"](1), progress), pretrained(name))
@@ -77,12 +80,13 @@ def imaged_noise(volume: np.ndarray, e: Example) -> float:
     return float(np.std(image) / np.std(e.image))
 
 
-def run(scenes: int, kind: Kind = UNROLLED, *, progress: Progress) -> dict[str, dict]:
+def run(networks: Unrolled, scenes: int, kind: Kind = UNROLLED, *, progress: Progress) -> dict[str, dict]:
     """`gains` of the scenes with something in them, dB, and `noise` of the others, by method."""
-    found = {name: {"gains": [], "noise": []} for name in methods(progress)}
+    by_name = methods(networks, progress)
+    found = {name: {"gains": [], "noise": []} for name in by_name}
     for number in progress.track(range(scenes), "Scenes"):
         e = example(SEED, number, kind)
-        for name, method in methods(progress).items():
+        for name, method in by_name.items():
             volume = method(e)
             if e.truth.any():
                 found[name]["gains"].append(gain(volume, e))
@@ -99,8 +103,10 @@ def interval(values: list[float]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def report(scenes: int, progress: Progress) -> Report:
-    found = run(scenes, progress=progress)
+def report(scenes: int, weights: Path | None, progress: Progress) -> Report:
+    if scenes < 1:
+        raise InputError(f"--scenes: found {scenes}, allowed: 1 or more.")
+    found = run(read_unrolled(weights) if weights else Unrolled.pretrained(), scenes, progress=progress)
     columns = ("method", "gain, dB", "95 %", "worst, dB", "noise imaged again, of its SD")
     rows = []
     for name, values in found.items():
@@ -112,4 +118,4 @@ def report(scenes: int, progress: Progress) -> Report:
 
 
 if __name__ == "__main__":
-    main(report, {"--scenes": {"type": int, "default": 24}})
+    main(report, {"--scenes": {"type": int, "default": 24}, "--weights": {"type": Path}})

@@ -127,6 +127,9 @@ def test_weights_come_back(tmp_path):
     np.savez(tmp_path / "old.npz", about=np.array('{"first": 1, "networks": 1, "last": 2, "width": 4}'))
     with pytest.raises(InputError, match="found 2 last steps of Richardson-Lucy, allowed: conjugate gradients"):
         read_unrolled(tmp_path / "old.npz")
+    np.savez(tmp_path / "slices.npz", about=np.array('{"offsets": [0], "widths": [2], "standardized": true}'))
+    with pytest.raises(InputError, match="another kind.*'widths'.*allowed: one with first, networks, width, squares"):
+        read_unrolled(tmp_path / "slices.npz")
     for name in ("other", "missing"):
         with pytest.raises(InputError, match=name):
             read_unrolled(tmp_path / f"{name}.npz")
@@ -173,7 +176,7 @@ def test_the_networks_of_the_package():
 @pytest.mark.slow
 def test_little_is_invented_on_noise():
     """A capture that shows nothing: the volume, imaged again, is to be a tenth of the noise."""
-    found = learned.run(1, TINY._replace(pixels=96), progress=Progress())
+    found = learned.run(Unrolled.pretrained(), 1, TINY._replace(pixels=96), progress=Progress())
     assert found["unrolled"]["gains"]
     e = example(1, 15, UNROLLED)
     assert not e.truth.any()

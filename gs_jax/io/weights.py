@@ -1,5 +1,6 @@
 """Weights of networks as files: half-precision arrays, and what they are as JSON. Nothing in one is ever executed."""
 
+import inspect
 import json
 import os
 import zipfile
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ..base.errors import short_repr
 from .disk import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance
 
@@ -58,7 +60,13 @@ def read_weights(path: str | os.PathLike[str], skeleton: Callable[..., PyTree]) 
         if size > _MOST_BYTES:
             raise ValueError(f"found {size} bytes, allowed: at most {_MOST_BYTES}")
         with np.load(path, allow_pickle=False) as archive:
-            leaves, structure = jax.tree.flatten(skeleton(**json.loads(str(archive["about"]))))
+            about, allowed = json.loads(str(archive["about"])), inspect.signature(skeleton)
+            try:
+                allowed.bind(**about)
+            except TypeError:
+                kind = f"found a network of another kind, {short_repr(about)}, allowed: one with"
+                raise ValueError(f"{kind} {', '.join(allowed.parameters)}") from None
+            leaves, structure = jax.tree.flatten(skeleton(**about))
             arrays = [archive[f"array_{i}"] for i in range(len(leaves))]
         for leaf, array in zip(leaves, arrays, strict=True):
             if array.shape != leaf.shape or array.dtype != np.float16 or not np.isfinite(array).all():
