@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from .base.arrays import library_of
 from .base.converters import as_float, as_float_or_none, as_pair, as_shape
 from .lenses import MicrolensArray, Scalar
 
@@ -216,19 +217,20 @@ class Imager(eqx.Module):
         assert self.tilt is not None
         return 1 / jnp.sqrt(1 + jnp.sum(self.tilt**2))
 
-    def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+    def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array | np.ndarray, "*batch"]:
         """`z'`: from the object to the lens vertices as the optics sees it, mm.
 
-        `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front.
+        `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front. An imager of NumPy's
+        numbers (`gs_jax.optics.refraction.on_host`) gives NumPy's.
         """
-        return jnp.asarray(depth) + self.array.air_in_front
+        return library_of(self.sensor_distance).asarray(depth) + self.array.air_in_front
 
     @property
     def reduced_sensor_distance(self) -> Scalar:
         """`v'`: from the lens vertices to the sensor as the optics sees it, `v`, or `v + t/n` with the plate behind."""
         return self.sensor_distance + self.array.air_behind
 
-    def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
+    def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array | np.ndarray, "*batch"]:
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
         return self.reduced_sensor_distance / self.reduced_depth(depth)
 

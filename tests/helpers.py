@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gs_jax import (
     Camera,
@@ -76,20 +77,28 @@ def backproject_loop(image, imager, grid, method="linear"):
     cos, sin = np.cos(float(imager.rotation)), np.sin(float(imager.rotation))
     centers = np.asarray(imager.array.centers, np.float64) @ np.array([[cos, sin], [-sin, cos]])
     centers = centers + np.asarray(imager.shift, np.float64)
+    tilt = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt, np.float64)
+    # The plane of the array turns about the line through its middle on which it stays level.
+    slope, angle = np.linalg.norm(tilt), np.arctan(np.linalg.norm(tilt))
+    axis = np.array([tilt[1], -tilt[0], 0]) / (slope or 1)
+    turned = Rotation.from_rotvec(angle * axis).apply(np.column_stack([centers, np.zeros(len(centers))]))
+    centers, lifts = turned[:, :2], turned[:, 2]
     thickness = float(imager.array.substrate_thickness) / float(imager.array.refractive_index)
+    in_front = thickness if imager.array.orientation == "plano" else 0.0
+    behind = float(imager.sensor_distance) + thickness - in_front
     pixel, radius2 = imager.sensor.pixel_pitch, imager.field_radius**2
     height, width = imager.sensor.shape
     for d, r, c in np.ndindex(*volume.shape):
-        depth = float(grid.depths[d]) + thickness
+        depth = float(grid.depths[d]) + in_front
         q = np.array([c - (grid.shape[1] - 1) / 2, r - (grid.shape[0] - 1) / 2]) * grid.pitch
-        for center in centers:
-            x, y = center + (center - q) * float(imager.sensor_distance) / depth
+        for center, lift in zip(centers, lifts, strict=True):
+            x, y = center + (center - q) * (behind + lift) / (depth - lift)
             u, v = y / pixel + (height - 1) / 2, x / pixel + (width - 1) / 2
             if method == "nearest":
                 u, v = np.floor(u + 0.5), np.floor(v + 0.5)
             if not (0 <= u <= height - 1 and 0 <= v <= width - 1):
                 continue
-            distance2 = np.sum((center - q) ** 2)
+            distance2 = np.sum((center - depth * tilt - q) ** 2)  # from the axis, which leans with the array
             t = np.clip((1.1 * radius2 - distance2) / (0.2 * radius2), 0, 1)
             weight = (depth**2 / (depth**2 + distance2)) ** 2 * t * t * (3 - 2 * t)
             i, j = min(int(u), height - 2), min(int(v), width - 2)

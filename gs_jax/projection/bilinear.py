@@ -68,7 +68,7 @@ def _gather(shapes: Shapes, rays: Rays, image):
             )
 
         new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
-        return lax.dynamic_update_slice(volume, new, _corner(y, x)), None
+        return _put(volume, new, y, x), None
 
     volume = jnp.zeros(shapes.volume, rays.parameters.dtype)
     return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
@@ -149,11 +149,23 @@ def _pairs(shapes: Shapes, rays: Rays) -> tuple[_Pair, _Pair]:
 
 def _patch(volume, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
     """The voxels that one lens may see."""
-    return lax.dynamic_slice(volume, _corner(y, x), (*y.pixel.shape, x.pixel.shape[1]))
+    size = y.pixel.shape[1], x.pixel.shape[1]
+    if y.start.size == 1:
+        return lax.dynamic_slice(volume, _corner(y, x), (len(volume), *size))
+    return jax.vmap(lambda plane, row, column: lax.dynamic_slice(plane, (row, column), size))(volume, y.start, x.start)
+
+
+def _put(volume, patch, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
+    """The volume with the voxels that one lens may see replaced."""
+    if y.start.size == 1:
+        return lax.dynamic_update_slice(volume, patch, _corner(y, x))
+    put = lambda plane, new, row, column: lax.dynamic_update_slice(plane, new, (row, column))
+    return jax.vmap(put)(volume, patch, y.start, x.start)
 
 
 def _corner(y: Axis, x: Axis):
-    return jnp.zeros_like(y.start), y.start, x.start
+    """Of the patch that is the same at all depths."""
+    return jnp.zeros_like(y.start[0]), y.start[0], x.start[0]
 
 
 def _weights(shapes: Shapes, y: Axis, x: Axis, parameters) -> Float[Array, "depth y x"]:

@@ -44,12 +44,12 @@ def gather(job_address, part, _):
     if not has_image:
         p.floats(at_pairs, 2 * here.length)[:] = ONE
     for lens in range(lenses):
-        y_start, x_start = tables.y_start[lens], tables.x_start[lens]
-        first, last = max(top - y_start, 0), min(bottom - y_start, ny)
-        if first >= last:
-            continue
-        shift = x_start % WIDTH
         for d in range(depths):
+            y_start, x_start = r.patch(tables, lens, d)
+            first, last = max(top - y_start, 0), min(bottom - y_start, ny)
+            if first >= last:
+                continue
+            shift = x_start % WIDTH
             p.fill(here, tables, at_tables, lens, d, shift, wide)
             size = p.windows(here, shift, nx, wide) if has_image else 0
             begin, end = shift, shift + nx
@@ -108,9 +108,9 @@ def scatter(job_address, part, _):
     here, reaches = p.place(at_columns, nx), p.place_reaches(at_reaches, wide)
     low, x2 = p.integers(here.pixel, here.length), p.floats(here.distance2, here.length)
     for lens in range(lenses):
-        y_start, x_start = tables.y_start[lens], tables.x_start[lens]
-        shift = x_start % WIDTH
         for d in range(depths):
+            y_start, x_start = r.patch(tables, lens, d)
+            shift = x_start % WIDTH
             y_pixel = tables.y_pixel[lens, d]
             first, last = r.first_below(y_pixel, bottom), r.first_below(y_pixel, top - 1)
             if first >= last:
@@ -193,9 +193,9 @@ def rays_bar(job_address, part, _):
     if not has_image:
         p.floats(at_pairs, 2 * space)[:] = ONE
     for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
-        y_start, x_start = tables.y_start[lens], tables.x_start[lens]
-        shift = x_start % WIDTH
         for d in range(depths):
+            y_start, x_start = r.patch(tables, lens, d)
+            shift = x_start % WIDTH
             p.fill(here, tables, at_tables, lens, d, shift, wide)
             size = p.windows(here, shift, nx, wide) if has_image else 0
             begin, end = shift, shift + nx

@@ -16,6 +16,7 @@ from ..base.progress import Progress
 from ..geometry import Imager, chief_ray
 from ..optics.cores import Cores, core_tables, drawn, ring_edges
 from ..optics.full import CORE_REACH, halo_nodes, halo_of, kernel_size
+from ..optics.refraction import on_host
 from .full import halo_image
 from .rays import Envelope, RingLight
 
@@ -145,8 +146,8 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
 
 def _rays(depth, imager, stamps):
     """Magnification, how much of it is the core's own, and parameters of the weight, for each point."""
-    reduced = depth + float(imager.reduced_depth(0.0))
-    magnification = float(imager.reduced_sensor_distance) / reduced
+    host = on_host(imager)
+    reduced, magnification = host.reduced_depth(depth), host.magnification(depth)
     if stamps.ring is None:
         return magnification, np.ones_like(reduced), reduced[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)

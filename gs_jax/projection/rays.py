@@ -25,7 +25,7 @@ _BAND = 1.5
 class Axis(NamedTuple):
     """One axis (rows or columns) of the rays, over the patch of voxels that a lens can see."""
 
-    start: Int[Array, " lens"]  # first voxel of the patch
+    start: Int[Array, "lens patch"]  # first voxel of the patch: of all depths, or of each if the array is tilted
     pixel: Int[Array, "lens depth voxel"]  # the pixel at or below the ray
     fraction: Float[Array, "lens depth voxel"]  # of the way to the next pixel
     distance2: Float[Array, "lens depth voxel"]  # squared distance from the lens's axis, mm^2; huge off the sensor
@@ -94,17 +94,18 @@ def trace(
 
     def axis(center, origin, voxels, pixels, middle, lean):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
-        # One patch for all depths: that of the mean one.
-        first = jnp.ceil((center + lean.mean() - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
+        # The axes of a tilted array lean, and what a lens sees moves with the depth.
+        middle_of_patch = center[:, None] if imager.tilt is None else center[:, None] + lean[None, :]
+        first = jnp.ceil((middle_of_patch - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
-        index = (start[:, None] + jnp.arange(size, dtype=jnp.int32)[None, :]).astype(center.dtype) - (voxels - 1) / 2
+        index = (start[..., None] + jnp.arange(size, dtype=jnp.int32)[None, None]).astype(center.dtype) - (voxels - 1) / 2
         from_grid, center = center - origin, center - middle
         pixel, fraction, offset = _project(
             center, from_grid, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
-        distance2 = jnp.where(on_sensor, (offset[:, None, :] + lean[None, :, None]) ** 2, _OUTSIDE)
+        distance2 = jnp.where(on_sensor, (offset + lean[None, :, None]) ** 2, _OUTSIDE)
         first_coordinate = jax.lax.stop_gradient(coordinate[..., 0])
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
@@ -119,17 +120,17 @@ def trace(
 
 
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
-    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, voxel)` from the vertex.
+    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, patch, voxel)` from the vertex.
 
-    `center` is the lens's as seen from the middle of the sensor's pixels, `from_origin` as seen from the grid's origin,
+    `index` is `(lens, patch, voxel)`, with a patch for all depths or for each. `center` is the lens's as seen from the middle of the sensor's pixels, `from_origin` as seen from the grid's origin,
     where voxels are counted from. `magnification` is `(lens, depth)`.
     """
     # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
     # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.
     whole = jax.lax.stop_gradient(jnp.round(center / pixel_pitch))
     center_here = _minus_multiple(center, whole, pixel_pitch)[:, None, None]
-    offset = _minus_multiple(from_origin[:, None], index, voxel_pitch)
-    ray = chief_ray(center_here, center_here - offset[:, None, :], magnification[:, :, None])
+    offset = _minus_multiple(from_origin[:, None, None], index, voxel_pitch)
+    ray = chief_ray(center_here, center_here - offset, magnification[:, :, None])
     middle = (pixels - 1) / 2
     coordinate = ray / pixel_pitch + middle % 1
     below = jax.lax.stop_gradient(jnp.floor(coordinate + 0.5 if nearest else coordinate))

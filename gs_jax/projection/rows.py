@@ -61,9 +61,16 @@ def tables_of_columns(job):
 def tables(job):
     return Tables(
         numbers(job, 0)[:, 0, 0], numbers(job, 1)[:, :, 0],
-        integers(job, 2)[:, 0, 0], integers(job, 3), numbers(job, 4), numbers(job, 5),
-        integers(job, 6)[:, 0, 0], integers(job, 7), numbers(job, 8), numbers(job, 9),
+        integers(job, 2)[:, :, 0], integers(job, 3), numbers(job, 4), numbers(job, 5),
+        integers(job, 6)[:, :, 0], integers(job, 7), numbers(job, 8), numbers(job, 9),
     )  # fmt: skip
+
+
+@inline
+def patch(tables, lens, d):
+    """First row and column of the voxels that a lens may see at a depth."""
+    d = min(d, tables.y_start.shape[1] - 1)
+    return tables.y_start[lens, d], tables.x_start[lens, d]
 
 
 @inline

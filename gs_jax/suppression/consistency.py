@@ -70,7 +70,7 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     # In NumPy: other numbers of points need no other program.
     host, centers = on_host(imager), np.asarray(imager.centers, np.float64)
     tilt, heights = host.tilt, np.asarray(imager.heights, np.float64)
-    reduced = points[:, 2] + float(imager.reduced_depth(0.0))
+    reduced = host.reduced_depth(points[:, 2])
     beside = points[:, :2] if tilt is None else points[:, :2] + reduced[:, None] * tilt
     tree = KDTree(centers)
     most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
@@ -78,7 +78,7 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     distance, lens = tree.query(beside, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
     distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
-    magnification = host.magnification_of((host.sensor_distance / reduced)[:, None], heights[lens])
+    magnification = host.magnification_of(host.magnification(points[:, 2])[:, None], heights[lens])
     landing = chief_ray(centers[lens], points[:, None, :2], magnification[..., None])
     pixels = np.asarray(imager.sensor.to_pixels(landing))
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
