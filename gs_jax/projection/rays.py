@@ -95,10 +95,11 @@ def trace(
     def axis(center, origin, voxels, pixels, middle, lean):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
         # The axes of a tilted array lean, and what a lens sees moves with the depth.
-        middle_of_patch = center[:, None] if imager.tilt is None else center[:, None] + lean[None, :]
-        first = jnp.ceil((middle_of_patch - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
+        axis = center[:, None] if imager.tilt is None else center[:, None] + lean[None, :]
+        first = jnp.ceil((axis - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
-        index = (start[..., None] + jnp.arange(size, dtype=jnp.int32)[None, None]).astype(center.dtype) - (voxels - 1) / 2
+        voxel = start[..., None] + jnp.arange(size, dtype=jnp.int32)[None, None]
+        index = voxel.astype(center.dtype) - (voxels - 1) / 2
         from_grid, center = center - origin, center - middle
         pixel, fraction, offset = _project(
             center, from_grid, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
@@ -120,10 +121,11 @@ def trace(
 
 
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
-    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, patch, voxel)` from the vertex.
+    """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, patch, voxel)` to the vertex.
 
-    `index` is `(lens, patch, voxel)`, with a patch for all depths or for each. `center` is the lens's as seen from the middle of the sensor's pixels, `from_origin` as seen from the grid's origin,
-    where voxels are counted from. `magnification` is `(lens, depth)`.
+    `index` is `(lens, patch, voxel)`: one patch for all depths, or one for each. `center` is the lens's as seen from
+    the middle of the sensor's pixels, `from_origin` as seen from the grid's origin, where voxels are counted from.
+    `magnification` is `(lens, depth)`.
     """
     # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
     # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.

@@ -1,6 +1,5 @@
 """What iterative methods invert: the microscope in pixels that suit the voxels, and the light that it is to explain."""
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..base.progress import Progress
-from ..geometry import Imager, Sensor
+from ..geometry import Imager
+from ..io.readout import Readout
 from ..optics.full import FullOptics
 from ..optics.kinds import KindOptics
 from ..projection.forward_model import Optics
@@ -60,6 +60,7 @@ def explainable(
     """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it."""
     rows, columns = model.imager.sensor.shape
     light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))
+    light = light[: rows * model.side, : columns * model.side]
     light = light.reshape(rows, model.side, columns, model.side).sum((1, 3))
     return light, np.maximum(between(square_levels(light)[0], light.shape), 0) if model.hazy else 0.0
 
@@ -113,16 +114,15 @@ def _waves(size, count, dtype):
 
 
 def _coarser(imager, grid):
-    """Pixels as squares that are at most as wide as a voxel's image, and divide the sensor; how many each way."""
+    """Sum squares of pixels that are at most as wide as a voxel's image; returns how many each way, too.
+
+    The last rows and columns, which fill no square, are left out.
+    """
     sensor = imager.sensor
     wanted = float(imager.magnification(grid.depths).mean()) * grid.pitch / sensor.pixel_pitch
-    common = math.gcd(*sensor.shape)
     # Two pixels each way must be left.
-    fits = lambda n: common % n == 0 and n <= wanted + _ROUNDING and min(sensor.shape) >= 2 * n
-    side = max((n for n in range(1, math.ceil(wanted) + 1) if fits(n)), default=1)
-    rows, columns = (n // side for n in sensor.shape)
-    coarse = Sensor((rows, columns), side * sensor.pixel_pitch, sensor.origin)
-    return eqx.tree_at(lambda i: i.sensor, imager, coarse), side
+    side = max(1, min(int(wanted + _ROUNDING), min(sensor.shape) // 2))
+    return eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=side).sensor(sensor)), side
 
 
 def slow_waves(imager: Imager, optics: Optics) -> int:

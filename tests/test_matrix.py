@@ -1,0 +1,215 @@
+"""The matrix of features: what users do, over what users may combine. Each pair is right, or refused in one line.
+
+A kind of lens, layer, method or format that is added to the package is added to `DEVICES` or `TASKS`.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gs_jax as gs
+from gs_jax import Design, Grid, Imager, InputError
+from gs_jax.codesign.study import Study
+from gs_jax.designs.sheet import datasheet
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
+from gs_jax.suppression.evidence import LEAST_SHARP, sharpness
+from gs_jax.tolerances.analysis import tolerance
+
+SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").glob("*.toml"))
+LENSES, PIXELS = 24, 600
+
+
+def cropped(name: str, *, lenses: int = LENSES, shape=(PIXELS, PIXELS), **tables) -> Design:
+    """The lenses of a shipped design nearest to the axis, and as much of its sensor as they cover."""
+    design = gs.read_design(Path(__file__).parents[1] / "design" / f"{name}.toml")
+    centers = np.array(design.array.centers_mm)
+    nearest = centers[np.argsort(np.abs(centers).max(1), kind="stable")]
+    side = 2 * np.abs(nearest[LENSES]).max()
+    data = design.model_dump()
+    data["sensor"] = {"shape": shape, "pixel_pitch_um": round(1000 * side / PIXELS, 2)}
+    data["array"] |= {"centers_mm": nearest[:lenses].tolist(), "size_mm": (1.2 * side, 1.2 * side)}
+    for table, values in tables.items():
+        data[table] |= values
+    return Design.model_validate(data)
+
+
+def with_two_radii() -> Design:
+    """Every second lens has a slightly longer focus, after the idea of multifocal arrays."""
+    return cropped("geomscope", lens={"radius_of_curvature_mm": [2.0, 2.06] * (LENSES // 2)})
+
+
+def mirrored() -> Design:
+    design = cropped("geomscope")
+    centers = [(-x, y) for x, y in design.array.centers_mm]
+    return design.model_copy(update={"array": design.array.model_copy(update={"centers_mm": tuple(centers)})})
+
+
+# Apertures of 1.2 mm, whose spots are small on both sides of the plate.
+SMALL = {"aperture_diameter_mm": 1.2}
+DEVICES: dict[str, Callable[[], Design]] = {
+    **{name: lambda name=name: cropped(name) for name in SHIPPED},
+    "curved side": lambda: cropped("geomscope", lens={**SMALL, "orientation": "curved"}),
+    "conic": lambda: cropped("geomscope", lens={"conic_constant": -0.6}),
+    "aspheric": lambda: cropped("geomscope", lens={"conic_constant": -0.5, "aspheric_terms": [-1e-3, 2e-4]}),
+    "two radii": with_two_radii,
+    "tilted": lambda: cropped("geomscope", calibration={"tilt_deg": (1.0, -0.6)}),
+    "turned": lambda: cropped("geomscope", calibration={"rotation_deg": 31.0, "shift_mm": (0.1, -0.2)}),
+    "mirrored": mirrored,
+    "region": lambda: cropped("geomscope", shape=(480, 520), sensor={"origin_mm": (0.27, -0.18)}),
+    "binned": lambda: cropped("geomscope", shape=(300, 300), sensor={"pixel_pitch_um": 20.0}),
+    "odd": lambda: cropped("geomscope", shape=(601, 577)),
+    "one lens": lambda: cropped("geomscope", lenses=1, array={"size_mm": (4.0, 4.0)}),
+    "float64": lambda: cropped("geomscope"),
+}
+
+
+class Case:
+    """A device, and what is imaged with it. What several tasks need is made once."""
+
+    def __init__(self, name: str):
+        self.name, self.design = name, DEVICES[name]()
+        self.imager: Imager = self.design.imager()
+        near, far = self.design.imaging.working_distance_mm
+        middle = 20.0 if far > 10 else (near + far) / 2
+        self.depths = [0.95 * middle, middle, 1.05 * middle]
+        self.sheet = datasheet(self.design, self.depths)
+        self.rng = np.random.default_rng(0)
+
+    @property
+    def points(self) -> np.ndarray:
+        field = self.imager.field_radius / 3
+        places = np.array([[0.33, -0.21], [-0.42, 0.13], [0.08, 0.37]]) * field + np.array(self.imager.sensor.origin)
+        return np.column_stack([places, self.depths, [1.0, 0.9, 0.8]])
+
+    def exposed(self, image: np.ndarray, seed: int = 0) -> np.ndarray:
+        return np.asarray(gs.expose(jnp.asarray(image), gs.Camera(), jax.random.key(seed), peak_electrons=2e4))
+
+    @property
+    @cache
+    def capture(self) -> np.ndarray:
+        return self.exposed(gs.simulate(self.points, self.imager))
+
+    @property
+    @cache
+    def grid(self) -> Grid:
+        return voxel_grid(self.imager, self.depths, pixels=COARSE)
+
+    @property
+    @cache
+    def truth(self) -> np.ndarray:
+        """A small sheet of letters' size in the middle plane."""
+        volume = np.zeros(self.grid.volume_shape, np.float32)
+        rows, columns = (slice(n // 2 - 6, n // 2 + 4) for n in self.grid.shape)
+        volume[1, rows, columns] = self.rng.random(volume[1, rows, columns].shape, np.float32) + 0.5
+        return volume
+
+    @property
+    @cache
+    def sheet_capture(self) -> np.ndarray:
+        return self.exposed(gs.simulate(self.truth, self.imager, self.grid))
+
+
+@contextmanager
+def as_users_do(name: str):
+    """JAX with its defaults: float32 unless float64 is asked for, no strict rules."""
+    with jax.enable_x64(name == "float64"), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+case_of = cache(Case)
+
+
+def points(case: Case) -> None:
+    found = gs.find_points(case.capture, case.imager, case.grid)
+    axial, lateral = (np.max(case.sheet[f"{axis}_resolution_um"]) / 1000 for axis in ("axial", "lateral"))
+    score = gs.localization(found, case.points, lateral=lateral, axial=axial)
+    assert score.f1 == 1, f"{len(found)} points found: {found}"
+
+
+def volume(method: str) -> Callable[[Case], None]:
+    def task(case: Case) -> None:
+        chosen = METHODS[method](8)
+        volume = gs.reconstruct(case.sheet_capture, case.imager, case.grid, chosen)
+        assert volume.dtype == np.float32 and np.isfinite(volume).all()
+        empty = gs.quality(np.zeros_like(case.truth), case.truth).psnr_db
+        assert gs.quality(volume, case.truth).psnr_db > empty + (0.01 if method == "backproject" else 0.3)
+        plane, row, column = np.unravel_index(volume.argmax(), volume.shape)
+        rows, columns = (n // 2 for n in case.grid.shape)
+        assert plane == 1 and abs(row - rows) < 8 and abs(column - columns) < 8
+
+    return task
+
+
+def calibrate(case: Case) -> None:
+    places = case.points[[0, 2], :3]
+    images = [case.exposed(gs.simulate(np.append(place, 1.0)[None], case.imager)) for place in places]
+    listed = case.imager
+    if case.name == "mirrored":
+        array = dataclasses.replace(listed.array, centers=listed.array.centers * jnp.array([-1.0, 1.0]))
+        listed = dataclasses.replace(listed, array=array)
+    start = dataclasses.replace(listed, sensor_distance=1.01 * listed.sensor_distance)
+    found = gs.calibrate(images, places, start, fit=("sensor_distance", "rotation", "shift"))
+    assert found.mirrored == (case.name == "mirrored") and found.rms < 0.5
+    ours, true = (np.asarray(i.magnification(np.array(case.depths))) for i in (found.imager, case.imager))
+    np.testing.assert_allclose(ours, true, rtol=3e-3)
+    where = [np.sort(np.asarray(i.project(case.points[:, :3]))[..., 0], 0) for i in (found.imager, case.imager)]
+    np.testing.assert_allclose(*where, atol=case.imager.sensor.pixel_pitch)
+
+
+def metrics(case: Case) -> None:
+    imager = case.design.imager()
+    np.testing.assert_allclose(case.sheet["magnification"], imager.magnification(np.array(case.depths)), rtol=1e-5)
+    for name in ("lateral_resolution_um", "axial_resolution_um", "occupancy", "lenses_per_point"):
+        assert np.all(np.asarray(case.sheet[name]) > 0), name
+
+
+def tolerances(case: Case) -> None:
+    outcome = tolerance(case.design, depths=case.depths, draws=16)
+    assert np.isfinite(outcome.devices.log_width).all() and np.isfinite(outcome.devices.calibrated).all()
+
+
+def optimise(case: Case) -> None:
+    v = case.design.imaging.sensor_distance_mm
+    study = Study.model_validate(
+        {
+            "depths_mm": case.depths[::2],
+            "depth_count": 2,
+            "free": {"sensor_distance_mm": [0.8 * v, 1.2 * v]},
+            "terms": [{"name": "thickness_mm", "minimise": v}],
+            "stages": [{"solver": "l-bfgs-b", "steps": 1}],
+        }
+    )
+    found = gs.optimize(case.design, study)
+    assert found.design.imaging.sensor_distance_mm < v
+    assert found.design.lens == case.design.lens and found.design.array == case.design.array
+
+
+def mold(case: Case, folder: Path) -> None:
+    report = gs.make_mold(case.design, folder / "mold.stl", chord=0.002)
+    assert report["lenses"] == len(case.design.array.centers_mm)
+
+
+def report(case: Case, folder: Path) -> None:
+    gs.write_report(folder / "report.html", case.design, volume=case.truth, grid=case.grid, points=case.points)
+    assert case.design.name in (folder / "report.html").read_text(encoding="utf-8")
+
+
+TASKS: dict[str, Callable[..., None]] = {
+    "points": points,
+    **{method: volume(method) for method in METHODS},
+    "calibrate": calibrate,
+    "metrics": metrics,
+    "tolerance": tolerances,
+    "optimise": optimise,
+    "mold": mold,
+    "report": report,
+}
