@@ -63,8 +63,8 @@ def write_volume(
     Raises
     ------
     InputError
-        As `check_output`; if values are out of float32's range, or integers it would round; if the depths are uneven or do not ascend and the
-        path is `.zarr`, which has one step only.
+        As `check_output`; if values are out of float32's range, or integers that it would round; if the depths are
+        uneven or do not ascend and the path is `.zarr`, which has one step only.
     ValueError
         If the volume has not the grid's shape, or holds a NaN or an infinity.
 
