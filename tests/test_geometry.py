@@ -141,8 +141,8 @@ def test_wrong_shapes_and_numbers_are_named(make, words):
         make()
 
 
-def one_lens(*numbers, **more):
-    return Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), *numbers, 1.0, **more)
+def one_lens(sensor_distance, **more):
+    return Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), sensor_distance, 1.0, **more)
 
 
 def test_numbers_that_are_traced_are_not_looked_at():
