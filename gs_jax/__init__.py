@@ -27,7 +27,7 @@ From a capture to a volume:
     ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator
     deconvolve           The scene that an image shows, seen through a system that is everywhere alike
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
-    write_volume         Writes a volume, never rescaled or clipped, whole or not at all
+    write_volume         Writes a volume as float32, never rescaled or clipped, whole or not at all
     read_volume          A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths
 
 Without the background:

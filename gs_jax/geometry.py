@@ -12,15 +12,18 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from .base.arrays import library_of
-from .base.converters import as_float, as_float_or_none, as_pair, as_shape
+from .base.converters import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, as_shape, check_fields
 from .lenses import MicrolensArray, Scalar
 
 # A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
 SHORTEST, LONGEST = 1e-5, 0.1
+_WAVELENGTH: Rule = (
+    f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)",
+    lambda x: (x >= SHORTEST) & (x <= LONGEST),
+)
 
 # Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a
 # gradient, narrow enough to leave the paper's N_e lenses nearly alone (it adds 5 % to the radius to visit).
@@ -154,7 +157,8 @@ class Imager(eqx.Module):
     Raises
     ------
     ValueError
-        If `field_radius` is not positive, or `wavelength` is none in mm.
+        If `field_radius` or `sensor_distance` is not positive, a number is not finite, or `wavelength` is none in mm
+        (values that JAX traces are not looked at).
 
     Examples
     --------
@@ -179,9 +183,7 @@ class Imager(eqx.Module):
     def __check_init__(self):
         if not self.field_radius > 0:
             raise ValueError(f"`field_radius` must be positive, got {self.field_radius}.")
-        if not isinstance(self.wavelength, Tracer) and not SHORTEST <= float(self.wavelength) <= LONGEST:
-            allowed = f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)"
-            raise ValueError(f"`wavelength` must be {allowed}, got {self.wavelength:g}.")
+        check_fields(self, sensor_distance=POSITIVE, rotation=FINITE, shift=FINITE, wavelength=_WAVELENGTH, tilt=FINITE)
 
     @property
     def centers(self) -> Float[Array, "lens 2"]:

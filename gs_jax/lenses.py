@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .base.arrays import library_of
-from .base.converters import as_float, as_float_or_none, as_pair
+from .base.converters import FINITE, NOT_NEGATIVE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, check_fields
 from .base.errors import InputError
 
 # Side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]
 # Numbers that lenses may have of their own.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
+_INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
 # Of JAX or of NumPy, as the array's own numbers are; `Scalars` are several.
 Scalar = Any
 Scalars = Any
@@ -54,8 +55,9 @@ class MicrolensArray(eqx.Module):
     Raises
     ------
     ValueError
-        If `centers` is not `(lens, 2)` or holds no lens, a number of each lens is there for too few or too many, or
-        there is no such orientation.
+        If `centers` is not `(lens, 2)` or holds no lens, a number of each lens is there for too few or too many, a
+        number is not finite or out of range (values that JAX traces are not looked at), or there is no such
+        orientation.
 
     Examples
     --------
@@ -85,6 +87,9 @@ class MicrolensArray(eqx.Module):
                 raise ValueError(f"`{name}` must be one number or {self.centers.shape[:1]}, got {shape}.")
         if self.orientation not in ("plano", "curved"):
             raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
+        check_fields(self, radius_of_curvature=POSITIVE, aperture_diameter=POSITIVE, thin_lens_focal_length=POSITIVE)
+        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE)
+        check_fields(self, centers=FINITE, conic_constant=FINITE, aspheric_terms=FINITE)
 
     @property
     def alike(self) -> bool:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .base.converters import as_float, as_shape
+from .base.converters import FINITE, POSITIVE, as_float, as_shape, check_fields
 from .geometry import Sensor
 
 
@@ -27,7 +27,8 @@ class Grid(eqx.Module):
     Raises
     ------
     ValueError
-        If there is no depth, no voxel, or the pitch is not positive.
+        If there is no depth, no voxel, the pitch or a depth is not positive, or a number is not finite (values that JAX
+        traces are not looked at).
 
     Examples
     --------
@@ -51,6 +52,7 @@ class Grid(eqx.Module):
             raise ValueError(f"`shape` must be two positive numbers of voxels, got {self.shape}.")
         if not self.pitch > 0:
             raise ValueError(f"`pitch` must be positive, got {self.pitch}.")
+        check_fields(self, depths=POSITIVE, origin=FINITE)
 
     @classmethod
     def over(cls, sensor: Sensor, *, depths, pitch: float) -> "Grid":

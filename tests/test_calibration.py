@@ -244,6 +244,8 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
         calibrate([blank, blank], POINTS[:2], design, find_lenses=True)
     with pytest.raises(InputError, match="positions: found 1 of 2 points unknown, allowed: known points, two or more"):
         calibrate([blank, blank], POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]], design, find_lenses=True)
+    with pytest.raises(InputError, match="capture 2: found 1 of .* pixels NaN or infinite"):
+        calibrate([blank, np.where(blank == blank.max(), np.nan, blank)], POINTS[:2], design)
     for points, of, message in (
         (POINTS, None, "found a source in capture 2, allowed: 1 to 1"),
         (POINTS[:0], None, "found 0 sources for 1 captures, none in capture 1, allowed: one or more in each"),

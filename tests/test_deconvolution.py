@@ -1,5 +1,7 @@
 """Deconvolution by a measured point spread function, of images that SciPy convolved."""
 
+import inspect
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -38,10 +40,14 @@ def test_a_scene_is_found_in_its_unit(solver):
     assert found.sum() / 1000 == pytest.approx(scene.sum(), rel=0.1)
 
 
-def test_darkness_is_named_or_stays():
+def test_wrong_input_is_named_and_darkness_stays():
     _, psf, image = seen()
     with pytest.raises(InputError, match="psf: found no light"):
         deconvolve(image, np.ones((5, 5)))
+    with pytest.raises(InputError, match="psf: found 1 of 9 pixels NaN"):
+        deconvolve(image, np.diag([1.0, np.nan, 1.0]))
+    with pytest.raises(InputError, match="solver: found <class .*FISTA'>, allowed: an object such as"):
+        inspect.unwrap(deconvolve)(image, psf, FISTA)  # past the tests' check of annotations
     assert not deconvolve(np.zeros((20, 20)), psf).any()
 
 

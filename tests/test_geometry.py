@@ -125,11 +125,31 @@ def test_map_is_separable():
         (lambda: Grid([20.0], (3, 3), 0.0), "`pitch` must be positive"),
         (lambda: Grid(np.zeros(0), (3, 3), 0.1), "a depth at least"),
         (lambda: MicrolensArray(np.zeros((0, 2))), "a lens at least"),
+        (lambda: one_lens(-5.8), "`sensor_distance` must be positive and finite, got -5.8"),
+        (lambda: one_lens(np.nan), "`sensor_distance` must be positive and finite, got nan"),
+        (lambda: one_lens(5.8, shift=(0.0, np.inf)), "`shift` must be finite, got inf"),
+        (lambda: one_lens(5.8, tilt=(np.nan, 0.0)), "`tilt` must be finite, got nan"),
+        (lambda: MicrolensArray([[0.0, np.nan]]), "`centers` must be finite, got nan"),
+        (lambda: MicrolensArray([[0.0, 0.0]], refractive_index=0.9), "`refractive_index` must be 1 or more.*, got 0.9"),
+        (lambda: MicrolensArray([[0.0, 0.0]], substrate_thickness=-1.0), "`substrate_thickness` must be .*, got -1"),
+        (lambda: Grid([20.0, -18.0], (3, 3), 0.1), "`depths` must be positive and finite, got -18"),
+        (lambda: Grid([np.nan], (3, 3), 0.1), "`depths` must be positive and finite, got nan"),
     ],
 )
-def test_wrong_shapes_are_named(make, words):
+def test_wrong_shapes_and_numbers_are_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def one_lens(sensor_distance, **more):
+    return Imager(MicrolensArray([[0.0, 0.0]]), Sensor((4, 4), 1), sensor_distance, 1.0, **more)
+
+
+def test_numbers_that_are_traced_are_not_looked_at():
+    """Objects are made in compiled code and in gradients."""
+    depth = lambda v, z: one_lens(v).magnification(Grid(z[None], (3, 3), 0.1).depths)[0]
+    value, slope = jax.jit(jax.value_and_grad(depth))(jnp.array(-5.8), jnp.array(20.0))
+    np.testing.assert_allclose([value, slope], np.array([-5.8, 1]) / (20 + 1 / 1.43), rtol=1e-12)
 
 
 def test_lenses_may_differ():

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from experiments import point_density
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import read_design
@@ -21,6 +22,7 @@ from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.scene import simulate_points
 from gs_jax.suppression.clustering import find_clusters
+from gs_jax.suppression.evidence import point_evidence
 from gs_jax.suppression.locate import find_points
 
 from .helpers import needs
@@ -216,6 +218,13 @@ def test_without_a_lens_in_reach_nothing_is_found():
 def test_a_wrong_image_is_named():
     with pytest.raises(ValueError, match=r"sensor's shape \(896, 960\), got \(4, 5\)"):
         find(np.zeros((4, 5)))
+    spoilt = np.ones((896, 960))
+    spoilt[:2, 0] = np.nan, np.inf
+    for search in (find, lambda image: point_evidence(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
+        with pytest.raises(
+            InputError, match="image: found 2 of 860160 pixels NaN or infinite, allowed: finite numbers"
+        ):
+            search(spoilt)
 
 
 # Ray-traced captures: the independent check.

@@ -8,23 +8,31 @@ import threading
 import time
 import tomllib
 from contextlib import contextmanager
-from errno import ENOSPC
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.cli import deconvolve, options
 from gs_jax.cli.interrupt import RESUMABLE, message
-from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import atomic_write
+from gs_jax.designs.design import read_design, write_design
+from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.disk import atomic_write, write_json, write_text
+from gs_jax.io.figures import write_figure
+from gs_jax.io.points import write_points
+from gs_jax.io.volumes import write_volume
+from gs_jax.mold.mask import Mask, write_mask
+from gs_jax.mold.mesh_files import Mesh, write_mesh
 from gs_jax.optics.window import PSFS
 from gs_jax.projection.levels import LEVELS
 from gs_jax.reconstruction.deconvolution import TV
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.simulation.scene import OPTICS
+from gs_jax.suppression.unet import pretrained, write_weights
+from gs_jax.voxels import Grid
 
 from .test_cli import RECONSTRUCT, folder, run
 
@@ -99,14 +107,66 @@ def test_results_are_replaced_and_it_is_said(folder, monkeypatch, capsys):
     assert status == 0 and err.strip() == "gs-jax: replaced v.tif"
 
 
-def test_a_full_disk_is_one_line_and_status_1(folder, monkeypatch, capsys):
-    def full(*_, **__):
-        raise OSError(ENOSPC, "No space left on device", "v.tif")
+@pytest.fixture(scope="module")
+def small_disk(tmp_path_factory):
+    """A file system with room for 4 KiB."""
+    place = tmp_path_factory.mktemp("disk")
+    try:
+        mount = ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place]
+        subprocess.run(mount, check=True, capture_output=True, timeout=10)
+    except (OSError, subprocess.SubprocessError) as error:
+        pytest.skip(f"no file system can be mounted: {error}")
+    yield place
+    subprocess.run(["umount", place], check=True)
 
-    monkeypatch.setattr("gs_jax.io.volumes.write_volume", full)
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
-    assert (status, err.strip()) == (1, "gs-jax: v.tif: No space left on device")
-    assert not list(folder.glob(".gs-jax*"))
+
+NOISE = np.random.default_rng(0).random((2, 99, 99), np.float32)
+GRID = Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
+MESH = Mesh(NOISE.reshape(-1, 3)[:999], np.arange(999).reshape(-1, 3))
+CIRCLES = np.column_stack([np.arange(999), np.zeros(999), np.full(999, 0.5)])
+MASK = Mask(np.array([[-1.0, -1.0], [999.0, -1.0], [999.0, 1.0], [-1.0, 1.0]]), CIRCLES, [], [])
+
+
+def _picture(path):
+    figure = Figure()
+    figure.subplots().imshow(NOISE[0])
+    write_figure(path, figure)
+
+
+WRITERS = {
+    "v.ome.tif": lambda path: write_volume(path, NOISE, GRID),
+    "v.zarr": lambda path: write_volume(path, NOISE, GRID),
+    "c.tif": lambda path: write_capture(path, NOISE[0]),
+    "c.png": lambda path: write_capture(path, NOISE[0].view(np.uint16)),
+    "c.npy": lambda path: write_capture(path, NOISE[0]),
+    "p.csv": lambda path: write_points(path, 1 + NOISE.reshape(-1, 6)[:, :4]),
+    "d.toml": lambda path: write_design(path, read_design(ROOT / "design" / "geomscope.toml")),
+    "w.npz": lambda path: write_weights(path, pretrained("paper")),
+    "f.png": _picture,
+    "r.html": lambda path: write_text(path, 9999 * "r", [".html"]),
+    "r.json": lambda path: write_json(path, NOISE),
+    "m.stl": lambda path: write_mesh(path, MESH, "m"),
+    "m.3mf": lambda path: write_mesh(path, MESH, "m"),
+    "m.dxf": lambda path: write_mask(path, MASK),
+    "m.svg": lambda path: write_mask(path, MASK),
+    "m.gds": lambda path: pytest.importorskip("gdstk") and write_mask(path, MASK),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_line_and_status_1(small_disk, monkeypatch, capsys, name):
+    path = small_disk / name
+    monkeypatch.setattr(commands, "main", lambda **_: WRITERS[name](path))
+    status, _, err = run(monkeypatch, capsys)
+    assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
+    assert list(small_disk.iterdir()) == []
+
+
+def test_a_command_on_a_full_disk_leaves_nothing(small_disk, folder, monkeypatch, capsys):
+    path = small_disk / "v.ome.tif"
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", path)
+    assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
+    assert list(small_disk.iterdir()) == []
 
 
 def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
@@ -132,8 +192,14 @@ HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
 BUSY = f"""
 {HEARD}
 import ctypes, gs_jax.__main__ as cli
-from gs_jax.io.captures import read_capture
-from gs_jax.io.disk import atomic_write
+from gs_jax.designs.design import read_design, write_design
+from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.disk import atomic_write, write_json, write_text
+from gs_jax.io.figures import write_figure
+from gs_jax.io.points import write_points
+from gs_jax.io.volumes import write_volume
+from gs_jax.mold.mask import Mask, write_mask
+from gs_jax.mold.mesh_files import Mesh, write_mesh
 def busy(*_, **__):
     with atomic_write("half.tif") as temporary:
         temporary.write_bytes(b"half")

@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax
 import manifold3d as m3
 import numpy as np
@@ -221,7 +222,11 @@ def test_two_thousand_lenses():
         (lenses([[0, 0]], (3.0, 3.0), thickness=0.0), "`substrate_thickness` must be more"),
         (lenses([[0, 0]], (5.0, 5.0), diameter=4.0, thickness=3.0), "`aperture_diameter` must be positive and at most"),
         (lenses([[0, 0]], (5.0, 5.0), diameter=5.0, thickness=3.0), "`aperture_diameter` must be positive and at most"),
-        (lenses([[0, math.nan]], (3.0, 3.0)), "`centers` must be finite"),
+        (
+            # As an optimiser may leave them.
+            eqx.tree_at(lambda array: array.centers, lenses([[0, 0]], (3.0, 3.0)), np.array([[0, math.nan]])),
+            "`centers` must be finite",
+        ),
         (lenses([[2, 0], [0, 0]], (3.0, 3.0)), "1 outside"),
         (lenses([[0, 0]], (math.inf, math.inf)), "two positive lengths"),
     ],

@@ -114,19 +114,21 @@ def test_a_new_design_holds_the_values(design, parent):
     assert found.imaging.sensor_distance_mm == 3.1235
     assert found.imaging.working_distance_mm == (18.5, 22.5)
     assert found.lens == design.lens and found.array == design.array
+    conic = new_design(design, parent, values | {"conic_constant": jnp.array(-0.87654321)}).lens.conic_constant
+    assert conic == -0.8765432
     assert set(start_values(parent)) == set(NAMES)
 
 
 def test_aspheric_terms_of_a_lens_without_any(design):
-    """Where they are free there are two of them, zero at first; a file holds them to four digits."""
+    """Where they are free there are two of them, zero at first; a file holds them to seven digits."""
     parent = parent_of(design, free={"aspheric_terms": (-0.1, 0.1)})
     np.testing.assert_array_equal(start_values(parent)["aspheric_terms"], [0, 0])
-    values = {"aspheric_terms": jnp.array([0.012345, -0.03]), "pitch_mm": 1.1 * parent.pitch}
+    values = {"aspheric_terms": jnp.array([0.012345, -0.0000123]), "pitch_mm": 1.1 * parent.pitch}
     np.testing.assert_array_equal(candidate(parent, values).imager.array.aspheric_terms, values["aspheric_terms"])
     found = new_design(design, parent, values)
-    assert found.lens.aspheric_terms == (0.0123, -0.03)
+    assert found.lens.aspheric_terms == (0.012345, -0.0000123)
     again = parent_of(found, free={"aspheric_terms": (-0.1, 0.1)})
-    np.testing.assert_array_equal(start_values(again)["aspheric_terms"], [0.0123, -0.03])
+    np.testing.assert_array_equal(start_values(again)["aspheric_terms"], [0.012345, -0.0000123])
 
 
 def test_values_that_make_no_microscope(design, parent):

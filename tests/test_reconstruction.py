@@ -17,6 +17,7 @@ from gs_jax.benchmark.compare import obstacle
 from gs_jax.optics.window import psf_of_depth
 from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
 from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
+from gs_jax.reconstruction.reprojection import reproject
 from gs_jax.simulation.scene import simulate_volume
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.iteration import solve
@@ -144,12 +145,33 @@ def test_wrong_arguments_are_named():
     imager, grid, *_, image = small()
     with pytest.raises(InputError, match="method: found 'fista', allowed: an object such as"):
         inspect.unwrap(reconstruct)(image, imager, grid, "fista")  # past the tests' check of annotations
+    with pytest.raises(InputError, match="method: found <class .*FISTA'>, allowed: an object such as"):
+        inspect.unwrap(reconstruct)(image, imager, grid, FISTA)
     with pytest.raises(InputError, match=r"image: found the shape \(5, 5\), allowed: the sensor's shape \(96, 80\)"):
         reconstruct(np.ones((5, 5)), imager, grid)
     with pytest.raises(InputError, match="interpolation: found 'cubic', allowed: linear, nearest"):
         BackProjection(interpolation="cubic")
     with pytest.raises(InputError, match="steps: found 0, allowed: 1 or more"):
         ListRichardsonLucy(steps=0)
+
+
+@pytest.mark.parametrize("method", [BackProjection(), RichardsonLucy(steps=7)])
+def test_what_is_not_finite_is_named(method):
+    imager, grid, psf, truth, image = small()
+    spoilt = image.at[0, :2].set([np.nan, np.inf])
+    with pytest.raises(InputError, match="image: found 2 of 7680 pixels NaN or infinite, allowed: finite numbers"):
+        reconstruct(spoilt, imager, grid, method, optics=psf)
+    with pytest.raises(InputError, match="volume: found 1 of 144 voxels NaN or infinite, allowed: finite numbers"):
+        reproject(truth.at[0, 0, 0].set(np.nan), image, imager, grid, optics=psf)
+
+
+def test_within_a_gradient_it_names_what_can_be_differentiated():
+    imager, grid, psf, _, image = small()
+    of_image = lambda image: reconstruct(image, imager, grid, FISTA(steps=1), optics=psf).sum()
+    of_imager = lambda imager: reconstruct(image, imager, grid).sum()
+    for call in (lambda: jax.grad(of_image)(image), lambda: jax.jit(of_imager)(imager)):
+        with pytest.raises(InputError, match="found a value that JAX traces .*`solve` and `backproject`"):
+            call()
 
 
 def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):

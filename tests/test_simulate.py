@@ -8,7 +8,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.unit import pupil_disc, unit_rays
 from gs_jax.optics.window import PSFS, psf_of_depth
-from gs_jax.simulation.scene import simulate_points, simulate_volume
+from gs_jax.simulation.scene import simulate, simulate_points, simulate_volume
 
 
 def imager(sensor_distance=5.8, pixel=0.01):
@@ -91,3 +91,14 @@ def test_what_cannot_be_simulated_is_refused():
         simulate_points(np.array([[0.0, 0.0, 0.05, 1.0]]), imager(pixel=0.002), **options)
     with pytest.raises(InputError, match="found a voxel of -1, allowed: 0 or more"):
         simulate_volume(-np.ones((1, 3, 3), np.float32), imager(), Grid([20.0], (3, 3), 0.05), **options)
+    for scene, grid, message in (
+        (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene: found 9 of 9 voxels NaN or infinite"),
+        (np.array([[0.0, np.nan, 20.0, 1.0]]), None, "scene: found 1 of 4 numbers NaN or infinite"),
+        (
+            np.array([[0.0, 0.0, 20.0, 1.0], [0.0, 0.0, -20.0, 1.0]]),
+            None,
+            "found a point at the depth -20 mm, allowed:",
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate(scene, imager(), grid, optics="near", psf="geometric")

@@ -81,6 +81,11 @@ def test_nothing_gives_nothing(shape):
     assert suppress(np.zeros(shape, np.float32), small()).shape == shape
 
 
+def test_a_volume_with_nan_is_named():
+    with pytest.raises(InputError, match="volume: found 9 of 18 voxels NaN"):
+        suppress(stack(2, 3, 3) * np.array([1, np.nan], np.float32)[:, None, None], small())
+
+
 @pytest.mark.parametrize("kind", [True, False])
 def test_darkness_stays_dark(kind):
     assert not suppress(np.zeros((2, 9, 9), np.float32), small(standardized=kind)).any()

@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Float64, Int, Num
 
+from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -120,8 +121,8 @@ def calibrate(
     Raises
     ------
     InputError
-        If points and captures do not fit together, lenses differ, no pattern of lenses is seen, or the spots do not
-        determine what is to be fitted.
+        If points and captures do not fit together, a pixel is not finite, lenses differ, no pattern of lenses is seen,
+        or the spots do not determine what is to be fitted.
 
     Examples
     --------
@@ -142,6 +143,8 @@ def calibrate(
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
     sources.check(len(images))
     sources.check_fit(fit)
+    for number, image in enumerate(images, 1):
+        check_finite(f"capture {number}", image)
     many = [int((sources.captures == number).sum()) for number in range(len(images))]
     # Filters of SciPy, which run beside each other.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float64
 from pydantic import ValidationError
 
 from ..base.converters import as_float
@@ -49,6 +49,8 @@ NAMES = (
 _TERMS = 2
 # Digits of a written length: 0.1 um is finer than a printer, and than a camera's mount.
 _DIGITS = 4
+# Significant digits of numbers that are no length, as many as float32 has: of a term of the surface picometres of sag.
+_SIGNIFICANT = 7
 # Of lenses that differ: enough for the mean clear aperture of a kind to 1e-3, an eighth of the work of all.
 _EDGES = 64
 
@@ -236,7 +238,10 @@ def of_lenses(parent: Parent, value: Float[Array, "..."]) -> Float[Array, "..."]
 
 
 def new_design(design: Design, parent: Parent, values: Values) -> Design:
-    """The design of these values as a file holds it: lengths to 0.1 um, the working distance that was asked for.
+    """The design of these values as a file holds it: the working distance is the one that was asked for.
+
+    Lengths and the refractive index are to four decimals (0.1 um), conics and aspheric terms to seven significant
+    digits.
 
     Raises
     ------
@@ -254,9 +259,9 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
     middle = float(parent.middle)
     working = [round(middle + sign * numbers["depth_span_mm"] / 2, _DIGITS) for sign in (-1, 1)]
     data = design.model_dump()
-    data["lens"] |= {name: _of_lenses_rounded(parent, values[name]) for name in LENS_KEYS}
+    data["lens"] |= {name: _of_lenses_rounded(parent, name, values[name]) for name in LENS_KEYS}
     data["lens"] |= {"refractive_index": numbers["refractive_index"]}
-    data["lens"] |= {"aspheric_terms": np.round(np.asarray(values["aspheric_terms"], float), _DIGITS).tolist()}
+    data["lens"] |= {"aspheric_terms": significant(values["aspheric_terms"]).tolist()}
     data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
     data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}
     try:
@@ -265,7 +270,14 @@ def new_design(design: Design, parent: Parent, values: Values) -> Design:
         raise InputError(f"the values found make no microscope: {one_line(error, Design, {})}.") from error
 
 
-def _of_lenses_rounded(parent: Parent, value: Float[Array, "..."]) -> float | list[float]:
+def significant(value: Float[Array, "..."]) -> Float64[np.ndarray, "..."]:
+    """Numbers to seven significant digits."""
+    numbers = np.asarray(value, float)
+    return np.array([float(f"{number:.{_SIGNIFICANT}g}") for number in numbers.flat]).reshape(numbers.shape)
+
+
+def _of_lenses_rounded(parent: Parent, name: str, value: Float[Array, "..."]) -> float | list[float]:
     """One number if all kinds come to the same."""
-    numbers = np.round(np.asarray(of_lenses(parent, value), float), _DIGITS)
+    numbers = of_lenses(parent, value)
+    numbers = np.round(np.asarray(numbers, float), _DIGITS) if name.endswith("_mm") else significant(numbers)
     return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

@@ -23,7 +23,7 @@ from ..base.workers import Workers
 from ..designs.design import Design
 from .checkpoint import Log
 from .objectives import unit_of
-from .parameters import NAMES, Values, start_values
+from .parameters import NAMES, Values, significant, start_values
 from .search import PathLike, opened
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
@@ -173,12 +173,11 @@ def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Poi
 def as_json(front: Front) -> dict[str, Any]:
     """The front's numbers: objectives and free parameters of every point."""
     names = [name for name in NAMES if name != "centers_mm"]
-    rounded = lambda value: np.round(np.asarray(value, float), 6).tolist()
     return {
         "objectives": [{"term": term.name, "kind": term.kind} for term in front.objectives],
         "points": [
             {term.name: float(f"{x:.6g}") for term, x in zip(front.objectives, row, strict=True)}
-            | {"parameters": {name: rounded(point.values[name]) for name in names}}
+            | {"parameters": {name: significant(point.values[name]).tolist() for name in names}}
             | {"terms": {t.name: list(r[:2]) for t, r in zip(front.terms, point.rows, strict=True)}}
             | {"feasible": point.feasible, "on_front": bool(best)}
             for point, row, best in zip(front.points, front.values, front.best, strict=True)

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import io
 import json
 import logging
@@ -146,17 +147,25 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     ------
     InputError
         As `check_output`, before anything is written.
+    OSError
+        If it cannot be written whole: with a number and the name of `path`.
     """
-    path = Path(os.path.realpath(path))
-    _check_target(path)
-    temporary = _temporary_beside(path)
+    target = Path(os.path.realpath(path))
+    _check_target(target)
+    temporary = _temporary_beside(target)
     _TEMPORARY.add(temporary)
     try:
         yield temporary
         if not temporary.is_dir():
             with open(temporary, "r+b") as file:
                 os.fsync(file.fileno())
-        _replace(temporary, path)
+        _replace(temporary, target)
+    except OSError as error:
+        # Errors of a full disk name no file or the temporary one; NumPy's and tifffile's have no number either.
+        if error.errno is not None and not str(error.filename or temporary).startswith(str(temporary)):
+            raise
+        reason = error.strerror or f"cannot be written: {error}"
+        raise OSError(error.errno or errno.ENOSPC, reason, str(path)) from error
     finally:
         _remove(temporary)
         _TEMPORARY.discard(temporary)

@@ -47,14 +47,14 @@ def write_volume(
     grid: Grid,
     provenance: Provenance | None = None,
 ) -> None:
-    """Writes a volume, never rescaled or clipped, whole or not at all.
+    """Writes a volume as float32, never rescaled or clipped, whole or not at all.
 
     Parameters
     ----------
     path
         Ends in `.tif` or `.tiff` (best `.ome.tif`) or in `.zarr`.
     volume
-        `(depth, row, column)` of float32, or of a type whose values float32 holds exactly.
+        `(depth, row, column)` of floating-point numbers, rounded to float32, or of integers that float32 holds exactly.
     grid
         Where its voxels are.
     provenance
@@ -63,8 +63,8 @@ def write_volume(
     Raises
     ------
     InputError
-        As `check_output`; if float32 cannot hold the values; if the depths are uneven or do not ascend and the
-        path is `.zarr`, which has one step only.
+        As `check_output`; if values are out of float32's range, or integers that it would round; if the depths are
+        uneven or do not ascend and the path is `.zarr`, which has one step only.
     ValueError
         If the volume has not the grid's shape, or holds a NaN or an infinity.
 
@@ -117,9 +117,13 @@ def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth ro
     if voxels.dtype.kind in "buif":
         with np.errstate(over="ignore", invalid="ignore"):
             cast = voxels.astype(np.float32)
-        if (cast.astype(np.float64) == voxels).all():
+        # Of floating-point numbers only the range may be too wide; a count that is rounded is another count.
+        is_float = voxels.dtype.kind == "f"
+        fits = np.isfinite(cast) == np.isfinite(voxels) if is_float else cast.astype(np.float64) == voxels
+        if fits.all():
             return cast
-    raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: float32, or values that it holds exactly.")
+    allowed = "floating-point numbers in float32's range, or integers that float32 holds exactly"
+    raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: {allowed}.")
 
 
 def _mm(value: float, unit: float) -> float:

@@ -31,6 +31,8 @@ Ring = Float[np.ndarray, "corner 2"]
 _CHORD = 1e-4
 # The unit of a GDSII file, and its grid, m.
 _GDS_UNIT, _GDS_GRID = 1e-6, 1e-9
+# Its last record, ENDLIB.
+_GDS_END = b"\0\4\4\0"
 
 
 class Mask(NamedTuple):
@@ -158,6 +160,9 @@ def _write_gds(path: Path, mask: Mask) -> None:
     for x, y, diameter in mask.circles:
         cell.add(gdstk.ellipse((um * x, um * y), um * diameter / 2, layer=1, tolerance=um * _CHORD))
     library.write_gds(path)
+    # gdstk says nothing of what it could not write.
+    if not path.read_bytes().endswith(_GDS_END):
+        raise OSError("found no end of the library in what was written")
 
 
 def _is_hole(ring: Ring) -> bool:

@@ -4,7 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float32, Num
 
-from ..base.errors import InputError
+from ..base.arrays import check_finite
+from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..solvers.convolution import Convolution
 from ..solvers.convolution_admm import ConvolutionADMM
@@ -50,7 +51,7 @@ def deconvolve(
     Raises
     ------
     InputError
-        If the PSF is dark.
+        If `solver` is none of these, a pixel is not finite, or the PSF is dark.
 
     Examples
     --------
@@ -63,7 +64,12 @@ def deconvolve(
     >>> print(*divmod(int(scene.argmax()), 64))
     30 30
     """
+    if not isinstance(solver, Deconvolver):
+        allowed = "an object such as ConvolutionADMM() or FISTA()"
+        raise InputError(f"solver: found {short_repr(solver)}, allowed: {allowed}.")
     progress = progress or Progress()
+    check_finite("image", image)
+    check_finite("psf", psf)
     light, spot = (above_offset(np.asarray(part, np.float32)) for part in (image, psf))
     if not spot.sum() > 0:
         raise InputError("psf: found no light above the darkest percent, allowed: the image of a point.")

@@ -7,8 +7,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float32, Num
 
+from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
@@ -113,8 +115,9 @@ def reconstruct(
     Raises
     ------
     InputError
-        If `method` is no method, the image is not `sensor.shape`, there is no such optics, or a depth of the grid is
-        blurred over more than 128 pixels ("near").
+        If `method` is no method, the image is not `sensor.shape` or not finite, there is no such optics, a depth of the
+        grid is blurred over more than 128 pixels ("near"), or JAX traces a value: `solve` is what can be differentiated
+        and compiled.
 
     Examples
     --------
@@ -135,7 +138,7 @@ def reconstruct(
     """
     if image.shape != imager.sensor.shape:
         raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
-    _check(method, optics)
+    _check(method, optics, imager, grid, image)
     progress = progress or Progress()
     volume_of = reconstructor(imager, grid, method, optics=optics, stop_at_noise=stop_at_noise, progress=progress)
     return volume_of(image, progress)
@@ -170,7 +173,7 @@ def reconstructor(
         more than 128 pixels ("near").
     """
     by_name = isinstance(optics, str)
-    _check(method, optics)
+    _check(method, optics, imager, grid)
     on_cores = by_name and optics != "pinhole"
     if on_cores and not imager.array.alike:
         if isinstance(method, BackProjection):
@@ -192,8 +195,12 @@ def reconstructor(
     return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
 
 
-def _check(method, optics):
-    if not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
+def _check(method, optics, *given):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((method, optics, given))):
+        allowed = "numbers; `solve` and `backproject` can be compiled and differentiated"
+        raise InputError(f"reconstruct: found a value that JAX traces (jit, grad or vmap), allowed: {allowed}.")
+    # A class has what the protocol asks for, too.
+    if isinstance(method, type) or not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
         raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
     if isinstance(optics, str) and optics not in LEVELS:
         raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
@@ -236,6 +243,7 @@ def _back_projector_of_kinds(imager, grid, method):
 
 
 def _back_projected(image, imager, grid, method, progress):
+    check_finite("image", image)
     options = {"method": method.interpolation, "normalize": method.normalize}
     planes = _PLANES * (devices := jax.local_device_count())
     project = backproject if devices == 1 else backproject_by_all

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from ..base.arrays import check_finite
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..projection.forward_model import Optics, forward
@@ -56,6 +57,11 @@ def reproject(
     image, imager, grid, optics, progress
         As for `reconstruct`.
 
+    Raises
+    ------
+    InputError
+        If a voxel or a pixel is not finite, or there is no such optics.
+
     Examples
     --------
     >>> import gs_jax as gs
@@ -70,6 +76,7 @@ def reproject(
     >>> print(found.error < 0.5, found.correlation > 0.9, found.regions.shape)
     True True (16, 16)
     """
+    check_finite("volume", volume, "voxels")
     model = model_of(imager, grid, optics, progress or Progress())
     light, background = explainable(image, model)
     again = forward(jnp.asarray(volume, light.dtype), model.imager, grid, model.optics)

@@ -8,6 +8,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from ..base.arrays import check_finite
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..io.readout import Readout
@@ -57,7 +58,11 @@ def model_of(imager: Imager, grid: Grid, optics: Optics | str, progress: Progres
 def explainable(
     image: Num[Array | np.ndarray, "row column"], model: Model
 ) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
-    """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it."""
+    """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it.
+
+    It raises `InputError` if a pixel is not finite.
+    """
+    check_finite("image", image)
     rows, columns = model.imager.sensor.shape
     light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))
     light = light[: rows * model.side, : columns * model.side]

@@ -10,7 +10,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from ..base.converters import as_float
+from ..base.converters import NOT_NEGATIVE, POSITIVE, as_float, check_fields
 from ..layouts.cells import Number
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
@@ -55,11 +55,8 @@ class Camera(eqx.Module):
     bits: int = eqx.field(static=True, default=16)
 
     def __check_init__(self):
-        _check("gain", self.gain, (self.gain > 0) & jnp.isfinite(self.gain), "positive and finite")
-        _check("offset", self.offset, (self.offset >= 0) & jnp.isfinite(self.offset), "finite and not negative")
-        noise = self.read_noise
-        _check("read_noise", noise, (noise >= 0) & jnp.isfinite(noise), "finite and not negative")
-        _check("full_well", self.full_well, self.full_well > 0, "positive")
+        well = ("positive", lambda x: x > 0)
+        check_fields(self, gain=POSITIVE, offset=NOT_NEGATIVE, read_noise=NOT_NEGATIVE, full_well=well)
         if not 1 <= self.bits <= 16:
             raise ValueError(f"`bits` must be 1 to 16, got {self.bits}.")
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
@@ -77,8 +78,8 @@ def simulate(
     Raises
     ------
     InputError
-        If there is no such optics or PSF, a voxel is negative, the work would not fit into the memory, or a depth is
-        blurred over more than 128 pixels each way ("near").
+        If there is no such optics or PSF, a voxel is negative, a number is not finite, a point's depth is not positive,
+        the work would not fit into the memory, or a depth is blurred over more than 128 pixels each way ("near").
 
     Examples
     --------
@@ -138,8 +139,9 @@ def simulate_volume(
     Raises
     ------
     InputError
-        If a voxel is negative, a divided plane would not fit into the memory, or the blur is too wide.
+        If a voxel is negative or not finite, a divided plane would not fit into the memory, or the blur is too wide.
     """
+    check_finite("scene", volume, "voxels")
     volume = np.asarray(volume, np.float32)
     finest = float(imager.magnification(grid.depths).max()) * grid.pitch / imager.sensor.pixel_pitch
     parts = math.ceil(2 * finest)
@@ -179,7 +181,10 @@ def simulate_points(
     kind: str = "diffraction",
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
-    """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate_volume`."""
+    """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate`."""
+    check_finite("scene", points, "numbers")
+    if (behind := ~(points[:, 2] > 0)).any():
+        raise InputError(f"scene: found a point at the depth {points[behind][0, 2]:g} mm, allowed: above 0.")
     if not len(points):
         return np.zeros(imager.sensor.shape, np.float32)
     if kind == "full":

@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
+from ..base.arrays import check_finite
 from ..geometry import Imager, chief_ray
 from ..optics.refraction import on_host
 from .background import between, smoothed, square_levels
@@ -36,7 +37,8 @@ class Signal(NamedTuple):
 
 
 def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
-    """Smooths an image a little and takes its background off."""
+    """Smooths an image a little and takes its background off; `InputError` if a pixel is not finite."""
+    check_finite("image", image)
     light = smoothed(np.asarray(image), _SMOOTHING)
     background, noise = (between(levels, light.shape) for levels in square_levels(light))
     light -= background

@@ -48,7 +48,7 @@ def point_evidence(
     imager: Imager,
     grid: Grid,
 ) -> Evidence:
-    """What speaks for the points that `find_points` found in an image, with the same arguments."""
+    """What speaks for the points that `find_points` found in an image, with the same arguments and errors."""
     light, places = image if isinstance(image, Signal) else signal(image), np.array(points[:, :3], np.float64)
     # Cores lie, and are looked for, where chief rays of other depths land.
     ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)

@@ -105,6 +105,8 @@ def find_points(
     ------
     ValueError
         If the image is not `sensor.shape`.
+    InputError
+        If a pixel is not finite.
 
     Examples
     --------
@@ -163,7 +165,8 @@ def searched_voxels(imager: Imager, grid: Grid) -> Grid:
     # A lens at the field radius sees a point move from plane to plane as from voxel to voxel.
     step = pitch * float(imager.reduced_depth(middle)) / imager.field_radius
     planes = near + step * np.arange(-1, math.ceil((far - near) / step) + 2)
-    return Grid.over(imager.sensor, depths=planes, pitch=pitch)
+    # `at`, as planes about the nearest depth may reach behind the array's front.
+    return Grid.over(imager.sensor, depths=[middle], pitch=pitch).at(planes)
 
 
 def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point"]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
+from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..io import weights
 from ..io.provenance import Provenance
@@ -155,6 +156,11 @@ def suppress(
     ndarray
         Of the volume's shape, not negative.
 
+    Raises
+    ------
+    InputError
+        If a voxel is not finite.
+
     Examples
     --------
     >>> import gs_jax as gs, numpy as np
@@ -164,6 +170,7 @@ def suppress(
     ((3, 64, 64), True)
     """
     network = pretrained() if network is None else network
+    check_finite("volume", volume, "voxels")
     volume = np.asarray(volume, np.float32)
     result = np.zeros_like(volume)
     if not volume.size:
