@@ -7,7 +7,7 @@ PARALLEL := -n auto --maxprocesses 4 --dist loadfile
 # About a minute of what other versions of Python, JAX and the libraries may break, compiled as users compile it.
 # Libraries older or newer than the others warn of each other.
 SHORT := -n auto --maxprocesses 4 --dist loadfile -o filterwarnings=default \
-	$(addprefix tests/test_,imports.py primitive.py operators.py shipped_capture.py solve.py files.py mold_files.py) \
+	$(addprefix tests/test_,imports.py primitive.py native.py operators.py shipped_capture.py solve.py files.py mold_files.py) \
 	tests/test_solvers.py::test_it_finds_two_bright_voxels
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
 LOWEST := .venv-lowest/bin/python
@@ -35,8 +35,9 @@ test-all: .venv/dev
 test-napari: .venv-napari/test
 	.venv-napari/bin/python -m pytest tests/test_napari.py
 
+# What one version of numba keeps for a Python, another would replace.
 test-lowest: .venv-lowest/test
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(LOWEST) -m pytest $(SHORT)
+	NUMBA_CACHE_DIR=$(CURDIR)/.venv-lowest/numba JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(LOWEST) -m pytest $(SHORT)
 
 # What is newest changes from day to day.
 test-newest:

@@ -5,7 +5,10 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib import import_module
 from inspect import unwrap
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -14,13 +17,15 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.projection import bilinear, native
+from gs_jax.projection import bilinear, convolve, native
 from gs_jax.projection.bilinear import Shapes
+from gs_jax.projection.convolve import Sizes
 from gs_jax.projection.rays import Envelope, RingLight, trace
 
 from .helpers import scene
 
-pytest.importorskip("numba")
+NumbaError = pytest.importorskip("numba.core.errors").NumbaError
+bridge, shuffles = (import_module(f"gs_jax.projection.{name}") for name in ("bridge", "shuffles"))
 
 # Voxels of all sizes, whose rays are 0.4 to 14 pixels apart: sixteen meet up to 32, 48, 64 or more pixels, and a pixel
 # is reached by two, four or more. Volumes that are narrower than sixteen; rays off the sensor; a sensor of odd shape.
@@ -38,22 +43,31 @@ def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5, seed=0):
     parameters = None
     if isinstance(weight, RingLight):
         parameters = jnp.asarray(rng.normal(size=(3, 7)), jnp.float32)
-    rays = trace(imager, grid, nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
+    options = dict(nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
+    rays = jax.jit(partial(trace, **options))(imager, grid)
     image = jnp.asarray(rng.random(imager.sensor.shape), jnp.float32)
     volume = jnp.asarray(rng.random(grid.volume_shape), jnp.float32)
     return Shapes(imager.sensor.shape, grid.volume_shape, weight), rays, image, volume
 
 
-def compared(function, shapes, rays, *arrays):
-    """Natively, and by XLA in float64: in float32 its derivative by the depth cancels more."""
-    ours = jax.jit(lambda rays, *arrays: function(shapes, rays, *arrays))
-    plain = jax.jit(lambda rays, *arrays: unwrap(function)(shapes, rays, *arrays))
-    assert native.TARGET in ours.lower(rays, *arrays).as_text()
-    assert native.TARGET not in plain.lower(rays, *arrays).as_text()
+def compared(*calls):
+    """Each `(function, shapes, *arrays)` natively, and by XLA in float64: in float32 its derivatives cancel more.
+
+    In one program each: most of the time is XLA's compiler's.
+    """
     double = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a
-    found = jax.tree.leaves(ours(rays, *arrays))
-    expected = jax.tree.leaves(plain(*jax.tree.map(double, (rays, *arrays))))
-    for a, b in zip(found, expected, strict=True):
+    given = [arrays for _, _, *arrays in calls]
+    functions = [(function, shapes) for function, shapes, *_ in calls]
+
+    def lowered(arrays, of=lambda function: function):
+        run = lambda each: [of(f)(shapes, *one) for (f, shapes), one in zip(functions, each, strict=True)]
+        return jax.jit(run).lower(arrays)
+
+    ours, plain = lowered(given), lowered(jax.tree.map(double, given), unwrap)
+    assert ours.as_text().count(f"@{native.TARGET}(") == len(calls)
+    assert native.TARGET not in plain.as_text()
+    found, expected = ours.compile()(given), plain.compile()(jax.tree.map(double, given))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert double(a).dtype == b.dtype
         # Sums of both signs: what rounding leaves is seen against the largest.
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * float(jnp.abs(b).max()))
@@ -67,25 +81,35 @@ def compared(function, shapes, rays, *arrays):
 )
 def test_all_three_are_those_of_xla(weight, grid):
     shapes, rays, image, volume = problem(weight, grid)
-    assert compared(bilinear._gather, shapes, rays, image)[0].any()
-    assert compared(bilinear._gather, shapes, rays, None)[0].any()
-    assert compared(bilinear._scatter, shapes, rays, volume)[0].any()
-    compared(bilinear._rays_bar, shapes, rays, image, volume)
-    compared(bilinear._rays_bar, shapes, rays, None, volume)
+    volumes_and_image = compared(
+        (bilinear._gather, shapes, rays, image),
+        (bilinear._gather, shapes, rays, None),
+        (bilinear._scatter, shapes, rays, volume),
+        (bilinear._rays_bar, shapes, rays, image, volume),
+        (bilinear._rays_bar, shapes, rays, None, volume),
+    )[:3]
+    assert all(result.any() for result in volumes_and_image)
+
+
+def test_sums_of_convolutions_are_those_of_xla():
+    """And the convolutions of one image: the fourth kernel, of which `test_convolve.py` knows more."""
+    rng = np.random.default_rng(0)
+    kernels, *sharp = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(2, 5, 5), *2 * [(46, 39)]])
+    sizes = Sizes((40, 33), (46, 39), whole=False, symmetric=False)
+    image = jnp.asarray(rng.normal(size=sizes.image), jnp.float32)
+    compared((convolve._convolve, sizes, kernels, tuple(sharp)), (convolve._correlate, sizes, kernels, image))
 
 
 def test_the_nearest_pixel():
     shapes, rays, image, volume = problem(WEIGHTS[0], nearest=True)
-    compared(bilinear._gather, shapes, rays, image)
-    compared(bilinear._scatter, shapes, rays, volume)
+    compared((bilinear._gather, shapes, rays, image), (bilinear._scatter, shapes, rays, volume))
 
 
 @pytest.mark.parametrize("dtype", [jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_])
 def test_pixels_of_other_types(dtype):
     shapes, rays, image, volume = problem(WEIGHTS[0])
     image = (200 * image).astype(dtype)
-    compared(bilinear._gather, shapes, rays, image)
-    compared(bilinear._rays_bar, shapes, rays, image, volume)
+    compared((bilinear._gather, shapes, rays, image), (bilinear._rays_bar, shapes, rays, image, volume))
 
 
 def test_nothing_is_seen():
@@ -142,28 +166,64 @@ def test_float64_and_narrow_sensors_are_for_xla():
     assert native.TARGET not in backproject.lower(jnp.zeros((96, 12), jnp.float32), narrow, grid).as_text()
 
 
-def test_without_numba(monkeypatch):
+@pytest.fixture
+def loading():
+    """Kernels are looked up anew, before and after."""
+    caches = native._load, native._warn
+    for function in caches:
+        function.cache_clear()
+    yield
+    for function in caches:
+        function.cache_clear()
+
+
+def test_without_numba(monkeypatch, loading):
     shapes, rays, image, _ = problem(WEIGHTS[0])
     expected = bilinear._gather(shapes, rays, image)
-    monkeypatch.setitem(sys.modules, "gs_jax.projection.bridge", None)  # an import that fails
-    monkeypatch.delattr("gs_jax.projection.bridge", raising=False)
     native._load.cache_clear()
-    try:
-        assert native.kernel_number("gather") is None
-        found = jax.jit(lambda image: bilinear._gather(shapes, rays, image))
-        assert native.TARGET not in found.lower(image).as_text()
-        np.testing.assert_allclose(found(image), expected, rtol=1e-5, atol=1e-5)
-    finally:
-        native._load.cache_clear()
+    monkeypatch.setitem(sys.modules, "numba", None)  # an import that fails
+    assert native.kernel_number("gather") is None
+    found = jax.jit(lambda image: bilinear._gather(shapes, rays, image))
+    assert native.TARGET not in found.lower(image).as_text()
+    np.testing.assert_allclose(found(image), expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
+def test_a_numba_that_cannot_compile_the_kernels_is_told_once(monkeypatch, loading):
+    def fail(name):
+        raise NumbaError(f"No implementation of function\nin {name}")
+
+    monkeypatch.setattr(bridge, "number", fail)
+    with pytest.warns(RuntimeWarning, match="XLA is used instead") as said:
+        assert [native.kernel_number(name) for name in bridge.KERNELS] == [None] * 4
+    assert len(said) == 1 and str(said[0].message).endswith("NumbaError: No implementation of function")
+
+
+def test_xla_refuses_a_handler_of_a_version_that_it_does_not_know(monkeypatch):
+    monkeypatch.setattr(bridge, "TARGET", "gs_jax_later")
+    monkeypatch.setattr(bridge, "VERSION", (0, 99))
+    with pytest.raises(RuntimeError, match=r"0\.99"):
+        bridge._register.__wrapped__()
+
+
+def comparisons():
+    """Of all four kernels."""
+    test_all_three_are_those_of_xla(WEIGHTS[0], GRIDS[0])
+    test_all_three_are_those_of_xla(WEIGHTS[1], GRIDS[0])
+    for dtype in (jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_):
+        test_pixels_of_other_types(dtype)
+    test_adjoint()
+    test_sums_of_convolutions_are_those_of_xla()
+
+
 def test_processors_that_do_not_pick():
-    """Without AVX-512 the same numbers, by other ways."""
-    chosen = "other_types or test_adjoint or (all_three and 0.05)"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", chosen, __file__]
-    done = subprocess.run(command, env=os.environ | {"NUMBA_CPU_NAME": "generic"}, capture_output=True, text=True)
-    assert done.returncode == 0 and "passed" in done.stdout, done.stdout
+    """Without AVX-512 the same numbers, by other ways; in a process of its own, for which numba compiles so."""
+    if not shuffles.PICKS:
+        pytest.skip("this processor has no AVX-512: the other tests run the kernels without it, and none with it")
+    code = "import jax; jax.config.update('jax_enable_x64', True); from tests import test_native as t; "
+    code += "assert not t.shuffles.PICKS; t.comparisons()"
+    environment, root = os.environ | {"NUMBA_CPU_NAME": "generic"}, Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_numba_is_not_imported_before_it_is_needed():
@@ -173,9 +233,8 @@ def test_numba_is_not_imported_before_it_is_needed():
 
 def fields(name):
     """Places of a structure's fields, in units of 8 bytes, from the header that comes with jaxlib."""
-    from gs_jax.projection import bridge
-
-    text = re.search(rf"struct XLA_FFI_{name} {{(.*?)\n}};", bridge.header(), re.DOTALL)
+    header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text(encoding="utf-8")
+    text = re.search(rf"struct XLA_FFI_{name} {{(.*?)\n}};", header, re.DOTALL)
     assert text
     code = re.sub(r"//.*", "", text[1])
     # Structures in structures are as long as they are.
@@ -188,9 +247,6 @@ def fields(name):
 
 
 def test_the_layout_is_that_of_the_header():
-    from gs_jax.projection import bridge
-
-    assert bridge.version()[0] == 0
     frame = fields("CallFrame")
     assert (frame["extension_start"], frame["api"]) == (bridge._EXTENSION, bridge._API)
     assert (frame["ctx"], frame["args"], frame["rets"]) == (bridge._CONTEXT, bridge._ARGUMENTS, bridge._RESULTS)

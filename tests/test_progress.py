@@ -1,12 +1,14 @@
 """How far long work is, on a terminal and in a pipe."""
 
+import math
 import re
 import subprocess
 import sys
 
+import psutil
 import pytest
 
-from gs_jax.base import progress as module
+from gs_jax.base import memory, progress as module
 from gs_jax.base.progress import QUIET, VERBOSE, Ended, Progress, Watched, shown
 
 from .test_cli import RECONSTRUCT, folder
@@ -76,6 +78,19 @@ def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
             f"; {quarter}: about 10 min" if quarter else ""
         )
         assert capsys.readouterr().err.splitlines()[0] == wanted
+
+
+@pytest.mark.parametrize("status", ["Name:\tpython\nThreads:\t4\n", None])
+def test_memory_where_proc_does_not_tell_it(status, monkeypatch, tmp_path):
+    """Without `VmHWM`, and without `/proc`."""
+    file = tmp_path / "status"
+    if status:
+        file.write_text(status, encoding="utf-8")
+    monkeypatch.setattr(memory, "Path", lambda _: file)
+    assert math.isnan(memory.status_mib("VmRSS"))
+    now = psutil.Process().memory_info().rss
+    # The kernel counts pages of threads late; the process that started this one may have had more.
+    assert 0.9 * now < memory.most_memory() < 100 * now
 
 
 def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):

@@ -21,7 +21,7 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 def peak_mib(call: Callable[[], Any]) -> tuple[float, Any]:
     """What a call adds at most to the resident memory of this process, MiB, and what it returned.
 
-    Meant for a fresh process. Only Linux tells (`/proc`); elsewhere it is NaN.
+    Meant for a fresh process. Only Linux tells (`/proc`), and not all of it; elsewhere it is NaN.
     """
     if sys.platform != "linux":
         return float("nan"), call()
@@ -29,7 +29,10 @@ def peak_mib(call: Callable[[], Any]) -> tuple[float, Any]:
     # What was freed before, and is kept for the next, would hide what the call takes.
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    except OSError:
+        return float("nan"), call()
     before = status_mib("VmRSS")
     result = call()
     return status_mib("VmHWM") - before, result

@@ -6,7 +6,6 @@ none of numba's threading layers is needed. Who calls works too, so it ends if n
 """
 
 import ctypes
-import re
 import sys
 from functools import cache
 from inspect import unwrap
@@ -31,9 +30,11 @@ KERNELS = {
 _EXTENSION, _API, _CONTEXT, _ARGUMENTS, _RESULTS, _ATTRIBUTES = 1, 2, 3, 5, 10, 20  # of the frame
 _COUNT, _ITEMS = 2, 4  # of its arguments and results
 _ERROR_DESTROY, _SCHEDULE, _THREADS = 8, 17, 18  # of the API
+# The version that these places are from. XLA refuses a handler of a version that it does not support.
+VERSION = 0, 3
 _METADATA, _TABLE = 1, 77  # types of extensions: XLA's, and our own, by which the handler learns where the table is
-# Places in the table: addresses of functions, the kernels last.
-_TASK, _ALLOCATE, _FREE, _YIELD, _ADVISE, _MINOR, _FIRST_KERNEL = range(7)
+# Places in the table: addresses of functions and the version, the kernels last.
+_TASK, _ALLOCATE, _FREE, _YIELD, _ADVISE, _MAJOR, _MINOR, _FIRST_KERNEL = range(8)
 # Places in a job; its parts and buffers are known to the kernels.
 _REFERENCES, _NEXT, _DONE, _KERNEL, _FREE_ME, _SCRATCH, _LENGTH = 0, 1, 2, 4, 5, 240, 256
 
@@ -131,17 +132,16 @@ def _use_large_pages(job, place, advise):
 
 def handle(frame_address, _):
     """XLA's handler."""
-    frame = _at(frame_address, 21)
+    frame, table = _at(frame_address, 21), _at(_at(_global(), 1)[0], 16)
     if frame[_EXTENSION] != 0:
         extension = _at(frame[_EXTENSION], 4)
         if extension[1] & 0xFFFFFFFF == _METADATA:
             version = carray(pointer(extension[3] + 24), 2, np.int32)
-            version[0], version[1] = 0, _at(_at(_global(), 1)[0], 16)[_MINOR]
+            version[0], version[1] = table[_MAJOR], table[_MINOR]
             return 0
         if extension[1] & 0xFFFFFFFF == _TABLE:
             _at(_global(), 1)[0] = extension[3]
             return 0
-    table = _at(_at(_global(), 1)[0], 16)
     address = _call(table[_ALLOCATE], 8 * _LENGTH, 0, 0)
     job = _at(address, _LENGTH)
     attributes = _at(frame[_ATTRIBUTES], 2)
@@ -182,41 +182,30 @@ def number(name: str) -> int:
 
     Raises
     ------
-    OSError
-        If this version of XLA has another layout.
+    RuntimeError
+        If XLA does not support the handler's version.
     """
     place = _FIRST_KERNEL + list(KERNELS).index(name)
-    if not _kept:
-        _register()
+    _register()
     if _table[place] == 0:
         _table[place] = _compile(KERNELS[name], types.void, 2)
     return place - _FIRST_KERNEL
 
 
+@cache
 def _register():
-    major, minor = version()
-    if major != 0:
-        raise OSError(f"XLA's foreign functions are of version {major}.{minor}, known are 0.x.")
     idle = ctypes.windll.kernel32.SwitchToThread if sys.platform == "win32" else ctypes.CDLL(None).sched_yield
     functions = (ctypes.pythonapi.PyMem_RawMalloc, ctypes.pythonapi.PyMem_RawFree, idle)
     for place, function in zip((_ALLOCATE, _FREE, _YIELD), functions, strict=True):
         _table[place] = ctypes.cast(function, ctypes.c_void_p).value or 0
     if sys.platform == "linux":
         _table[_ADVISE] = ctypes.cast(ctypes.CDLL(None).madvise, ctypes.c_void_p).value or 0
-    _table[_MINOR], _table[_TASK] = minor, _compile(task, types.int64, 1)
+    (_table[_MAJOR], _table[_MINOR]), _table[_TASK] = VERSION, _compile(task, types.int64, 1)
     handler = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(_compile(handle, types.int64, 1))
     extension, frame = np.array([32, _TABLE, 0, _table.ctypes.data], np.int64), np.zeros(21, np.int64)
     frame[_EXTENSION] = extension.ctypes.data
     handler(frame.ctypes.data)
     jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
-
-
-def header() -> str:
-    return (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text(encoding="utf-8")
-
-
-def version() -> tuple[int, ...]:
-    return tuple(int(n) for n in re.findall(r"#define XLA_FFI_API_M\w+ (\d+)", header()))
 
 
 def _compile(function, result, arguments) -> int:

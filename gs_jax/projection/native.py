@@ -1,10 +1,12 @@
 """On a processor by compiled kernels, where these are at hand; by XLA everywhere else."""
 
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial, wraps
+from importlib.util import find_spec
 from threading import Lock
 
 import jax
@@ -86,20 +88,29 @@ def _suits(shapes, arrays) -> bool:
 
 
 def kernel_number(name: str) -> int | None:
-    """By which the handler knows a kernel; None where there is no numba, or it does not work."""
+    """By which the handler knows a kernel; None where there is no numba, or where it does not work, with a warning."""
     with _lock:
         return _load(name)
 
 
 @cache
 def _load(name):
+    if find_spec("numba") is None:  # as for a Python that is too new for it
+        return None
     try:
         from . import bridge
 
         return bridge.number(name)
-    # No numba, one that does not know this Python or XLA, or nowhere to keep what it compiled.
-    except (ImportError, OSError, RuntimeError):
+    # Of numba, llvmlite or XLA, which may be too new, or nowhere to keep what is compiled: XLA does without all that.
+    except Exception as error:
+        _warn(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
         return None
+
+
+@cache
+def _warn(reason):
+    text = f"numba's kernels do not work, XLA is used instead, which is slower: {reason}"
+    warnings.warn(text, RuntimeWarning, stacklevel=2)
 
 
 def call(kernel: str, results, *buffers):
