@@ -20,6 +20,7 @@ from gs_jax.calibration.outcome import calibrated, picture, scales
 from gs_jax.calibration.scene import calibrate_by_scene
 from gs_jax.calibration.sources import Sources, Spots
 from gs_jax.calibration.spots import core_offsets, find_spots
+from gs_jax.calibration.start import begin_without_lenses
 from gs_jax.calibration.unknowns import FITTABLE, FITTED
 from gs_jax.cli.calibrate import _NAMES
 from gs_jax.designs.builtin import geomscope
@@ -117,8 +118,13 @@ def test_lenses_beside_the_sensor_are_left_out():
     assert new.provenance["lenses_beside_the_sensor"] == all_of_them - left
 
 
+# Of an array, relative: what is near to a lens depends on the pitch.
+SIZES = pytest.mark.parametrize("size", [1.0, 0.1])
+
+
+@SIZES
 @pytest.mark.parametrize("seed", range(6))
-def test_a_pattern_is_matched_at_any_rotation_mirrored_or_not(seed):
+def test_a_pattern_is_matched_at_any_rotation_mirrored_or_not(seed, size):
     rng = np.random.default_rng(seed)
     centers = np.asarray(device(seed)[1].array.centers)
     c = centers @ (1, 1j)
@@ -126,14 +132,15 @@ def test_a_pattern_is_matched_at_any_rotation_mirrored_or_not(seed):
     near = np.argsort(np.abs(c - complex(*rng.uniform(-2, 2, 2))))[:20]
     p = factor * (c.conj() if seed % 2 else c)[near] + shift + rng.normal(0, 0.003, (20, 2)) @ (1, 1j)
     p[[3, 7, 11]] = rng.uniform(-4, 4, (3, 2)) @ (1, 1j)
-    found = match(np.stack([p.real, p.imag], -1), centers, 1.27, 0.05)
+    found = match(size * np.stack([p.real, p.imag], -1), size * centers, 1.27, 0.05)
     assert found.mirrored == bool(seed % 2) and found.is_clear and found.on_lenses >= 17
-    assert abs(found.factor - factor) < 0.005 and abs(found.shift - shift) < 0.02
+    assert abs(found.factor - factor) < 0.005 and abs(found.shift / size - shift) < 0.02
 
 
-def test_chance_is_no_pattern():
-    centers = np.asarray(device(0)[1].array.centers)
-    spots = np.random.default_rng(0).uniform(-4, 4, (20, 2))
+@SIZES
+def test_chance_is_no_pattern(size):
+    centers = size * np.asarray(device(0)[1].array.centers)
+    spots = size * np.random.default_rng(0).uniform(-4, 4, (20, 2))
     assert not match(spots, centers, 1.28, 0.05).is_clear and not match(spots[:2], centers, 1.28, 0.05).is_clear
 
 
@@ -148,6 +155,24 @@ def test_geometry_is_found_from_a_poor_start(seed):
     depth, seen, fitted = scales(found).T
     np.testing.assert_allclose(seen, fitted, atol=2e-4)
     assert set(depth) <= {18.0, 20.0, 22.0} and len(picture(found).axes) == 3
+
+
+def smaller(imager: Imager) -> Imager:
+    """All lengths a fiftieth: its captures are the same."""
+    a, sensor = imager.array, imager.sensor
+    lengths = {name: getattr(a, name) / 50 for name in ("centers", "radius_of_curvature", "aperture_diameter")}
+    array = dataclasses.replace(a, substrate_thickness=a.substrate_thickness / 50, **lengths)
+    sensor = dataclasses.replace(sensor, pixel_pitch=sensor.pixel_pitch / 50)
+    numbers = {name: getattr(imager, name) / 50 for name in ("sensor_distance", "field_radius", "shift")}
+    return dataclasses.replace(imager, array=array, sensor=sensor, **numbers)
+
+
+def test_a_small_device_is_calibrated_as_a_large_one():
+    actual, design, mirrored = device(0)
+    found = calibrate(captures(actual)[1:2], POINTS[1:2] / 50, smaller(design))
+    assert found.mirrored == mirrored and found.rms < 0.1
+    np.testing.assert_allclose(50 * found.imager.centers, actual.centers, atol=2e-3)
+    check(found, smaller(actual), NAMES[:1])
 
 
 def test_one_capture_does():
@@ -218,6 +243,19 @@ def test_lenses_of_no_list_are_found():
     check(found, actual, NAMES[:1])
 
 
+def test_lenses_of_no_list_are_where_they_are_without_the_designs_tilt():
+    """They are found in the sensor's frame: rotation, shift and tilt are in their places."""
+    actual, design, _ = device(5)
+    level = eqx.tree_at(lambda i: i.tilt, actual, jnp.zeros(2))
+    points = MANY[:3]
+    found = [np.asarray(level.project(points[[k]]))[:, 0] for k in range(3)]
+    tilted = eqx.tree_at(lambda i: i.tilt, design, jnp.array([0.03, -0.02]), is_leaf=lambda leaf: leaf is None)
+    start = begin_without_lenses(found, Sources(points, np.arange(3)), tilted).imager
+    away = KDTree(np.asarray(level.centers)).query(np.asarray(start.centers))[0]
+    # The sensor's distance is searched for in steps of a hundredth.
+    assert start.tilt is None and np.max(away) < 0.01
+
+
 def test_a_scene_that_nobody_knows():
     actual, design, mirrored = device(4)
     assert not mirrored
@@ -266,9 +304,9 @@ def test_numbers_that_the_spots_do_not_determine_are_refused():
 def test_a_displaced_pattern():
     pattern = np.random.default_rng(0).uniform(-4, 4, (30, 2))
     spots = np.concatenate([pattern[::2] + [0.7, -1.3], [[0.0, 0.0]]])
-    shift, count = match_shift(spots, pattern)
+    shift, count = match_shift(spots, pattern, 0.06)
     np.testing.assert_allclose(shift, [0.7, -1.3], atol=0.01)
-    assert count >= 15 and match_shift(spots[:0], pattern)[1] == 0
+    assert count >= 15 and match_shift(spots[:0], pattern, 0.06)[1] == 0
 
 
 def test_positions_are_read_with_what_is_known(tmp_path):

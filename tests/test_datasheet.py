@@ -2,6 +2,7 @@ import io
 import json
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from jax.test_util import check_grads
 from rich.console import Console
 
-from gs_jax import Imager, MicrolensArray
+from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import read_design
 from gs_jax.designs.microscope import Microscope
@@ -17,7 +18,8 @@ from gs_jax.designs.problems import findings
 from gs_jax.designs.sheet import datasheet, summary, tables
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
-from gs_jax.optics.aperture import clear_diameter, pitch
+from gs_jax.optics.aperture import cells_of, clear_diameter, pitch
+from gs_jax.optics.kinds import lenses_by_kind
 
 from .helpers import scene
 from .test_cli import run
@@ -162,7 +164,7 @@ def test_an_infinite_plate_has_no_density():
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
         one = jnp.array(1.0)
-        Microscope(imager, grid.depths, one, one, confusion=one, plate_scale=one)
+        Microscope(imager, grid.depths, one, confusion=one)
 
 
 def test_gradients_by_everything_that_is_continuous():
@@ -182,7 +184,6 @@ def test_gradients_by_everything_that_is_continuous():
         m = Microscope(
             Imager(moved, imager.sensor, v, 1.0, wavelength=um * 1e-3),
             depths,
-            clear_diameter=clear_diameter(moved),
             field_radius=field_radius,
             confusion=um * 1e-2,
             plate_scale=um,
@@ -206,6 +207,36 @@ def test_gradients_by_everything_that_is_continuous():
     arguments = (array.centers, one(2.0), one(1.43), one(0.5), one(1.0), one(5.8), grid.depths, one(0.4), one(0.52))
     # Blurs and resolutions are 1e-2 mm: the tolerance is a millionth of a wave's worth of it.
     check_grads(values, arguments, order=1, eps=1e-7, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("how", ["by cells", "by centres", "kinds"])
+def test_the_clear_aperture_follows_the_imager(how):
+    """Of lenses whose discs overlap, whatever of the imager is replaced: also where centres coincide, in value."""
+    centers = jnp.array([[-0.4, 0.1], [0.35, -0.2], [0.1, 0.7], [0.6, 0.65]])
+    diameter = jnp.array([1.0, 1.0, 0.9, 0.9]) if how == "kinds" else jnp.array(1.0)
+    array = MicrolensArray(centers, aperture_diameter=diameter, size=(2.0, 2.0))
+    imager = Imager(array, Sensor((40, 40), 1e-3), 5.8, 0.4)
+    cells = cells_of(np.asarray(centers), array.size) if how == "by cells" else None
+    lenses = lenses_by_kind(imager) if how == "kinds" else ()
+    m = Microscope(
+        imager, jnp.array([20.0]), jnp.array(0.4), jnp.array(0.01), cells=cells, directions=16, lenses=lenses
+    )
+
+    @jax.jit
+    def values(diameter, centers):
+        where = lambda m: (m.imager.array.aperture_diameter, m.imager.array.centers)
+        changed = eqx.tree_at(where, m, (diameter, centers))
+        each = [(kind.f_number, kind.lateral_resolution, kind.depth_of_field) for kind in changed.each]
+        return changed.coverage, each
+
+    # Steps of 1e-6 of numbers of order one.
+    check_grads(values, (diameter, centers), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
+    (coverage, [whole, *_]), (fewer, [half, *_]) = values(diameter, centers), values(diameter / 2, centers)
+    assert half[0] > 1.5 * whole[0] and half[1] > 1.2 * whole[1] and half[2] > 1.5 * whole[2] and fewer < coverage / 2
+    slope = jax.jit(jax.grad(lambda centers: values(diameter, centers)[0]))
+    assert jnp.abs(slope(centers)).max() > 0.01
+    if how == "by centres":
+        assert jnp.all(jnp.isfinite(slope(jnp.zeros_like(centers))))
 
 
 def test_the_built_in_design_matches_its_file():

@@ -34,11 +34,11 @@ def parent(centers=CENTERS, orientation="plano", **options):
 def ideal(c, depth, sensor_distance, diameter):
     """A thin lens without aberrations, judged at one depth and on its axis alone."""
     imager = dataclasses.replace(c.imager, field_radius=1e-3)
-    where = lambda i: (i.array.thin_lens_focal_length, i.sensor_distance)
-    values = c.imager.array.focal_length, jnp.array(sensor_distance)
+    where = lambda i: (i.array.thin_lens_focal_length, i.sensor_distance, i.array.aperture_diameter)
+    values = c.imager.array.focal_length, jnp.array(sensor_distance), jnp.array(diameter)
     imager = eqx.tree_at(where, imager, values, is_leaf=lambda x: x is None)
     judged = {"depths": jnp.array([depth]), "field_radius": jnp.array(1e-3)}
-    return dataclasses.replace(c, imager=imager, clear_diameter=jnp.array(diameter), **judged)
+    return dataclasses.replace(c, imager=imager, **judged)
 
 
 def perfect(frequency, c):

@@ -81,3 +81,15 @@ def test_what_mistakes_of_calibration_leave():
     said = {"nothing": 0.0, "each centre, 3 um": 1.2, "tilt, 0.5 degrees": 1.2, "all centres, 0.2 %": 0.8}
     said |= {"one place, 20 um sideways": 0.5, "one depth, 50 um": 0.3, "all depths, 200 um": 0.2}
     assert {name: round(left[name], 1) for name in said} == said and left["two captures swapped"] > 40
+
+
+def test_contributing_names_what_exists():
+    """Files, and words of the code."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    files = [path for folder in ("gs_jax", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    known = {path.name for path in files} | {path.parent.name for path in files} | {path.stem for path in files}
+    code = "\n".join(path.read_text(encoding="utf-8") for path in files)
+    words, paths = re.findall(r"`(\w+)`", text), re.findall(r"`([\w/-]+\.(?:py|yml|html|md))`", text)
+    assert len(words) > 20 and len(paths) > 10
+    assert not [path for path in paths if not (ROOT / path).exists() and path not in known]
+    assert not [word for word in words if word not in known and not re.search(rf"\b{word}\b", code)]

@@ -83,9 +83,9 @@ def pinholes(design) -> Bench:
     return bench._replace(offsets=nothing, changes=0 * bench.changes)
 
 
-def judged(imager: Imager, diameter=0.4) -> Microscope:
+def judged(imager: Imager) -> Microscope:
     one, depths = jnp.ones(()), jnp.array(DEPTHS)
-    return Microscope(imager, depths, diameter * one, imager.field_radius * one, 0.01 * one, one)
+    return Microscope(imager, depths, imager.field_radius * one, 0.01 * one)
 
 
 def single(**lens) -> Imager:

@@ -16,7 +16,7 @@ from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
-from .matching import NEAR
+from .matching import near_of
 from .sources import Sources, Spots, assigned
 from .spots import find_spots
 from .start import begin, begin_without_lenses
@@ -39,10 +39,11 @@ from .unknowns import (
 
 # Spots looked for in a capture, for each of its sources.
 _SPOTS = 60
-# How near a spot must be to where it is due, mm on the sensor: wide, then narrow.
-_WITHIN = (NEAR, 0.03, 0.015)
-# Standard deviation that lenses of a printed array may have from their places, mm, and lenses of no list.
-_PRINTED, _ANYWHERE = 0.01, 1.0
+# How near a spot must be to where it is due, over `near_of`: wide, then narrow.
+_WITHIN = (1.0, 0.5, 0.25)
+# Standard deviation that lenses may have from their places: of a printed array, mm, whatever its pitch, as printers
+# have it; and of no list, over `near_of`.
+_PRINTED, _ANYWHERE = 0.01, 17.0
 # Captures that are looked at side by side, each with several times its memory.
 _THREADS = 2
 # Steps of the solver at most.
@@ -154,7 +155,7 @@ def calibrate(
         start = begin_without_lenses(found, sources, imager) if find_lenses else begin(found, sources, imager)
     if find_lenses:
         fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
-    loose = _ANYWHERE if find_lenses else _PRINTED
+    loose = _ANYWHERE * near_of(start.imager.array.centers) if find_lenses else _PRINTED
     result = refine(found, start.imager, start.sources, np.isnan(sources.points), fit, loose, progress)
     return _seen_alone(result) if find_lenses else result._replace(mirrored=start.mirrored)
 
@@ -176,7 +177,7 @@ def refine(
     loose: float = _PRINTED,
     progress: Progress | None = None,
 ) -> Calibration:
-    """The fit, from a geometry and sources that put spots within 0.06 mm of where they are.
+    """The fit, from a geometry and sources that put spots within a twentieth of the pitch of where they are.
 
     Parameters
     ----------
@@ -197,14 +198,14 @@ def refine(
         If the spots do not determine what is to be fitted.
     """
     fit = [name for name in FITTABLE if name in fit]
-    done = None
+    done, near = None, near_of(imager.array.centers)
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
-        done = _fitted(found, imager, sources, unknown, fit, loose, within, done)
+        done = _fitted(found, imager, sources, unknown, fit, loose, within * near, done)
     assert done is not None
     state, known, spots = done
     off = np.asarray(residuals(state, known), np.float64)[: len(spots.lenses)]
     deviations = deviations_of(state, known, loose, noise_of(off, state, spots))
-    check_known(deviations)
+    check_known(deviations, near)
     sources = sources._replace(points=np.asarray(found_points(state, known), np.float64))
     return Calibration(applied(state, imager), False, values_of(state), deviations, sources, spots, off)
 
@@ -228,7 +229,7 @@ def _fitted(found, imager: Imager, sources: Sources, unknown, fit, loose, within
     start = before.state if before else guessed(fit, known)
     if not jax.tree.leaves(start):
         raise InputError(f"calibration: found nothing to fit, allowed: some of {', '.join(FITTABLE)}.")
-    check_known(deviations_of(start, known, loose, NOISE))
+    check_known(deviations_of(start, known, loose, NOISE), near_of(imager.array.centers))
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
     given = known, jnp.asarray(loose, known.places.dtype)
     state = optx.least_squares(weighed, solver, start, given, throw=False, max_steps=_MOST_STEPS).value
@@ -248,7 +249,9 @@ def residuals_of(
     """How far the spots of captures of other points are from where a calibration puts them, `(x, y)`, pixels."""
     imager, sources = found.imager, Sources(points, np.arange(len(points)))
     offsets = offsets_of(imager, points[:, 2])
-    spots = assigned([spots_in(image, imager) for image in images], sources, imager, offsets, _WITHIN[0])
+    spots = assigned(
+        [spots_in(image, imager) for image in images], sources, imager, offsets, near_of(imager.array.centers)
+    )
     known = _known(imager, points, np.zeros_like(points, bool), spots, offsets)
     return np.asarray(residuals(Unknowns(), known), np.float64)[: len(spots.lenses)]
 

@@ -9,15 +9,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Array, Float, Float64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from ..layouts.cells import nearest_neighbour_distances
+
 # The brightest spots that guesses are made from and tried on, of each source and at most, and lenses that make a pair.
 _FIRST, _TRIED, _MOST, _NEIGHBOURS = 5, 20, 3, 12
-# A spot is on a lens within this, mm on the plate: a twentieth of the pitch of the paper's array.
-NEAR = 0.06
+# A spot is on a lens within this, in pitches of the array: 0.06 mm on the plate of the paper's.
+_NEAR = 0.0488
 # Spots that must be on lenses at least, and their share of those tried.
 _FEWEST, _SHARE = 6, 0.5
 _AT_ONCE = 20_000
@@ -44,6 +46,11 @@ class Similarity(NamedTuple):
         return self.on_lenses >= max(_FEWEST, _SHARE * self.tried / self.sources)
 
 
+def near_of(centers: Float[Array | np.ndarray, "lens 2"]) -> float:
+    """How near to a lens of an array a spot counts as on it, mm: a twentieth of the pitch."""
+    return _NEAR * float(nearest_neighbour_distances(np.asarray(centers, np.float64)).mean())
+
+
 def match(
     spots: Float[np.ndarray, "spot 2"],
     centers: Float[np.ndarray, "lens 2"],
@@ -65,9 +72,9 @@ def match(
     best = Similarity(1 + 0j, 0j, False, 0, len(p), sources)
     if len(p) < 3 or len(c) < 3:
         return best
-    tree = KDTree(centers)
-    near = np.asarray(tree.query(centers, k=min(_NEIGHBOURS + 1, len(c)))[1])
-    first, second = np.repeat(np.arange(len(c)), near.shape[1] - 1), near[:, 1:].ravel()
+    tree, near = KDTree(centers), near_of(centers)
+    beside = np.asarray(tree.query(centers, k=min(_NEIGHBOURS + 1, len(c)))[1])
+    first, second = np.repeat(np.arange(len(c)), beside.shape[1] - 1), beside[:, 1:].ravel()
     begin, end = np.meshgrid(np.arange(min(_FIRST * some, len(p))), np.arange(len(p)))
     one, other = begin[begin != end], end[begin != end]
     for mirrored in (False, True):
@@ -78,11 +85,11 @@ def match(
             pair, lens = pairs[start : start + _AT_ONCE].T
             factor = factors[pair, lens]
             shift = p[one[pair]] - factor * lenses[first[lens]]
-            count = (_distance(p, factor, shift, tree, mirrored) < NEAR).sum(1)
+            count = (_distance(p, factor, shift, tree, mirrored) < near).sum(1)
             top = int(count.argmax())
             if count[top] > best.on_lenses:
                 best = Similarity(complex(factor[top]), complex(shift[top]), mirrored, int(count[top]), len(p), sources)
-    return _improved(best, p, c, tree)
+    return _improved(best, p, c, tree, near)
 
 
 def _distance(p, factor, shift, tree, mirrored) -> Float64[np.ndarray, "guess spot"]:
@@ -92,14 +99,14 @@ def _distance(p, factor, shift, tree, mirrored) -> Float64[np.ndarray, "guess sp
     return tree.query(np.stack([back.real, back.imag], -1))[0]
 
 
-def _improved(found: Similarity, p, c, tree) -> Similarity:
+def _improved(found: Similarity, p, c, tree, near) -> Similarity:
     """By least squares over the spots that are on lenses."""
     if found.on_lenses < 2:
         return found
     back = (p - found.shift) / found.factor
     back = back.conj() if found.mirrored else back
     distance, lens = tree.query(np.stack([back.real, back.imag], -1))
-    use = distance < NEAR
+    use = distance < near
     lenses = (c.conj() if found.mirrored else c)[lens[use]]
     system = np.stack([lenses, np.ones_like(lenses)], -1)
     factor, shift = np.linalg.lstsq(system, p[use])[0]
@@ -107,15 +114,15 @@ def _improved(found: Similarity, p, c, tree) -> Similarity:
 
 
 def match_shift(
-    spots: Float[np.ndarray, "spot 2"], pattern: Float[np.ndarray, "lens 2"]
+    spots: Float[np.ndarray, "spot 2"], pattern: Float[np.ndarray, "lens 2"], near: float
 ) -> tuple[Float64[np.ndarray, "2"], int]:
-    """By how much a pattern of spots, mm, is displaced on the sensor, and how many spots say so."""
+    """By how much a pattern of spots, mm, is displaced on the sensor, and how many spots say so, each as `near`."""
     if not len(spots) or not len(pattern):
         return np.zeros(2), 0
     apart = (spots[:, None] - pattern[None]).reshape(-1, 2)
     tree = KDTree(apart)
-    count = tree.query_ball_point(apart, NEAR, return_length=True)
-    together = tree.query_ball_point(apart[int(count.argmax())], NEAR)
+    count = tree.query_ball_point(apart, near, return_length=True)
+    together = tree.query_ball_point(apart[int(count.argmax())], near)
     return np.median(apart[together], axis=0), len(together)
 
 

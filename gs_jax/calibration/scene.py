@@ -14,6 +14,7 @@ from ..geometry import Imager
 from ..suppression.locate import find_points
 from ..voxels import Grid
 from .fit import Calibration, refine, spots_in
+from .matching import near_of
 from .sources import Sources
 
 # What is fitted by default: a scene of unknown depth and place tells neither sensor distance nor shift.
@@ -22,8 +23,8 @@ FITTED = ("rotation", "tilt")
 _POINTS, _FEWEST = 60, 5
 # The rotation is searched for so far on either side of the design's, in such steps, radians, by so many bright spots.
 _ROTATION, _ROTATION_STEP, _SPOTS = np.radians(5.0), np.radians(0.4), 5
-# Lenses agree on a point within this on the sensor, mm; steps of the depth so fine that its spots move less.
-_NEAR = 0.03
+# Lenses agree on a point within this on the sensor, over `near_of`; steps of the depth move its spots by less.
+_NEAR = 0.5
 
 
 def calibrate_by_scene(
@@ -77,10 +78,11 @@ def calibrate_by_scene(
 def _turned(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths: tuple[float, float]) -> Imager:
     """At the rotation where most lines through spots and lenses meet."""
     near, far = (float(imager.magnification(depth)) for depth in depths)
-    step = _NEAR / imager.field_radius
+    within = _NEAR * near_of(imager.array.centers)
+    step = within / imager.field_radius
     magnifications = np.linspace(far, near, max(int(np.ceil((near - far) / step)) + 1, 2))
     turns = np.arange(-np.floor(_ROTATION / _ROTATION_STEP), np.floor(_ROTATION / _ROTATION_STEP) + 1) * _ROTATION_STEP
-    met = [max(_meeting(spots, _by(imager, turn), m) for m in magnifications) for turn in turns]
+    met = [max(_meeting(spots, _by(imager, turn), m, within) for m in magnifications) for turn in turns]
     return _by(imager, float(turns[int(np.argmax(met))]))
 
 
@@ -88,7 +90,7 @@ def _by(imager: Imager, turn: float) -> Imager:
     return eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + jnp.asarray(turn, imager.rotation.dtype))
 
 
-def _meeting(spots, imager: Imager, magnification: float) -> float:
+def _meeting(spots, imager: Imager, magnification: float, within: float) -> float:
     """How clearly lines meet in a plane: the sum of squares of how many pass where most do."""
     centers = np.asarray(imager.centers, np.float64)
     points = ((1 + magnification) * centers - spots[:, None]) / magnification
@@ -96,6 +98,6 @@ def _meeting(spots, imager: Imager, magnification: float) -> float:
     points = points[seen]
     if not len(points):
         return 0.0
-    count = KDTree(points).query_ball_point(points, _NEAR / magnification, return_length=True)
+    count = KDTree(points).query_ball_point(points, within / magnification, return_length=True)
     # The mean of these counts would be the same for any pattern of as many lines; peaks are what differs.
     return float((np.asarray(count, float) ** 3).sum())

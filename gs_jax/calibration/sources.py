@@ -11,8 +11,8 @@ from ..base.errors import InputError
 from ..geometry import Imager
 from .unknowns import Offsets, due
 
-# Spots that are due nearer to each other than this on the sensor are blurred into one, mm.
-_APART = 0.03
+# Spots that are due nearer to each other than this on the sensor are blurred into one, pixels.
+_APART = 6.67
 
 
 class Sources(NamedTuple):
@@ -72,13 +72,13 @@ def assigned(
     places = np.asarray(due(imager, np.nan_to_num(sources.points, nan=1.0), offsets), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)
     seen = (beside < imager.field_radius) & ~np.isnan(sources.points.sum(1))[:, None]
-    rows = []
+    rows, apart = [], _APART * imager.sensor.pixel_pitch
     for capture, spots in enumerate(found):
         source, lens = np.argwhere(seen & (sources.captures == capture)[:, None]).T
         if not len(spots) or not len(source):
             continue
         wanted = places[source, lens]
-        alone = np.asarray(KDTree(wanted).query_ball_point(wanted, _APART, return_length=True)) == 1
+        alone = np.asarray(KDTree(wanted).query_ball_point(wanted, apart, return_length=True)) == 1
         distance, nearest = (np.asarray(part) for part in KDTree(spots).query(wanted))
         rows += [
             (source[k], lens[k], *spots[nearest[k]])

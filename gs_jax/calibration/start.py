@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
 from ..lenses import MicrolensArray
-from .matching import NEAR, Similarity, match, match_shift, meeting_lenses
+from .matching import Similarity, match, match_shift, meeting_lenses, near_of
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of
 
@@ -24,6 +24,8 @@ _SCALE, _SCALE_OFF = 1.3, 0.2
 _GUESSES = 6
 # Share of the spots that must be on lenses which other captures show, too.
 _SHARED = 0.5
+# How near lines pass that meet in a lens of no list, in field radii: 0.06 mm of the paper's.
+_MEETING = 0.02
 
 
 class Start(NamedTuple):
@@ -81,7 +83,7 @@ def _scale(imager: Imager, depth: float) -> tuple[float, float]:
 
 def _explained(found, start: Start) -> int:
     offsets = offsets_of(start.imager, start.sources.points[:, 2])
-    return len(assigned(found, start.sources, start.imager, offsets, NEAR).lenses)
+    return len(assigned(found, start.sources, start.imager, offsets, near_of(start.imager.array.centers)).lenses)
 
 
 def _begun(best: Similarity, source: int, found, sources: Sources, imager: Imager) -> Start:
@@ -128,7 +130,8 @@ def _place(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
         magnification = max(abs(near.factor) - 1, 1e-3)
         depth = max(float(imager.reduced_sensor_distance) / magnification - float(imager.reduced_depth(0.0)), 1e-3)
     magnification = float(imager.magnification(depth))
-    shift, _ = match_shift(spots, (1 + magnification) * np.asarray(imager.centers, np.float64))
+    pattern = (1 + magnification) * np.asarray(imager.centers, np.float64)
+    shift, _ = match_shift(spots, pattern, near_of(imager.array.centers))
     x, y = -shift / magnification
     return float(x), float(y), depth
 
@@ -140,7 +143,7 @@ def _without(spots, point, imager: Imager):
     if not len(spots) or not seen.any():
         return spots
     wanted = chief_ray(centers[seen], point[:2], magnification)
-    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > NEAR]
+    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > near_of(imager.array.centers)]
 
 
 def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:
@@ -158,16 +161,17 @@ def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: S
         raise InputError(f"positions: found {text}, allowed: {allowed}.")
     spots = [found[int(k)] for k in sources.captures]
     nominal = np.asarray(imager.magnification(points[:, 2]), np.float64)
-    steps = np.linspace(1 - _DISTANCE, 1 + _DISTANCE, _STEPS)
-    met = np.array([meeting_lenses(spots, points[:, :2], step * nominal, NEAR / 4)[2] for step in steps])
+    steps, near = np.linspace(1 - _DISTANCE, 1 + _DISTANCE, _STEPS), _MEETING * imager.field_radius
+    met = np.array([meeting_lenses(spots, points[:, :2], step * nominal, near / 4)[2] for step in steps])
     step = float(steps[met == met.max()].mean())
-    centers, count, _ = meeting_lenses(spots, points[:, :2], step * nominal, NEAR)
+    centers, count, _ = meeting_lenses(spots, points[:, :2], step * nominal, near)
     if not count or count < _SHARED * sum(map(len, spots)):
         text = f"{count} of {sum(map(len, spots))} spots on lenses that several captures show"
         allowed = "half of them; are positions and the sensor's pixels right?"
         raise InputError(f"captures: found {text}, allowed: {allowed}")
-    where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
+    where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift, i.tilt)
     zero = jnp.zeros((), imager.sensor_distance.dtype)
     distance = imager.reduced_sensor_distance * step - imager.array.air_behind
-    new = (moved_lenses(imager.array, centers), distance, zero, jnp.zeros(2, zero.dtype))
-    return Start(eqx.tree_at(where, imager, new), False, sources)
+    # Rotation, shift and tilt are in the lenses' places.
+    new = (moved_lenses(imager.array, centers), distance, zero, jnp.zeros(2, zero.dtype), None)
+    return Start(eqx.tree_at(where, imager, new, is_leaf=lambda leaf: leaf is None), False, sources)

@@ -16,16 +16,16 @@ from .unknowns import NOISE, OUTLIER, Known, Unknowns, weighed
 _LEAST = 0.01
 # Singular values below this part of the first are none, and leave undetermined what is this part of their direction.
 _SINGULAR, _PART = 1e-6, 1e-2
-# Standard deviations beyond which a number is not known.
+# Standard deviations beyond which a number is not known; lengths over `near_of`.
 _UNKNOWN = {
-    "sensor_distance_mm": 0.2,
+    "sensor_distance_mm": 3.33,
     "rotation_deg": 1.0,
-    "shift_x_mm": 0.2,
-    "shift_y_mm": 0.2,
+    "shift_x_mm": 3.33,
+    "shift_y_mm": 3.33,
     "tilt_x_deg": 0.5,
     "tilt_y_deg": 0.5,
     "scale": 0.02,
-    "depth_offset_mm": 0.5,
+    "depth_offset_mm": 8.33,
 }
 # What the leaves of `Unknowns` are called in files, and their unit there.
 _CALLED = {
@@ -94,9 +94,10 @@ def _jacobian(state, given):
     return jax.jacfwd(lambda flat: ravel_pytree(weighed(back(flat), given))[0])(flat)
 
 
-def check_known(deviations: dict[str, float]) -> None:
-    """`InputError` if a standard deviation is larger than anybody wants."""
-    unknown = {name: sd for name, sd in deviations.items() if sd > _UNKNOWN.get(name, math.inf)}
+def check_known(deviations: dict[str, float], near: float) -> None:
+    """`InputError` if a standard deviation is larger than anybody wants of an array with `near_of`, mm."""
+    most = {name: limit * (near if name.endswith("_mm") else 1) for name, limit in _UNKNOWN.items()}
+    unknown = {name: sd for name, sd in deviations.items() if sd > most.get(name, math.inf)}
     if unknown:
         found = ", ".join(f"{name} to {sd:.2g}" if sd < 100 else name for name, sd in unknown.items())
         allowed = "sources at more depths and places, or known ones, or hold some of these"

@@ -8,7 +8,6 @@ conic constant are a value for each kind, in the order of their first lenses; wh
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -26,10 +25,9 @@ from ..designs.design import Design
 from ..designs.microscope import Microscope
 from ..geometry import Imager
 from ..io.tables import one_line
-from ..layouts.cells import cell_edges
-from ..lenses import EACH, MicrolensArray
-from ..optics.aperture import aperture_area, pitch, wedge
-from ..optics.kinds import lenses_by_kind, of_kinds
+from ..lenses import EACH
+from ..optics.aperture import Cells, cells_of, pitch
+from ..optics.kinds import lenses_by_kind
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -53,17 +51,6 @@ _DIGITS = 4
 _SIGNIFICANT = 7
 # Of lenses that differ: enough for the mean clear aperture of a kind to 1e-3, an eighth of the work of all.
 _EDGES = 64
-
-
-class Cells(eqx.Module):
-    """The edges of the Voronoi cells of lenses that stay where they are: the fast way to their clear aperture.
-
-    `height`: distance of the edge's line from its lens, mm. `low`, `high`: the edge's ends along it, from the foot.
-    """
-
-    height: Float[Array, " edge"] = eqx.field(converter=as_float)
-    low: Float[Array, " edge"] = eqx.field(converter=as_float)
-    high: Float[Array, " edge"] = eqx.field(converter=as_float)
 
 
 class Parent(eqx.Module):
@@ -112,12 +99,13 @@ def parent_of(
     """
     near, far = depths_mm or design.imaging.working_distance_mm
     imager = design.imager()
+    stays = imager.array.alike and "centers_mm" not in free
     if "aspheric_terms" in free and not imager.array.aspheric_terms.size:
         none = jnp.zeros(_TERMS, imager.sensor_distance.dtype)
         imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, none)
     return Parent(
         imager,
-        _cells(design) if imager.array.alike and "centers_mm" not in free else None,
+        cells_of(np.array(design.array.centers_mm), design.array.size_mm) if stays else None,
         pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
@@ -140,25 +128,6 @@ def _largest_magnification(design: Design, near: float, far: float, free: Mappin
     nearest = (near + far - most("depth_span_mm", far - near)) / 2
     distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
     return (distance + back) / (nearest + front)
-
-
-def _cells(design: Design) -> Cells:
-    edges = cell_edges(np.array(design.array.centers_mm), design.array.size_mm)
-    return Cells(edges.height, edges.low, edges.high)
-
-
-def _clear_diameters(parent: Parent, array: MicrolensArray) -> list[Float[Array, ""]]:
-    """Of the mean lens, and of the mean lens of each kind if there are several, mm: of discs of the same area."""
-    count, cells = len(array.centers), parent.cells
-    if cells is None:
-        areas = aperture_area(array, directions=_EDGES)
-        several = parent.lenses if len(parent.lenses) > 1 else ()
-        means = [jnp.sum(areas) / count, *(jnp.mean(areas[np.array(which)]) for which in several)]
-    else:
-        radius = array.aperture_diameter / 2
-        within = wedge(cells.high, cells.height, radius) - wedge(cells.low, cells.height, radius)
-        means = [jnp.sum(within) / count]
-    return [jnp.sqrt(4 / math.pi * mean) for mean in means]
 
 
 def start_values(parent: Parent) -> Values:
@@ -203,28 +172,21 @@ def candidate(parent: Parent, values: Values) -> Microscope:
     )
     radius, diameter, conic = (of_lenses(parent, values[name]) for name in LENS_KEYS)
     terms, others = values["aspheric_terms"], (values["refractive_index"], values["sensor_distance_mm"])
-    # Areas before scaling, on the plate as it is: its size cannot be traced.
-    smaller = terms * scale ** jnp.arange(3, 2 * terms.size + 3, 2, dtype=scale.dtype)
-    numbers = (values["centers_mm"], radius / scale, diameter / scale, conic, others[0], smaller, others[1])
-    mean, *clear = _clear_diameters(parent, eqx.tree_at(where, parent.imager, numbers).array)
     numbers = (scale * values["centers_mm"], radius, diameter, conic, others[0], terms, others[1])
     imager = eqx.tree_at(where, parent.imager, numbers)
     offsets = jnp.linspace(-0.5, 0.5, parent.depth_count, dtype=scale.dtype)
-    whole = Microscope(
+    return Microscope(
         imager,
         parent.middle + values["depth_span_mm"] * offsets,
-        clear_diameter=scale * mean,
         field_radius=jnp.array(imager.field_radius, scale.dtype),
         confusion=parent.confusion,
         plate_scale=scale,
         largest_magnification=parent.largest_magnification,
         exposure=parent.exposure,
+        cells=parent.cells,
+        directions=_EDGES,
+        lenses=parent.lenses if len(parent.lenses) > 1 else (),
     )
-    if not clear:
-        return whole
-    each = zip(of_kinds(imager, parent.lenses), clear, strict=True)
-    kinds = (dataclasses.replace(whole, imager=one, clear_diameter=scale * own) for one, own in each)
-    return dataclasses.replace(whole, kinds=tuple(kinds))
 
 
 def of_lenses(parent: Parent, value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -5,14 +5,20 @@ A datasheet and the terms of a co-design are both made of this.
 
 import dataclasses
 import math
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..base.converters import as_float
 from ..geometry import Imager
+from ..lenses import MicrolensArray
 from ..optics import aberrations, theory
 from ..optics.aberrations import Wavefront
+from ..optics.aperture import Cells, clear_diameter
+from ..optics.kinds import of_kinds
 
 
 class Microscope(eqx.Module):
@@ -21,13 +27,11 @@ class Microscope(eqx.Module):
     Parameters
     ----------
     imager
-        On a plate of finite size. Its own `field_radius` decides shapes and cannot be traced.
+        On a plate of finite size.
     depths
         From the plate, mm.
-    clear_diameter
-        Of the disc whose area is the mean clear aperture, mm: `gs_jax.optics.aperture.clear_diameter(imager.array)`.
     field_radius
-        `sqrt(A_e / pi)`, mm.
+        `sqrt(A_e / pi)`, mm: the imager's, which decides shapes and cannot be traced.
     confusion
         Diameter of the circle of confusion, mm.
     plate_scale
@@ -36,9 +40,11 @@ class Microscope(eqx.Module):
         What magnifications stay below whatever is free, for windows that have to hold all images.
     exposure
         Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
-    kinds
-        The lenses of each kind alone, where they differ; none if all are alike. What follows from a lens's shape is
-        theirs then, the rest also that of the whole, whose clear diameter is the mean lens's.
+    cells, directions
+        How the clear aperture is found, as of `gs_jax.optics.aperture.clear_diameter`.
+    lenses
+        Which are of each kind, where they differ; none if all are alike. What follows from a lens's shape is of the
+        `kinds` then, the rest also of the whole, whose clear diameter is the mean lens's.
 
     Raises
     ------
@@ -48,13 +54,14 @@ class Microscope(eqx.Module):
 
     imager: Imager
     depths: Float[Array, " depth"]
-    clear_diameter: Float[Array, ""]
     field_radius: Float[Array, ""]
     confusion: Float[Array, ""]
-    plate_scale: Float[Array, ""]
+    plate_scale: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     largest_magnification: float = eqx.field(static=True, default=math.inf)
     exposure: float = eqx.field(static=True, default=1e4)
-    kinds: tuple["Microscope", ...] = ()
+    cells: Cells | None = None
+    directions: int = eqx.field(static=True, default=512)
+    lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         if not math.isfinite(math.prod(self.imager.array.size)):
@@ -66,6 +73,11 @@ class Microscope(eqx.Module):
         return self.plate_scale * jnp.array(self.imager.array.size, self.plate_scale.dtype)
 
     @property
+    def kinds(self) -> tuple["Microscope", ...]:
+        """The lenses of each kind alone, where they differ."""
+        return tuple(dataclasses.replace(self, imager=one, lenses=()) for one in of_kinds(self.imager, self.lenses))
+
+    @property
     def each(self) -> tuple["Microscope", ...]:
         """Of each kind of lens; of lenses that are alike this itself."""
         return self.kinds or (self,)
@@ -73,8 +85,16 @@ class Microscope(eqx.Module):
     @property
     def middle(self) -> "Microscope":
         """The same at the middle of the depths alone."""
-        kinds = tuple(kind.middle for kind in self.kinds)
-        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2, kinds=kinds)
+        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2)
+
+    @property
+    def clear_diameter(self) -> Float[Array, ""]:
+        """Of the disc whose area is the mean clear aperture of the lenses."""
+        if self.lenses:
+            shares = [len(which) / len(self.imager.array.centers) for which in self.lenses]
+            squares = [share * kind.clear_diameter**2 for share, kind in zip(shares, self.kinds, strict=True)]
+            return jnp.sqrt(jnp.sum(jnp.stack(squares)))
+        return _clear_diameter(self.imager.array, self.plate_scale, self.cells, self.directions)
 
     @property
     def focal_length(self) -> Float[Array, ""]:
@@ -178,3 +198,22 @@ class Microscope(eqx.Module):
         """The same as seen in the object."""
         v = self.imager.reduced_sensor_distance
         return theory.object_blur(self.focal_length, self.clear_diameter, self.reduced, v)
+
+
+@partial(jax.jit, static_argnames="directions")
+def _clear_diameter(array: MicrolensArray, plate_scale, cells: Cells | None, directions: int) -> Float[Array, ""]:
+    # As large as the plate's size says.
+    return plate_scale * clear_diameter(_shrunk(array, plate_scale), cells=cells, directions=directions)
+
+
+def _shrunk(array: MicrolensArray, scale) -> MicrolensArray:
+    """The lenses over a scale, on the same plate."""
+    terms = array.aspheric_terms
+    return dataclasses.replace(
+        array,
+        centers=array.centers / scale,
+        radius_of_curvature=array.radius_of_curvature / scale,
+        aperture_diameter=array.aperture_diameter / scale,
+        aspheric_terms=terms * scale ** jnp.arange(3, 2 * terms.size + 3, 2, dtype=scale.dtype),
+        others=None if array.others is None else _shrunk(array.others, scale),
+    )

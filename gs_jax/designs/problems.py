@@ -39,7 +39,7 @@ def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None =
     InputError
         As `datasheet`.
     """
-    kinds = microscopes_of(design, sheet["depth_mm"], confusion=confusion, covered=sheet["coverage"])
+    kinds = microscopes_of(design, sheet["depth_mm"], confusion=confusion)
     focus = _focus(design, sheet, kinds)
     # What a wavefront error does is said of lenses that are alike: each kind has its own.
     strehl = _strehl(design, sheet, kinds[0]) if len(kinds) == 1 else []

@@ -11,11 +11,10 @@ from rich.table import Table
 
 from ..base.converters import as_float
 from ..base.errors import InputError, short_repr
-from ..layouts.cells import check_positive, coverage, nearest_neighbour_distances
+from ..layouts.cells import check_positive, nearest_neighbour_distances
 from ..optics import aberrations
-from ..optics.aperture import clear_diameter
-from ..optics.kinds import lenses_by_kind, of_kinds
-from .checks import of_each
+from ..optics.aperture import cells_of
+from ..optics.kinds import lenses_by_kind
 from .design import Design
 from .microscope import Microscope
 from .spots import encircled_radius, psf_width
@@ -25,54 +24,30 @@ _DEPTHS = 7
 
 
 def microscope_of(
-    design: Design,
-    depths: Sequence[float] | np.ndarray,
-    *,
-    confusion: float | None = None,
-    covered: float | None = None,
+    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float | None = None
 ) -> Microscope:
-    """A design as it is judged at these depths, mm, with `datasheet`'s circle of confusion.
-
-    `covered` is the share of the plate that its lenses' discs cover, which says how wide a lens is, if it is known.
-    """
+    """A design as it is judged at these depths, mm, with `datasheet`'s circle of confusion."""
     imager = design.imager()
     if not imager.array.alike:
         raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
-    if covered is None:
-        centers = np.array(design.array.centers_mm)
-        covered = coverage(centers, design.array.size_mm, diameter=of_each(design, "aperture_diameter_mm")[0])
-    count, area = len(design.array.centers_mm), math.prod(design.array.size_mm)
-    return Microscope(
-        imager,
-        as_float(depths),
-        clear_diameter=as_float(math.sqrt(4 / math.pi * covered * area / count)),
-        field_radius=as_float(design.imaging.field_radius_mm),
-        confusion=as_float(confusion_of(design, confusion)),
-        plate_scale=as_float(1.0),
-    )
+    return microscopes_of(design, depths, confusion=confusion)[0]
 
 
 def microscopes_of(
-    design: Design,
-    depths: Sequence[float] | np.ndarray,
-    *,
-    confusion: float | None = None,
-    covered: float | None = None,
+    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float | None = None
 ) -> list[Microscope]:
     """`microscope_of` with the lenses of each kind alone, in the order of their first lenses."""
     imager = design.imager()
-    if imager.array.alike:
-        return [microscope_of(design, depths, confusion=confusion, covered=covered)]
-    shared: dict[str, Any] = {
-        "depths": as_float(depths),
-        "field_radius": as_float(design.imaging.field_radius_mm),
-        "confusion": as_float(confusion_of(design, confusion)),
-        "plate_scale": as_float(1.0),
-    }
-    return [
-        Microscope(one, clear_diameter=clear_diameter(one.array), **shared)
-        for one in of_kinds(imager, lenses_by_kind(imager))
-    ]
+    alike = imager.array.alike
+    whole = Microscope(
+        imager,
+        as_float(depths),
+        field_radius=as_float(design.imaging.field_radius_mm),
+        confusion=as_float(confusion_of(design, confusion)),
+        cells=cells_of(np.array(design.array.centers_mm), design.array.size_mm) if alike else None,
+        lenses=() if alike else lenses_by_kind(imager),
+    )
+    return list(whole.each)
 
 
 def datasheet(

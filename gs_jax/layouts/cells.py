@@ -97,6 +97,7 @@ class Edges(NamedTuple):
     """Edges of Voronoi cells, each once for every cell: their lens, and where they are as seen from its centre, mm.
 
     `start`, `end`: points. `height`: distance of the edge's line. `low`, `high`: the ends along it, from the foot.
+    `beyond`: the lens on its other side; for the plate's sides at -x, +x, -y and +y the count of lenses plus 0 to 3.
     """
 
     lens: Int[np.ndarray, " edge"]
@@ -105,6 +106,7 @@ class Edges(NamedTuple):
     height: Float[np.ndarray, " edge"]
     low: Float[np.ndarray, " edge"]
     high: Float[np.ndarray, " edge"]
+    beyond: Int[np.ndarray, " edge"]
 
 
 def cell_edges(centers, size) -> Edges:
@@ -112,14 +114,17 @@ def cell_edges(centers, size) -> Edges:
     _check_inside(centers, half := half_size(size))
     points, _ = _reflected(centers, half)
     diagram = Voronoi(points)
-    lens = diagram.ridge_points.ravel()
+    lens, beyond = diagram.ridge_points.ravel(), diagram.ridge_points[:, ::-1].ravel()
+    # Reflections follow the lenses, side by side.
+    beyond = np.where(beyond < len(centers), beyond, len(centers) + beyond // len(centers) - 1)
     vertices = np.repeat(diagram.ridge_vertices, 2, axis=0)
     ends = diagram.vertices[vertices]
     kept = (lens < len(centers)) & (ends[:, 0] != ends[:, 1]).any(axis=1)
-    lens, ends = lens[kept], ends[kept] - points[lens[kept], None]
+    lens, beyond, ends = lens[kept], beyond[kept], ends[kept] - points[lens[kept], None]
     start, end = ends[:, 0], ends[:, 1]
     along = (end - start) / np.hypot(*(end - start).T)[:, None]
-    return Edges(lens, start, end, np.abs(cross(start, along)), (start * along).sum(axis=1), (end * along).sum(axis=1))
+    height, low, high = np.abs(cross(start, along)), (start * along).sum(axis=1), (end * along).sum(axis=1)
+    return Edges(lens, start, end, height, low, high, beyond)
 
 
 def cross(a, b):

@@ -10,15 +10,18 @@ reappear behind a steep neighbour; what does is not counted.
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..base.safe import safe_sqrt
+from ..layouts.cells import cell_edges
 from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses that are handled at once.
@@ -163,9 +166,81 @@ def _first_root(function, end):
     return at, jax.grad(function)(at)
 
 
-def clear_diameter(array: MicrolensArray) -> Float[Array, ""]:
-    """Diameter of the disc whose area is the mean clear aperture of the lenses, mm."""
-    return jnp.sqrt(4 / math.pi * jnp.mean(aperture_area(array)))
+class Cells(eqx.Module):
+    """What bounds the Voronoi cells of lenses: with it the mean clear aperture of lenses that are alike is a short sum.
+
+    Of each edge of each cell its `lens`, what is `beyond` it (as of `gs_jax.layouts.cells.Edges`), and the edges
+    `before` and `after` it, counterclockwise. It holds while cells keep their neighbours: lenses may move a little.
+    """
+
+    lens: Int[Array, " edge"]
+    beyond: Int[Array, " edge"]
+    before: Int[Array, " edge"]
+    after: Int[Array, " edge"]
+
+
+def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cells:
+    """The cells of lenses on a plate. Host code."""
+    edges = cell_edges(centers, size)
+    x, y = (edges.start + edges.end).T
+    order = np.lexsort((np.arctan2(y, x), edges.lens))
+    lens, count = edges.lens[order], len(order)
+    first, last = (np.searchsorted(lens, lens, side) for side in ("left", "right"))
+    here = np.arange(count)
+    before, after = np.where(here == first, last, here) - 1, np.where(here + 1 == last, first, here + 1)
+    return Cells(*(jnp.asarray(part) for part in (lens, edges.beyond[order], before, after)))
+
+
+def clear_diameter(array: MicrolensArray, *, cells: Cells | None = None, directions: int = 512) -> Float[Array, ""]:
+    """Diameter of the disc whose area is the mean clear aperture of the lenses, mm.
+
+    Parameters
+    ----------
+    cells
+        Of the lenses, if they are alike and stay about where they are: a hundred times faster.
+    directions
+        As of `aperture_area`.
+    """
+    return jnp.sqrt(4 / math.pi * _mean_area(directions, array, cells))
+
+
+# One number of many: by a reverse pass all derivatives cost as much as one, and whatever asks for them again computes
+# the same, which XLA sees.
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _mean_area(directions: int, array: MicrolensArray, cells: Cells | None):
+    if cells is None:
+        return jnp.mean(aperture_area(array, directions=directions))
+    return _area_of_cells(array, cells) / len(array.centers)
+
+
+@_mean_area.defjvp
+def _(directions, primals, tangents):
+    (array, cells), (changes, _) = primals, tangents
+    area, slopes = jax.value_and_grad(lambda array: _mean_area.fun(directions, array, cells))(array)
+    pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(changes), strict=True)
+    return area, sum(jnp.vdot(slope, change) for slope, change in pairs)
+
+
+def _area_of_cells(array: MicrolensArray, cells: Cells):
+    """Of all lenses."""
+    centers = array.centers
+    sides = jnp.array([[-1, 0], [1, 0], [0, -1], [0, 1]], centers.dtype)
+    half = jnp.repeat(jnp.array(array.size, centers.dtype) / 2, 2)
+    side = jnp.maximum(cells.beyond - len(centers), 0)
+    own = centers[cells.lens]
+    halfway, away = _bisectors(centers[jnp.minimum(cells.beyond, len(centers) - 1)] - own, array.aperture_diameter)
+    ends = cells.beyond >= len(centers)
+    normal = jnp.where(ends[:, None], sides[side], halfway)
+    height = jnp.where(ends, half[side] - jnp.sum(sides[side] * own, 1), away)
+
+    def crossing(edge):
+        cos = jnp.sum(normal * normal[edge], 1)
+        sin = normal[:, 0] * normal[edge, 1] - normal[:, 1] * normal[edge, 0]
+        return (height[edge] - height * cos) / sin
+
+    radius = array.aperture_diameter / 2
+    ends = wedge(crossing(cells.after), height, radius) - wedge(crossing(cells.before), height, radius)
+    return jnp.sum(ends)
 
 
 @jax.jit

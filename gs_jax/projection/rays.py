@@ -18,8 +18,8 @@ from ..voxels import Grid
 # Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
 # where the envelope and all its derivatives vanish.
 _OUTSIDE = 1e8
-# Neighbouring lenses read neighbouring pixels: in bands of this height (mm) the cache is used best.
-_BAND = 1.5
+# Neighbouring lenses read neighbouring pixels: in bands of this height (in field radii) the cache is used best.
+_BAND = 0.5
 
 
 class Axis(NamedTuple):
@@ -86,7 +86,7 @@ def trace(
     """
     if parameters is None:
         parameters = imager.reduced_depth(grid.depths)[:, None]
-    order = _snake(imager.centers)
+    order = _snake(imager.centers, _BAND * imager.field_radius)
     magnification = imager.magnifications(grid.depths)
     magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
@@ -148,8 +148,8 @@ def _minus_multiple(x: Float[Array, "..."], count: Float[Array, "..."], step: fl
     return (x - count * high) - count * (step - high)
 
 
-def _snake(centers: Float[Array, "lens 2"]) -> Int[Array, " lens"]:
-    """Order that runs through the lenses band by band, to and fro."""
+def _snake(centers: Float[Array, "lens 2"], height: float) -> Int[Array, " lens"]:
+    """Order that runs through the lenses band by band of a height, mm, to and fro."""
     x, y = jax.lax.stop_gradient(centers).T
-    band = jnp.floor(y / _BAND)
+    band = jnp.floor(y / height)
     return jnp.lexsort((jnp.where(band % 2 == 0, x, -x), band))
