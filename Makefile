@@ -2,11 +2,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
-# A file of tests stays in one process: its tests share what they compiled.
-PARALLEL := -n auto --maxprocesses 4 --dist loadfile
+# What one process compiled, the others read from the cache.
+PARALLEL := -n auto --maxprocesses 4 --dist worksteal
 # About a minute of what other versions of Python, JAX and the libraries may break, compiled as users compile it.
 # Libraries older or newer than the others warn of each other.
-SHORT := -n auto --maxprocesses 4 --dist loadfile -o filterwarnings=default \
+SHORT := $(PARALLEL) -o filterwarnings=default -m "not slow" \
 	$(addprefix tests/test_,imports.py primitive.py native.py operators.py shipped_capture.py solve.py files.py mold_files.py) \
 	tests/test_solvers.py::test_it_finds_two_bright_voxels
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
@@ -16,7 +16,7 @@ NEWEST := .venv-newest/bin/python
 # Ray-traced captures, if they are at hand.
 DATA ?= $(wildcard ../shared/data/oracle/dev)
 
-.PHONY: demo test test-all test-napari test-lowest test-newest lint figures docs dist
+.PHONY: demo test integration test-all test-napari test-lowest test-newest lint figures docs dist
 .DELETE_ON_ERROR:
 
 demo: .venv/core
@@ -28,8 +28,12 @@ figures: .venv/dev
 test: .venv/dev
 	$(BIN)/python -m pytest $(PARALLEL)
 
+# What is slow by nature: other processes, browsers, the README, tutorials, experiments, all of the matrix of features.
+integration: .venv/dev
+	$(BIN)/python -m pytest $(PARALLEL) -m "integration and not slow"
+
 test-all: .venv/dev
-	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest $(PARALLEL) -m ""
+	EXAMPLES=all JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest $(PARALLEL) -m ""
 
 # Half a gigabyte of napari and Qt, in an environment of their own.
 test-napari: .venv-napari/test

@@ -1,5 +1,6 @@
 """A small scene and slow, literal references."""
 
+import os
 from pathlib import Path
 
 import jax
@@ -32,6 +33,11 @@ SOURCES = {
     "oracle": "whole captures by the ray tracer of tests/data",
     "diffusercam": "real captures of Waller Lab's DiffuserCam tutorial",
 }
+
+
+def examples(count: int) -> int:
+    """How many examples hypothesis draws: at most 100, but all of them in `make test-all`."""
+    return count if os.environ.get("EXAMPLES") == "all" else min(count, 100)
 
 
 def needs(path: str) -> Path:

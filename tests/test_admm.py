@@ -105,6 +105,7 @@ def test_the_cost_is_that_of_a_plain_numpy_version():
     np.testing.assert_allclose(found.x.sum(), x.sum(), rtol=1e-6)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("depths", [1, 2])
 def test_ffts_conjugate_gradients_and_fista_meet(depths):
     """Sparsity alone, which all three can."""
@@ -125,6 +126,7 @@ def minimum(depths, isotropic):
     return jax.jit(lambda b: solve(convolution, b, solver))(image)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("isotropic", [False, True])
 @pytest.mark.parametrize("depths", [1, 2])
 def test_total_variation_is_at_its_minimum(isotropic, depths):
@@ -161,6 +163,7 @@ def test_the_penalty_finds_its_way_and_the_residuals_stop_it():
         np.testing.assert_allclose(cost, found.costs[found.steps - 1] / scale**2, rtol=1e-3)
 
 
+@pytest.mark.integration
 def test_gradients():
     convolution, image = system()
     psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))

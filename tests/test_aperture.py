@@ -140,6 +140,7 @@ def test_pitch_of_one_lens_and_of_coincident_lenses():
     assert jnp.all(jax.grad(lambda c: sum(pitch(c)))(jnp.zeros((3, 2))) == 0)
 
 
+@pytest.mark.integration
 def test_memory_of_a_thousand_lenses():
     """What XLA plans to allocate, for the gradient too."""
     lenses = array(layout(1000, (44.0, 44.0)), (44.0, 44.0))

@@ -77,6 +77,7 @@ def test_adjoint_over_several_blocks_and_the_sensors_edge():
     )
 
 
+@pytest.mark.integration
 def test_adjoint_matches_the_transpose_of_a_plain_jax_version():
     """Dense and slow, through `project`: what JAX derives by itself."""
     imager, grid = scene(voxels=(9, 8), pitch=0.1)
@@ -141,6 +142,7 @@ def test_gradient_of_the_normalized_volume():
     check_grads(values, (imager,), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("normalize", [False, True])
 def test_gradients_stay_finite_in_the_dark_and_where_nothing_is_seen(normalize):
     imager, grid = scene()
@@ -152,6 +154,7 @@ def test_gradients_stay_finite_in_the_dark_and_where_nothing_is_seen(normalize):
         assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.integration
 def test_vmap_over_images_and_over_imagers():
     imager, grid = scene()
     images = jnp.stack([image_of(imager.sensor, key=k) for k in range(3)])
@@ -206,6 +209,7 @@ def test_a_changed_distance_does_not_recompile():
     assert len(traces) == 1
 
 
+@pytest.mark.integration
 def test_memory_is_image_and_volume_and_a_small_constant():
     """What XLA itself plans to allocate, at full scale."""
     centers = np.random.default_rng(0).uniform(-10, 10, (213, 2))

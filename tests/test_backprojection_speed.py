@@ -16,6 +16,8 @@ from gs_jax.geometry import field_limit
 
 from .helpers import scene
 
+pytestmark = pytest.mark.integration
+
 # Rotated lenses, rays that miss the sensor, voxels of all sizes.
 SCENES: tuple[dict[str, Any], ...] = (dict(), dict(voxels=(40, 33), pitch=0.006), dict(voxels=(9, 8), pitch=0.21))
 

@@ -12,6 +12,8 @@ from gs_jax.benchmark.scenes import Case, bench, peaks, scores, spots
 
 from .helpers import scene
 
+pytestmark = pytest.mark.integration
+
 KEYS = {"method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"}
 
 

@@ -186,6 +186,7 @@ def test_one_capture_does():
 MANY = np.array([[x, y, z] for z in (18.0, 20.0, 22.0) for x, y in ((-1.2, 0.3), (1.1, 0.8), (0.1, -1.0))])
 
 
+@pytest.mark.integration
 def test_several_sources_in_a_capture_and_some_places_unknown():
     actual, design, _ = device(5)
     given, of = MANY.copy(), [0, 1, 2, 0, 1, 2, 0, 1, 2]
@@ -199,6 +200,7 @@ def test_several_sources_in_a_capture_and_some_places_unknown():
     assert np.abs(found.sources.points - MANY)[:, :2].max() < 5e-3 and len(found.residuals) > 60
 
 
+@pytest.mark.integration
 def test_two_sources_of_one_depth_are_told_apart():
     """Both unknown in the plane, in one capture; a known one is in another."""
     actual, design, _ = device(5)
@@ -213,6 +215,7 @@ def test_two_sources_of_one_depth_are_told_apart():
     np.testing.assert_allclose(places, true[1:], atol=5e-3)
 
 
+@pytest.mark.integration
 def test_places_unknown_in_the_plane():
     """The shift is the design's: any other shows the same spots, from sources that are displaced."""
     actual, design, _ = device(6)
@@ -223,6 +226,7 @@ def test_places_unknown_in_the_plane():
     np.testing.assert_allclose(found.sources.points, POINTS, atol=5e-3)
 
 
+@pytest.mark.integration
 def test_scale_offset_and_each_lens():
     actual, design, _ = device(7)
     moves = np.random.default_rng(0).normal(0, 0.008, design.array.centers.shape)
@@ -234,6 +238,7 @@ def test_scale_offset_and_each_lens():
     assert np.sqrt((away**2).mean()) < 0.001 and found.rms < 0.1
 
 
+@pytest.mark.integration
 def test_lenses_of_no_list_are_found():
     actual, design, _ = device(5)
     design = eqx.tree_at(lambda i: i.array.centers, design, 1.7 * design.array.centers[::-1])
@@ -256,6 +261,7 @@ def test_lenses_of_no_list_are_where_they_are_without_the_designs_tilt():
     assert start.tilt is None and np.max(away) < 0.01
 
 
+@pytest.mark.integration
 def test_a_scene_that_nobody_knows():
     actual, design, mirrored = device(4)
     assert not mirrored
@@ -342,6 +348,7 @@ def test_the_command_knows_what_can_be_fitted():
     assert tuple(name.replace("-", "_") for name in _NAMES) == FITTABLE
 
 
+@pytest.mark.integration
 def test_the_command(tmp_path):
     """With a small design, whose array is mirrored and turned in the captures."""
     actual, design, mirrored = device(2)

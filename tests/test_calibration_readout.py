@@ -12,6 +12,7 @@ from gs_jax.io.readout import Readout
 from .test_calibration import POINTS, captures
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_region_calibrates_the_whole(binning):
     actual, design, _ = device(0)

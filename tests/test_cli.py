@@ -69,6 +69,7 @@ def test_reconstruct(folder, monkeypatch, capsys, name):
     assert sorted(p.name for p in folder.iterdir()) == ["capture.tif", "design.toml", name]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("how", [("--method", "list-rl"), ("--method", "richardson-lucy"), ("--suppress", "unet")])
 def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
     tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
@@ -97,6 +98,7 @@ def test_the_papers_clusters(folder, monkeypatch, capsys):
     assert volume.sum() == pytest.approx(found[:, 3].sum(), rel=1e-5)
 
 
+@pytest.mark.integration
 def test_points_of_a_capture(folder, monkeypatch, capsys):
     design = DESIGN.replace("[96, 80]", "[480, 400]").replace("_um = 20.0", "_um = 4.5")
     (folder / "design.toml").write_text(design)
@@ -172,6 +174,7 @@ def test_a_negative_voxel_names_the_file(folder, monkeypatch, capsys):
     assert (status, err) == (2, "gs-jax: scene.ome.tif: found a voxel of -1, allowed: 0 or more.\n")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("optics", [(), ("--optics", "near", "--psf", "gaussian")], ids=["full", "near"])
 def test_simulate_a_volume_and_reconstruct_it(optics, folder, monkeypatch, capsys):
     grid = Grid([19.0, 20.0, 21.0], (9, 9), 0.05)
@@ -313,6 +316,7 @@ def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
     assert not (folder / "v.tif").exists()
 
 
+@pytest.mark.integration
 def test_as_a_process(folder):
     """The real thing: quiet in a pipe, status 2 and one line for a wrong design."""
     command = [sys.executable, "-m", "gs_jax", *RECONSTRUCT, "-o", "v.ome.tif"]
@@ -324,6 +328,7 @@ def test_as_a_process(folder):
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
+@pytest.mark.integration
 def test_a_ray_traced_capture_to_a_volume_to_scale(tmp_path, monkeypatch, capsys):
     """The first milestone: the point within 20 um laterally and 100 um axially, in a file to scale."""
     capture, design = needs("oracle/dev/P1_a.tif"), needs("oracle/dev/P1.toml")

@@ -115,6 +115,7 @@ def test_where_lenses_overlap_they_end_as_those_of_the_file():
     np.testing.assert_allclose(found.clear_diameter, clear_diameter(array), rtol=1e-3)
 
 
+@pytest.mark.integration
 def test_terms_of_kinds_that_are_alike_are_those_of_one():
     """The same lenses, counted as one kind and as two."""
     one = parent_of(conics(), depths_mm=(15.0, 30.0), depth_count=3)
@@ -156,6 +157,7 @@ def test_webs_are_between_apertures_of_their_own_size():
     np.testing.assert_allclose(TERMS["web_mm"].function(found), least, rtol=1e-12)
 
 
+@pytest.mark.integration
 def test_gradients():
     """By what is free of each kind, apart and where discs overlap; every entry, so that ties do not matter."""
     _, parent = two_kinds()
@@ -169,6 +171,7 @@ def test_gradients():
     check_grads(light, (values,), order=1, modes=["rev"], eps=1e-7, atol=1e-3, rtol=1e-3)
 
 
+@pytest.mark.integration
 def test_one_kind_is_as_before():
     """`kinds = 1` changes nothing, to the last digit."""
     few = {"stages": [{"solver": "lbfgsb", "steps": 3}], "terms": [{"name": "psf_width_um", "minimise": 100.0}]}
@@ -184,6 +187,7 @@ def searches():
     return one, optimize(one.design, study(free=free, kinds=2))
 
 
+@pytest.mark.integration
 def test_two_foci_are_better_over_a_long_span(searches):
     """Than the start, and than the single kind, by 2 dB."""
     one, two = searches

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.designs.design import Design, read_design, write_design
 
-from .helpers import needs
+from .helpers import examples, needs
 
 BASE = {
     "name": "small",
@@ -356,7 +356,7 @@ def parses_or_refuses(path):
         assert isinstance(design, Design) and design.imager().centers.shape[1] == 2
 
 
-FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=examples(150), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FUZZ

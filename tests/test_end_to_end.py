@@ -179,6 +179,7 @@ def slopes(centers, imager, key, grid, psf):
     return jax.value_and_grad(lambda c: reconstruction_loss(moved(c), key, grid=grid, psf=psf, **options))(centers)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("place", [0.0, 30.0], ids=["coincident", "out of sight"])
 def test_gradients_are_finite(place):
     imager, grid = scene()

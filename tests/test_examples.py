@@ -10,6 +10,8 @@ import pytest
 
 import gs_jax as gs
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[1]
 NAMES = [name for name in gs.__all__ if not name.startswith("_")]
 SLOW = {"calibrate", "Unrolled"}

@@ -14,6 +14,8 @@ from experiments import table1
 from experiments.common import Report, main, table, write
 from gs_jax.base.progress import Progress
 
+pytestmark = pytest.mark.integration
+
 SCRIPTS = [
     path.stem
     for path in sorted(Path(table1.__file__).parent.glob("*.py"))

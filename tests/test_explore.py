@@ -207,6 +207,7 @@ def test_what_is_no_question_is_said(server, body):
     assert status == 200 and "allowed" in json.loads(text)["error"] and not list(folder.glob("*bad*"))
 
 
+@pytest.mark.integration
 def test_a_browser_moves_it(server, browser):
     """Each slider changes something; kept designs come back; what is saved is a new file each time."""
     from playwright.sync_api import expect
@@ -245,6 +246,7 @@ def test_it_is_no_wider_than_the_screen(server, browser, width):
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.integration
 def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "design.toml").write_text(DESIGN)

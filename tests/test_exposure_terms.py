@@ -63,6 +63,7 @@ def test_transfer_of_an_ideal_lens(off):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3 if off else 0)
 
 
+@pytest.mark.integration
 def test_a_lens_and_a_plane_are_wieners_filter():
     """One plane under one lens: 1 / (1 + S H^2 L^2 M^2 w / n), over the object's frequencies."""
     c = candidate(parent(((0.0, 0.0),), exposure=300.0), {})
@@ -129,6 +130,7 @@ def test_spots_have_the_transfer_function():
     np.testing.assert_allclose(seen, np.sqrt(power), atol=0.03)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 def test_gradients(orientation):
     """By everything that shapes a lens, and by the lenses' places, some of which are too far away to see the object."""

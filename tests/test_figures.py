@@ -15,6 +15,8 @@ from gs_jax.designs.design import read_design
 
 from .helpers import needs
 
+pytestmark = pytest.mark.integration
+
 
 def test_the_width_of_a_gaussian_and_the_dip_of_two():
     x = np.linspace(-5, 5, 401)

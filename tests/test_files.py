@@ -27,7 +27,7 @@ from gs_jax.io.disk import atomic_write, check_output, read_table, write_json
 from gs_jax.io.points import POINTS_HEADER, read_points, write_points
 from gs_jax.io.volumes import read_volume, write_volume
 
-from .helpers import needs
+from .helpers import examples, needs
 
 GREY = np.arange(30, dtype=np.uint16).reshape(5, 6) * 2000
 GRID = Grid([18.0, 18.1, 18.2], (5, 6), 0.0123)
@@ -248,7 +248,7 @@ def test_wrong_points(tmp_path, name):
 
 FLOATS = st.floats(-1e4, 1e4)
 ROWS = st.lists(st.tuples(FLOATS, FLOATS, st.floats(1e-3, 1e4), st.floats(0, 1e300)), max_size=4)
-FUZZ = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=examples(120), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FUZZ
@@ -816,7 +816,7 @@ def valid(tmp_path_factory):
     return valid_files(tmp_path_factory.mktemp("valid"))
 
 
-@settings(parent=FUZZ, max_examples=600)
+@settings(parent=FUZZ, max_examples=examples(600))
 @given(data=st.data())
 def test_mutated_files(tmp_path, valid, data):
     read, name, content = data.draw(st.sampled_from(valid))

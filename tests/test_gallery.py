@@ -10,6 +10,8 @@ from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
 
+pytestmark = pytest.mark.integration
+
 
 def test_the_target_is_that_of_the_standard():
     elements = {(e.group, e.number): e for e in fig6_usaf.target()}

@@ -33,6 +33,7 @@ def differing(scope: Imager, radii=RADII, **numbers) -> Imager:
     return eqx.tree_at(lambda i: i.array, scope, dataclasses.replace(array, **numbers))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("level", ["near", "full"])
 def test_the_adjoint_is_exact(level):
     scope, voxels = differing(imager()), grid(shape=(7, 6))
@@ -81,6 +82,7 @@ def test_a_sharp_lens_counts_more():
     np.testing.assert_allclose(np.array([5, 4]) @ weights / 9, 1)
 
 
+@pytest.mark.integration
 def test_back_projection_adds_kinds_by_weight():
     scope, voxels = differing(imager()), grid(shape=(7, 6))
     image = np.asarray(simulate(np.array([[0.2, -0.1, 20.0, 1.0]]), scope))
@@ -95,6 +97,7 @@ def test_back_projection_adds_kinds_by_weight():
         reconstruct(image, scope, voxels, ListRichardsonLucy())
 
 
+@pytest.mark.integration
 def test_points_of_lenses_with_several_apertures():
     """Ideal lenses, a third of them wider: the points that are there, and nothing else."""
     scope, voxels = small()

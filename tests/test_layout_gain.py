@@ -7,6 +7,8 @@ from experiments.layout_scenes import METHODS, Study
 from gs_jax.base.progress import Progress
 from gs_jax.layouts.cells import nearest_neighbour_distances
 
+pytestmark = pytest.mark.integration
+
 ROOMY = Study(plate=(5.0, 5.0), distance=1.0)
 
 

@@ -3,6 +3,8 @@ import pytest
 from experiments.layout_light import LENSES, layouts, run
 from gs_jax.base.progress import Progress
 
+pytestmark = pytest.mark.integration
+
 
 def test_all_layouts_have_as_many_lenses():
     assert {centers.shape for centers in layouts().values()} == {(LENSES, 2)}

@@ -70,6 +70,7 @@ def many() -> np.ndarray:
 LATERAL, AXIAL = 0.01, 0.1
 
 
+@pytest.mark.integration
 def test_points_are_found_placed_and_measured():
     truth = many()
     image = image_of(truth)
@@ -153,6 +154,7 @@ def test_a_spot_that_is_a_ring_is_one_point():
     assert len(found) == 10 and localization(found, truth).f1 == 1
 
 
+@pytest.mark.integration
 def test_what_only_half_of_the_lenses_see_is_a_ghost():
     """Spots of the left lenses of one point and of the right lenses of another: one half of each is taken away."""
     imager, grid = small()
@@ -182,6 +184,7 @@ def test_two_lenses_may_be_blocked():
     assert score.f1 == 1 and score.lateral_rmse < LATERAL
 
 
+@pytest.mark.integration
 def test_the_voxels_do_not_matter_and_the_box_does():
     capture, truth = capture_of(many()), many()
     _, grid = small()

@@ -11,6 +11,8 @@ from gs_jax import random_layout
 from gs_jax.base.progress import Progress
 from gs_jax.layouts.dealing import dealt
 
+pytestmark = pytest.mark.integration
+
 
 def test_neighbours_are_of_other_kinds():
     centers = np.asarray(random_layout(200, (17.1, 17.1), pitch=1.05, pitch_sd=0.08, seed=1))

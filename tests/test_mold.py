@@ -191,6 +191,7 @@ def test_lenses_in_float32_are_sound():
         assert_sound(random_lenses())
 
 
+@pytest.mark.integration
 def test_the_paper_s_array():
     array = read_design(needs("oracle/dev/P1.toml")).imager().array
     mesh = assert_sound(array, chord=5e-4)

@@ -153,6 +153,7 @@ def test_molds_of_unequal_lenses_are_sound(changes):
     assert_sound(unequal(**changes), shape=MoldShape(shrinkage=0.01, label="x"))
 
 
+@pytest.mark.integration
 @settings(max_examples=8, deadline=None)
 @given(
     count=st.integers(1, 12),

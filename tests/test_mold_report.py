@@ -224,6 +224,7 @@ def test_layers_are_compared_with_the_lenses():
     assert "print layers of 0.3 um" in coarse.text
 
 
+@pytest.mark.integration
 def test_the_defaults_do_not_warn_of_themselves(tmp_path):
     report = make_mold(geomscope(), tmp_path / "m.stl")
     found = {finding["check"]: finding["level"] for finding in report["checks"]}

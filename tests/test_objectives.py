@@ -46,6 +46,7 @@ def terms(focused):
     return everything(focused)
 
 
+@pytest.mark.integration
 def test_the_papers_metrics_are_those_of_the_datasheet(design, focused, terms):
     """The same formulas by two ways: six digits are what a datasheet has."""
     sheet = datasheet(design, focused.depths.tolist(), confusion=0.018)
@@ -205,6 +206,7 @@ def test_gradients_are_finite_where_lenses_coincide_and_rays_are_lost():
     assert [name for name in CONTINUOUS if not finite(name)] == []
 
 
+@pytest.mark.integration
 def test_in_single_precision(focused):
     low = lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
     single, double = everything(jax.tree.map(low, focused)), everything(focused)

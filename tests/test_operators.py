@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import pytest
 
 from gs_jax import backproject, backproject_adjoint, forward_operator
 
@@ -19,6 +20,7 @@ def test_transpose_is_backprojection():
     np.testing.assert_array_equal(operator.T.T.mv(volume), operator.mv(volume))
 
 
+@pytest.mark.integration
 def test_it_composes_and_solves():
     """Regularised least squares by conjugate gradients, as ADMM will do, against the dense solution."""
     imager, grid = scene(voxels=(5, 4), pitch=0.2, depths=(20.0,))

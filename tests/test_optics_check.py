@@ -7,6 +7,7 @@ from gs_jax import Imager, MicrolensArray, Sensor
 from .helpers import needs
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("field", [0.0, 3.0])
 def test_optiland_has_the_same_rays(field):
     """Off the paper's lens too; a pupil that reaches to 1 mm."""
@@ -42,6 +43,7 @@ def test_strehl_ratio_beside_huygens_sum_over_optilands_rays():
     assert len(curves(result).axes) == 4
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("design", "place", "size_tolerance"), [("P1", "core_px", 0.15), ("P2", "centroid_px", 0.02)])
 def test_ray_traced_spots_are_where_we_say_and_as_large(design, place, size_tolerance):
     """In focus the core, out of focus the whole disc: much of a halo is below a count of the camera."""
@@ -55,6 +57,7 @@ def test_ray_traced_spots_are_where_we_say_and_as_large(design, place, size_tole
     assert found["light_over_area_and_envelope_relative_sd"] < 0.03
 
 
+@pytest.mark.integration
 def test_equation_9_breaks_down():
     small, large = breakdown(radii=(0.4, 0.65))
     # Up to 0.1 waves it leaves out 2 %; at 0.3 it is not even the right size.

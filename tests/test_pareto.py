@@ -95,6 +95,7 @@ SPLIT = STUDY | {
 }
 
 
+@pytest.mark.integration
 def test_stages_keep_what_the_one_before_found():
     """Stages that free different parameters; each search ends where `optimize` does with the same limit."""
     start = geomscope(sensor_distance_mm=4.0)

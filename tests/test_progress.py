@@ -140,6 +140,7 @@ def test_the_terminal_announces_it_too(monkeypatch, capsys):
     assert "Imaging: about" in capsys.readouterr().err
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("method", ["list-rl", "admm"])
 def test_the_memory_that_is_announced_is_what_is_taken(folder, method):
     """By the kernel's count at the end, within a factor of two; and the voxels named are twice as wide."""

@@ -195,12 +195,14 @@ def test_more_samples_change_little(v, size, samples):
     assert float(jnp.abs(image - finer).sum()) < 0.03
 
 
+@pytest.mark.integration
 def test_depths_map():
     depths = jnp.array([18.0, 20.0])
     one = lambda z: diffraction_psf(unit(), z, size=33, radius=RADIUS)
     np.testing.assert_allclose(jax.vmap(one)(depths)[1], one(20.0), atol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", SLOW_FIRST)
 def test_gradients(kind):
     smooth = jnp.cos(jnp.arange(17.0) / 5)

@@ -1,7 +1,11 @@
+import pytest
+
 from experiments.ray_traced_captures import run
 from gs_jax.base.progress import Progress
 
 from .helpers import needs
+
+pytestmark = pytest.mark.integration
 
 
 def test_every_one_of_120_ray_traced_points_is_a_peak():

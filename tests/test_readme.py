@@ -3,7 +3,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from .helpers import design_and_capture
+
+pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[1]
 

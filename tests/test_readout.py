@@ -89,6 +89,7 @@ def test_back_projection_of_a_region_is_that_of_the_whole_without_the_rest(metho
     np.testing.assert_allclose(seen, backproject(lit, imager, grid, method=method), atol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("level", ["pinhole", "near"])
 def test_the_image_on_a_region_is_the_region_of_the_image(level):
     imager, grid = scene()
@@ -102,6 +103,7 @@ def test_the_image_on_a_region_is_the_region_of_the_image(level):
     np.testing.assert_allclose(seen[edge], whole[edge], atol=1e-9 * whole.max())
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("level", ["pinhole", "full"])
 def test_an_origin_moves_the_frame_and_nothing_else(level):
     """The chief-ray map does not mind where the origin is; of "full", coarse pixels lie on the region."""

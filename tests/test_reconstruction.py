@@ -57,6 +57,7 @@ class Log(Progress):
         yield advance
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
     """The second call compiles nothing, with another image and for another number of steps, too."""
@@ -131,6 +132,7 @@ def test_back_projection_has_its_options_and_all_its_planes():
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.integration
 def test_the_near_psf_is_that_of_the_rays():
     imager, grid, _, _, image = small()
     kernel = psf_of_depth(imager, np.asarray(grid.depths), "geometric")

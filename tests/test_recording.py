@@ -89,6 +89,7 @@ def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name
     assert read_provenance("v.zarr")[f"input {os.path.basename(name)}"].startswith("5 frames")
 
 
+@pytest.mark.integration
 def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
     """With a correction, which is read once, and an iterative method."""
     save("rec.tif")
@@ -159,6 +160,7 @@ def test_odd_ends_are_means_of_what_is_there():
     np.testing.assert_allclose(halved(volume), [[[3, 5, 6.5], [10.5, 12.5, 14]]])
 
 
+@pytest.mark.integration
 def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, capsys):
     frames = np.random.default_rng(1).integers(100, 3000, (60, 96, 80)).astype(np.uint16)
     save("rec.tif", frames)
@@ -189,6 +191,7 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(folder, monkeypatch, c
     np.testing.assert_allclose(volumes(), volumes("w.zarr"), rtol=1e-4)
 
 
+@pytest.mark.integration
 def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, capsys):
     save("frames")
     good = (folder / "frames" / "f10.tif").read_bytes()
@@ -216,6 +219,7 @@ def test_where_no_frame_is_good_nothing_is_written(folder, monkeypatch, capsys):
     assert status == 2 and "found 50 x 80 pixels" in err and not (folder / "v.zarr").exists()
 
 
+@pytest.mark.integration
 def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
     save("frames")
     (folder / "frames" / "f10.tif").write_bytes(b"II*\0")

@@ -276,6 +276,7 @@ def test_charts_draw_what_is_finite():
         assert "nan" not in line_chart({"a": ([1.0], [2.0])}, x="x", y="y", title="t", log=log)
 
 
+@pytest.mark.integration
 def test_thinning_is_the_mean_of_squares():
     image = np.arange(36.0).reshape(6, 6)
     np.testing.assert_allclose(thinned(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))

@@ -5,9 +5,12 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from .test_cli import folder
 from .test_recording import FRAMES, command, save, volumes
+
+pytestmark = pytest.mark.integration
 
 __all__ = ["folder"]
 

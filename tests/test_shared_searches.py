@@ -20,6 +20,8 @@ from .test_training import TINY
 from .test_unrolled import TINY as TINY_UNROLLED
 from .test_workers import two
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["two"]
 
 SEVERAL = Study.model_validate(

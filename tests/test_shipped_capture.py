@@ -13,6 +13,8 @@ from gs_jax.suppression.locate import find_points
 
 from .helpers import CAPTURES
 
+pytestmark = pytest.mark.integration
+
 BLACK = 16  # The camera's value in the dark.
 
 

@@ -16,6 +16,7 @@ def imager(sensor_distance=5.8, pixel=0.01):
     return Imager(array, Sensor((96, 80), pixel), sensor_distance, 0.6)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", PSFS)
 def test_a_point_is_a_small_voxel(kind):
     out_of_focus = imager(sensor_distance=4.8)  # a pixel is small beside the blur

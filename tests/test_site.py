@@ -60,6 +60,7 @@ def test_commands_exist_with_their_options(path):
         assert {word for word in rest if word.startswith("-")} <= known, line
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["gradients", "solver"])
 def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

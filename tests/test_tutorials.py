@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
 # Constants at the top of each, and what they are here.
 TOY = {

@@ -2,9 +2,12 @@
 
 import jax
 import numpy as np
+import pytest
 
 from experiments.two_step_variants import COUNT, SIZE, Gated, Stack, batch, channels, cleaned
 from gs_jax.suppression.unet import multislice_network
+
+pytestmark = pytest.mark.integration
 
 
 def stack() -> Stack:

@@ -21,6 +21,8 @@ from gs_jax.io.volume_series import JOURNAL
 from .test_cli import folder, run
 from .test_recording import FRAMES, command, files, save, volumes
 
+pytestmark = pytest.mark.integration
+
 __all__ = ["folder"]
 
 distributed = pytest.importorskip("distributed", reason="needs pip install 'gs-jax[cluster]'")
