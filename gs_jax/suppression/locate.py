@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Float32, Float64, Shaped
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
+from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
@@ -106,7 +107,7 @@ def find_points(
     ValueError
         If the image is not `sensor.shape`.
     InputError
-        If a pixel is not finite.
+        If a pixel is not finite, or there are fewer than three lenses, which cannot agree on a point.
 
     Examples
     --------
@@ -122,6 +123,9 @@ def find_points(
     """
     progress = progress or Progress()
     seen = image if isinstance(image, Signal) else signal(image)
+    if (lenses := len(imager.array.centers)) < _FEWEST:
+        found = f"{lenses} lens" if lenses == 1 else f"{lenses} lenses"
+        raise InputError(f"points: found {found}, allowed: {_FEWEST} lenses or more, which have to agree on a point.")
     if seen.light.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {seen.light.shape}.")
     depths = _around(grid)
