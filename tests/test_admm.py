@@ -119,6 +119,27 @@ def test_ffts_conjugate_gradients_and_fista_meet(depths):
     np.testing.assert_allclose(costs, costs[-1], rtol=1e-8)
 
 
+@pytest.mark.parametrize("tv", [0.0, 0.01])
+def test_few_applications_of_the_operator_reach_the_minimum(tv):
+    """Fewer equations than unknowns, as of a volume. FISTA's power method is not counted."""
+    A = lx.MatrixLinearOperator(jax.random.uniform(jax.random.key(0), (60, 120)))
+    scene = jnp.zeros(120).at[jnp.array([3, 20, 21, 50])].set(1.0)
+    image = A.mv(scene) + 0.05 * jax.random.normal(jax.random.key(1), (60,))
+    unit = A.T.mv(image).max()
+
+    def final(solver):
+        x = jax.jit(lambda b: solve(A, b, solver).x)(image)
+        residual = A.mv(x) - image
+        variation = total_variation(differences(x, wrap=False), isotropic=False)
+        return float(jnp.vdot(residual, residual) / 2 + unit * (tv * variation + 0.01 * jnp.sum(x)))
+
+    found, least = (final(ADMM(steps, sparsity=0.01, tv=tv)) for steps in (20, 2000))
+    assert found < 1.03 * least
+    if not tv:
+        assert found < 0.8 * final(FISTA(60, sparsity=0.01))
+        np.testing.assert_allclose(least, final(FISTA(2000, sparsity=0.01)), rtol=1e-6)
+
+
 @cache
 def minimum(depths, isotropic):
     convolution, image = system(depths)

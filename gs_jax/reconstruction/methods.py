@@ -91,13 +91,13 @@ _LUCY = {"accelerate": True, "tents": TENTS, "least_seen": 0.3}
 
 Method = BackProjection | ListRichardsonLucy | Solver
 
-# By the name that the command line and the benchmark know it by: from the number of steps to the method. A step of
-# ADMM holds few conjugate gradients, as each starts from the last; unrolled steps are as many as were trained.
+# By the name that the command line and the benchmark know it by: from the number of steps to the method. Unrolled
+# steps are as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
     "list-rl": lambda steps: ListRichardsonLucy(steps, **_LUCY),
     "richardson-lucy": lambda steps: RichardsonLucy(steps, **_LUCY),
     "fista": FISTA,
-    "admm": lambda steps: ADMM(steps, cg_steps=3),
+    "admm": ADMM,
     "unrolled": lambda steps: Unrolled.pretrained(),
 }

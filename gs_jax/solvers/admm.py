@@ -6,7 +6,8 @@ It minimises
 
 by the alternating direction method of multipliers (Boyd et al., Found. Trends Mach. Learn. 3, 1, 2011). `x` is split
 from its differences `D x` and from its copy that is not negative; the x-step is a linear system, `A'A + rho (D'D + 1)`,
-solved by a few conjugate gradients. `convolution_admm` has the version for convolutions, by FFTs.
+solved by a few conjugate gradients. Without total variation there is no split of the differences, which would only
+hold the steps back. `convolution_admm` has the version for convolutions, by FFTs.
 """
 
 from typing import Any, NamedTuple
@@ -23,9 +24,12 @@ from ..base.safe import Real, divide
 from .iteration import as_image, check_options, least_weight_of_darkness, norm
 from .variation import differences, differences_adjoint, shrink, total_variation
 
-# The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1). Boyd's 10
-# changes it more often; on a measured image both end at the same cost.
-_BALANCE, _FACTOR = 100.0, 2.0
+# The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1), and so often
+# at most: a penalty that stays the same from some step on is what convergence is proven for.
+_BALANCE, _FACTOR, _CHANGES = 10.0, 2.0, 50
+# Over-relaxation (Boyd, section 3.4.3) with conjugate gradients. Measured on images of particles and of letters: with
+# 1.8 the cost after as many steps is below that with 1, and about that with 1.6.
+_RELAXATION = 1.8
 
 
 class Prior(eqx.Module):
@@ -43,8 +47,13 @@ class Prior(eqx.Module):
         tv, l1 = (jnp.asarray(weight, back.dtype) * unit for weight in (solver.tv, solver.sparsity))
         return cls(tv, l1, solver.isotropic, wrap)
 
+    @property
+    def varies(self) -> Float[Array, ""]:
+        """1 with total variation, 0 without: the weight of the differences in the split."""
+        return (self.tv > 0).astype(self.tv.dtype)
+
     def split(self, x):
-        return differences(x, wrap=self.wrap), x
+        return self.varies * differences(x, wrap=self.wrap), x
 
     def adjoint(self, split):
         u, w = split
@@ -60,12 +69,31 @@ class Prior(eqx.Module):
 
 
 class Splitting(NamedTuple):
-    """Scaled ADMM's `x`, its split `z`, the multipliers `u` and the penalty `rho`."""
+    """Scaled ADMM's `x`, its split `z`, the multipliers `u`, the penalty `rho` and how often that may still change."""
 
-    x: Array
+    x: PyTree
     z: PyTree
     u: PyTree
     rho: Array
+    changes: Array
+
+    @classmethod
+    def start(cls, x: PyTree, split: PyTree, rho: Array) -> "Splitting":
+        """From `x = 0` and its split."""
+        return cls(x, split, split, rho, jnp.array(_CHANGES))
+
+
+class Point(NamedTuple):
+    """A volume `x`, `A x` and `A'A x`: kept together, a step of conjugate gradients applies `A` and `A'` once."""
+
+    x: Array
+    image: Array
+    back: Array
+
+    @classmethod
+    def of(cls, A: lx.AbstractLinearOperator, x: Array) -> "Point":
+        image = A.mv(x)
+        return cls(x, image, A.T.mv(image))
 
 
 class State(NamedTuple):
@@ -79,9 +107,12 @@ class State(NamedTuple):
 class ADMM(eqx.Module):
     """ADMM: least squares with total variation and sparsity, not negative, for any operator.
 
-    The x-step is done by conjugate gradients that start from the last x.
-    The residual is the larger of the primal and the dual one, each relative (Boyd, section 3.3). The costs are of the
-    unconstrained part of the split, which may be slightly negative before it has converged; the estimate is not.
+    The x-step is done by conjugate gradients that start from the last x; each applies the operator and its adjoint
+    once, and nothing else does. The steps are over-relaxed, and the penalty adapts: it starts at the mean of the
+    diagonal of `A'A` and is doubled or halved, a bounded number of times, where the primal residual is ten times the
+    dual one or the reverse (Boyd, sections 3.4.1 and 3.4.3). The residual is the larger of the two, each relative
+    (Boyd, section 3.3). The costs are of the unconstrained part of the split, which may be slightly negative before it
+    has converged; the estimate is not.
 
     Parameters
     ----------
@@ -89,11 +120,11 @@ class ADMM(eqx.Module):
         As for `Solver`.
     sparsity, tv
         Weights of the sum of `x` and of its total variation, both in parts of `max(A' image)`: the least weight of the
-        sum that leaves nothing but darkness.
+        sum that leaves nothing but darkness. At `tv=0` the derivative with respect to `tv` is 0.
     isotropic
         Total variation of vectors rather than of each axis.
     cg_steps
-        Of each x-step.
+        Of each x-step. Three give the lowest cost for the same number of applications of the operator, or nearly so.
 
     Raises
     ------
@@ -110,7 +141,7 @@ class ADMM(eqx.Module):
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 19:23, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
-    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.ADMM(steps=5, tv=0.001, cg_steps=3))
+    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
     >>> print(bool(found.x.min() >= 0))
     True
     """
@@ -120,16 +151,18 @@ class ADMM(eqx.Module):
     sparsity: Real | Float[Array, ""] = 0.01
     tv: Real | Float[Array, ""] = 0.0
     isotropic: bool = eqx.field(static=True, default=False)
-    cg_steps: int = eqx.field(static=True, default=10)
+    cg_steps: int = eqx.field(static=True, default=3)
 
     def __check_init__(self):
         check_options(self)
 
     def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
-        back = A.T.mv(as_image(A, image))
+        image = as_image(A, image)
+        back = A.T.mv(image)
         prior = Prior.of(self, back, wrap=False)
         x = jnp.zeros_like(back)
-        return State(Splitting(x, prior.split(x), prior.split(x), _mean_gain(A)), prior, back)
+        dark = Point(x, jnp.zeros_like(image), x)
+        return State(Splitting.start(dark, prior.split(x), _mean_gain(A)), prior, back)
 
     def step(
         self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
@@ -137,23 +170,25 @@ class ADMM(eqx.Module):
         image = as_image(A, image)
         splitting, prior, back = state
 
-        def update(x, target, rho):
-            normal = lambda x: A.T.mv(A.mv(x)) + rho * prior.adjoint(prior.split(x))
-            x = _conjugate_gradients(normal, back + rho * prior.adjoint(target), x, self.cg_steps)
-            return x, prior.split(x)
+        def update(point, target, rho):
+            smooth = lambda x: rho * prior.adjoint(prior.split(x))
+            point = _conjugate_gradients(A, smooth, back + rho * prior.adjoint(target), point, self.cg_steps)
+            return point, prior.split(point.x)
 
-        def cost(x, split):
-            residual = A.mv(x) - image
+        def cost(point, split):
+            residual = point.image - image
             return jnp.vdot(residual, residual) / 2 + prior.cost(split)
 
-        splitting, now, residual = advance(splitting, update, prior.prox, cost)
+        splitting, now, residual = advance(splitting, update, prior.prox, cost, _RELAXATION)
         return State(splitting, prior, back), now, residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.splitting.z[-1]
 
 
-def advance(splitting: Splitting, update, prox, cost) -> tuple[Splitting, Float[Array, ""], Float[Array, ""]]:
+def advance(
+    splitting: Splitting, update, prox, cost, relaxation: float = 1.0
+) -> tuple[Splitting, Float[Array, ""], Float[Array, ""]]:
     """One step of scaled ADMM, its cost and its residual.
 
     Parameters
@@ -164,41 +199,46 @@ def advance(splitting: Splitting, update, prox, cost) -> tuple[Splitting, Float[
         The proximal map of the split, with `rho`.
     cost
         Of `x` and its split.
+    relaxation
+        Between 1 and 2: more than 1 over-relaxes.
     """
     add = lambda a, b: jax.tree.map(jnp.add, a, b)
     subtract = lambda a, b: jax.tree.map(jnp.subtract, a, b)
-    x, z, u, rho = splitting
+    x, z, u, rho, changes = splitting
     x, split = update(x, subtract(z, u), rho)
-    new = prox(add(split, u), rho)
-    gap = subtract(split, new)
-    u = add(u, gap)
+    relaxed = jax.tree.map(lambda a, b: relaxation * a + (1 - relaxation) * b, split, z)
+    new = prox(add(relaxed, u), rho)
+    u = add(u, subtract(relaxed, new))
     # Before the adjoint of the split, not after as Boyd has it: where the image is split off too, the adjoint of
     # the multipliers is 0 at the solution, and nothing would be left to compare with.
-    primal = divide(norm(gap), jnp.maximum(norm(split), norm(new)))
+    primal = divide(norm(subtract(split, new)), jnp.maximum(norm(split), norm(new)))
     dual = divide(norm(subtract(new, z)), jnp.maximum(norm(u), norm(new)))
     factor = jnp.where(primal > _BALANCE * dual, _FACTOR, jnp.where(dual > _BALANCE * primal, 1 / _FACTOR, 1))
-    factor = factor.astype(rho.dtype)
-    splitting = Splitting(x, new, jax.tree.map(lambda leaf: leaf / factor, u), rho * factor)
+    factor = jnp.where(changes > 0, factor, 1).astype(rho.dtype)
+    changes = changes - (factor != 1).astype(changes.dtype)
+    splitting = Splitting(x, new, jax.tree.map(lambda leaf: leaf / factor, u), rho * factor, changes)
     return splitting, cost(x, split), jnp.maximum(primal, dual)
 
 
-def _conjugate_gradients(normal, vector, x, steps):
-    """So many steps toward the solution of `normal(x) = vector`.
+def _conjugate_gradients(A, smooth, vector, point, steps):
+    """So many steps toward the solution of `A'A x + smooth(x) = vector`, from a `Point`.
 
     Not `lineax.CG`: `linear_solve` is differentiated as the exact solution is, which so few steps do not reach. The
     derivative here is that of what was computed.
     """
 
     def step(state, _):
-        x, residual, direction, square = state
-        product = normal(direction)
+        point, residual, direction, square = state
+        moved = Point.of(A, direction)
+        product = moved.back + smooth(direction)
         length = divide(square, jnp.vdot(direction, product))
-        x, residual = x + length * direction, residual - length * product
+        point = jax.tree.map(lambda a, b: a + length * b, point, moved)
+        residual = residual - length * product
         new = jnp.vdot(residual, residual)
-        return (x, residual, residual + divide(new, square) * direction, new), None
+        return (point, residual, residual + divide(new, square) * direction, new), None
 
-    residual = vector - normal(x)
-    return lax.scan(step, (x, residual, residual, jnp.vdot(residual, residual)), length=steps)[0][0]
+    residual = vector - point.back - smooth(point.x)
+    return lax.scan(step, (point, residual, residual, jnp.vdot(residual, residual)), length=steps)[0][0]
 
 
 def _mean_gain(A):

@@ -38,6 +38,9 @@ class State(NamedTuple):
 class ConvolutionADMM(eqx.Module):
     """What `ADMM` minimises, for a `Convolution`; parameters and errors as there.
 
+    The x-step is exact and the steps are not over-relaxed: with 1.6 or 1.8 the cost of DiffuserCam's image falls more
+    slowly.
+
     Differences wrap round the edge of the scene, in depth too. The estimate is of `system.scene_shape`;
     `system.place` says where the image is in it.
 
@@ -68,10 +71,10 @@ class ConvolutionADMM(eqx.Module):
         gain = safe_sqrt(safe_sqrt(jnp.mean(power) * jnp.max(power)))
         spectrum = _times(divide(jnp.ones_like(gain), gain), spectrum)
         curvature = _curvature(shape, axes, gain.dtype)[..., : spectrum.shape[-1]]
-        solvent = 1 / (jnp.abs(spectrum) ** 2 + curvature + 1)
+        solvent = 1 / (jnp.abs(spectrum) ** 2 + prior.varies * curvature + 1)
         x = jnp.zeros(shape, gain.dtype)
         split = (x, *prior.split(x))
-        return State(Splitting(x, split, split, or_one(_START * gain**2)), prior, gain, spectrum, solvent)
+        return State(Splitting.start(x, split, or_one(_START * gain**2)), prior, gain, spectrum, solvent)
 
     def step(
         self, system: Convolution, image: Num[Array | np.ndarray, "row column"], state: State
