@@ -85,7 +85,7 @@ def test_operators_are_adjoint_and_differentiable_by_the_tilt():
 @pytest.mark.parametrize("dtype, orientation", [(jnp.float64, "plano"), (jnp.float32, "curved")])
 def test_volume_is_that_of_the_literal_loop_at_every_depth(dtype, orientation):
     """The axes lean by 0.6 mm at the nearest plane and 1.8 mm at the farthest: no patch of voxels holds both."""
-    flat, grid = scene(dtype, shape=(240, 260), voxels=(41, 43), depths=(10.0, 30.0), pitch=0.1)
+    flat, grid = scene(dtype, shape=(240, 260), voxels=(21, 23), depths=(10.0, 30.0), pitch=0.2)
     array = dataclasses.replace(flat.array, orientation=orientation)
     imager = dataclasses.replace(flat, array=array, tilt=(0.05, -0.03))
     imager = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), imager)
