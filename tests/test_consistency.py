@@ -1,5 +1,7 @@
 """Readings against `Imager.project`, statistics against SciPy and against chance itself."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy.stats import binom
 
 from gs_jax.suppression.consistency import (
     Readings,
+    Signal,
     agreed_level,
     log_false_alarms,
     readings,
@@ -18,6 +21,22 @@ from gs_jax.suppression.consistency import (
 )
 
 from .helpers import scene
+
+
+@pytest.mark.parametrize("orientation, tilt", [("curved", None), ("plano", (0.02, -0.01)), ("curved", (0.02, -0.01))])
+def test_points_are_read_where_the_imager_has_them(orientation, tilt):
+    flat = scene()[0]
+    array = dataclasses.replace(flat.array, orientation=orientation)
+    imager = dataclasses.replace(flat, array=array, tilt=tilt)
+    points = np.array([[0.05, -0.1, 18.0], [-0.2, 0.12, 23.0]])
+    light = np.zeros(imager.sensor.shape, np.float32)
+    found = readings(points, Signal(light, light), imager)
+    places = np.asarray(imager.sensor.to_pixels(imager.project(points)))
+    for number, seen in enumerate(found.seen):
+        read = found.pixels[number, seen]
+        assert len(read) > 1
+        nearest = np.linalg.norm(read[:, None] - places[None, :, number], axis=-1).min(1)
+        np.testing.assert_allclose(nearest, 0, atol=1e-9)
 
 
 def test_a_slope_is_background_and_a_spot_is_light():

@@ -18,6 +18,7 @@ from gs_jax.optics.window import psf_of_depth
 from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
 from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
 from gs_jax.reconstruction.reprojection import reproject
+from gs_jax.reconstruction.system import explainable, model_of
 from gs_jax.simulation.scene import simulate_volume
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.iteration import solve
@@ -186,3 +187,17 @@ def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
     with pytest.raises(InputError, match="GiB that are free"):
         simulate_volume(np.ones((1, 900, 900), np.float32), imager, Grid([20.0], (900, 900), 0.001))
     assert obstacle("admm, dense", 30, None, 1e9) is not None
+
+
+def test_pixels_of_any_number_are_summed():
+    """61 and 83 have no common divisor: squares of four pixels, and what is left at the end is left out."""
+    imager = scene(shape=(61, 83))[0]
+    grid = Grid([20.0], (11, 13), 4.2 * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
+    model = model_of(imager, grid, "pinhole", Progress())
+    assert model.side == 4 and model.imager.sensor.shape == (15, 20)
+    image = np.random.default_rng(0).random((61, 83)) + 1
+    light = explainable(image, model._replace(hazy=False))[0]
+    offset = np.percentile(image, 1)
+    assert light[14, 19] == pytest.approx((image[56:60, 76:80] - offset).sum())
+    own = imager.sensor.to_mm(np.mgrid[56:60, 76:80].reshape(2, -1).T.astype(float))
+    np.testing.assert_allclose(model.imager.sensor.to_mm(np.array([14.0, 19.0])), own.mean(0), atol=1e-12)
