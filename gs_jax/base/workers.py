@@ -91,7 +91,8 @@ class Workers:
         ----------
         build
             Makes the function that is called with each item: in this process, or in each worker, once, so that each
-            compiles once. For workers it can be pickled, as its items and results can.
+            compiles once. For workers it can be pickled, functions of a script or notebook by what they do, as its
+            items and results can.
 
         Returns
         -------
@@ -103,10 +104,12 @@ class Workers:
         if self._client is None:
             function = build()
             return lambda items: ((item, partial(function, item)) for item in items)
+        import cloudpickle  # Dask brings it
         import jax
 
         double: Any = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-        return partial(self._stream, _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, pickle.dumps(build)))
+        work = _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, cloudpickle.dumps(build))
+        return partial(self._stream, work)
 
     def _stream(self, work: _Work, items):
         from distributed import as_completed
