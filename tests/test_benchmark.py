@@ -15,6 +15,8 @@ from .helpers import scene
 pytestmark = pytest.mark.integration
 
 KEYS = {"method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"}
+# Of the solvers of least squares a number.
+KEYS |= {"objective"}
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +36,13 @@ def found():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "ProcessPoolExecutor", Here)
         patch.setattr(compare, "_REPEATS", 2)
-        names = ("backproject", "backproject + clusters", "richardson-lucy", "richardson-lucy, dense")
+        names = ("backproject", "backproject + clusters", "richardson-lucy", "richardson-lucy, dense", "admm, dense")
         return run((16,), methods=names, seeds=(0,))
 
 
 def test_records_and_files(found, tmp_path):
     records, left_out = found
-    assert len(records) == 5 and not left_out
+    assert len(records) == 6 and not left_out
     assert all(set(record) == KEYS for record in records)
     assert {r["pairs"] for r in records} == {16.0**4}
     report.write(records, [{"method": "m", "pairs": 1.0, "reason": "too slow"}], tmp_path)
@@ -48,6 +50,7 @@ def test_records_and_files(found, tmp_path):
     with (tmp_path / "benchmark.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(records)
     text = (tmp_path / "benchmark.md").read_text()
+    assert text.startswith("Every solver takes 30 steps, converged or not.")
     assert "| richardson-lucy, dense |" in text and "| m | 1.0e+00 | too slow |" in text
     assert (tmp_path / "benchmark.png").stat().st_size > 10_000
 
@@ -56,6 +59,16 @@ def test_the_matrix_is_the_operator(found):
     """Dense and matrix-free Richardson-Lucy of one image: the same iteration, in float32."""
     psnr = {record["method"]: record["psnr_db"] for record in found[0]}
     assert abs(psnr["richardson-lucy, dense"] - psnr["richardson-lucy"]) < 0.01
+
+
+def test_what_least_squares_reached_is_told(found):
+    """Of an empty volume it is 1 by definition; that of other methods is not what they minimise."""
+    reached = {record["method"]: record["objective"] for record in found[0]}
+    assert 0 < reached.pop("admm, dense") < 0.1 and set(reached.values()) == {None}
+    at = bench(16)
+    image = np.arange(256, dtype=np.float32).reshape(16, 16)
+    volume = np.zeros(at.grid.volume_shape, np.float32)
+    assert compare.objective(volume, image, at, compare.ADMM()) == pytest.approx(1)
 
 
 def test_the_floor_scores_as_zeros_do():

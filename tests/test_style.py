@@ -14,8 +14,13 @@ METHODS = ["backproject", "backproject + cluster", "backproject + unet", "unroll
 def test_a_method_looks_the_same_under_all_of_its_names():
     assert line_of("back-projection") == line_of("backproject")
     assert line_of("our network") == line_of("backproject + our U-Net") == line_of("backproject + unet")
-    assert label_of("another") == "another" and label_of("admm, dense") == "ADMM-TV, dense"
+    assert label_of("another") == "another" and label_of("admm, dense") == "ADMM, dense"
     assert line_of("admm, dense")["color"] == line_of("admm")["color"] and line_of("admm, dense")["ls"] == "--"
+
+
+def test_no_label_says_more_than_what_runs():
+    """Neither has total variation in the pictures."""
+    assert [label_of(method) for method in ("fista", "admm")] == ["FISTA", "ADMM"]
 
 
 def test_methods_differ_in_colour_and_in_marker():

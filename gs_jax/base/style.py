@@ -22,8 +22,8 @@ _METHODS = {
     "unrolled": ("unrolled", PALETTE[4], "P"),
     "list-rl": ("list-RL", PALETTE[8], "h"),
     "richardson-lucy": ("Richardson-Lucy", PALETTE[6], "s"),
-    "fista": ("FISTA-TV", PALETTE[3], "p"),
-    "admm": ("ADMM-TV", "#009e73", "X"),
+    "fista": ("FISTA", PALETTE[3], "p"),
+    "admm": ("ADMM", "#009e73", "X"),
     "truth": ("truth", "black", ""),
 }
 # Methods that some tables call otherwise.

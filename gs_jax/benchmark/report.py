@@ -13,9 +13,14 @@ from ..base.style import line_of
 from ..io.disk import atomic_write, write_json, write_text
 from ..io.figures import write_figure
 from ..io.provenance import KEY, Provenance
-from .compare import slopes
+from .compare import STEPS, slopes
 
-COLUMNS = ("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed")
+COLUMNS = (
+    *("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"),
+    "objective",
+)
+# The stopping rule, and so what the times are of.
+_STOP = f"Every solver takes {STEPS} steps, converged or not."
 # The paper's Fig. 9(A), in words of its text: linear, and below 0.5.
 _PAPER = {"admm, dense": 1.0, "richardson-lucy, dense": 1.0, "backproject": 0.5}
 _PANELS = {
@@ -56,7 +61,7 @@ def write(records: Records, left_out: Records, folder: Path, provenance: Provena
 
 
 def _of(records: Records, method: str, pairs: float, key: str) -> list[float]:
-    return [r[key] for r in records if r["method"] == method and r["pairs"] == pairs]
+    return [r[key] for r in records if r["method"] == method and r["pairs"] == pairs and r[key] is not None]
 
 
 def _unique(records: Records, key: str) -> list:
@@ -72,10 +77,11 @@ def spread(values: Sequence[float], form: str) -> str:
 
 
 def markdown(records: Records, left_out: Records) -> str:
-    """Time, memory and quality against pairs, the exponents of time, and what was left out and why."""
+    """The stopping rule; time, memory and quality against pairs, exponents of time, what was left out and why."""
     methods, sizes = _unique(records, "method"), sorted(_unique(records, "pairs"))
     timed = [m for m in methods if any(r["seconds"] > 0 for r in records if r["method"] == m)]
-    parts = []
+    convex = [m for m in methods if any(r["objective"] is not None for r in records if r["method"] == m)]
+    parts = [_STOP]
     for title, key, form, rows in (
         ("Time, s (the fastest of some warm calls)", "seconds", ".2g", timed),
         ("Compilation (of a dense method: the matrix too), s", "compile_seconds", ".2g", timed),
@@ -84,6 +90,7 @@ def markdown(records: Records, left_out: Records) -> str:
         ("SSIM", "ssim", ".3f", methods),
         ("MSE", "mse", ".1e", methods),
         ("F1 of the peaks", "f1", ".2f", methods),
+        ("Objective of least squares, over that of an empty volume", "objective", ".4f", convex),
     ):
         body = [[m, *(spread(_of(records, m, p, key), form) for p in sizes)] for m in rows]
         parts += [f"**{title}**", markdown_table(["pairs", *(f"{p:.1e}" for p in sizes)], body)]
@@ -118,5 +125,6 @@ def picture(records: Records) -> Figure:
         if key in ("seconds", "peak_mib", "mse"):
             axes.set_yscale("log")
         axes.grid(alpha=0.25)
-    figure.legend(*figure.axes[2].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
+    handles, labels = figure.axes[2].get_legend_handles_labels()
+    figure.legend(handles, labels, title=_STOP, loc="outside lower center", ncols=5, fontsize=9)
     return figure
