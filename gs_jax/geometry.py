@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .base.arrays import library_of
 from .base.converters import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, as_shape, check_fields
-from .lenses import MicrolensArray, Scalar
+from .lenses import MicrolensArray, Scalar, Scalars
 
 # A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
 SHORTEST, LONGEST = 1e-5, 0.1
@@ -219,7 +219,7 @@ class Imager(eqx.Module):
         assert self.tilt is not None
         return 1 / jnp.sqrt(1 + jnp.sum(self.tilt**2))
 
-    def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array | np.ndarray, "*batch"]:
+    def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """`z'`: from the object to the lens vertices as the optics sees it, mm.
 
         `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front. An imager of NumPy's
@@ -232,7 +232,7 @@ class Imager(eqx.Module):
         """`v'`: from the lens vertices to the sensor as the optics sees it, `v`, or `v + t/n` with the plate behind."""
         return self.sensor_distance + self.array.air_behind
 
-    def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array | np.ndarray, "*batch"]:
+    def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
         return self.reduced_sensor_distance / self.reduced_depth(depth)
 

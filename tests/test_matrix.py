@@ -149,9 +149,9 @@ def calibrate(case: Case, _) -> None:
     start = dataclasses.replace(listed, sensor_distance=1.01 * listed.sensor_distance)
     found = gs.calibrate(images, places, start, fit=("sensor_distance", "rotation", "shift"))
     assert found.mirrored == (case.name == "mirrored") and found.rms < 0.5
-    landings = [np.asarray(i.project(case.points[:, :3])) for i in (found.imager, case.imager)]
+    ours, true = (np.asarray(i.project(case.points[:, :3])) for i in (found.imager, case.imager))
     # A mirrored array has its lenses in the same order.
-    np.testing.assert_allclose(*landings, atol=case.imager.sensor.pixel_pitch)
+    np.testing.assert_allclose(ours, true, atol=case.imager.sensor.pixel_pitch)
 
 
 def metrics(case: Case, _) -> None:
