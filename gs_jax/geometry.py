@@ -249,9 +249,9 @@ class Imager(eqx.Module):
 
     def lean(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "depth 2"]:
         """How far beside its vertex a lens's axis is at a depth, mm: it is normal to the array's plane."""
-        depth = self.reduced_depth(depth)[:, None]
-        tilt = jnp.zeros(2, depth.dtype) if self.tilt is None else self.tilt
-        return -depth * tilt[None]
+        reduced = self.reduced_depth(depth)[:, None]
+        tilt = jnp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
+        return -reduced * tilt[None]
 
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""

@@ -85,7 +85,7 @@ def trace(
     that and the `parameters` of its weight are by default those of the envelope.
     """
     if parameters is None:
-        parameters = imager.reduced_depth(grid.depths)[:, None]
+        parameters = jnp.asarray(imager.reduced_depth(grid.depths))[:, None]
     order = _snake(imager.centers, _BAND * imager.field_radius)
     magnification = imager.magnifications(grid.depths)
     magnification = magnification if len(magnification) == 1 else magnification[order]
