@@ -26,10 +26,10 @@ settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
 
 # Programs take memory, and memory maps, of which Linux gives a process 65,530: in a worker, what it may hold.
-_MOST_BYTES, _MOST_MAPS = 1.2e9, 30_000
+_MOST_BYTES, _MOST_MAPS = 1.3e9, 30_000
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _compiled_code_is_dropped():
     """Forget compiled programs where a process has too many: they are read from the cache when they are needed."""
     yield

@@ -93,6 +93,7 @@ def test_shrinking_is_the_proximal_map(isotropic):
     assert not np.any(gradient)
 
 
+@pytest.mark.integration
 def test_the_cost_is_that_of_a_plain_numpy_version():
     convolution, image = system()
     psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))

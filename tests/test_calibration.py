@@ -144,6 +144,7 @@ def test_chance_is_no_pattern(size):
     assert not match(spots, centers, 1.28, 0.05).is_clear and not match(spots[:2], centers, 1.28, 0.05).is_clear
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", [0, 1])
 def test_geometry_is_found_from_a_poor_start(seed):
     actual, design, mirrored = device(seed)

@@ -140,6 +140,7 @@ def test_depths_include_the_stop_only_when_it_falls_on_the_step(folder, monkeypa
 POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"
 
 
+@pytest.mark.integration
 def test_simulate_points(folder, monkeypatch, capsys):
     (folder / "points.csv").write_text(POINTS)
     command = ("simulate", "points.csv", "design.toml", "-o", "c.tif")

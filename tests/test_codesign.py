@@ -41,6 +41,7 @@ def outcome(table1):
     return optimize(table1, study(starts=2))
 
 
+@pytest.mark.integration
 def test_from_table_1_to_the_targets(table1, outcome):
     assert [row.met for row in outcome.before] == [True, False, False, True]
     assert all(row.met for row in outcome.after)

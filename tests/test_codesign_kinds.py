@@ -87,6 +87,7 @@ def test_kinds_that_cannot_be():
         study(kinds=9)
 
 
+@pytest.mark.integration
 def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     design, parent = two_kinds()
     values = start_values(parent)
@@ -134,6 +135,7 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
         np.testing.assert_allclose(several[name], expected, rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.integration
 def test_the_best_kind_at_each_depth_is_the_datasheets():
     design, parent = two_kinds()
     found, sheet = candidate(parent, {}), datasheet(design, [15.0, 22.5, 30.0])

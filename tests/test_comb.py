@@ -122,6 +122,7 @@ def test_flatness_and_condition_number():
     assert ratio * 2000 ** (-2 / 16) <= condition_number(uneven, floor=0.1) <= ratio
 
 
+@pytest.mark.integration
 def test_gradients():
     base, frequencies = random_imager(), np.random.default_rng(2).uniform(-10, 10, (30, 2))
 

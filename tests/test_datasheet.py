@@ -167,6 +167,7 @@ def test_an_infinite_plate_has_no_density():
         Microscope(imager, grid.depths, one, confusion=one)
 
 
+@pytest.mark.integration
 def test_gradients_by_everything_that_is_continuous():
     imager, grid = scene()
     array = imager.array

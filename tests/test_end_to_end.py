@@ -187,6 +187,7 @@ def test_gradients_are_finite(place):
     assert jnp.isfinite(value) and jnp.isfinite(gradient).all()
 
 
+@pytest.mark.integration
 def test_float32():
     (low, grid), (high, exact) = scene(jnp.float32), scene()
     found = loss(low, KEY, grid, psfs(jnp.float32))

@@ -36,6 +36,7 @@ def test_places_are_counted_where_cores_are_looked_for(monkeypatch):
     assert abs(float(voxels.depths[1] - searched_voxels(imager, grid).depths[1])) > 0.01
 
 
+@pytest.mark.integration
 def test_evidence_of_points_that_are_there():
     imager, grid = small()
     image = capture_of(many())

@@ -85,6 +85,7 @@ MOVES = {
 }
 
 
+@pytest.mark.integration
 def test_the_numbers_are_the_datasheets(design, bench):
     values = checked_values(design, MOVES)
     found, sheet = judge(bench, values), datasheet(moved(design, values))
@@ -106,6 +107,7 @@ def test_what_is_saved_is_what_was_seen(design, bench):
         np.testing.assert_allclose(found.numbers[name], sheet[name], rtol=1e-3, err_msg=name)
 
 
+@pytest.mark.integration
 def test_nothing_is_compiled_twice(design, bench):
     """Whatever moves: what takes the time is compiled once."""
     judge(bench, checked_values(design, {}))

@@ -89,6 +89,7 @@ def test_planes_that_no_parallax_tells_apart():
     assert losses[1].max() < 0.1
 
 
+@pytest.mark.integration
 def test_a_pinhole_pays_at_equal_exposure():
     """Of a lens in focus without aberrations, a third of the diameter has a ninth of the light."""
     found = {}
@@ -105,6 +106,7 @@ def test_a_pinhole_pays_at_equal_exposure():
     assert all(bright[0] < dim[0] for bright, dim in zip(found[1e5], found[1e3], strict=True))
 
 
+@pytest.mark.integration
 def test_the_bound_is_that_of_the_pixels():
     """Against the bound that sums up pixels of the diffraction PSF, in a bright background: both have the same noise
     then, and differ by what is beyond the pixels' highest frequency and by the mean over the field."""

@@ -51,6 +51,7 @@ def test_each_depth_is_convolved_with_its_psf():
     np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
 
 
+@pytest.mark.integration
 def test_light_of_chief_rays_beside_the_sensor():
     """The middle of a larger sensor: a PSF of 11 pixels reaches 5 pixels in."""
     imager, grid = scene(shape=(48, 40))
@@ -86,6 +87,7 @@ def test_its_transpose_is_its_adjoint(dtype, tolerance):
     np.testing.assert_allclose(jnp.vdot(volume, back), forth, rtol=tolerance)
 
 
+@pytest.mark.integration
 def test_gradients():
     imager, grid = scene()
     volume, kernels = volume_of(grid), psfs(3)
@@ -159,6 +161,7 @@ def zone_scene(field_radius):
     return imager, Grid([10.0], (23, 23), 0.04)
 
 
+@pytest.mark.integration
 def test_equation_2_as_printed_where_each_voxel_is_a_zone():
     imager, grid = zone_scene(0.4)
     volume, kernels = volume_of(grid), psfs(1)

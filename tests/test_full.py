@@ -42,6 +42,7 @@ def volume(shape, dtype=float) -> jax.Array:
     return jax.random.uniform(jax.random.key(0), shape, dtype)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-11), (jnp.float32, 1e-5)])
 @pytest.mark.parametrize("pixels", [(96, 81), (80, 80)])
 def test_the_adjoint_is_exact(dtype, rtol, pixels):

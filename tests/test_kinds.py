@@ -44,6 +44,7 @@ def test_the_adjoint_is_exact(level):
     np.testing.assert_allclose(one, other, rtol=1e-11)
 
 
+@pytest.mark.integration
 def test_the_image_is_the_sum_of_the_kinds():
     """And of kinds with the same numbers nothing but what one kind is, up to the cores of a mean lens."""
     scope, voxels = imager(), grid(shape=(7, 6))

@@ -100,6 +100,7 @@ def test_searches_keep_which_lens_is_of_which_kind(tmp_path):
     assert problem_of(design, study).parent.lenses == ((0, 2), (1,))
 
 
+@pytest.mark.integration
 def test_a_datasheet_of_kinds(tmp_path):
     """Each kind is what a design of it alone is, but for where its neighbours cut it."""
     design = read_design(written(tmp_path, {"lens.radius_of_curvature_mm": RADII}))

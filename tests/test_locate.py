@@ -89,6 +89,7 @@ def test_points_are_found_placed_and_measured():
     assert (np.diff(found[:, 3]) <= 0).all()
 
 
+@pytest.mark.integration
 def test_offset_and_gain_of_the_camera_do_not_matter():
     capture = capture_of(many()).astype(np.float32)
     one, other = find(capture), find(3 * capture + 500)
@@ -198,6 +199,7 @@ def test_the_voxels_do_not_matter_and_the_box_does():
     assert (deep[:, 2] > 19.8).all()
 
 
+@pytest.mark.integration
 def test_depths_may_be_one_or_in_any_order():
     truth = many()
     capture = capture_of(truth)

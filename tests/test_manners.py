@@ -326,6 +326,7 @@ def test_a_folder_that_threads_still_write_to_is_removed(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.integration
 def test_a_design_is_found_by_its_name(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert {path.stem for path in options.shipped_designs()} >= {"geomscope", "geomscope-optimized", "endoscope"}

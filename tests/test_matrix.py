@@ -209,8 +209,7 @@ REFUSED: dict[tuple[str, str], str] = {
     **{("two radii", task): DIFFER for task in ("list-rl", "unrolled", "calibrate", "tolerance")},
 }
 
-# Of each kind of task every device has one in `make test`, with near PSFs; all of them, with all of the light, are
-# `integration`.
+# Of each kind of task every device has one in `make test`; all others are `integration`.
 KINDS = (("points",), tuple(METHODS), ("calibrate",), ("metrics", "optimise"), ("mold", "report"))
 
 
@@ -218,8 +217,12 @@ def pairs():
     for number, device in enumerate(DEVICES):
         quick = {kind[number % len(kind)] for kind in KINDS}
         for task in TASKS:
-            optics, marks = ("near", ()) if task in quick else ("full", pytest.mark.integration)
-            yield pytest.param(device, task, optics, marks=marks, id=f"{device}-{task}")
+            marks = () if task in quick else pytest.mark.integration
+            yield pytest.param(device, task, "near", marks=marks, id=f"{device}-{task}")
+    # The designs that are recommended most, with all of the light.
+    for device in ("geomscope-asphere", "geomscope-exposure"):
+        for task in ("points", *METHODS):
+            yield pytest.param(device, task, "full", marks=pytest.mark.integration, id=f"{device}-{task}-full")
 
 
 @pytest.mark.parametrize("device, task, optics", pairs())

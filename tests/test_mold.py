@@ -167,6 +167,7 @@ def test_degenerate_layouts_are_sound(centers, size):
     assert_sound(lenses(centers, size))
 
 
+@pytest.mark.integration
 @settings(max_examples=25, deadline=None)
 @given(
     count=st.integers(1, 30),

@@ -91,6 +91,7 @@ def test_all_three_are_those_of_xla(weight, grid):
     assert all(result.any() for result in volumes_and_image)
 
 
+@pytest.mark.integration
 def test_sums_of_convolutions_are_those_of_xla():
     """And the convolutions of one image: the fourth kernel, of which `test_convolve.py` knows more."""
     rng = np.random.default_rng(0)

@@ -119,6 +119,7 @@ def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     np.testing.assert_allclose(jax.jit(TERMS["psf_width_um"].function)(middle)[0], width, rtol=0.15)
 
 
+@pytest.mark.integration
 def test_manufacture(design, focused, terms):
     centers = np.array(design.array.centers_mm)
     np.testing.assert_allclose(terms["spacing_mm"], nearest_neighbour_distances(centers), rtol=1e-9)
@@ -166,6 +167,7 @@ def test_manufacture_of_a_polynomial(focused):
     np.testing.assert_allclose(TERMS["least_radius_mm"].function(shaped)[20], 1 / max(along, across), rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 def test_widths_have_gradients_by_the_shape(orientation):
     design = small_design()

@@ -21,6 +21,7 @@ def test_optiland_has_the_same_rays(field):
     np.testing.assert_allclose(row["wavefront_rms_waves"], row["wavefront_rms_optiland_waves"], rtol=1e-7)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("field", [0.0, 3.0])
 @pytest.mark.parametrize("lens", SHAPES.values(), ids=list(SHAPES))
 def test_optiland_has_the_same_rays_through_aspheres_with_either_side_in_front(lens, field):

@@ -44,6 +44,7 @@ def front():
     return trade_off(geomscope(), Study.model_validate(STUDY))
 
 
+@pytest.mark.integration
 def test_light_against_depth_of_field(front):
     """Eq. 8 alone: the widest lens with that depth of field, found by a scan.
 
@@ -110,6 +111,7 @@ def test_stages_keep_what_the_one_before_found():
         np.testing.assert_allclose(light.low, optimize(start, alone).after[1].low, rtol=1e-2)
 
 
+@pytest.mark.integration
 def test_every_stage_compiles_once(monkeypatch):
     """However many limits there are, and whatever the stage before it found."""
     calls, candidate = [0], stages.candidate

@@ -76,6 +76,7 @@ def test_every_method_shows_the_voxel_and_compiles_once(name, caplog):
     assert not np.array_equal(first, second)
 
 
+@pytest.mark.integration
 def test_it_is_what_the_solver_finds_in_one_loop():
     imager, grid, psf, _, image = small()
     found = reconstruct(image, imager, grid, FISTA(steps=7), optics=psf)
@@ -108,6 +109,7 @@ def test_the_cameras_offset_is_taken_off_once():
     np.testing.assert_allclose(found, in_one_loop()(noisy), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_list_richardson_lucy_multiplies_by_mean_ratios():
     imager, grid = scene(voxels=(8, 7), pitch=0.1, depths=(18.0, 20.0))
     # Its darkest percent is no light, so nothing is taken off.
@@ -124,6 +126,7 @@ def test_list_richardson_lucy_multiplies_by_mean_ratios():
     np.testing.assert_allclose(found, x, rtol=1e-6)
 
 
+@pytest.mark.integration
 def test_back_projection_has_its_options_and_all_its_planes():
     imager, grid, *_, image = small()
     many = grid.at(np.linspace(17, 22, 19))  # more than are done at a time

@@ -98,6 +98,7 @@ def test_volume_is_that_of_the_literal_loop_at_every_depth(dtype, orientation):
     assert back == pytest.approx(np.vdot(np.float64(volume), expected), rel=tolerance)
 
 
+@pytest.mark.integration
 def test_points_are_where_the_grid_has_them_and_are_found():
     """40 points through lenses whose magnifications differ by three percent: chief rays of no tilt miss by pixels."""
     rng = np.random.default_rng(3)
