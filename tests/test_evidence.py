@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from gs_jax import Grid, Sensor, geomscope
 from gs_jax.optics.cores import apparent_depths
