@@ -54,6 +54,15 @@ def test_the_adjoint_is_exact(dtype, rtol, pixels):
     assert A.mv(x).dtype == dtype and one > 0
 
 
+def test_nothing_is_scattered():
+    """Some versions of JAX compile a scatter-add for GPUs to loops that wait for each other."""
+    scope, voxels = imager(), grid(shape=(6, 5))
+    A = forward_operator(scope, voxels, full_optics(scope, voxels.depths))
+    for operator in (A, A.T):
+        lowered = jax.jit(lambda x, operator=operator: operator.mv(x)).lower(operator.in_structure())
+        assert "stablehlo.scatter" not in lowered.as_text()
+
+
 def test_gradients_by_volume_centers_and_distance():
     scope, voxels = imager(), grid(shape=(6, 5))
     optics = full_optics(scope, voxels.depths)

@@ -126,6 +126,8 @@ def geometric_psf(
     corner = jnp.floor(position)
     fraction, corner = position - corner, corner.astype(int)
     image = jnp.zeros((size, size), dtype)
+    # A scatter-add: on a processor a product of the rows' and the columns' shares takes 1.6 times as long for 15 pixels
+    # and 8 times for 65, to sort the rays so that pixels gather them 4 to 9 times.
     for down, right in np.ndindex(2, 2):
         share = weights * jnp.abs(1 - down - fraction[:, 0]) * jnp.abs(1 - right - fraction[:, 1])
         row, column = corner[:, 0] + down, corner[:, 1] + right
