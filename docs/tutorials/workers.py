@@ -23,8 +23,8 @@ FRAMES = 4
 # %% [markdown]
 # ## What is there
 #
-# `pip install 'gs-jax[gpu]'` brings JAX for NVIDIA's GPUs. JAX takes a GPU if it finds one; here is what built this
-# page. `JAX_PLATFORMS=cpu` in the environment keeps it on processors.
+# `pip install 'gs-jax[gpu]'` brings JAX for NVIDIA's GPUs, best [on Python 3.12 or newer](../install.md#gpu). JAX takes
+# a GPU if it finds one; here is what built this page. `JAX_PLATFORMS=cpu` in the environment keeps it on processors.
 
 # %%
 print(jax.devices())
