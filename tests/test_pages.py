@@ -86,7 +86,7 @@ def test_what_mistakes_of_calibration_leave():
 def test_contributing_names_what_exists():
     """Files, and words of the code."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    files = [path for folder in ("gs_jax", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    files = [path for folder in ("gs_jax", "tests", "experiments") for path in (ROOT / folder).rglob("*.py")]
     known = {path.name for path in files} | {path.parent.name for path in files} | {path.stem for path in files}
     code = "\n".join(path.read_text(encoding="utf-8") for path in files)
     words, paths = re.findall(r"`(\w+)`", text), re.findall(r"`([\w/-]+\.(?:py|yml|html|md))`", text)
