@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gs_jax.base.progress import Progress
+from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import optimize
 from gs_jax.codesign.study import Study
@@ -87,6 +88,24 @@ def test_points_of_a_front(two):
     found = trade_off(geomscope(), study, workers=two, each=lambda front: sizes.append(len(front.points)))
     np.testing.assert_allclose(found.values, trade_off(geomscope(), study).values, rtol=1e-9)
     assert sizes == [1, 2, 3, 4] and len(as_json(found)["points"]) == 4
+
+
+def test_terms_of_ones_own(two, monkeypatch):
+    """A worker has not filled the table. One of ours that was replaced is the replacement there, too, but only then."""
+
+    def found(name, target):
+        only = {"free": {"sensor_distance_mm": [2.0, 6.5]}, "starts": 2, "stages": [{"solver": "levenberg-marquardt"}]}
+        study = Study.model_validate(STUDY | only | {"pareto": [], "terms": [{"name": name, "equal": target}]})
+        return optimize(geomscope(), study, workers=two).design.imaging.sensor_distance_mm
+
+    times = 3
+    own = Term("thrice the sensor's distance", lambda c: times * c.imager.sensor_distance)
+    with monkeypatch.context() as patch:
+        for name in ("own_mm", "thickness_mm"):
+            patch.setitem(TERMS, name, own)
+            assert found(name, 15.0) == pytest.approx(5.0, abs=0.01)
+    # With the plate, 1 mm. Equal is within 0.1 %.
+    assert found("thickness_mm", 5.0) == pytest.approx(4.0, abs=0.01)
 
 
 def test_training_data(two, tmp_path):

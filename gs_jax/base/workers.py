@@ -91,7 +91,8 @@ class Workers:
         ----------
         build
             Makes the function that is called with each item: in this process, or in each worker, once, so that each
-            compiles once. For workers it can be pickled, as its items and results can.
+            compiles once. For workers it can be pickled, functions of a script or notebook by what they do, as its
+            items and results can.
 
         Returns
         -------
@@ -103,10 +104,12 @@ class Workers:
         if self._client is None:
             function = build()
             return lambda items: ((item, partial(function, item)) for item in items)
+        import cloudpickle  # Dask brings it
         import jax
 
         double: Any = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-        return partial(self._stream, _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, pickle.dumps(build)))
+        work = _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, cloudpickle.dumps(build))
+        return partial(self._stream, work)
 
     def _stream(self, work: _Work, items):
         from distributed import as_completed
@@ -121,7 +124,7 @@ class Workers:
                 room = _AHEAD * threads - len(waiting)
                 # What counts comes first: the other would take an item, and drop it.
                 for _, item in zip(range(room), left, strict=False):
-                    future = self._client.submit(_run, work, item, pure=False)
+                    future = self._client.submit(_run, work, pickle.dumps(item), pure=False)
                     waiting[future.key] = item
                     done.add(future)
                 if not waiting:
@@ -188,15 +191,15 @@ def _threads(count: int) -> dict[str, str]:
     return dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(count))
 
 
-def _run(work: _Work, item):
-    """In a worker."""
+def _run(work: _Work, item: bytes):
+    """In a worker, which reads the item when it has its settings."""
     with _lock:
         if work.token not in _functions:
             _prepare(work)
             _functions.clear()
             _functions[work.token] = pickle.loads(work.build)()
         function = _functions[work.token]
-    return function(item)
+    return function(pickle.loads(item))
 
 
 def _prepare(work: _Work) -> None:

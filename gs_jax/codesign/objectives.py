@@ -8,9 +8,10 @@ Bare equation numbers mean the GEOMScope paper.
 """
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from importlib.metadata import entry_points
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,7 @@ from .layout_terms import (
 )
 
 Result = Float[Array, "..."]
+Built = TypeVar("Built")
 
 UM = 1000.0
 # Of the entry points that are terms.
@@ -222,6 +224,9 @@ TERMS: dict[str, Term] = {
     "least_radius_mm": Term("least radius of curvature of a lens's surface", of_each(least_radius), kinds=True),
 }
 
+# As they are in every process, whatever a caller puts into the table.
+_OURS = dict(TERMS)
+
 _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "waves"}
 
 
@@ -229,7 +234,7 @@ def check_term(name: str) -> None:
     """Whether there is a term of this name; those of other installed packages are looked up when they are asked for.
 
     A package has its own as entry points of the group `gs_jax.terms`, whose names are the terms' and whose objects are
-    `Term`s. Python callers may also put theirs into `TERMS`.
+    `Term`s. Python callers may also put theirs into `TERMS`; workers of a search get them.
 
     Raises
     ------
@@ -242,6 +247,17 @@ def check_term(name: str) -> None:
         near = difflib.get_close_matches(name, TERMS, n=3) or list(TERMS)[:3]
         others = len(TERMS) - len(near)
         raise ValueError(f"found the name {short_repr(name)}, allowed: {', '.join(near)} or {others} others")
+
+
+def with_terms(build: Callable[[], Built], names: Iterable[str]) -> Callable[[], Built]:
+    """`build` for another process, whose `TERMS` then are of these names what they are here: its own go with it."""
+    terms = {name: None if TERMS[name] is _OURS.get(name) else TERMS[name] for name in names}
+    return partial(_built_with, build, terms)
+
+
+def _built_with(build, terms):
+    TERMS.update({name: term or _OURS[name] for name, term in terms.items()})
+    return build()
 
 
 def unit_of(name: str) -> str:

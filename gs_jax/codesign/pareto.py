@@ -22,7 +22,7 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..designs.design import Design
 from .checkpoint import Log
-from .objectives import unit_of
+from .objectives import unit_of, with_terms
 from .parameters import NAMES, Values, start_values
 from .search import PathLike, opened
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
@@ -115,7 +115,8 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     problem, kept, moving = sweep
     objectives = [next(term for term in kept if term.is_goal), *moving]
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
-    stream, points = workers.stream_of(partial(searcher, sweep)), {}
+    build = with_terms(partial(searcher, sweep), [term.name for term in (*kept, *moving)])
+    stream, points = workers.stream_of(build), {}
     front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
     with progress.counter("Trade-off", len(combinations)) as advance:
         values = start_values(problem.parent)

@@ -21,7 +21,7 @@ from ..designs.design import Design
 from ..lenses import kinds
 from .bounds import Bounds, Box
 from .checkpoint import Log, restored
-from .objectives import TERMS
+from .objectives import TERMS, with_terms
 from .parameters import Parent, Values, candidate, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, stepper
 from .study import MOST_KINDS, StageTable, Study, TermTable, labels
@@ -215,7 +215,8 @@ def run_stages(
                 # What was saved within a start is left: a worker runs it from its beginning.
                 saved = None
                 log.steps[:] = [step for step in log.steps if step["start"] in ended]
-                stream = workers.stream_of(partial(_starts_of_worker, problem, terms, values))
+                build = with_terms(partial(_starts_of_worker, problem, terms, values), [term.name for term in terms])
+                stream = workers.stream_of(build)
                 for _, result in stream(starts):
                     steps, end = result()
                     log.steps.extend(steps)
