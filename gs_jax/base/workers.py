@@ -124,7 +124,7 @@ class Workers:
                 room = _AHEAD * threads - len(waiting)
                 # What counts comes first: the other would take an item, and drop it.
                 for _, item in zip(range(room), left, strict=False):
-                    future = self._client.submit(_run, work, item, pure=False)
+                    future = self._client.submit(_run, work, pickle.dumps(item), pure=False)
                     waiting[future.key] = item
                     done.add(future)
                 if not waiting:
@@ -191,15 +191,15 @@ def _threads(count: int) -> dict[str, str]:
     return dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(count))
 
 
-def _run(work: _Work, item):
-    """In a worker."""
+def _run(work: _Work, item: bytes):
+    """In a worker, which reads the item when it has its settings."""
     with _lock:
         if work.token not in _functions:
             _prepare(work)
             _functions.clear()
             _functions[work.token] = pickle.loads(work.build)()
         function = _functions[work.token]
-    return function(item)
+    return function(pickle.loads(item))
 
 
 def _prepare(work: _Work) -> None:

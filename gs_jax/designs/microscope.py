@@ -10,6 +10,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.converters import as_float
@@ -17,7 +18,7 @@ from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..optics import aberrations, theory
 from ..optics.aberrations import Wavefront
-from ..optics.aperture import Cells, clear_diameter
+from ..optics.aperture import Cells, clear_diameter, clear_diameters
 from ..optics.kinds import of_kinds
 
 
@@ -41,10 +42,12 @@ class Microscope(eqx.Module):
     exposure
         Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
     cells, directions
-        How the clear aperture is found, as of `gs_jax.optics.aperture.clear_diameter`.
+        How clear apertures are found, as of `gs_jax.optics.aperture`: of lenses that are alike, and of others.
     lenses
         Which are of each kind, where they differ; none if all are alike. What follows from a lens's shape is of the
         `kinds` then, the rest also of the whole, whose clear diameter is the mean lens's.
+    found_diameter
+        Of one of `kinds`, which are made anew whenever they are asked for: those of all are found at once.
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Microscope(eqx.Module):
     cells: Cells | None = None
     directions: int = eqx.field(static=True, default=512)
     lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
+    found_diameter: Float[Array, ""] | None = None
 
     def __check_init__(self):
         if not math.isfinite(math.prod(self.imager.array.size)):
@@ -75,7 +79,10 @@ class Microscope(eqx.Module):
     @property
     def kinds(self) -> tuple["Microscope", ...]:
         """The lenses of each kind alone, where they differ."""
-        return tuple(dataclasses.replace(self, imager=one, lenses=()) for one in of_kinds(self.imager, self.lenses))
+        if not self.lenses:
+            return ()
+        pairs = zip(of_kinds(self.imager, self.lenses), self._clear_diameters, strict=True)
+        return tuple(dataclasses.replace(self, imager=one, lenses=(), found_diameter=own) for one, own in pairs)
 
     @property
     def each(self) -> tuple["Microscope", ...]:
@@ -90,11 +97,17 @@ class Microscope(eqx.Module):
     @property
     def clear_diameter(self) -> Float[Array, ""]:
         """Of the disc whose area is the mean clear aperture of the lenses."""
-        if self.lenses:
-            shares = [len(which) / len(self.imager.array.centers) for which in self.lenses]
-            squares = [share * kind.clear_diameter**2 for share, kind in zip(shares, self.kinds, strict=True)]
-            return jnp.sqrt(jnp.sum(jnp.stack(squares)))
-        return _clear_diameter(self.imager.array, self.plate_scale, self.cells, self.directions)
+        if self.found_diameter is not None:
+            return self.found_diameter
+        each = self._clear_diameters
+        if not self.lenses:
+            return each[0]
+        shares = np.array([len(which) for which in self.lenses]) / len(self.imager.array.centers)
+        return jnp.sqrt(jnp.sum(jnp.asarray(shares, each.dtype) * each**2))
+
+    @property
+    def _clear_diameters(self):
+        return _clear_diameters(self.imager.array, self.plate_scale, self.cells, self.directions, self.lenses)
 
     @property
     def focal_length(self) -> Float[Array, ""]:
@@ -200,10 +213,14 @@ class Microscope(eqx.Module):
         return theory.object_blur(self.focal_length, self.clear_diameter, self.reduced, v)
 
 
-@partial(jax.jit, static_argnames="directions")
-def _clear_diameter(array: MicrolensArray, plate_scale, cells: Cells | None, directions: int) -> Float[Array, ""]:
+@partial(jax.jit, static_argnames=("directions", "lenses"))
+def _clear_diameters(array: MicrolensArray, plate_scale, cells: Cells | None, directions: int, lenses):
+    """Of each kind, or of all lenses."""
     # As large as the plate's size says.
-    return plate_scale * clear_diameter(_shrunk(array, plate_scale), cells=cells, directions=directions)
+    array = _shrunk(array, plate_scale)
+    if lenses:
+        return plate_scale * clear_diameters(array, lenses, directions=directions)
+    return plate_scale * clear_diameter(array, cells=cells)[None]
 
 
 def _shrunk(array: MicrolensArray, scale) -> MicrolensArray:

@@ -1,5 +1,6 @@
 """What a design promises, Eqs. 1-11 over its working distance, as numbers and as tables."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -47,7 +48,8 @@ def microscopes_of(
         cells=cells_of(np.array(design.array.centers_mm), design.array.size_mm) if alike else None,
         lenses=() if alike else lenses_by_kind(imager),
     )
-    return list(whole.each)
+    # Each finds its own diameter, whatever of its imager is replaced.
+    return [dataclasses.replace(kind, found_diameter=None) for kind in whole.each]
 
 
 def datasheet(

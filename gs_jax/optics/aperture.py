@@ -191,34 +191,42 @@ def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cel
     return Cells(*(jnp.asarray(part) for part in (lens, edges.beyond[order], before, after)))
 
 
-def clear_diameter(array: MicrolensArray, *, cells: Cells | None = None, directions: int = 512) -> Float[Array, ""]:
+def clear_diameter(array: MicrolensArray, *, cells: Cells | None = None) -> Float[Array, ""]:
     """Diameter of the disc whose area is the mean clear aperture of the lenses, mm.
 
     Parameters
     ----------
     cells
         Of the lenses, if they are alike and stay about where they are: a hundred times faster.
-    directions
-        As of `aperture_area`.
     """
-    return jnp.sqrt(4 / math.pi * _mean_area(directions, array, cells))
+    return jnp.sqrt(4 / math.pi * _mean_areas(512, (), array, cells)[0])
 
 
-# One number of many: by a reverse pass all derivatives cost as much as one, and whatever asks for them again computes
-# the same, which XLA sees.
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _mean_area(directions: int, array: MicrolensArray, cells: Cells | None):
-    if cells is None:
-        return jnp.mean(aperture_area(array, directions=directions))
-    return _area_of_cells(array, cells) / len(array.centers)
+def clear_diameters(
+    array: MicrolensArray, lenses: tuple[tuple[int, ...], ...], *, directions: int = 512
+) -> Float[Array, " kind"]:
+    """`clear_diameter` of the lenses of each kind, all found at once; `lenses` are which, `directions` as above."""
+    return jnp.sqrt(4 / math.pi * _mean_areas(directions, lenses, array, None))
 
 
-@_mean_area.defjvp
-def _(directions, primals, tangents):
+# A few numbers of many: by reverse passes all derivatives cost as much as a few, and whatever asks for them again
+# computes the same, which XLA sees.
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _mean_areas(directions: int, lenses, array: MicrolensArray, cells: Cells | None) -> Float[Array, " kind"]:
+    """Of each kind, or of all lenses."""
+    if cells is not None:
+        return _area_of_cells(array, cells)[None] / len(array.centers)
+    areas = aperture_area(array, directions=directions)
+    return jnp.stack([jnp.mean(areas[np.array(which)]) for which in lenses or [range(len(areas))]])
+
+
+@_mean_areas.defjvp
+def _(directions, lenses, primals, tangents):
     (array, cells), (changes, _) = primals, tangents
-    area, slopes = jax.value_and_grad(lambda array: _mean_area.fun(directions, array, cells))(array)
+    areas, back = jax.vjp(lambda array: _mean_areas.fun(directions, lenses, array, cells), array)
+    (slopes,) = jax.vmap(back)(jnp.eye(len(areas), dtype=areas.dtype))
     pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(changes), strict=True)
-    return area, sum(jnp.vdot(slope, change) for slope, change in pairs)
+    return areas, sum(jnp.tensordot(slope, change, change.ndim) for slope, change in pairs)
 
 
 def _area_of_cells(array: MicrolensArray, cells: Cells):
