@@ -23,7 +23,7 @@ from ..base.workers import Workers
 from ..designs.design import Design
 from .checkpoint import Log
 from .objectives import unit_of, with_terms
-from .parameters import NAMES, Values, start_values
+from .parameters import NAMES, Values, significant, start_values
 from .search import PathLike, opened
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
