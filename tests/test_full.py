@@ -105,6 +105,7 @@ def traced_light(scope: Imager, point) -> float:
     return total
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("point", [(0.2, -0.1, 18.0), (2.0, 1.0, 21.0)])
 def test_it_holds_the_light_that_rays_bring(point):
     """To 5 %: an aperture that neighbours cut counts as round, with the mean lens's openness and its own area."""
@@ -116,6 +117,7 @@ def test_it_holds_the_light_that_rays_bring(point):
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
 
 
+@pytest.mark.integration
 def test_fewer_rings_hold_the_same_light():
     scope, voxels = imager(), grid()
     x = volume(voxels.volume_shape)

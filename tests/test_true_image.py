@@ -29,6 +29,7 @@ def test_a_single_lens_passes_the_light_that_a_solid_angle_says(orientation, red
 CURVED_CONIC = {"orientation": "curved", "conic_constant": -0.7}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("shape", "error", "correlation", "light"), [({}, 0.2, 0.98, 0.05), (CURVED_CONIC, 0.265, 0.965, 0.25)], ids=str
 )
