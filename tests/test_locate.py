@@ -216,7 +216,7 @@ def test_it_says_the_same_each_time():
 
 def test_without_a_lens_in_reach_nothing_is_found():
     imager, grid = small()
-    far = Imager(MicrolensArray([[50.0, 0.0]]), imager.sensor, 5.75, 2.0)
+    far = Imager(MicrolensArray([[50.0, 0.0], [51.0, 0.0], [50.0, 1.0]]), imager.sensor, 5.75, 2.0)
     assert len(find_points(capture_of(many()), far, grid, progress=Progress())) == 0
 
 
