@@ -1,16 +1,12 @@
 import math
 import os
-from importlib.metadata import version
 from pathlib import Path
 
-# A test computes little and compiles much. Fewer optimisations halve the time that XLA takes, and what was compiled is
+# A test computes little and compiles much. Fewer optimisations take less time, and what was compiled is
 # kept for the other processes and the next run. JAX reads these when it is imported.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# Newer versions of XLA end at an option that they do not know.
-if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and version("jaxlib").startswith("0.10."):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
