@@ -197,15 +197,16 @@ def _replace(temporary: Path, path: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
-        # Zarr's own threads go on writing for a moment after an interrupt.
-        for _ in range(_ATTEMPTS):
-            shutil.rmtree(path, ignore_errors=True)
-            time.sleep(_PAUSE)
-            if not path.exists():
-                break
-    else:
-        path.unlink(missing_ok=True)
+    # Zarr's own threads go on writing for a moment after an interrupt; the folder may be made only then.
+    for _ in range(_ATTEMPTS):
+        if not path.is_dir():
+            with contextlib.suppress(IsADirectoryError):
+                path.unlink(missing_ok=True)
+                return
+        shutil.rmtree(path, ignore_errors=True)
+        time.sleep(_PAUSE)
+        if not path.exists():
+            return
 
 
 @contextlib.contextmanager
