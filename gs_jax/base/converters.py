@@ -18,6 +18,9 @@ NOT_NEGATIVE: Rule = ("finite and not negative", lambda x: (x >= 0) & (x < np.in
 
 
 def as_float(x) -> Array:
+    # A float array keeps its precision, so that `dataclasses.replace` changes nothing else.
+    if isinstance(x, Array) and jnp.issubdtype(x.dtype, jnp.floating):
+        return x
     # What is no array yet becomes one on the host: JAX would compile a conversion for each shape.
     return jnp.asarray(x if isinstance(x, Array) else np.asarray(x, float), dtype=float)
 

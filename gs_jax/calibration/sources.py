@@ -9,10 +9,11 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..geometry import Imager
+from .matching import near_of
 from .unknowns import Offsets, due
 
-# Spots that are due nearer to each other than this on the sensor are blurred into one, pixels.
-_APART = 6.67
+# Spots that are due nearer to each other than this on the sensor are blurred into one, over `near_of`.
+_APART = 0.5
 
 
 class Sources(NamedTuple):
@@ -72,7 +73,7 @@ def assigned(
     places = np.asarray(due(imager, np.nan_to_num(sources.points, nan=1.0), offsets), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)
     seen = (beside < imager.field_radius) & ~np.isnan(sources.points.sum(1))[:, None]
-    rows, apart = [], _APART * imager.sensor.pixel_pitch
+    rows, apart = [], _APART * near_of(imager.array.centers)
     for capture, spots in enumerate(found):
         source, lens = np.argwhere(seen & (sources.captures == capture)[:, None]).T
         if not len(spots) or not len(source):

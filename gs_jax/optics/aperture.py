@@ -21,7 +21,6 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ..base.safe import safe_sqrt
-from ..layouts.cells import cell_edges
 from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses that are handled at once.
@@ -181,6 +180,9 @@ class Cells(eqx.Module):
 
 def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cells:
     """The cells of lenses on a plate. Host code."""
+    # A reconstruction needs no cells, and SciPy's import takes as long as a back-projection.
+    from ..layouts.cells import cell_edges
+
     edges = cell_edges(centers, size)
     x, y = (edges.start + edges.end).T
     order = np.lexsort((np.arctan2(y, x), edges.lens))
