@@ -109,7 +109,7 @@ def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
 
 
 def _sharpness(imager, grid):
-    from ..suppression.evidence import sharpness
+    from ..optics.focus import sharpness
 
     return sharpness(imager, grid)
 
@@ -118,17 +118,16 @@ def _points(image, imager, grid, sharp, progress):
     """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
     import numpy as np
 
+    from ..optics.focus import blur_of
     from ..suppression.consistency import signal
-    from ..suppression.evidence import LEAST_SHARP, point_evidence
-    from ..suppression.locate import find_points
+    from ..suppression.evidence import point_evidence
+    from ..suppression.locate import NOT_TRUSTED, find_points
 
     light = signal(image)
-    points, warning = find_points(light, imager, grid, progress=progress), None
-    if sharp < LEAST_SHARP:
-        share = f"{sharp:.1%} of a spot's light falls into its core, where points need {LEAST_SHARP:.0%}"
-        warning = f"out of focus at these depths: {share}; no point is to be trusted"
+    points = find_points(light, imager, grid, progress=progress)
+    warning = blur_of(sharp, "points", NOT_TRUSTED)
     columns = point_evidence(points, light, imager, grid)._asdict()
-    return points, columns | {"confident": np.full(len(points), int(sharp >= LEAST_SHARP))}, warning
+    return points, columns | {"confident": np.full(len(points), int(warning is None))}, warning
 
 
 def _network(weights: Path | None):

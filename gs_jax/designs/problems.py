@@ -185,7 +185,7 @@ def _length(mm: float) -> str:
 
 
 def _span(values: np.ndarray) -> str:
-    low, high = _two_digits(values.min()), _two_digits(values.max())
+    low, high = _two_digits(float(values.min())), _two_digits(float(values.max()))
     return low if low == high else f"{low} to {high}"
 
 

@@ -16,6 +16,7 @@ from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..optics.cores import apparent_depths
+from ..optics.focus import warn_if_blurred
 from ..optics.kinds import kind_weights, lenses_by_kind, of_kinds
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
@@ -171,6 +172,11 @@ def reconstructor(
     InputError
         If `method` is no method, or none for lenses that differ, there is no such optics, or a depth is blurred over
         more than 128 pixels ("near").
+
+    Warns
+    -----
+    InputWarning
+        If `ListRichardsonLucy` or `Unrolled` is asked for where the microscope is out of focus.
     """
     by_name = isinstance(optics, str)
     _check(method, optics, imager, grid)
@@ -189,6 +195,9 @@ def reconstructor(
     model = model_of(imager, grid, optics, progress or Progress())
     # Of these, back-projection stands for the adjoint.
     unmatched = isinstance(method, ListRichardsonLucy | Unrolled)
+    if unmatched and by_name:
+        what = "the pixels that back-projection reads"
+        warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
     least_squares = not isinstance(method, ListRichardsonLucy | RichardsonLucy)
     slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
     system = System(model.imager, grid, model.optics, seen if unmatched else None, slow)

@@ -1,4 +1,4 @@
-"""How far points can be trusted: what their lenses say, and whether the microscope is one that shows points."""
+"""How far points can be trusted: what their lenses say."""
 
 import math
 from typing import NamedTuple
@@ -7,16 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Shaped
 
 from ..geometry import Imager
-from ..optics.cores import apparent_depths, core_shares
-from ..optics.kinds import lenses_by_kind, of_kinds
+from ..optics.cores import apparent_depths
+from ..optics.focus import core_side
 from ..voxels import Grid
 from .consistency import Signal, agreed_level, log_false_alarms, signal, survival
 from .kinds import kinds_of, readings_of
-from .locate import APERTURE, FIELDS, LIT, SHARE, count_of, searched_voxels
+from .locate import LIT, SHARE, count_of, searched_voxels
 
-# Least part of a spot's light, of lenses within the field radius, that must fall into its core. The paper's microscope
-# has 21 to 51 % in focus, over 18 to 22 mm, and 1 % with its sensor at 4 mm.
-LEAST_SHARP = 0.05
 # Depths at which it is asked which kinds of lenses can see points.
 _DEPTHS = 9
 # What a file holds in the place of the logarithm of 0.
@@ -53,9 +50,7 @@ def point_evidence(
     # Cores lie, and are looked for, where chief rays of other depths land.
     ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
     depths = np.concatenate([ends, points[:, 2]])
-    kinds = kinds_of(
-        imager, np.linspace(depths.min(), depths.max(), _DEPTHS), (2 * APERTURE + 1) * imager.sensor.pixel_pitch
-    )
+    kinds = kinds_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS), core_side(imager))
     apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
     places[:, 2] = apparent[2:]
     seen = readings_of(places, light, kinds)
@@ -66,18 +61,3 @@ def point_evidence(
     lit = (seen.seen & (seen.light > LIT * seen.noise)).sum(1)
     signal_to_noise = np.divide(level, noise, out=np.zeros_like(level), where=noise > 0)
     return Evidence(lit, lenses, np.clip(log, _LEAST_LOG, -_LEAST_LOG), signal_to_noise)
-
-
-def sharpness(imager: Imager, grid: Grid) -> float:
-    """The part of a spot's light that falls into its core, of lenses within the field radius.
-
-    The least over the depths of a grid, by exact rays. Points are found by their cores: below `LEAST_SHARP` what is
-    found are caustics, and no points.
-    """
-    depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
-    fields = np.linspace(0, imager.field_radius, FIELDS)
-    core = (2 * APERTURE + 1) * imager.sensor.pixel_pitch
-    each = [imager] if imager.array.alike else of_kinds(imager, lenses_by_kind(imager))
-    in_square = lambda one, side: core_shares(one, depths, fields, side) @ fields
-    # At each depth the kind of lenses that is the sharpest.
-    return float(np.max([in_square(one, core) / in_square(one, math.inf) for one in each], 0).min())

@@ -19,6 +19,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..optics.cores import apparent_depths, core_shares
+from ..optics.focus import FIELDS, HALF_SIDE, core_side, warn_if_blurred
 from ..projection.backprojection import backproject
 from ..voxels import Grid
 from .background import in_bands
@@ -55,11 +56,12 @@ _REFINEMENTS = 7
 _COARSE = 2
 # Most planes that are searched at once.
 _PLANES = 32
-# Half the side, in pixels, of the square in which the light of a spot is summed; depths and fields at which the share
-# of the light in it is computed.
-APERTURE, _DEPTHS, FIELDS = 3, 5, 17
+# Depths at which the share of a spot's light in its core is computed.
+_DEPTHS = 5
 # Depths whose cores are traced, and how far they go beyond the grid, in depths.
 _TRACED, _BEYOND = 9, 0.05
+# What is to be said of points where spots are not sharp.
+NOT_TRUSTED = "no point is to be trusted"
 # Searches: the second, without the light that the first explains, finds what is close to brighter points.
 _SEARCHES = 2
 
@@ -109,6 +111,12 @@ def find_points(
     InputError
         If a pixel is not finite, or there are fewer than three lenses, which cannot agree on a point.
 
+    Warns
+    -----
+    InputWarning
+        If the microscope is out of focus at the grid's depths (`gs_jax.optics.focus`). Of an image, not of a
+        `Signal`, which is for many images of one microscope.
+
     Examples
     --------
     >>> import gs_jax as gs, numpy as np
@@ -128,8 +136,10 @@ def find_points(
         raise InputError(f"points: found {found}, allowed: {_FEWEST} lenses or more, which have to agree on a point.")
     if seen.light.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {seen.light.shape}.")
+    if not isinstance(image, Signal):
+        warn_if_blurred(imager, grid, "points", NOT_TRUSTED)
     depths = _around(grid)
-    kinds = kinds_of(imager, depths, (2 * APERTURE + 1) * imager.sensor.pixel_pitch)
+    kinds = kinds_of(imager, depths, core_side(imager))
     # Of lenses that differ, each kind is read where its own cores land: points are at their depths all along.
     apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
@@ -314,7 +324,7 @@ def _intensity(
     Summed in a square about each spot; of it the part that is the point's own in the middle; over the share of the
     point's light that falls into the square.
     """
-    side = np.arange(-APERTURE, APERTURE + 1)
+    side = np.arange(-HALF_SIDE, HALF_SIDE + 1)
     middle = np.floor(seen.pixels + 0.5).astype(int)
     row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
     total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
@@ -332,8 +342,7 @@ def _expected(points: Places, seen: Readings, imager: Imager) -> Float64[np.ndar
         return np.zeros_like(seen.light)
     depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
     fields = np.linspace(0, imager.field_radius, FIELDS)
-    side = (2 * APERTURE + 1) * imager.sensor.pixel_pitch
-    shares = core_shares(imager, depths, fields, side)
+    shares = core_shares(imager, depths, fields, core_side(imager))
     place = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
     at = np.stack(np.broadcast_arrays(place, seen.field / fields[1]))
     return map_coordinates(shares, at.reshape(2, -1), order=1, mode="nearest").reshape(seen.field.shape)
