@@ -4,9 +4,11 @@ BIN := .venv/bin
 OUT ?= out/demo
 # What one process compiled, the others read from the cache.
 PARALLEL := -n auto --maxprocesses 4 --dist worksteal
+# Shapes and types are checked at each call of a function: a quarter of the time of a run, so not in the quick one.
+TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # About a minute of what other versions of Python, JAX and the libraries may break, compiled as users compile it.
 # Libraries older or newer than the others warn of each other.
-SHORT := $(PARALLEL) -o filterwarnings=default -m "not slow" \
+SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -m "not slow" \
 	$(addprefix tests/test_,imports.py primitive.py native.py operators.py shipped_capture.py solve.py files.py \
 	mold_files.py solvers.py::test_it_finds_two_bright_voxels)
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
@@ -30,10 +32,10 @@ test: .venv/dev
 
 # What is slow by nature: other processes, browsers, the README, tutorials, experiments, all of the matrix of features.
 integration: .venv/dev
-	$(BIN)/python -m pytest $(PARALLEL) -m "integration and not slow"
+	$(BIN)/python -m pytest $(PARALLEL) $(TYPED) -m "integration and not slow"
 
 test-all: .venv/dev
-	EXAMPLES=all JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest $(PARALLEL) -m ""
+	EXAMPLES=all JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest $(PARALLEL) $(TYPED) -m ""
 
 # Half a gigabyte of napari and Qt, in an environment of their own.
 test-napari: .venv-napari/test

@@ -217,6 +217,7 @@ def test_a_lens_without_coma_has_no_limit_by_the_printed_sum():
     assert jnp.isfinite(jax.grad(lambda z: 1 / radius(z))(jnp.array(low * 1.01)))
 
 
+@pytest.mark.integration
 @ORIENTATIONS
 def test_gradients(plano):
     arguments = tuple(jnp.array(x) for x in (F, N, 0.7, DEPTH, 1.2, 5.7))

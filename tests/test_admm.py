@@ -120,6 +120,7 @@ def test_ffts_conjugate_gradients_and_fista_meet(depths):
     np.testing.assert_allclose(costs, costs[-1], rtol=1e-8)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("tv", [0.0, 0.01])
 def test_few_applications_of_the_operator_reach_the_minimum(tv):
     """Fewer equations than unknowns, as of a volume. FISTA's power method is not counted."""
@@ -174,6 +175,7 @@ def test_isotropic_total_variation_denoises_as_scikit_image_does():
     np.testing.assert_allclose(found.x, expected, atol=2e-3)
 
 
+@pytest.mark.integration
 def test_the_penalty_finds_its_way_and_the_residuals_stop_it():
     convolution, image = system()
     solver = ConvolutionADMM(3000, tolerance=1e-5, **weights(convolution, image, tv=0.05, sparsity=0.1))
@@ -200,6 +202,7 @@ def test_gradients():
     check_grads(jax.jit(moment), (psf, image, tv), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("isotropic", [False, True])
 def test_a_dark_image_gives_zeros(isotropic):
     convolution, image = system(2)

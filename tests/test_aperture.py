@@ -62,6 +62,7 @@ def test_area_is_the_integral_of_the_edge():
     np.testing.assert_allclose(aperture_area(lenses), integral, rtol=2e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("lenses", "expected"),
     [
@@ -116,6 +117,7 @@ def test_float32_and_rounding(angle):
         np.testing.assert_allclose(area[inner], 1, rtol=tolerance)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", [(8.0, 6.0), (np.inf, np.inf)])
 def test_gradients(size):
     @jax.jit

@@ -110,6 +110,7 @@ def smooth_image(sensor):
     return 2 + jnp.sin(row / 30) + jnp.cos(column / 40 + row / 50)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients_by_everything(modes):
     imager, grid = scene(voxels=(6, 5), pitch=0.15)
@@ -125,6 +126,7 @@ def test_gradients_by_everything(modes):
     check_grads(values, (*arguments, grid.depths, image), order=1, modes=modes, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients_of_the_adjoint(modes):
     imager, grid = scene(voxels=(6, 5), pitch=0.15)
@@ -136,6 +138,7 @@ def test_gradients_of_the_adjoint(modes):
     check_grads(moment, (imager, grid.depths, volume), order=1, modes=modes, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.integration
 def test_gradient_of_the_normalized_volume():
     imager, grid = scene(voxels=(6, 5), pitch=0.15)
     values = lambda imager: backproject(smooth_image(imager.sensor), imager, grid, normalize=True)
@@ -176,6 +179,7 @@ def test_second_derivatives_are_refused_in_words():
         jax.grad(jax.grad(total))(imager.sensor_distance)
 
 
+@pytest.mark.integration
 def test_many_depths_go_in_groups():
     """37 depths are three groups of 13, of which two are padding."""
     imager, grid = scene(voxels=(7, 6), pitch=0.15, depths=np.linspace(18, 24, 37))
@@ -267,6 +271,7 @@ def test_a_region_of_interest_is_a_part_of_the_whole(interpolation):
     np.testing.assert_allclose(part, whole[:, rows, columns], rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.integration
 def test_gradient_by_the_origin():
     """Moving the region is moving all of the microscope the other way."""
     imager, grid = scene()

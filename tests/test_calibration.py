@@ -168,6 +168,7 @@ def smaller(imager: Imager) -> Imager:
     return dataclasses.replace(imager, array=array, sensor=sensor, **numbers)
 
 
+@pytest.mark.integration
 def test_a_small_device_is_calibrated_as_a_large_one():
     actual, design, mirrored = device(0)
     found = calibrate(captures(actual)[1:2], POINTS[1:2] / 50, smaller(design))
@@ -176,6 +177,7 @@ def test_a_small_device_is_calibrated_as_a_large_one():
     check(found, smaller(actual), NAMES[:1])
 
 
+@pytest.mark.integration
 def test_one_capture_does():
     actual, design, mirrored = device(0)
     found = calibrate(captures(actual)[1:2], POINTS[1:2], design)
@@ -302,6 +304,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
             calibrate([blank], points, design, captures=of)
 
 
+@pytest.mark.integration
 def test_numbers_that_the_spots_do_not_determine_are_refused():
     actual, design, _ = device(0)
     with pytest.raises(InputError, match="spots that do not determine sensor_distance_mm.*depth_offset"):

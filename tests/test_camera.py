@@ -34,6 +34,7 @@ def chi_square_p(sample, mean):
     return stats.chisquare(found[used], expected[used]).pvalue
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("mean", [0.01, 0.3, 1.0, 3.7, 15.99, 16.0, 60.0, 400.0])
 def test_poisson_has_its_distribution(mean, dtype):
@@ -59,6 +60,7 @@ def test_the_expansion_has_the_error_that_is_stated(mean):
     np.testing.assert_allclose(variance, mean, rtol=2.4e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("mean", [0.5, 15.9, 16.1, 1e4, 1e6])
 def test_poisson_mean_and_variance(mean, dtype):
@@ -122,6 +124,7 @@ def test_a_dark_image_is_offset_and_read_noise():
     assert (expose(dark, Camera(read_noise=0.0), KEY, peak_electrons=1e4) == 16).all()
 
 
+@pytest.mark.integration
 def test_the_brightest_pixel_has_the_peak():
     image = np.random.default_rng(0).uniform(0, 3e-9, (48, 60))
     mean = np.mean(
@@ -180,6 +183,7 @@ def test_keys_and_independence():
         assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 5 / math.sqrt(a.size)
 
 
+@pytest.mark.integration
 def test_vmap_over_images_and_keys():
     """Of 19 rows, which are not a whole number of blocks."""
     images = jnp.asarray(np.random.default_rng(0).random((2, 19, 20)))

@@ -81,6 +81,7 @@ def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
     assert np.isfinite(volume).all() and volume.min() >= 0
 
 
+@pytest.mark.integration
 def test_the_papers_clusters(folder, monkeypatch, capsys):
     """The brightest voxels of connected groups, here of one point seen by four lenses; in the volume and as a table."""
     image = np.full((96, 80), 16, np.uint16)
@@ -131,6 +132,7 @@ def test_the_default_voxel_is_a_pixel_seen_at_the_middle_depth(folder, monkeypat
     assert f"{expected:.1f} um" in out
 
 
+@pytest.mark.integration
 def test_depths_include_the_stop_only_when_it_falls_on_the_step(folder, monkeypatch, capsys):
     for text, count in (("18:18.3:0.1", 4), ("18:18.25:0.1", 3), ("20:20:1", 1)):
         status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], text, "-o", "v.tif")

@@ -53,6 +53,7 @@ def test_from_table_1_to_the_targets(table1, outcome):
     assert 18 < in_focus < 23
 
 
+@pytest.mark.integration
 def test_only_what_is_free_changes(table1, outcome):
     old, new = table1.model_dump(), outcome.design.model_dump()
     assert old["sensor"] == new["sensor"]
@@ -92,6 +93,7 @@ def interrupted(table1, question, path, monkeypatch, *, writes):
     monkeypatch.setattr(search, "write_checkpoint", write)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("writes", [pytest.param(6, marks=pytest.mark.slow), 10], ids=["stage 1", "stage 2"])
 def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
     """Bit for bit, in the second start of the first stage or in the second stage."""
@@ -107,6 +109,7 @@ def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
     assert resumed.design == whole.design and resumed.log == whole.log
 
 
+@pytest.mark.integration
 def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path = tmp_path / "a.checkpoint"
     with pytest.raises(InputError, match="cannot be read"):

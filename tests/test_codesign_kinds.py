@@ -108,6 +108,7 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     assert same.lens.radius_of_curvature_mm == 1.34
 
 
+@pytest.mark.integration
 def test_where_lenses_overlap_they_end_as_those_of_the_file():
     """With a pitch that scales them all, as the plate's size cannot be traced."""
     design, parent = two_kinds(diameter=1.3)
@@ -200,6 +201,7 @@ def test_two_foci_are_better_over_a_long_span(searches):
     assert "12 lenses of 2 kinds" in repr(two.design)
 
 
+@pytest.mark.integration
 def test_what_is_found_goes_on_as_a_design_of_two_kinds(searches):
     """What is written is read as its kinds, and judged as it was."""
     design = searches[1].design

@@ -136,6 +136,7 @@ def test_gradients():
     check_grads(terms, (base.array.centers,), order=1, modes=("fwd", "rev"), eps=1e-7, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("place", [0.0, 30.0], ids=["coincident", "out of sight"])
 def test_gradients_are_finite(place):
     base, frequencies = random_imager(), np.array([[0.0, 0.0], [3.0, 1.0]])

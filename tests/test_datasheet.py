@@ -48,6 +48,7 @@ def test_the_keys_and_their_types(table1):
     assert json.loads(json.dumps(sheet, allow_nan=False)) == sheet
 
 
+@pytest.mark.integration
 def test_the_papers_design(table1):
     """Table 1 and thin-lens figures at 20 mm, with the clear diameter for the diameter."""
     sheet = datasheet(table1, [18.0, 20.0, 30.0])
@@ -79,6 +80,7 @@ def test_the_clear_diameter_is_that_of_the_array(table1):
     np.testing.assert_allclose([sheet["pitch_mm"], sheet["pitch_sd_mm"]], [mean, deviation], rtol=1e-5)
 
 
+@pytest.mark.integration
 def test_infinity_is_none(table1):
     sheet = datasheet(table1, [3.0, 200.0], confusion=0.1)
     assert sheet["focus_distance_mm"][0] is None
@@ -126,6 +128,7 @@ def test_what_is_wrong_with_the_design_in_focus(table1):
     assert "draws the sharpest image of 18 mm toward the lens, by up to 460 um" in text
 
 
+@pytest.mark.integration
 def test_an_ideal_lens_has_no_aberrations(table1):
     """In focus at 20 mm its wavefront is perfect there, and what is wrong elsewhere is defocus."""
     thin = changed(changed(table1, "lens", focal_length_mm=4.65), "imaging", sensor_distance_mm=6.0)
@@ -210,6 +213,7 @@ def test_gradients_by_everything_that_is_continuous():
     check_grads(values, arguments, order=1, eps=1e-7, atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("how", ["by cells", "by centres", "kinds"])
 def test_the_clear_aperture_follows_the_imager(how):
     """Of lenses whose discs overlap, whatever of the imager is replaced: also where centres coincide, in value."""
@@ -246,6 +250,7 @@ def test_the_built_in_design_matches_its_file():
     np.testing.assert_allclose(sheet["blur_um"], 53, atol=0.5)
 
 
+@pytest.mark.integration
 def test_the_command(tmp_path, monkeypatch, capsys, table1):
     design = Path(__file__).parents[1] / "design" / "geomscope-table1.toml"
     output = tmp_path / "sheet.json"

@@ -40,6 +40,7 @@ def test_it_is_what_the_truth_has_left(side):
     assert misfit_of_noise(image, light, counts=False) == pytest.approx(squares, rel=0.05)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("solver", [RichardsonLucy(steps=100), FISTA(steps=100)])
 def test_solvers_end_where_noise_is_left(solver):
     imager, _ = scene()

@@ -81,6 +81,7 @@ def test_reconstruct_is_back_projection_less_its_mean():
     np.testing.assert_allclose(reconstruct(image, imager, grid, background_width=0.2), expected, atol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("shape", [(60, 50), (61, 50), (96, 80)])
 def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
     """A volume beside the axis, in the frame of the part and in that of the whole."""
@@ -110,6 +111,7 @@ def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
     assert lit.sum() == expected.size
 
 
+@pytest.mark.integration
 def test_voxels_leave_no_gaps_in_the_image():
     """An even volume, voxels 1.9 to 2.2 pixels apart: as points they are a grid of dots, as footprints even light."""
     imager = Imager(MicrolensArray(np.zeros((1, 2))), Sensor((96, 80), 0.02), 5.8, 2.0)
@@ -141,6 +143,7 @@ def loss(imager, key, grid, psf, electrons=1000.0):
     return reconstruction_loss(imager, key, grid=grid, psf=psf, electrons=electrons, **OPTIONS)
 
 
+@pytest.mark.integration
 def test_light_lowers_the_loss():
     """In electrons of a voxel through a lens: shot noise is most of the error at 1, nothing at a million."""
     imager, grid = scene()
@@ -148,6 +151,7 @@ def test_light_lowers_the_loss():
     assert bright < dark - 0.3
 
 
+@pytest.mark.integration
 def test_the_key_decides():
     imager, grid = scene()
     of = lambda key: loss(imager, key, grid, psfs())

@@ -96,6 +96,7 @@ def test_the_numbers_are_the_datasheets(design, bench):
     assert found.scalars["coverage"] == pytest.approx(sheet["coverage"], rel=1e-5)
 
 
+@pytest.mark.integration
 def test_what_is_saved_is_what_was_seen(design, bench):
     """With the pitch too: the pattern and its plate are scaled."""
     values = checked_values(design, MOVES | {"pitch_mm": 1.2 * float(bench.parent.pitch)})
@@ -241,6 +242,7 @@ def test_a_browser_moves_it(server, browser):
         assert [part.split("kept")[0] for part in parts()][1:] == [part.split("kept")[0] for part in start][1:]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("width", [1200, 400])
 def test_it_is_no_wider_than_the_screen(server, browser, width):
     with watched(browser, server[0].url, width) as page:

@@ -77,6 +77,7 @@ def test_a_lens_and_a_plane_are_wieners_filter():
     np.testing.assert_allclose(jax.jit(lost_power)([c], jnp.zeros((1, 2)))[0], expected, rtol=3e-3)
 
 
+@pytest.mark.integration
 def test_planes_that_no_parallax_tells_apart():
     """By a single lens two planes of the same sharpness are half of each other, however bright: what is found of each
     is the half that the sum tells; of 40 lenses apart far more."""
@@ -120,6 +121,7 @@ def test_the_bound_is_that_of_the_pixels():
     np.testing.assert_allclose(jax.jit(crowded_bound)([c], PLACES)[0], pixels, rtol=0.15)
 
 
+@pytest.mark.integration
 def test_spots_have_the_transfer_function():
     """Where all light is in the window and nothing is cut off below zero: the Fourier transform gives it back."""
     c = candidate(parent(), {"aperture_diameter_mm": jnp.array(0.4), "sensor_distance_mm": jnp.array(5.6)})

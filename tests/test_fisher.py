@@ -106,6 +106,7 @@ def test_off_the_sensor_and_out_of_sight():
     np.testing.assert_allclose(cramer_rao(far, random_imager(), **OPTIONS), 10, rtol=1e-9)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("noise", [0.0, 2.0])
 @pytest.mark.parametrize("place", [0.1, 40.0], ids=["coincident", "out of sight"])
 def test_gradients_are_finite(place, noise):

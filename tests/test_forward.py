@@ -29,6 +29,7 @@ def volume_of(grid, dtype=jnp.float64):
     return jax.random.uniform(jax.random.key(2), grid.volume_shape, dtype)
 
 
+@pytest.mark.integration
 def test_without_a_psf_it_is_the_adjoint_of_back_projection():
     imager, grid = scene()
     volume = volume_of(grid)
@@ -40,6 +41,7 @@ def test_without_a_psf_it_is_the_adjoint_of_back_projection():
     np.testing.assert_allclose(found[inner], expected[inner], atol=1e-13 * expected.max())
 
 
+@pytest.mark.integration
 def test_each_depth_is_convolved_with_its_psf():
     imager, grid = scene()
     volume, kernels = volume_of(grid), psfs(3)
@@ -68,6 +70,7 @@ def test_light_of_chief_rays_beside_the_sensor():
     np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_voxels_may_be_integers():
     imager, grid = scene()
     volume = jax.random.randint(jax.random.key(2), grid.volume_shape, 0, 9)
@@ -267,6 +270,7 @@ def test_many_points_are_spots_one_by_one(dtype):
         assert np.abs(image - expected).sum() < 2e-3 * expected.sum()
 
 
+@pytest.mark.integration
 def test_many_points_take_little_memory():
     """200 lenses by 50 000 points are 160 MB; 3 of 4 points are seen by no lens, the others by one."""
     centers = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0)), -1).reshape(-1, 2)

@@ -23,6 +23,7 @@ def folder(tmp_path, monkeypatch):
     return design_and_capture(tmp_path)
 
 
+@pytest.mark.integration
 def test_the_first_script(folder):
     scope = gs.read_design("design/geomscope.toml").imager()
     image = gs.read_capture("capture.tif", scope.sensor.shape)
@@ -38,6 +39,7 @@ def test_the_first_script(folder):
     assert gs.reconstruct(image, scope, coarse, method=gs.RichardsonLucy(steps=2)).shape == coarse.volume_shape
 
 
+@pytest.mark.integration
 def test_files_take_strings_and_paths(folder, tmp_path):
     assert gs.read_design(tmp_path / "design" / "geomscope.toml") == gs.read_design("design/geomscope.toml")
     for path in ("points.csv", tmp_path / "points.csv"):

@@ -55,6 +55,7 @@ def test_the_adjoint_is_exact(dtype, rtol, pixels):
     assert A.mv(x).dtype == dtype and one > 0
 
 
+@pytest.mark.integration
 def test_nothing_is_scattered():
     """Some versions of JAX compile a scatter-add for GPUs to loops that wait for each other."""
     scope, voxels = imager(), grid(shape=(6, 5))
@@ -64,6 +65,7 @@ def test_nothing_is_scattered():
         assert "stablehlo.scatter" not in lowered.as_text()
 
 
+@pytest.mark.integration
 def test_gradients_by_volume_centers_and_distance():
     scope, voxels = imager(), grid(shape=(6, 5))
     optics = full_optics(scope, voxels.depths)
@@ -78,6 +80,7 @@ def test_gradients_by_volume_centers_and_distance():
     check_grads(jax.jit(of), (x, scope.array.centers, scope.sensor_distance), 1, modes=["rev"], eps=1e-7, rtol=1e-3)
 
 
+@pytest.mark.integration
 def test_darkness_is_dark_and_has_finite_gradients():
     scope, voxels = imager(), grid()
     optics = full_optics(scope, voxels.depths)
@@ -167,6 +170,7 @@ def test_zones_are_the_lenses_apertures():
     assert (alone.open == 1).all() and (alone.by_area == 0).all()
 
 
+@pytest.mark.integration
 def test_tables_are_kept_for_the_same_microscope():
     scope = imager(pixels=(24, 24), pitch=0.2)
     first = full_optics(scope, [20.0])
@@ -208,6 +212,7 @@ def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():
     np.testing.assert_allclose(apparent_depths(scope, many)[::29], few, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_levels_have_names():
     scope, voxels = imager(), grid()
     assert optics_of(scope, DEPTHS, "pinhole") is None
@@ -219,6 +224,7 @@ def test_levels_have_names():
         optics_of(scope, DEPTHS, "exact")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("level", ["full", "near", "pinhole"])
 def test_every_level_reconstructs(level):
     """A bright voxel is the brightest, whatever the method knows of the light."""
@@ -232,6 +238,7 @@ def test_every_level_reconstructs(level):
     assert np.abs(np.array(at[1:]) - (8, 13)).max() <= 1 and np.isfinite(found).all()
 
 
+@pytest.mark.integration
 def test_intensities_are_what_points_send_out():
     scope = imager(pixels=(600, 600), pitch=0.009, lenses=25)
     truth = np.array([[0.3, 0.2, 19.5, 1.0], [-0.4, -0.5, 20.4, 2.0]])

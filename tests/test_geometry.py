@@ -71,6 +71,7 @@ def test_envelope_is_cos4_inside_and_half_at_the_field_radius():
     assert envelope(1e8, 20.7, 3.0) == 0
 
 
+@pytest.mark.integration
 def test_geometry_has_gradients():
     imager, _ = scene()
     points = jnp.array([[0.1, 0.2, 19.0], [-0.3, 0.1, 22.0]])

@@ -35,6 +35,7 @@ def parent():
     return parent_of(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, free={"centers_mm": (-10.0, 10.0)})
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", NAMES)
 def test_values_and_gradients_are_finite(parent, name):
     """Also where two lenses coincide; their gradients are checked where they are written."""
@@ -79,6 +80,7 @@ def test_points_are_located_to_a_small_part_of_a_pixel(parent):
     assert (least < found[:2]).all() and (found[:2] < 20 * least).all() and found[2] < 1000
 
 
+@pytest.mark.integration
 def test_spectrum_of_random_lenses_and_of_a_lattice():
     """Random: exponential powers, a flatness of exp(-Euler's constant) = 0.56; a lattice has power in few places."""
     rng = np.random.default_rng(0)

@@ -131,6 +131,7 @@ def test_adjoint():
         np.testing.assert_allclose(jnp.vdot(bilinear._gather(shapes, rays, image), volume), forth, rtol=1e-5)
 
 
+@pytest.mark.integration
 def test_derivatives_in_both_modes_and_batches():
     imager, grid = scene(jnp.float32)
     image = jax.random.uniform(jax.random.key(0), imager.sensor.shape, jnp.float32)

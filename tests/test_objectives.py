@@ -101,6 +101,7 @@ def test_width_of_an_ideal_lens_out_of_focus(focused):
     np.testing.assert_allclose(jax.jit(TERMS["encircled_radius_um"].function)(lens), np.sqrt(0.8) * radius, rtol=0.03)
 
 
+@pytest.mark.integration
 def test_width_of_a_lens_in_focus_is_that_of_its_diffraction(focused):
     """A Gaussian of the same variance against the PSF's own width. Two pixels make the spot: it is no Gaussian, 15 %.
 

@@ -35,6 +35,7 @@ def test_optiland_has_the_same_rays_through_aspheres_with_either_side_in_front(l
     np.testing.assert_allclose(row["wavefront_rms_waves"], row["wavefront_rms_optiland_waves"], rtol=1e-6)
 
 
+@pytest.mark.integration
 def test_strehl_ratio_beside_huygens_sum_over_optilands_rays():
     pytest.importorskip("optiland")
     result = run(fields=(0.0, 2.0), depths=(20.0,))

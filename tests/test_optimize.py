@@ -65,6 +65,7 @@ def test_nothing_is_written_on_wrong_input(folder):
     assert set(folder.iterdir()) == before
 
 
+@pytest.mark.integration
 def test_pareto(folder):
     (folder / "study.toml").write_text(STUDY + '[[pareto]]\nname = "occupancy"\nat_least = [0.3, 0.5]\n')
     result = run(pareto, "study.toml", "--out", "out")

@@ -76,6 +76,7 @@ def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
     np.testing.assert_allclose(found.lenses_per_point, 200 * np.pi * 9 / 22**2, rtol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("moving", [False, True])
 def test_everything_has_gradients(moving):
     small = geomscope().model_copy(

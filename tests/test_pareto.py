@@ -63,6 +63,7 @@ def test_light_against_depth_of_field(front):
     assert front.best.all()
 
 
+@pytest.mark.integration
 def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
     calls, run = [0], stages.run
 
@@ -135,6 +136,7 @@ def test_a_study_without_limits_that_move():
         trade_off(geomscope(), Study.model_validate(STUDY | {"pareto": []}))
 
 
+@pytest.mark.integration
 def test_the_command_reads_its_study_once_and_signs_its_numbers(tmp_path, monkeypatch):
     """The command, the study and the design with their hashes, and the design's text; from the first point on."""
     read, counted = [], lambda path: read.append(path) or read_study(path)

@@ -89,6 +89,7 @@ def test_a_single_depth_and_a_single_voxel():
     np.testing.assert_array_equal(rasterize(emitters, grid([20.0], (1, 1))), [[[1.0]]])
 
 
+@pytest.mark.integration
 def test_gradients_of_rasterize():
     voxels, emitters = grid(), scattered(20)
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(4, 9, 7)))

@@ -84,6 +84,7 @@ def test_of_what_is_no_number_nothing_is_said(value):
     assert all(slip(key, value) is None for key in USUAL)
 
 
+@pytest.mark.integration
 def test_commands_say_it_once_and_go_on(folder, monkeypatch, capsys):
     """Whatever reads the design; a warning of another kind stays what it is."""
     (folder / "design.toml").write_text(DESIGN.replace("sensor_distance_mm = 5.8", "sensor_distance_mm = 58.0"))

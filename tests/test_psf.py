@@ -69,6 +69,7 @@ def test_far_from_focus_it_is_the_shadow_of_the_aperture(field):
     np.testing.assert_allclose(np.asarray(rays)[distance < blur - 2], 1 / (np.pi * blur**2), rtol=0.15)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("v", "field"), [pytest.param(4.0, (0.0, 0.0), marks=pytest.mark.slow), (5.67, (3.0, 0.0))])
 def test_huygens_principle_summed_directly(v, field):
     """Wavelets from points of the lens, a sum for each point of the sensor; no exit pupil, no linear phase."""
@@ -114,6 +115,7 @@ SMALL = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("what", SMALL)
 def test_strehl_of_small_errors_is_the_exponential(what):
     lens, radius, beside, field = SMALL[what]
@@ -130,6 +132,7 @@ def test_strehl_is_one_without_aberrations():
     np.testing.assert_allclose(strehl(in_focus(), 20.0, radius=RADIUS), 1, rtol=1e-9)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("field", [(0.0, 0.0), (1.0, -2.0)])
 def test_rays_and_waves_have_the_same_centroid(field):
     """Ehrenfest: the mean of the waves is that of the rays, whatever the aberrations."""
@@ -149,6 +152,7 @@ def test_the_gaussian_has_the_rays_second_moment():
     np.testing.assert_allclose(second(image) - 1 / 12, second(rays) - 1 / 6, rtol=2e-3)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", KINDS)
 def test_sum_centre_and_symmetry(kind):
     options = dict(size=65, radius=RADIUS)
@@ -175,6 +179,7 @@ def test_edges_cut_the_aperture(kind):
     assert float(image[:, :64].sum()) > 0.97
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("v", "field", "size"),
     [(5.8, (0.0, 0.0), 65), (5.8, (3.0, 0.0), 65), pytest.param(4.0, (0.0, 0.0), 129, marks=pytest.mark.slow)],

@@ -83,6 +83,7 @@ def test_it_is_what_the_solver_finds_in_one_loop():
     np.testing.assert_allclose(found, in_one_loop()(image), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.integration
 def test_each_step_is_shown_and_can_be_the_last():
     imager, grid, psf, _, image = small()
     log = Log()
@@ -97,6 +98,7 @@ def test_each_step_is_shown_and_can_be_the_last():
     assert len(interrupted.parts) == 3
 
 
+@pytest.mark.integration
 def test_the_cameras_offset_is_taken_off_once():
     imager, grid, psf, _, image = small()
     counts = np.round(1000 * np.asarray(image) / float(image.max()))

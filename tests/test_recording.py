@@ -78,6 +78,7 @@ def expected(frames=FRAMES, **options):
     return np.stack([reconstruct(frame.astype(np.float32), imager, grid, **options) for frame in frames])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["rec.tif", "rec.npy", "frames", "frames/f*.tif", "rec.zarr"])
 def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name):
     status, out, err = run(monkeypatch, capsys, *command(save(name)))
@@ -102,6 +103,7 @@ def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
     assert "dark.tif" in read_provenance("v.zarr")["correction"]
 
 
+@pytest.mark.integration
 def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
     assert (
@@ -244,6 +246,7 @@ def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
     assert (status, err) == (0, "gs-jax: replaced v.zarr\n")
 
 
+@pytest.mark.integration
 def test_points_of_all_frames_in_one_table(folder, monkeypatch, capsys):
     scope = read_design("design.toml").imager()
     frames = np.full((3, 96, 80), 16, np.uint16)

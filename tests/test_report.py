@@ -74,6 +74,7 @@ def made(tmp_path_factory):
     return folder
 
 
+@pytest.mark.integration
 def test_the_page_has_all_parts_and_no_path(made):
     text = (made / "report.html").read_text()
     parts = re.findall(r'<section id="(\w+)">', text)
@@ -87,6 +88,7 @@ def test_the_page_has_all_parts_and_no_path(made):
     assert not re.findall(r'(?:src|href)="(?!data:|#)', text) and "@import" not in text
 
 
+@pytest.mark.integration
 def test_a_page_of_a_design_alone(tmp_path):
     """Nothing was imaged; an ideal lens has no surface, so no mold."""
     (tmp_path / "design.toml").write_text(DESIGN.replace("[array]", "focal_length_mm = 4.6\n[array]"))
@@ -268,6 +270,7 @@ def test_the_contrast_of_a_perfect_lens():
     np.testing.assert_allclose(curve.contrast, ideal.contrast, atol=0.02)
 
 
+@pytest.mark.integration
 def test_charts_draw_what_is_finite():
     drawn = line_chart({"a <b>": ([1.0, 2.0, 3.0], [1.0, None, 3.0])}, x="x", y="y", title="t")
     assert drawn.count("<polyline") == 1 and "a &lt;b&gt;" in drawn and "nan" not in drawn

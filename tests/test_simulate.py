@@ -35,6 +35,7 @@ def test_a_point_is_a_small_voxel(kind):
     np.testing.assert_allclose(from_points.max(), from_volume.max(), rtol=0.3)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("sensor_distance", "pixel"), [(5.0, 0.002), (5.0, 0.001), (5.8, 0.01)])
 def test_the_window_holds_the_light(sensor_distance, pixel):
     """Near the focus of the rim's rays other zones land farther out: all rays that get through, counted one by one."""
@@ -47,6 +48,7 @@ def test_the_window_holds_the_light(sensor_distance, pixel):
     assert np.sum(weights, where=rays.valid & inside) > 0.999 * np.sum(weights, where=rays.valid)
 
 
+@pytest.mark.integration
 def test_a_coarse_volume_has_no_dots():
     """Voxels three pixels apart on the sensor make an image as even as an even object does."""
     grid = Grid([20.0], (9, 9), 0.12)
@@ -55,6 +57,7 @@ def test_a_coarse_volume_has_no_dots():
     np.testing.assert_allclose(middle, middle.mean(), rtol=0.05)  # the envelope falls by 2 %, the raster's ripple by 3
 
 
+@pytest.mark.integration
 def test_dark_scenes_are_dark():
     options: dict[str, Any] = dict(progress=Progress())
     grid = Grid([20.0], (5, 5), 0.05)
@@ -64,6 +67,7 @@ def test_dark_scenes_are_dark():
     assert not simulate_points(far_beside, imager(), **options).any()
 
 
+@pytest.mark.integration
 def test_many_depths_share_stamps():
     """Between the depths of the stamps the PSF is interpolated: the image of a column of points stays smooth."""
     z = np.linspace(20, 20.5, 40)
@@ -76,6 +80,7 @@ def test_many_depths_share_stamps():
     )
 
 
+@pytest.mark.integration
 def test_depths_are_taken_some_at_a_time(monkeypatch):
     """A long column of points, one of them on the border of two slabs, is the sum of its images in one slab."""
     z = np.append(np.linspace(15, 16.3, 30), 15.5)

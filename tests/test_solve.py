@@ -36,6 +36,7 @@ def test_rosenbrocks_valley(solver):
     assert reason == CONVERGED
 
 
+@pytest.mark.integration
 def test_rosenbrocks_valley_within_bounds():
     """L-BFGS-B of SciPy comes to the same place, on a bound; the unit square, from 0 to 1."""
     start, two = INSIDE, jnp.array(2.0)
@@ -47,6 +48,7 @@ def test_rosenbrocks_valley_within_bounds():
     assert state.free["x"] == 1 and reason == CONVERGED
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("solver", (*SOLVERS, "lbfgsb", "adam"))
 def test_going_on_from_any_step_is_the_same(solver):
     """Bit for bit: the state is all that the next step depends on, and it survives a copy through bytes."""

@@ -135,6 +135,7 @@ PARAMETRIC = {"dense": lambda: (lx.MatrixLinearOperator, (dense().matrix,)), "ra
 KINDS = ["dense", pytest.param("ray", marks=pytest.mark.slow)]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_gradients_by_image_and_operator(solver, kind):
@@ -154,6 +155,7 @@ def test_gradients_by_image_and_operator(solver, kind):
     check_grads(moment, (image, *parameters), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_gradients_stay_finite_in_the_dark(solver, kind):
@@ -167,6 +169,7 @@ def test_gradients_stay_finite_in_the_dark(solver, kind):
     assert value == 0 and all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_an_early_end_and_the_same_step_by_step(solver):
     A = dense()
@@ -252,6 +255,7 @@ def test_richardson_lucy_is_scikit_images():
     np.testing.assert_allclose(found.x[0][system.place], expected, atol=1e-8)
 
 
+@pytest.mark.integration
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
     A = forward_operator(*small())
     truth = light(A)
@@ -268,6 +272,7 @@ def test_richardson_lucy_with_background_acceleration_and_total_variation():
     assert variation(smooth) < 0.97 * variation(rough)
 
 
+@pytest.mark.integration
 def test_richardson_lucy_fits_a_slow_background():
     A = forward_operator(*small())
     truth = light(A)

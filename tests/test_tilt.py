@@ -60,6 +60,7 @@ def test_light_is_brightest_on_the_axis_that_leans():
     assert np.abs((np.array([column, row]) - 80) * 0.02 - center - lean).max() < 0.02
 
 
+@pytest.mark.integration
 def test_no_tilt_and_a_tilt_of_zero_are_the_same():
     grid, volume = Grid([18.0, 21.0], (61, 67), 0.1), np.random.default_rng(1).random((2, 61, 67))
     image = [forward(volume, imager, grid) for imager in (tilted(None), tilted((0.0, 0.0)))]
@@ -72,6 +73,7 @@ def tilted_by(tilt) -> Imager:
     return eqx.tree_at(lambda i: i.tilt, tilted(), tilt)
 
 
+@pytest.mark.integration
 def test_operators_are_adjoint_and_differentiable_by_the_tilt():
     rng, grid = np.random.default_rng(2), Grid([18.0, 20.0, 22.0], (101, 111), 0.07)
     volume = rng.random(grid.volume_shape)

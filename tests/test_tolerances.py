@@ -124,6 +124,7 @@ def test_steps_of_a_lens_are_in_its_middle():
     assert lens_squares(array, 0.2, 0.0, pixel, 520e-6) == (0, 0)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation):
     imager = single(orientation=orientation)
@@ -135,6 +136,7 @@ def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation):
     check_grads(lambda v: axial_strehl(dataclasses.replace(imager, sensor_distance=v), 18.0), (3.7,), 1, rtol=1e-4)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", range(3))
 def test_images_of_wrong_lenses_by_optilands_rays(seed):
     """Radius, conic, index and distance wrong at once, 3 standard deviations of the defaults and more."""
@@ -164,6 +166,7 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
         np.testing.assert_allclose(ratio[row], light, rtol=0.01)
 
 
+@pytest.mark.integration
 def test_wrong_distances_and_indices_have_closed_forms(design, pinholes):
     """`M = v/z'` is what is seen, whatever made it: `-z' dv / (v + dv)`, and the plate's `t/n`."""
     nothing, n, v = no_errors(len(design.array.centers_mm)), 1.43, 3.8
@@ -220,6 +223,7 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
             np.testing.assert_allclose(found[row], z - one[0][2], atol=1e-4)
 
 
+@pytest.mark.integration
 def test_gradients_are_finite_differences(design, outcome):
     spreads, nothing = spreads_of(outcome.tolerances), no_errors(len(design.array.centers_mm))
     microscope = microscope_of(design, np.array(DEPTHS))
@@ -259,6 +263,7 @@ def test_roughness_takes_light_from_the_core(outcome):
     assert (np.asarray(outcome.alone["printed layers"].log_width) > 0).all()
 
 
+@pytest.mark.integration
 def test_yields(design, outcome):
     assert 0 <= outcome.all_met.mean() <= min(met.mean() for met in outcome.met.values())
     assert set(outcome.yields_without) == set(RULED) and costs(outcome)[0] in sentences(outcome)[1]
@@ -283,6 +288,7 @@ def test_the_picture_and_the_numbers(outcome):
     assert shown.widths["devices, median"] == (numbers["depth_mm"], middle)
 
 
+@pytest.mark.integration
 def test_the_command(folder, monkeypatch, capsys):
     (folder / "made.toml").write_text("position_um = 1.0\ntilt_deg = 0.1\n")
     options = ("--tolerances", "made.toml", "--tilt-deg", 0.3, "--depths", "18:22:2", "--draws", 20, "-q")

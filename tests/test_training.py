@@ -33,12 +33,14 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.integration
 def test_the_loss_falls():
     losses = train(toy(), start(toy(), steps=40, seed=1)).losses
     assert np.isfinite(losses).all()
     assert losses[-10:].mean() < 0.5 * losses[:5].mean()
 
 
+@pytest.mark.integration
 def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
     """Bit for bit: weights, the optimizer's memory and losses, through a file."""
     whole = train(toy(), start(toy(), steps=8, seed=2))
@@ -57,6 +59,7 @@ def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
     assert_equal(train(toy(), state), whole)
 
 
+@pytest.mark.integration
 def test_seeds_make_a_difference():
     states = [train(toy(), start(toy(), steps=2, seed=seed)) for seed in (0, 0, 1)]
     assert_equal(states[0], states[1])
@@ -148,6 +151,7 @@ def test_an_empty_stack_gives_patches():
 TINY = (Kind(96, 0.045, 0.2, 5),)
 
 
+@pytest.mark.integration
 def test_a_simulated_stack_shows_its_scene():
     one, again, other = (simulated_stack(0, number, TINY) for number in (0, 0, 1))
     assert_equal(one, again)
@@ -160,11 +164,13 @@ def test_a_simulated_stack_shows_its_scene():
         assert np.polyfit(truth, volume, 1)[0] == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.integration
 def test_some_stacks_are_nothing_but_noise():
     stack = simulated_stack(0, 15, TINY)
     assert not stack.truth.any() and np.asarray(stack.volume, np.float32).std() > 0
 
 
+@pytest.mark.integration
 def test_stacks_are_kept(tmp_path):
     folder = tmp_path / "stacks"
     made = stacks(folder, 2, 5, kinds=TINY)
@@ -187,6 +193,7 @@ def toy_command(monkeypatch):
     return invoke
 
 
+@pytest.mark.integration
 def test_the_command_writes_weights_losses_and_a_checkpoint(toy_command, tmp_path):
     path = tmp_path / "w.npz"
     result = toy_command("--steps", 5, "-o", path)
@@ -198,6 +205,7 @@ def test_the_command_writes_weights_losses_and_a_checkpoint(toy_command, tmp_pat
     assert history.count(".") >= 5
 
 
+@pytest.mark.integration
 def test_what_was_trained_reconstructs(toy_command, tmp_path, monkeypatch):
     """From `train` to the volume: `--weights` is the network of that file and no other."""
     assert toy_command("--steps", 3, "-o", tmp_path / "w.npz").exit_code == 0
@@ -215,6 +223,7 @@ def test_what_was_trained_reconstructs(toy_command, tmp_path, monkeypatch):
     assert not np.allclose(volume, suppress(plain))
 
 
+@pytest.mark.integration
 def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, monkeypatch):
     whole, broken = tmp_path / "whole.npz", tmp_path / "broken.npz"
     assert toy_command("--steps", 5, "-o", whole).exit_code == 0

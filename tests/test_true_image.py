@@ -15,6 +15,7 @@ from .helpers import needs
 BARS = {"letters": (0.12, 0.965, 0.03), "USAF target": (0.2, 0.975, 0.05), "120 points": (0.33, 0.935, 0.06)}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("orientation", "reduced"), [("plano", 100 + 1 / 1.5), ("curved", 100.0)])
 def test_a_single_lens_passes_the_light_that_a_solid_angle_says(orientation, reduced):
     """Our own tracer, on the axis and far away: the lens's solid angle less 4 % at either face, n = 1.5."""

@@ -63,6 +63,7 @@ def test_lenses_that_are_apart_are_discs_on_the_plate():
     np.testing.assert_allclose(aperture_area(near[0]), aperture_area(near[1]), rtol=1e-3)
 
 
+@pytest.mark.integration
 def test_areas_are_those_of_a_raster():
     """The highest cap at each place, steps of 4 um: an edge of 1 mm along a row of them is right to 2e-3 of a lens."""
     array, step = unequal(), 0.004
@@ -86,6 +87,7 @@ def test_a_kind_keeps_its_neighbours():
     np.testing.assert_allclose(areas, aperture_area(array)[np.concatenate(which)], rtol=1e-12)
 
 
+@pytest.mark.integration
 def test_how_open_lenses_are_by_radius():
     """The integral over the radii is the area; of the same lenses as two kinds the shares are those of one."""
     disc = dataclasses.replace(unequal(), size=(np.inf, np.inf))
@@ -98,6 +100,7 @@ def test_how_open_lenses_are_by_radius():
     np.testing.assert_allclose(np.mean(halves, 0), zones(alike).open, atol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("size", [SIZE, (np.inf, np.inf)])
 def test_gradients_of_areas(size):
     array = unequal(6, size)

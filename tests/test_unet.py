@@ -158,6 +158,7 @@ def test_edge_depths_are_repeated():
     np.testing.assert_allclose(suppress(np.repeat(plane, 3, 0), network)[1], alone[0], rtol=1e-6)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", [True, False])
 def test_gradients(kind):
     network = small(widths=(2, 3), standardized=kind, dtype=jnp.float64)

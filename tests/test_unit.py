@@ -78,6 +78,7 @@ def falls(squared, orientation="plano", conic_constant=0.0, aspheric_terms=()):
     return conic + sum(term * r ** (4 + 2 * k) for k, term in enumerate(aspheric_terms))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 def test_rays_without_a_compiler_are_the_same(field, lens):
@@ -164,6 +165,7 @@ def test_an_ideal_lens_collimates_from_its_focus():
     np.testing.assert_allclose(rays.tangent, np.broadcast_to([-0.5 / 4.65, 0], (40, 2)), atol=1e-14)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("v", [4.0, 5.8])
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("lens", SHAPES, ids=str)
@@ -181,6 +183,7 @@ def test_best_focus_of_a_thin_lens_is_the_image():
     np.testing.assert_allclose(v, 1 / (1 / 4.65 - 1 / (20 + 1 / 1.43)), rtol=1e-12)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("lens", SHAPES, ids=str)
 def test_best_focus_is_the_least_wavefront_error(field, lens):
@@ -199,6 +202,7 @@ def test_disc_averages():
     np.testing.assert_allclose(jnp.sum(weights * x**4 * y**2), 0.7**6 / 64, rtol=1e-13)
 
 
+@pytest.mark.integration
 def test_no_ray_through_what_is_no_lens():
     """Beside the sphere, or where the light is reflected totally: no value, and gradients that are finite."""
     points = np.array([[2.5, 0.0], [2.0, 0.0], [1.9, 0.0], [0.5, 0.0]])
@@ -217,6 +221,7 @@ def test_a_perfect_wavefront_has_a_gradient():
     assert value < 1e-12 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients(lens, modes):

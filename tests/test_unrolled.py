@@ -42,6 +42,7 @@ def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     return networks, Case(np.asarray(light), system, np.asarray(truth), start)
 
 
+@pytest.mark.integration
 def test_a_bright_voxel_is_the_brightest():
     scope, voxels = imager(), Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
     place = voxels.to_mm(np.array([[1, 8, 13]]))
@@ -51,6 +52,7 @@ def test_a_bright_voxel_is_the_brightest():
     assert np.isfinite(found).all() and found.min() >= 0
 
 
+@pytest.mark.integration
 def test_darkness_stays_dark_and_has_finite_gradients():
     networks, case = small()
     dark = case._replace(light=np.zeros_like(case.light), truth=np.zeros_like(case.truth))
@@ -59,12 +61,14 @@ def test_darkness_stays_dark_and_has_finite_gradients():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.integration
 def test_gradients_by_the_weights():
     networks, case = small()
     networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
     check_grads(jax.jit(lambda n: unrolled_loss(n, case)), (networks,), 1, modes=["rev"], rtol=2e-3)
 
 
+@pytest.mark.integration
 def test_gradients_by_the_image():
     networks, case = small(untrained(1, 1, 2, 4, key=KEY))
     networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
@@ -72,6 +76,7 @@ def test_gradients_by_the_image():
     check_grads(volume, (jnp.asarray(case.light),), 1, modes=["rev"], rtol=2e-3)
 
 
+@pytest.mark.integration
 def test_the_last_steps_are_conjugate_gradients():
     """SciPy's, with the same preconditioner and as many, where slow waves are left out of account."""
     networks, case = small(untrained(1, 1, 4, 4, key=KEY))
@@ -135,6 +140,7 @@ def test_weights_come_back(tmp_path):
             read_unrolled(tmp_path / f"{name}.npz")
 
 
+@pytest.mark.integration
 def test_an_example_is_its_seed_and_number():
     one, again, other = (example(0, number, TINY) for number in (0, 0, SCENES))
     np.testing.assert_array_equal(one.image, again.image)
