@@ -52,26 +52,34 @@ def test_a_bright_voxel_is_the_brightest():
     assert np.isfinite(found).all() and found.min() >= 0
 
 
-@pytest.mark.integration
-def test_darkness_stays_dark_and_has_finite_gradients():
-    networks, case = small()
-    dark = case._replace(light=np.zeros_like(case.light), truth=np.zeros_like(case.truth))
-    assert not solve(case.system.operator, dark.light, networks).x.any()
-    gradient = jax.grad(lambda n: jnp.sum(solve(case.system.operator, dark.light, n).x))(networks)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-
-
-@pytest.mark.integration
-def test_gradients_by_the_weights():
-    networks, case = small()
-    networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
-    check_grads(jax.jit(lambda n: unrolled_loss(n, case)), (networks,), 1, modes=["rev"], rtol=2e-3)
-
-
-@pytest.mark.integration
-def test_gradients_by_the_image():
+@pytest.fixture(scope="module")
+def differentiable():
+    """Networks of float64, a case of theirs, and what training lowers, by the networks and another image and truth."""
     networks, case = small(untrained(1, 1, 2, 4, key=KEY))
     networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
+    of = lambda networks, light, truth: unrolled_loss(networks, case._replace(light=light, truth=truth))
+    return networks, case, jax.jit(of)
+
+
+@pytest.mark.integration
+def test_darkness_stays_dark_and_has_finite_gradients(differentiable):
+    networks, case, loss = differentiable
+    dark = (np.zeros_like(case.light), np.zeros_like(case.truth))
+    assert not solve(case.system.operator, dark[0], networks).x.any()
+    _, back = jax.vjp(lambda networks: loss(networks, *dark), networks)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(back(jnp.ones(()))))
+
+
+@pytest.mark.integration
+def test_gradients_by_the_weights(differentiable):
+    networks, case, loss = differentiable
+    of_networks = lambda networks: loss(networks, case.light, case.truth)
+    check_grads(of_networks, (networks,), 1, modes=["rev"], rtol=2e-3)
+
+
+@pytest.mark.integration
+def test_gradients_by_the_image(differentiable):
+    networks, case, _ = differentiable
     volume = jax.jit(lambda light: solve(case.system.operator, light, networks).x)
     check_grads(volume, (jnp.asarray(case.light),), 1, modes=["rev"], rtol=2e-3)
 
