@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, forward, forward_operator, optics_of, reconstruct
+from gs_jax.designs.design import read_design
 from gs_jax.geometry import falloff
 from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring_edges, ring_share, spread
 from gs_jax.optics.full import full_optics
@@ -116,6 +118,21 @@ def test_it_holds_the_light_that_rays_bring(point):
     one = Grid([point[2]], (1, 1), 0.1, point[:2])
     image = forward(jnp.full((1, 1, 1), 2.0), scope, one, full_optics(scope, one.depths))
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
+
+
+@pytest.mark.parametrize("pitch", [0.0045, 0.018, 0.052])
+def test_a_lens_that_is_sharp_has_no_halo(pitch):
+    """Whatever the pixels: what cores do not explain of sharp spots would be sharpened by the halo's filter."""
+    lens = read_design(Path(__file__).parents[1] / "design" / "geomscope-asphere.toml").imager()
+    array = dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0))
+    scope = dataclasses.replace(lens, array=array, sensor=Sensor((41, 41), pitch, (-0.148, 0.0)))
+    one = Grid([20.0], (1, 1), 0.1, (1.0, 0.0))
+    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, full_optics(scope, one.depths)))
+    # All in a few pixels, and nothing that is negative.
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    reach = max(round(0.02 / pitch), 1)
+    core = image[row - reach : row + reach + 1, column - reach : column + reach + 1].sum()
+    assert core > 0.95 * image.sum() and image.min() > -0.02 * image.max()
 
 
 @pytest.mark.integration

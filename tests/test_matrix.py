@@ -82,7 +82,7 @@ class Case:
         self.imager = self.design.imager()
         near, far = self.design.imaging.working_distance_mm
         middle = 20.0 if far > 10 else (near + far) / 2
-        self.depths = [0.95 * middle, middle, 1.05 * middle]
+        self.depths = [0.9 * middle, middle, 1.1 * middle]
         self.sheet = datasheet(self.design, self.depths)
         self.grid = voxel_grid(self.imager, self.depths, pixels=COARSE)
 

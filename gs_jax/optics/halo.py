@@ -25,6 +25,8 @@ _LINEAR = 0.45
 _NODES = 44
 # How far beyond the widest field's chief ray light is followed on the sensor, in the image of the widest field.
 _BEYOND = 0.35
+# How steeply angular harmonics end where waves of two pixels do.
+_STEEP = 8
 # Of each field; samples of a core.
 _RAYS, _CORE_SAMPLES = 16384, 2048
 
@@ -106,7 +108,14 @@ def halo_table(
             table[0, field] -= _shared(grid, landing, np.full(len(core), amount[field] / len(core)))
     around = table.reshape(2, grid.fields, grid.radii, grid.angles)
     # Spots are symmetric about the field's direction: their spectra are real.
-    return np.fft.rfft(around).real.transpose(0, 3, 2, 1).astype(np.float32)
+    spectra = np.fft.rfft(around).real * _resolved(grid)
+    return spectra.transpose(0, 3, 2, 1).astype(np.float32)
+
+
+def _resolved(grid: HaloGrid) -> Float64[np.ndarray, "radius harmonic"]:
+    """Near the axis nodes are closer together than pixels, which would sample what they cannot resolve."""
+    finest = np.pi * np.maximum(grid.nodes(grid.radii), 0.5)
+    return 1 / (1 + (np.arange(grid.angles // 2 + 1) / finest[:, None]) ** _STEEP)
 
 
 def polar_shares(
