@@ -188,7 +188,7 @@ def optimise(case: Case, _) -> None:
 
 
 def mold(case: Case, folder: Path) -> None:
-    report = gs.make_mold(case.design, folder / "mold.stl", chord=0.002)
+    report = gs.make_mold(case.design, folder / "mold.stl", chord=0.001)
     assert report["verification"]["lenses"] == len(case.design.array.centers_mm)
 
 

@@ -165,7 +165,7 @@ def simulate_volume(
 
 
 def _optics_of_depth(imager, grid, kind):
-    depths = np.asarray(grid.depths)
+    depths = np.asarray(grid.depths, np.float64)
     if kind == "full":
         extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
         nodes = halo_nodes(imager, depths, extent=extent)
