@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import datetime
 import math
 import os
@@ -7,6 +8,8 @@ import tomllib
 import warnings
 from pathlib import Path
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,10 +17,14 @@ import tomli_w
 from hypothesis import HealthCheck, given, settings, strategies as st
 from pydantic import ValidationError
 
+from gs_jax import geomscope
 from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.designs.design import Design, read_design, write_design
+from gs_jax.designs.sheet import datasheet
 
 from .helpers import examples, needs
+
+SHIPPED = sorted((Path(__file__).parents[1] / "design").glob("*.toml"))
 
 BASE = {
     "name": "small",
@@ -438,3 +445,54 @@ def test_the_shape_of_a_lens_goes_to_the_imager_and_back(tmp_path):
     v = design.imaging.sensor_distance_mm
     np.testing.assert_allclose(imager.reduced_sensor_distance, v + 1 / 1.43)
     assert "k = -0.7, 2 aspheric terms, curved side to the object" in repr(found)
+
+
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_design_is_its_imagers(path, x64):
+    with jax.enable_x64(x64):
+        design = read_design(path).model_copy(update={"provenance": {}})
+        imager, depths = design.imager(), design.imaging.working_distance_mm
+        found = Design.from_imager(imager, name=design.name, working_distance_mm=depths)
+        assert found == design
+        assert eqx.tree_equal(found.imager(), imager)
+
+
+def test_a_design_of_everything_is_its_imagers():
+    given = {
+        "lens": BASE["lens"]
+        | {"radius_of_curvature_mm": [2.0, 2.1, 2.0], "conic_constant": -0.6, "orientation": "curved"},
+        "sensor": BASE["sensor"] | {"origin_mm": [0.13, -0.07], "pixel_pitch_um": 3.45},
+        "imaging": BASE["imaging"] | {"wavelength_nm": 532.1},
+        "calibration": {"rotation_deg": 31.4, "shift_mm": [0.1, -0.2], "tilt_deg": [0.9, -0.7]},
+    }
+    design = Design.model_validate(BASE | given)
+    assert Design.from_imager(design.imager(), name="small", working_distance_mm=(18.0, 30.0)) == design
+
+
+def test_a_design_of_an_imager_says_what_is_sharp():
+    design = geomscope()
+    found = Design.from_imager(design.imager(), name="mine").imaging.working_distance_mm
+    in_focus = 1 / (0.43 / 2.0 - 1 / 5.8) - 1.0 / 1.43
+    sheet = datasheet(design, [in_focus])
+    assert found == pytest.approx((sheet["near_limit_mm"][0], sheet["far_limit_mm"][0]), abs=2e-3)
+    with pytest.raises(
+        InputError, match=r"imager: found no depth in focus, allowed: with `working_distance_mm` only\."
+    ):
+        Design.from_imager(design.replace(sensor_distance_mm=4.0).imager(), name="mine")
+    endless = dataclasses.replace(design.imager().array, size=(math.inf, math.inf))
+    with pytest.raises(InputError, match="`array.size`: found .*allowed: a plate of finite size"):
+        Design.from_imager(dataclasses.replace(design.imager(), array=endless), name="mine")
+
+
+def test_keys_are_replaced_and_checked():
+    design = geomscope()
+    moved = design.replace(centers_mm=np.array([[0.0, 0.0], [1.5, 0.25]]), sensor_distance_mm=6.0, name="two")
+    assert moved.array.centers_mm == ((0.0, 0.0), (1.5, 0.25)) and moved.imaging.sensor_distance_mm == 6.0
+    assert moved.name == "two" and moved.lens == design.lens
+    with pytest.raises(InputError, match="found the key sensor_distance, allowed: sensor_distance_mm"):
+        design.replace(sensor_distance=6.0)
+    with pytest.raises(InputError, match="`imaging.sensor_distance_mm`: found -1, allowed: a number of mm"):
+        design.replace(sensor_distance_mm=-1)
+    with pytest.raises(InputError, match="allowed: near below far"):
+        design.replace(working_distance_mm=(30.0, 18.0))

@@ -10,7 +10,8 @@ from rich.table import Table
 
 from ..base.errors import InputError
 from ..designs.checks import reach
-from ..designs.design import CalibrationTable, Design
+from ..designs.design import Design
+from ..designs.tables import CalibrationTable
 from ..io.provenance import Provenance
 from ..io.tables import one_line
 from .fit import Calibration

@@ -1,7 +1,8 @@
 """The built-in designs, as the paper describes them."""
 
 from ..layouts.patterns import random_layout
-from .design import ArrayTable, Design, ImagingTable, LensTable, SensorTable
+from .design import Design
+from .tables import ArrayTable, ImagingTable, LensTable, SensorTable
 
 
 def geomscope(*, sensor_distance_mm: float = 5.8) -> Design:

@@ -3,175 +3,29 @@
 A key carries its unit, and this module is where units end: `Design.imager` gives the geometry in mm and radians.
 """
 
+import difflib
 import math
 import os
 import re
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import tomli_w
-from pydantic import Field, Tag, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
-from ..geometry import LONGEST, SHORTEST, Imager, Sensor
+from ..geometry import Imager, Sensor
 from ..io.disk import read_text, write_text
-from ..io.tables import EACH, ONE, Table, one_line, one_or_each
-from ..lenses import MicrolensArray, Orientation
-from .centers import LENS_KEYS, MAX_LENSES, CentersTable, inline_centers
+from ..io.tables import Table, one_line
+from ..lenses import MicrolensArray
+from .centers import LENS_KEYS, CentersTable, inline_centers
 from .checks import check_whole, of_each
+from .imagers import sharp_depths, tables_of
 from .plausible import doubts, slips
-
-# Every description is what the error message says is allowed, every title what the key means: comments in files, the
-# schema for editors and the page of keys are made of both.
-Length = Annotated[float, Field(ge=1e-6, le=1e4, description="a number of mm from 1e-6 to 1e4")]
-Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Pixels = Annotated[int, Field(ge=2, le=65536)]
-Wavelength = Annotated[
-    float, Field(ge=1e6 * SHORTEST, le=1e6 * LONGEST, description="a number of nanometres from 10 to 1e5")
-]
-# Strict as everything else, but a TOML array is a list and a frozen model wants tuples.
-Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False, description="[x, y] in mm, up to 1e4")]
-Size = Annotated[tuple[Length, Length], Field(strict=False, description="[x, y] in mm from 1e-6 to 1e4")]
-Range = Annotated[tuple[Length, Length], Field(strict=False, description="[near, far] in mm, near below far")]
-Shape = Annotated[
-    tuple[Pixels, Pixels], Field(strict=False, description="[rows, columns], whole numbers from 2 to 65536")
-]
-Terms = Annotated[
-    tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...],
-    Field(strict=False, max_length=6, description="up to 6 numbers from -1e12 to 1e12"),
-]
-Conic = Annotated[float, Field(ge=-100, le=100)]
-_ForEach = Field(strict=False, min_length=1, max_length=MAX_LENSES)
-# Of all lenses, or of each.
-Lengths = Annotated[Annotated[Length, Tag(ONE)] | Annotated[tuple[Length, ...], _ForEach, Tag(EACH)], one_or_each]
-Conics = Annotated[Annotated[Conic, Tag(ONE)] | Annotated[tuple[Conic, ...], _ForEach, Tag(EACH)], one_or_each]
-_ONE_EACH = "or a list with one for each lens, in the order of the centres"
-Slope = Annotated[float, Field(ge=-10, le=10)]
-Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
-Centers = Annotated[
-    tuple[Point, ...],
-    Field(
-        strict=False,
-        min_length=1,
-        max_length=MAX_LENSES,
-        description=f"[x, y] in mm, of 1 to {MAX_LENSES} lenses, or `centers_file`",
-    ),
-]
-
-
-class SensorTable(Table):
-    """`[sensor]`: the camera. With `origin_mm` it is a region of a larger one, whose centre is the frame's origin.
-
-    The key is the region's middle. Lenses need not reach a region, but one of them.
-    """
-
-    pixel_pitch_um: float = Field(
-        ge=1e-3,
-        le=1e4,
-        title="distance of neighbouring pixels' centres; pixels are square",
-        description="a number of micrometres from 1e-3 to 1e4",
-    )
-    shape: Shape = Field(title="size of the image in pixels: rows (y) first, then columns (x)")
-    origin_mm: Point | None = Field(
-        default=None,
-        title="middle of a region of a larger sensor, whose centre stays the frame's origin",
-        description="[x, y] in mm, up to 1e4",
-    )
-
-
-class LensTable(Table):
-    """`[lens]`: plano-convex microlenses. `focal_length_mm` overrides the radius, for a thin-lens study.
-
-    What may be a list is a number of each lens; columns of these names in the `centers_file` are read into it.
-    At the radius r the curved side is `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A4 r^4 + A6 r^6 + ...` below its
-    vertex, with `c = 1/R` and all lengths in mm.
-    """
-
-    radius_of_curvature_mm: Lengths = Field(
-        title="R of the curved side at its vertex, positive; a focal length f in air is R = f (n - 1)",
-        description=f"a number of mm from 1e-6 to 1e4, {_ONE_EACH}",
-    )
-    refractive_index: float = Field(
-        gt=1,
-        le=5,
-        title="n of lenses and plate at the wavelength: PDMS 1.43, fused silica 1.46, acrylic 1.49, BK7 1.52",
-        description="a number above 1, up to 5",
-    )
-    aperture_diameter_mm: Lengths = Field(
-        title="D of each lens, before neighbours clip it; at most 2 R of a sphere",
-        description=f"a number of mm from 1e-6 to 1e4, {_ONE_EACH}",
-    )
-    orientation: Orientation = Field(
-        default="plano", title="side of the lenses that faces the object", description='"plano" or "curved"'
-    )
-    conic_constant: Conics = Field(
-        default=0.0,
-        title="k of the curved side: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid",
-        description=f"a number from -100 to 100, {_ONE_EACH}",
-    )
-    aspheric_terms: Terms = Field(
-        default=(),
-        title="[A4, A6, ...] of the curved side, for millimetres; a lens must fall all the way from its vertex",
-    )
-    focal_length_mm: Length | None = Field(
-        default=None,
-        title="f of an ideal thin lens, in place of the sphere that the radius describes; leave it out for real lenses",
-        description="a number of mm from 1e-6 to 1e4",
-    )
-
-
-class ArrayTable(Table):
-    """`[array]`: the plate and where its lenses are. `centers_file` is replaced by its content on reading."""
-
-    size_mm: Size = Field(title="width (x) and height (y) of the plate, with its middle at [0, 0]")
-    substrate_thickness_mm: float = Field(
-        ge=0,
-        le=1e4,
-        title="t of the plate, from its plano face to the lens vertices",
-        description="a number of mm from 0 to 1e4",
-    )
-    centers_mm: Centers = Field(
-        title="lens vertices from the plate's middle: +x right (increasing column), +y down (increasing row)"
-    )
-
-
-class ImagingTable(Table):
-    """`[imaging]`: where the sensor and the object are."""
-
-    sensor_distance_mm: Length = Field(
-        title="v from the array's back to the sensor, positive: from the lens vertices, or the plano face behind them"
-    )
-    working_distance_mm: Range = Field(
-        title="nearest and farthest object: depths z from the array's front, plano face or lens vertices, positive"
-    )
-    wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
-    field_radius_mm: Length = Field(
-        title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
-    )
-
-
-class CalibrationTable(Table):
-    """`[calibration]`: the array as found on the sensor, rotated about its centre (+x toward +y), shifted, then tilted.
-
-    The tilt is by how much the array's plane rises toward the object along +x and +y.
-    """
-
-    rotation_deg: float = Field(
-        default=0.0,
-        ge=-360,
-        le=360,
-        title="turn of the array about its middle, from +x toward +y: clockwise in the image as it is shown",
-        description="a number of degrees from -360 to 360",
-    )
-    shift_mm: Point = Field(
-        default=(0.0, 0.0), title="where the array's middle is, from the sensor's, once it is turned"
-    )
-    tilt_deg: Tilt = Field(
-        default=(0.0, 0.0), title="by how much the array's plane rises toward the object along +x and +y"
-    )
+from .tables import ArrayTable, CalibrationTable, ImagingTable, LensTable, SensorTable
 
 
 class Design(Table):
@@ -249,11 +103,91 @@ class Design(Table):
             Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
             sensor_distance=imaging.sensor_distance_mm,
             field_radius=imaging.field_radius_mm,
-            wavelength=imaging.wavelength_nm * 1e-6,
+            wavelength=imaging.wavelength_nm / 1e6,
             rotation=math.radians(calibration.rotation_deg),
             shift=calibration.shift_mm,
             tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
         )
+
+    @classmethod
+    def from_imager(
+        cls, imager: Imager, *, name: str, working_distance_mm: tuple[float, float] | None = None
+    ) -> "Design":
+        """The design of an imager, to be written to a file; `imager()` gives it back, to rounding of degrees.
+
+        Parameters
+        ----------
+        imager
+            Of real numbers: on a plate of finite size, in range of what files allow.
+        name
+            What reports call the design.
+        working_distance_mm
+            Nearest and farthest object. By default what is sharp by Eq. 8 with a circle of confusion of two pixels.
+
+        Raises
+        ------
+        InputError
+            If the imager makes no design, or has no depth in focus and no working distance is given.
+
+        Examples
+        --------
+        >>> import gs_jax as gs
+        >>> scope = gs.geomscope().imager()
+        >>> mine = gs.Design.from_imager(scope, name="mine", working_distance_mm=(18.0, 30.0))
+        >>> mine.imaging == gs.geomscope().imaging
+        True
+        """
+        data = {"name": name} | tables_of(imager)
+        data["imaging"]["working_distance_mm"] = working_distance_mm or sharp_depths(imager)
+        return _validated(data)
+
+    def replace(self, **values: Any) -> "Design":
+        """The design with some keys of its tables replaced, checked as a file is.
+
+        Parameters
+        ----------
+        **values
+            By key, without its table: `centers_mm`, `sensor_distance_mm`, `shape`, ...; arrays may be arrays.
+
+        Raises
+        ------
+        InputError
+            If there is no such key, or the whole makes no microscope.
+
+        Examples
+        --------
+        >>> import gs_jax as gs
+        >>> gs.geomscope().replace(sensor_distance_mm=6.0).imaging.sensor_distance_mm
+        6.0
+        """
+        data, tables = self.model_dump(), {key: table for table in _TABLES for key in _fields(table)}
+        for key, value in values.items():
+            value = value.tolist() if hasattr(value, "tolist") else value
+            if key in tables:
+                data[tables[key]][key] = value
+            elif key in ("name", "provenance"):
+                data[key] = value
+            else:
+                nearest = difflib.get_close_matches(key, tables, n=3) or sorted(tables)
+                raise InputError(f"found the key {key}, allowed: {', '.join(nearest)}.")
+        return _validated(data)
+
+
+# Whose keys all differ.
+_TABLES = ("sensor", "lens", "array", "imaging", "calibration")
+
+
+def _fields(table: str):
+    annotation = Design.model_fields[table].annotation
+    assert isinstance(annotation, type) and issubclass(annotation, Table)
+    return annotation.model_fields
+
+
+def _validated(data: dict[str, Any]) -> Design:
+    try:
+        return Design.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{one_line(error, Design, {})}.") from error
 
 
 def _one_if_alike(numbers: float | tuple[float, ...]) -> float | tuple[float, ...]:

@@ -1,0 +1,87 @@
+"""The tables of a design file from an imager: units of files, and numbers without the rounding of binary ones."""
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from ..base.errors import InputError
+from ..geometry import Imager
+from ..lenses import kinds
+from ..optics import theory
+from ..optics.aperture import clear_diameter
+
+
+def tables_of(imager: Imager) -> dict[str, dict[str, Any]]:
+    """All tables but the working distance, which an imager has not."""
+    array, sensor = imager.array, imager.sensor
+    if not np.isfinite(array.size).all():
+        raise InputError(f"`array.size`: found {array.size}, allowed: a plate of finite size.")
+    tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
+    focal_length = array.thin_lens_focal_length
+    return {
+        "sensor": {
+            "pixel_pitch_um": _scaled(np.float64(1000 * sensor.pixel_pitch)),
+            "shape": sensor.shape,
+            "origin_mm": sensor.origin if any(sensor.origin) else None,
+        },
+        "lens": {
+            "radius_of_curvature_mm": _decimal(array.radius_of_curvature),
+            "refractive_index": _decimal(array.refractive_index),
+            "aperture_diameter_mm": _decimal(array.aperture_diameter),
+            "orientation": array.orientation,
+            "conic_constant": _decimal(array.conic_constant),
+            "aspheric_terms": _decimal(array.aspheric_terms),
+            "focal_length_mm": None if focal_length is None else _decimal(focal_length),
+        },
+        "array": {
+            "size_mm": array.size,
+            "substrate_thickness_mm": _decimal(array.substrate_thickness),
+            "centers_mm": _decimal(array.centers),
+        },
+        "imaging": {
+            "sensor_distance_mm": _decimal(imager.sensor_distance),
+            "wavelength_nm": _scaled(1e6 * np.asarray(imager.wavelength)),
+            "field_radius_mm": imager.field_radius,
+        },
+        "calibration": {
+            "rotation_deg": _scaled(np.degrees(np.asarray(imager.rotation))),
+            "shift_mm": _decimal(imager.shift),
+            "tilt_deg": tilt,
+        },
+    }
+
+
+def sharp_depths(imager: Imager) -> tuple[float, float]:
+    """Nearest and farthest depth that is sharp by Eq. 8, for any of the lenses, mm; two pixels are a point.
+
+    Raises
+    ------
+    InputError
+        If no depth is in focus, or what is sharp has no end.
+    """
+    v, confusion, ends = float(imager.reduced_sensor_distance), 2 * imager.sensor.pixel_pitch, []
+    for which in kinds(imager.array):
+        array = imager.array.some(which)
+        focal_length = float(array.focal_length)
+        in_focus = 1 / focal_length - 1 / v
+        if in_focus > 0:
+            sharp = focal_length, focal_length / float(clear_diameter(array)), 1 / in_focus, confusion
+            ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
+    front = float(imager.reduced_depth(0.0))
+    if not ends or not np.isfinite(ends).all() or min(ends) <= front:
+        found = "no depth in focus" if not ends else "no end of what is sharp"
+        raise InputError(f"imager: found {found}, allowed: with `working_distance_mm` only.")
+    return round(min(ends) - front, 4), round(max(ends) - front, 4)
+
+
+def _decimal(value: Array) -> Any:
+    """Numbers, or lists of them, by the fewest decimals that are read back as they are."""
+    value = np.asarray(value)
+    return [_decimal(part) for part in value] if value.ndim else float(str(value[()]))
+
+
+def _scaled(value: np.ndarray | np.floating) -> Any:
+    """Numbers, or lists of them, without the last digits, which a change of units rounds."""
+    digits = np.finfo(value.dtype).precision
+    return [_scaled(part) for part in value] if value.ndim else float(f"{value:.{digits}g}")
