@@ -8,11 +8,12 @@ the array's back, the other of these two. Bare equation numbers mean the GEOMSco
 """
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from .base.arrays import library_of
 from .base.converters import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, as_shape, check_fields
@@ -132,6 +133,18 @@ class Sensor(eqx.Module):
         return jnp.stack([x, y], axis=-1)
 
 
+class Views(NamedTuple):
+    """How lenses see points, one view for each pair of a lens and a point.
+
+    `spot`: where the chief ray meets the sensor, `(x, y)`, mm. `offset`: the point's `(x, y)` from the lens's axis, mm.
+    `reduced_depth`: `z'`, mm.
+    """
+
+    spot: Float[Array | np.ndarray, "*view 2"]
+    offset: Float[Array | np.ndarray, "*view 2"]
+    reduced_depth: Float[Array | np.ndarray, "*view"]
+
+
 class Imager(eqx.Module):
     """A microlens array in front of a sensor, and the light: the one geometry of the package.
 
@@ -203,21 +216,22 @@ class Imager(eqx.Module):
     def heights(self) -> Float[Array, " lens"]:
         """Lens vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
-            return jnp.zeros(len(self.array.centers), self.sensor_distance.dtype)
+            return library_of(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
         return self._cosine * (self._in_plane @ self.tilt)
 
     @property
     def _in_plane(self):
         """Lens vertices after rotation and shift, before the tilt."""
-        cos, sin = jnp.cos(self.rotation), jnp.sin(self.rotation)
+        xp = library_of(self.rotation)
+        cos, sin = xp.cos(self.rotation), xp.sin(self.rotation)
         x, y = self.array.centers.T
-        return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
+        return xp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
 
     @property
     def _cosine(self):
         """Of the angle of the tilt."""
         assert self.tilt is not None
-        return 1 / jnp.sqrt(1 + jnp.sum(self.tilt**2))
+        return 1 / library_of(self.tilt).sqrt(1 + (self.tilt**2).sum())
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """`z'`: from the object to the lens vertices as the optics sees it, mm.
@@ -247,16 +261,58 @@ class Imager(eqx.Module):
         v = self.reduced_sensor_distance
         return magnification * (v + height) / (v - height * magnification)
 
-    def lean(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "depth 2"]:
-        """How far beside its vertex a lens's axis is at a depth, mm: it is normal to the array's plane."""
-        reduced = self.reduced_depth(depth)[:, None]
-        tilt = jnp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
-        return -reduced * tilt[None]
+    def lean(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
+        """How far beside its vertex a lens's axis is at a depth, mm, `(*batch, 2)`: it is normal to the array."""
+        xp, reduced = library_of(self.sensor_distance), self.reduced_depth(depth)
+        tilt = xp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
+        return -xp.multiply.outer(reduced, tilt)
 
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""
         return 1 + self.magnification(depth)
 
-    def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array, "lens point 2"]:
+    def views(
+        self,
+        points: Float[Array | np.ndarray, "*view 3"],
+        lenses: Int[Array | np.ndarray, "*view"],
+        *,
+        distortion: Scalars = 1.0,
+    ) -> Views:
+        """How lenses see points `(x, y, z)`, mm: the map from a point to its spot, with the tilt.
+
+        Everything asks it but the kernels, which keep x and y apart (`gs_jax.projection.rays`) and are tested against
+        it. `points` and `lenses` broadcast. An imager of NumPy's numbers gives NumPy's.
+
+        Parameters
+        ----------
+        points
+            In the sensor's frame.
+        lenses
+            Indices of `array.centers`.
+        distortion
+            By what the spot's distance from the image of the lens's axis is multiplied: 1 of a chief ray, and of a
+            spot's core what `gs_jax.optics.cores` finds.
+        """
+        xp = library_of(self.sensor_distance)
+        depth, lenses = points[..., 2], xp.asarray(lenses)
+        magnification, reduced = distortion * self.magnification(depth), self.reduced_depth(depth)
+        center, point = self.centers[lenses], points[..., :2]
+        if self.tilt is None:
+            return Views(chief_ray(center, point, magnification[..., None]), point - center, reduced)
+        lean = self.lean(depth)
+        magnification = self.magnification_of(magnification, self.heights[lenses])
+        # Distances are from the lens's axis, which leans.
+        drawn = point + xp.broadcast_to(1 / distortion - 1, reduced.shape)[..., None] * lean
+        return Views(chief_ray(center, drawn, magnification[..., None]), point - center - lean, reduced)
+
+    def views_of_all(self, points: Float[Array | np.ndarray, "point 3"]) -> Views:
+        """How each lens sees each point: `views`, `(lens, point)`."""
+        return self.views(points[None], np.arange(len(self.array.centers))[:, None])
+
+    def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array | np.ndarray, "lens point 2"]:
         """Where each lens images each point `(x, y, z)`, mm on the sensor."""
-        return chief_ray(self.centers[:, None, :], points[None, :, :2], self.magnifications(points[:, 2])[..., None])
+        return self.views_of_all(points).spot
+
+    def brightness(self, views: Views) -> Float[Array | np.ndarray, "*view"]:
+        """The envelope C of views: how much of a point's light a lens gives to its spot."""
+        return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)

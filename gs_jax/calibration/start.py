@@ -10,8 +10,9 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..geometry import Imager, chief_ray
+from ..geometry import Imager
 from ..lenses import MicrolensArray
+from ..optics.refraction import on_host
 from .matching import Similarity, match, match_shift, meeting_lenses, near_of
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of
@@ -138,12 +139,11 @@ def _place(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
 
 def _without(spots, point, imager: Imager):
     """The spots that are not of a source."""
-    centers, magnification = np.asarray(imager.centers, np.float64), float(imager.magnification(point[2]))
-    seen = np.linalg.norm(centers - point[:2], axis=1) < imager.field_radius
+    views = on_host(imager).views_of_all(np.asarray(point, np.float64)[None])
+    seen = np.linalg.norm(views.offset[:, 0], axis=1) < imager.field_radius
     if not len(spots) or not seen.any():
         return spots
-    wanted = chief_ray(centers[seen], point[:2], magnification)
-    return spots[np.asarray(KDTree(wanted).query(spots)[0]) > near_of(imager.array.centers)]
+    return spots[np.asarray(KDTree(views.spot[seen, 0]).query(spots)[0]) > near_of(imager.array.centers)]
 
 
 def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry import Imager, chief_ray
+from ..geometry import Imager
 from ..lenses import MicrolensArray
 from .spots import core_offsets
 
@@ -138,20 +138,14 @@ def weighed(state: Unknowns, given: tuple[Known, Float[Array, ""]]):
 
 
 def _due(imager: Imager, points, lenses, offsets: Offsets) -> Float[Array, "spot 2"]:
-    center, height, depth = imager.centers[lenses], imager.heights[lenses], points[:, 2]
-    magnification = imager.magnification_of(imager.magnification(depth), height)
-    chief = chief_ray(center, points[:, :2], magnification[:, None])
-    beside = points[:, :2] - center
-    if imager.tilt is not None:
-        # The lens's axis is normal to its plate.
-        beside = beside + imager.tilt[None] * (imager.reduced_depth(depth) - height)[:, None]
-    field2 = jnp.sum(beside**2, -1) / imager.field_radius**2
-    at = lambda column: jnp.interp(depth, offsets.depths, column)
-    along = jnp.zeros_like(depth)
+    views = imager.views(points, lenses)
+    field2 = jnp.sum(views.offset**2, -1) / imager.field_radius**2
+    at = lambda column: jnp.interp(points[:, 2], offsets.depths, column)
+    along = jnp.zeros_like(field2)
     for power in reversed(range(offsets.here.shape[1])):
         here, slope = at(offsets.here[:, power]), at(offsets.slope[:, power])
         along = along * field2 + here + (imager.sensor_distance - offsets.sensor_distance) * slope
-    return chief + beside / imager.field_radius * along[:, None]
+    return views.spot + views.offset / imager.field_radius * along[:, None]
 
 
 def offsets_of(imager: Imager, depths: Float[np.ndarray, " source"]) -> Offsets:

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager, envelope
+from ..geometry import Imager
 from ..optics.theory import Real
 
 # Least power that a frequency counts with, as a fraction of one lens's: keeps logarithms finite.
@@ -197,9 +197,8 @@ def condition_number(
 
 def _teeth(imager: Imager, points: Array) -> tuple[Array, Array]:
     """Images `(lens, point, 2)` of points, mm, and the envelope `(lens, point)` at each."""
-    offset = imager.centers[:, None] - points[None, :, :2]
-    reduced = imager.reduced_depth(points[:, 2])
-    return imager.project(points), envelope(jnp.sum(offset**2, axis=2), reduced[None], imager.field_radius)
+    views = imager.views_of_all(points)
+    return views.spot, imager.brightness(views)
 
 
 def _meet(teeth, place, width):

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager, envelope
+from ..geometry import Imager
 from ..optics.theory import Real
 
 # What is known before the image, standard deviations of x, y, z (mm) and of the logarithm of the brightness.
@@ -58,10 +58,8 @@ def mean_images(
         Of a window along a side, pixels, odd.
     """
     point, brightness = parameters[:3], jnp.exp(parameters[3])
-    centers = imager.centers
-    places = imager.sensor.to_pixels(imager.project(point[None])[:, 0]) - corners
-    distance2 = jnp.sum((centers - point[None, :2]) ** 2, axis=1)
-    weights = envelope(distance2, imager.reduced_depth(point[2]), imager.field_radius)
+    views = imager.views_of_all(point[None])
+    places, weights = imager.sensor.to_pixels(views.spot[:, 0]) - corners, imager.brightness(views)[:, 0]
     spot = jnp.asarray(spot, parameters.dtype)
     if spot.ndim:
         light = jax.vmap(lambda place: _moved(spot, place - size // 2))(places)

@@ -147,10 +147,8 @@ def _dots(imager: Imager, points: np.ndarray) -> np.ndarray:
     image = np.zeros(imager.sensor.shape)
     if not len(points):
         return image
-    places = np.asarray(imager.sensor.to_pixels(imager.project(points)), float)
-    squared = ((np.asarray(imager.centers, float)[:, None] - points[None, :, :2]) ** 2).sum(-1)
-    light = envelope(squared, imager.reduced_depth(points[:, 2])[None], imager.field_radius)
-    light = np.asarray(light, float)
+    views = imager.views_of_all(points)
+    places, light = np.asarray(imager.sensor.to_pixels(views.spot), float), np.asarray(imager.brightness(views), float)
     corner = np.floor(places)
     share = places - corner
     for down, right in np.ndindex(2, 2):

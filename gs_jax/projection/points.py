@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
 from ..base.progress import Progress
-from ..geometry import Imager, chief_ray
+from ..geometry import Imager
 from ..optics.cores import Cores, core_tables, drawn, ring_edges
 from ..optics.full import CORE_REACH, halo_nodes, halo_of, kernel_size
 from ..optics.refraction import on_host
@@ -117,16 +117,14 @@ def forward_points(
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
-        beside = some[:, :2] - np.asarray(
-            imager.lean(jnp.asarray(some[:, 2], imager.sensor_distance.dtype)), np.float64
-        )
+        beside = some[:, :2] - on_host(imager).lean(some[:, 2])
         pairs = KDTree(beside).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
             spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
             count = min(_SPOTS, len(pairs) - first)
-            rays = _rays(some[:, 2], imager, stamps)
-            seen = (some[spots["i"]], spots["j"], *(part[spots["i"]] for part in rays))
+            core = _core(some[:, 2], imager, stamps)
+            seen = (some[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
             tiles = _add_spots(tiles, count, *seen, imager, depths, kernels, weight)
     image = np.zeros((rows * _TILE + size - 1, columns * _TILE + size - 1), stamps.kernels.dtype)
     for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
@@ -144,16 +142,12 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
     return RingLight(*stamps.ring.ends) if stamps.ring else Envelope(imager.field_radius)
 
 
-def _rays(depth, imager, stamps):
-    """Magnification, how much of it is the core's own, and parameters of the weight, for each point."""
-    host = on_host(imager)
-    reduced, magnification = host.reduced_depth(depth), host.magnification(depth)
+def _core(depth, imager, stamps):
+    """The core's distortion and the parameters of its weight, for each point."""
     if stamps.ring is None:
-        return magnification, np.ones_like(reduced), reduced[:, None]
+        return np.ones_like(depth), on_host(imager).reduced_depth(depth)[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
-    light = np.stack([between(part) for part in stamps.ring.light.T], -1)
-    stretch = between(stamps.ring.stretch)
-    return magnification * stretch, stretch, light
+    return between(stamps.ring.stretch), np.stack([between(part) for part in stamps.ring.light.T], -1)
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -162,8 +156,7 @@ def _add_spots(
     count: Int[ArrayLike, ""],
     points: Float[Array | np.ndarray, "spot 4"],
     lenses: Int[Array | np.ndarray, " spot"],
-    magnification: Float[Array | np.ndarray, " spot"],
-    stretch: Float[Array | np.ndarray, " spot"],
+    distortion: Float[Array | np.ndarray, " spot"],
     parameters: Float[Array | np.ndarray, "spot parameter"],
     imager: Imager,
     depths: Float[Array, " depth"],
@@ -172,20 +165,14 @@ def _add_spots(
 ) -> Float[Array, "tile side side"]:
     """Adds the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
     size, dtype = kernels.shape[-1], imager.sensor_distance.dtype
-    numbers = (points, magnification, stretch, parameters)
-    points, magnification, stretch, parameters = (jnp.asarray(part, dtype) for part in numbers)
-    center, point, depth = imager.centers[lenses], points[:, :2], points[:, 2]
-    lean = imager.lean(depth)
-    light = (points[:, 3] * weight(jnp.sum((center + lean - point) ** 2, -1), parameters)).astype(kernels.dtype)
-    between = jnp.interp(depth, depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
+    points, distortion, parameters = (jnp.asarray(part, dtype) for part in (points, distortion, parameters))
+    views = imager.views(points[:, :3], lenses, distortion=distortion)
+    light = (points[:, 3] * weight(jnp.sum(views.offset**2, -1), parameters)).astype(kernels.dtype)
+    between = jnp.interp(points[:, 2], depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
     near = between.astype(int)
     far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
 
-    magnification = imager.magnification_of(magnification, imager.heights[lenses])
-    # Cores are drawn to the axis of the lens, which leans.
-    point = point + (1 / stretch - 1)[:, None] * lean
-    place = imager.sensor.to_pixels(chief_ray(center, point, magnification[:, None]))
-    fifths = jnp.floor(place * STEPS + 0.5).astype(int) + STEPS // 2
+    fifths = jnp.floor(imager.sensor.to_pixels(views.spot) * STEPS + 0.5).astype(int) + STEPS // 2
     (i, j), corner = (fifths % STEPS).T, fifths // STEPS + size // 2
     last = jnp.array(imager.sensor.shape) + size - 2
     lit = (jnp.arange(len(points)) < count) & jnp.all((corner >= 0) & (corner <= last[None]), -1)

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from ..base.arrays import check_finite
-from ..geometry import Imager, chief_ray
+from ..geometry import Imager
 from ..optics.refraction import on_host
 from .background import between, smoothed, square_levels
 
@@ -71,18 +71,14 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
     """
     # In NumPy: other numbers of points need no other program.
     host, centers = on_host(imager), np.asarray(imager.centers, np.float64)
-    tilt, heights = host.tilt, np.asarray(imager.heights, np.float64)
-    reduced = host.reduced_depth(points[:, 2])
-    beside = points[:, :2] if tilt is None else points[:, :2] + reduced[:, None] * tilt
+    beside = points[:, :2] - host.lean(points[:, 2])
     tree = KDTree(centers)
     most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
     # With two or more there is an axis of lenses.
     distance, lens = tree.query(beside, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
     distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
-    magnification = host.magnification_of(host.magnification(points[:, 2])[:, None], heights[lens])
-    landing = chief_ray(centers[lens], points[:, None, :2], magnification[..., None])
-    pixels = np.asarray(imager.sensor.to_pixels(landing))
+    pixels = np.asarray(imager.sensor.to_pixels(host.views(points[:, None], lens).spot))
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
     row, column = np.moveaxis(np.floor(pixels + 0.5).astype(int), -1, 0)

@@ -30,6 +30,7 @@ from ..calibration.unknowns import (
     residuals,
 )
 from ..geometry import Imager
+from ..optics.refraction import on_host
 from .devices import Errors, built, no_errors
 
 # Lenses that must see a point: one says no depth.
@@ -110,10 +111,11 @@ def _changed(imager: Imager, name: str) -> Imager:
 
 def _seen(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> Sights:
     """The lenses within the field radius of each point whose image is on the sensor."""
-    centers, ends = np.asarray(imager.centers), np.asarray(imager.project(points)).transpose(1, 0, 2)
+    views = on_host(imager).views_of_all(points)
+    ends = views.spot.transpose(1, 0, 2)
     left, right, bottom, top = imager.sensor.extent
     on = (ends > (left, top)).all(-1) & (ends < (right, bottom)).all(-1)
-    near = np.hypot(*(centers[None] - points[:, None, :2]).transpose(2, 0, 1)) < imager.field_radius
+    near = np.hypot(*views.offset.T) < imager.field_radius
     seen = near & on
     count = seen.sum(1)
     if count.min() < _FEWEST:
