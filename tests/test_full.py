@@ -120,7 +120,10 @@ def test_it_holds_the_light_that_rays_bring(point):
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
 
 
-@pytest.mark.parametrize("pitch", [0.0045, 0.018, 0.052])
+ALSO = pytest.mark.integration
+
+
+@pytest.mark.parametrize("pitch", [pytest.param(0.0045, marks=ALSO), 0.018, pytest.param(0.052, marks=ALSO)])
 def test_a_lens_that_is_sharp_has_no_halo(pitch):
     """Whatever the pixels: what cores do not explain of sharp spots would be sharpened by the halo's filter."""
     lens = read_design(Path(__file__).parents[1] / "design" / "geomscope-asphere.toml").imager()

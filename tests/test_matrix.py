@@ -226,11 +226,10 @@ WARNED = {("geomscope-table1", task) for task in ("points", "list-rl", "unrolled
 # `make test` runs one task of each kind for every device, these in turn and these always; `make integration` the rest.
 IN_TURN = (tuple(METHODS), ("points", "calibrate"))
 ALWAYS = ("metrics", "mold", "optimise")
-# What people are told to use first, and tasks that take long, once.
+# What people are told to use first; a report takes long, so once.
 ALSO = (
     ("geomscope-asphere", "points"),
     ("geomscope-exposure", "points"),
-    ("geomscope", "tolerance"),
     ("geomscope-optimized", "report"),
 )
 

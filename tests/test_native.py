@@ -217,6 +217,7 @@ def comparisons():
     test_sums_of_convolutions_are_those_of_xla()
 
 
+@pytest.mark.integration
 def test_processors_that_do_not_pick():
     """Without AVX-512 the same numbers, by other ways; in a process of its own, for which numba compiles so."""
     if not shuffles.PICKS:

@@ -238,6 +238,7 @@ def test_gradients_are_finite_differences(design, outcome):
             np.testing.assert_allclose(slope, by_gradient, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.integration
 def test_what_is_drawn_is_what_gradients_say(outcome):
     """Where all is nearly linear; 100 devices have an RMS within 20 % or so."""
     found = changes(outcome)
@@ -247,6 +248,7 @@ def test_what_is_drawn_is_what_gradients_say(outcome):
     np.testing.assert_allclose(together(outcome.alone).calibrated, np.sqrt(squares[0]))
 
 
+@pytest.mark.integration
 def test_what_a_calibration_is_for(outcome):
     """Distance and tilt are found by it and cost nothing; what remains is where lenses are, and what they are."""
     alone = outcome.alone
@@ -256,6 +258,7 @@ def test_what_a_calibration_is_for(outcome):
     np.testing.assert_allclose(alone["sensor distance"].designed[:5], (18 + 1 / 1.43) * 0.05 / 3.8, rtol=0.05)
 
 
+@pytest.mark.integration
 def test_roughness_takes_light_from_the_core(outcome):
     lost = -((2 * np.pi * 0.43 * 20e-6 / 520e-6) ** 2)
     np.testing.assert_allclose(outcome.alone["roughness"].log_strehl, lost, rtol=1e-6)
@@ -275,6 +278,7 @@ def test_yields(design, outcome):
     assert not hard.met["spot width"].any() and hard.met["depth"].all()
 
 
+@pytest.mark.integration
 def test_the_picture_and_the_numbers(outcome):
     figure = picture(outcome)
     assert len(figure.axes) == 4 and all(", " in axes.get_xlabel() for axes in figure.axes)
