@@ -136,13 +136,13 @@ class Sensor(eqx.Module):
 class Views(NamedTuple):
     """How lenses see points, one view for each pair of a lens and a point.
 
-    `spot`: where the chief ray meets the sensor, `(x, y)`, mm. `offset`: the point's `(x, y)` from the lens's axis, mm.
-    `reduced_depth`: `z'`, mm.
+    `spot`: where the chief ray meets the sensor, `(*view, 2)`, mm. `offset`: the point's `(x, y)` from the lens's axis,
+    mm. `reduced_depth`: `z'`, mm, which broadcasts.
     """
 
-    spot: Float[Array | np.ndarray, "*view 2"]
-    offset: Float[Array | np.ndarray, "*view 2"]
-    reduced_depth: Float[Array | np.ndarray, "*view"]
+    spot: Scalars
+    offset: Scalars
+    reduced_depth: Scalars
 
 
 class Imager(eqx.Module):
@@ -199,8 +199,8 @@ class Imager(eqx.Module):
         check_fields(self, sensor_distance=POSITIVE, rotation=FINITE, shift=FINITE, wavelength=_WAVELENGTH, tilt=FINITE)
 
     @property
-    def centers(self) -> Float[Array, "lens 2"]:
-        """Lens vertices in the sensor's frame, mm.
+    def centers(self) -> Scalars:
+        """Lens vertices `(lens, 2)` in the sensor's frame, mm.
 
         A rotated array is nothing but moved centres: in the sensor's frame the chief-ray map stays
         separable in x and y, which is what makes back-projection fast. So does a tilted one, seen from above; its
@@ -213,8 +213,8 @@ class Imager(eqx.Module):
         return centers - (centers @ self.tilt)[:, None] * self.tilt[None] * (cosine**2 / (1 + cosine))
 
     @property
-    def heights(self) -> Float[Array, " lens"]:
-        """Lens vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
+    def heights(self) -> Scalars:
+        """Lens vertices `(lens,)` above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
             return library_of(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
         return self._cosine * (self._in_plane @ self.tilt)
@@ -273,8 +273,8 @@ class Imager(eqx.Module):
 
     def views(
         self,
-        points: Float[Array | np.ndarray, "*view 3"],
-        lenses: Int[Array | np.ndarray, "*view"],
+        points: Float[Array | np.ndarray, "*#view 3"],
+        lenses: Int[Array | np.ndarray, "*#view"],
         *,
         distortion: Scalars = 1.0,
     ) -> Views:
@@ -309,10 +309,10 @@ class Imager(eqx.Module):
         """How each lens sees each point: `views`, `(lens, point)`."""
         return self.views(points[None], np.arange(len(self.array.centers))[:, None])
 
-    def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Float[Array | np.ndarray, "lens point 2"]:
-        """Where each lens images each point `(x, y, z)`, mm on the sensor."""
+    def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Scalars:
+        """Where each lens images each point `(x, y, z)`, `(lens, point, 2)`, mm on the sensor."""
         return self.views_of_all(points).spot
 
-    def brightness(self, views: Views) -> Float[Array | np.ndarray, "*view"]:
+    def brightness(self, views: Views) -> Scalars:
         """The envelope C of views: how much of a point's light a lens gives to its spot."""
         return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)

@@ -137,7 +137,7 @@ class Design(Table):
         >>> mine.imaging == gs.geomscope().imaging
         True
         """
-        data = {"name": name} | tables_of(imager)
+        data: dict[str, Any] = {"name": name} | tables_of(imager)
         data["imaging"]["working_distance_mm"] = working_distance_mm or sharp_depths(imager)
         return _validated(data)
 

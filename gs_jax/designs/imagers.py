@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from jax import Array
 
 from ..base.errors import InputError
 from ..geometry import Imager
@@ -12,7 +11,7 @@ from ..optics import theory
 from ..optics.aperture import clear_diameter
 
 
-def tables_of(imager: Imager) -> dict[str, dict[str, Any]]:
+def tables_of(imager: Imager) -> dict[str, Any]:
     """All tables but the working distance, which an imager has not."""
     array, sensor = imager.array, imager.sensor
     if not np.isfinite(array.size).all():
@@ -75,13 +74,13 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
     return round(min(ends) - front, 4), round(max(ends) - front, 4)
 
 
-def _decimal(value: Array) -> Any:
+def _decimal(value: Any) -> Any:
     """Numbers, or lists of them, by the fewest decimals that are read back as they are."""
     value = np.asarray(value)
     return [_decimal(part) for part in value] if value.ndim else float(str(value[()]))
 
 
-def _scaled(value: np.ndarray | np.floating) -> Any:
+def _scaled(value: Any) -> Any:
     """Numbers, or lists of them, without the last digits, which a change of units rounds."""
     digits = np.finfo(value.dtype).precision
     return [_scaled(part) for part in value] if value.ndim else float(f"{value:.{digits}g}")
