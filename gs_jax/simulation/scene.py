@@ -169,7 +169,7 @@ def _optics_of_depth(imager, grid, kind):
     if kind == "full":
         extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
         nodes = halo_nodes(imager, depths, extent=extent)
-        return lambda depth: full_optics(imager, [depth], nodes=nodes)
+        return lambda depth: full_optics(imager, np.array([depth], np.float64), nodes=nodes)
     kernel = psf_of_depth(imager, depths, kind)
     return lambda depth: kernel(depth)[None]
 
