@@ -44,11 +44,18 @@ def native_on_cpu(kernel: str, native: Callable) -> Callable[[Callable], Callabl
     """
 
     def decorate(function):
+        @partial(jax.custom_jvp, nondiff_argnums=(0,))
+        def fast(shapes, *arrays):
+            return lax.platform_dependent(*arrays, cpu=partial(native, shapes), default=partial(function, shapes))
+
+        @fast.defjvp
+        def _(shapes, arrays, tangents):
+            return jax.jvp(partial(function, shapes), arrays, tangents)
+
         @wraps(function)
         def either(shapes, *arrays):
-            if not _suits(shapes, arrays) or kernel_number(kernel) is None:
-                return function(shapes, *arrays)
-            return lax.platform_dependent(*arrays, cpu=partial(native, shapes), default=partial(function, shapes))
+            use = _suits(shapes, arrays) and kernel_number(kernel) is not None
+            return (fast if use else function)(shapes, *arrays)
 
         return either
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from inspect import unwrap
 from typing import Any
 
 import jax
@@ -24,9 +23,10 @@ def linear_call(
 ) -> PyTree:
     """`function(static, constants, x)`, linear in `x`, with derivatives that are given instead of derived.
 
-    It works under `jit`, `vmap`, `jvp`, `grad` (once) and `jax.linear_transpose`, hence as a `lineax` operator
-    and through its solvers. `jax.custom_vjp` has neither `jvp` nor a transpose, `jax.custom_derivatives.linear_call`
-    neither `vmap` nor derivatives by the constants; so this is a primitive.
+    It works under `jit`, `vmap`, `jvp`, `grad` and `jax.linear_transpose`, hence as a `lineax` operator and through its
+    solvers. First derivatives are the given functions; of second ones by the constants, the part that these do not give
+    is what JAX derives of them. `jax.custom_vjp` has neither `jvp` nor a transpose,
+    `jax.custom_derivatives.linear_call` neither `vmap` nor derivatives by the constants; so this is a primitive.
 
     Parameters
     ----------
@@ -36,16 +36,11 @@ def linear_call(
         `transpose(static, constants, y)`, with `y` like what `function` returns, returns what is like `x`.
     constants_bar
         `constants_bar(static, constants, x, y)`: the derivative of `<y, function(static, constants, x)>` by the
-        constants, like them; what stands at integers is ignored. None if it has none.
+        constants, like them; what stands at integers is ignored. If None, JAX derives it.
     static
         Hashable; shapes and the like.
     constants, x
         Pytrees of arrays.
-
-    Raises
-    ------
-    NotImplementedError
-        When a second derivative is asked for that involves the constants.
     """
     flat_constants, constants_tree = tree.flatten(constants)
     flat_x, x_tree = tree.flatten(x)
@@ -122,24 +117,22 @@ def _jvp(primals, tangents, *, call):
         terms.append(_linear.bind(*constants, *map(ad.instantiate_zeros, x_dot), call=call))
     moving = tuple(i for i, t in enumerate(constants_dot) if type(t) is not ad.Zero)
     if moving:
-        if call.constants_bar is None:
-            raise NotImplementedError("Only first derivatives are implemented here (of back-projection, say).")
         dots = [constants_dot[i] for i in moving]
-        terms.append(linear_call(_by_constants, _by_constants_transpose, None, (call, moving), primals, dots))
+        if call.constants_bar is None:
+            terms.append(_by_constants((call, moving), primals, dots))
+        else:
+            terms.append(linear_call(_by_constants, _by_constants_transpose, None, (call, moving), primals, dots))
     return y, [sum(term[1:], term[0]) for term in zip(*terms, strict=True)]
 
 
 def _by_constants(static, primals, dots):
     call, moving = static
 
-    # What calls a kernel has no derivative; what it is wrapped around has.
-    plain = replace(call, function=unwrap(call.function))
-
     def move(values):
         arrays = list(primals)
         for i, value in zip(moving, values, strict=True):
             arrays[i] = value
-        return plain(*arrays)
+        return call(*arrays)
 
     return jax.jvp(move, ([primals[i] for i in moving],), (list(dots),))[1]
 
