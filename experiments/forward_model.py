@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.common import Report, main, table
 from experiments.true_image import TWO_RINGS
-from gs_jax import Imager, RichardsonLucy, backproject_adjoint, forward, forward_operator
+from gs_jax import Imager, ImagingOperator, RichardsonLucy, backproject_adjoint, forward
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
 from gs_jax.designs.builtin import geomscope
@@ -88,7 +88,7 @@ def by_whole_images(volume, imager, grid, psf):
 def _adjoint_and_step(model):
     def operator(imager, grid, optics):
         if model is forward:
-            return forward_operator(imager, grid, optics)
+            return ImagingOperator(imager, grid, optics)
         volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
         return lx.FunctionLinearOperator(lambda volume: model(volume, imager, grid, optics), volume)
 

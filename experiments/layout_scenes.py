@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward, forward_operator
+from gs_jax import Grid, Imager, ImagingOperator, MicrolensArray, Sensor, forward
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
@@ -112,7 +112,7 @@ def _reconstructed(image, centers, study, method):
     image = jnp.asarray(image, centers.dtype)
     if method == "backproject":
         return reconstruct(image, study.imager(centers), study.grid(), background_width=BACKGROUND)
-    return solve(forward_operator(study.imager(centers), study.grid()), image, RichardsonLucy(steps=10)).x
+    return solve(ImagingOperator(study.imager(centers), study.grid()), image, RichardsonLucy(steps=10)).x
 
 
 def judge(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, forward, forward_operator, optics_of, reconstruct
+from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Sensor, forward, optics_of, reconstruct
 from gs_jax.designs.design import read_design
 from gs_jax.geometry import falloff
 from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring_edges, ring_share, spread
@@ -49,7 +49,7 @@ def volume(shape, dtype=float) -> jax.Array:
 @pytest.mark.parametrize("pixels", [(96, 81), (80, 80)])
 def test_the_adjoint_is_exact(dtype, rtol, pixels):
     scope, voxels = imager(dtype, pixels=pixels), grid(dtype)
-    A = forward_operator(scope, voxels, full_optics(scope, voxels.depths))
+    A = ImagingOperator(scope, voxels, full_optics(scope, voxels.depths))
     x = volume(voxels.volume_shape, dtype)
     y = jax.random.uniform(jax.random.key(1), pixels, dtype)
     one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
@@ -61,7 +61,7 @@ def test_the_adjoint_is_exact(dtype, rtol, pixels):
 def test_nothing_is_scattered():
     """Some versions of JAX compile a scatter-add for GPUs to loops that wait for each other."""
     scope, voxels = imager(), grid(shape=(6, 5))
-    A = forward_operator(scope, voxels, full_optics(scope, voxels.depths))
+    A = ImagingOperator(scope, voxels, full_optics(scope, voxels.depths))
     for operator in (A, A.T):
         lowered = jax.jit(lambda x, operator=operator: operator.mv(x)).lower(operator.in_structure())
         assert "stablehlo.scatter" not in lowered.as_text()

@@ -4,8 +4,11 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
+from jax.test_util import check_grads
+from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import lsmr
 
-from gs_jax import backproject, backproject_adjoint, forward_operator
+from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, optics_of
 
 from .helpers import scene
 
@@ -14,7 +17,7 @@ def test_transpose_is_backprojection():
     imager, grid = scene()
     image = jax.random.normal(jax.random.key(0), imager.sensor.shape)
     volume = jax.random.normal(jax.random.key(1), (3, *grid.shape))
-    operator = forward_operator(imager, grid)
+    operator = ImagingOperator(imager, grid)
     np.testing.assert_array_equal(operator.mv(volume), backproject_adjoint(volume, imager, grid))
     np.testing.assert_array_equal(operator.T.mv(image), backproject(image, imager, grid))
     np.testing.assert_array_equal(operator.T.T.mv(volume), operator.mv(volume))
@@ -28,12 +31,12 @@ def test_it_composes_and_solves():
 
     @jax.jit
     def solve(image, imager):
-        operator = forward_operator(imager, grid)
+        operator = ImagingOperator(imager, grid)
         damping = lx.IdentityLinearOperator(operator.in_structure())
         normal = lx.TaggedLinearOperator(operator.T @ operator + 0.1 * damping, lx.positive_semidefinite_tag)
         return lx.linear_solve(normal, operator.T.mv(image), lx.CG(rtol=1e-12, atol=1e-12)).value
 
-    columns = jax.vmap(lambda e: forward_operator(imager, grid).mv(e.reshape(1, 5, 4)).ravel())(jnp.eye(20))
+    columns = jax.vmap(lambda e: ImagingOperator(imager, grid).mv(e.reshape(1, 5, 4)).ravel())(jnp.eye(20))
     expected = np.linalg.solve(columns @ columns.T + 0.1 * np.eye(20), columns @ image.ravel())
     np.testing.assert_allclose(solve(image, imager).ravel(), expected, rtol=1e-8)
 
@@ -43,3 +46,120 @@ def test_it_composes_and_solves():
     v, step = imager.sensor_distance, 1e-6
     numeric = (total(v + step) - total(v - step)) / (2 * step)
     np.testing.assert_allclose(jax.grad(total)(v), numeric, rtol=1e-4)
+
+
+OPERATORS = {
+    "pinholes": lambda *scene: ImagingOperator(*scene),
+    "near": lambda imager, grid: ImagingOperator(imager, grid, optics_of(imager, grid.depths, "near")),
+    "full": lambda imager, grid: ImagingOperator(imager, grid, optics_of(imager, grid.depths, "full")),
+    "back-projection": lambda *scene: BackprojectionOperator(*scene),
+    "normalized": lambda *scene: BackprojectionOperator(*scene, normalize=True),
+}
+SLOW = [pytest.param(name, marks=pytest.mark.integration) for name in OPERATORS if name != "pinholes"]
+
+
+@pytest.mark.parametrize("name", ["pinholes", *SLOW])
+def test_the_transpose_is_the_adjoint_and_maps_over_batches(name):
+    A = OPERATORS[name](*scene())
+    x, y = (jax.random.normal(jax.random.key(n), s.shape) for n, s in enumerate((A.in_structure(), A.out_structure())))
+    assert A.T.in_structure() == A.out_structure() and A.T.T.out_structure() == A.out_structure()
+    np.testing.assert_allclose(jnp.vdot(A.mv(x), y), jnp.vdot(x, A.T.mv(y)), rtol=1e-9)
+    both = jnp.stack([x, 2 * x])
+    np.testing.assert_allclose(jax.vmap(A.mv)(both), jnp.stack([A.mv(x), 2 * A.mv(x)]), atol=1e-9)
+
+
+def test_it_is_an_argument_that_compiles_once():
+    imager, grid = scene()
+    image, traced = jnp.ones(imager.sensor.shape), []
+
+    @eqx.filter_jit
+    def loss(A, image):
+        traced.append(A)
+        return jnp.sum(A.T.mv(image) ** 2)
+
+    step = eqx.filter_jit(eqx.filter_value_and_grad(loss))
+    for v in (5.8, 5.9, 6.0):
+        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, jnp.asarray(v))
+        _, slope = step(ImagingOperator(moved, grid), image)
+        assert np.isfinite(slope.imager.array.centers).all() and slope.imager.array.centers.any()
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize("name", ["pinholes", *SLOW])
+def test_hessian_vector_products_are_differences_of_gradients(name):
+    imager, grid = scene()
+    A = OPERATORS[name](imager, grid)
+    truth, volume = (gaussian_filter(jax.random.normal(jax.random.key(n), A.out_structure().shape), 2) for n in (0, 1))
+    x = gaussian_filter(jax.random.normal(jax.random.key(2), A.in_structure().shape), 1)
+
+    def loss(centers, v):
+        where = lambda A: (A.imager.array.centers, A.imager.sensor_distance)
+        return jnp.sum(volume * (eqx.tree_at(where, A, (centers, v)).mv(x) - truth) ** 2)
+
+    at = imager.array.centers, imager.sensor_distance
+    along = 0.1 * jax.random.normal(jax.random.key(3), at[0].shape), jnp.asarray(0.05)
+    gradient = jax.jit(jax.grad(loss, (0, 1)))
+    product = jax.jvp(gradient, at, along)[1]
+    step = 1e-7
+    ends = [gradient(*(a + sign * step * b for a, b in zip(at, along, strict=True))) for sign in (1, -1)]
+    for ours, ahead, behind in zip(product, *ends, strict=True):
+        numeric = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(ours, numeric, rtol=1e-4, atol=1e-5 * float(jnp.abs(numeric).max()))
+
+
+@pytest.mark.integration
+def test_second_derivatives_are_those_of_reverse_passes_too():
+    imager, grid = scene(voxels=(5, 4), pitch=0.2, depths=(20.0,))
+    image = jnp.asarray(gaussian_filter(np.random.default_rng(0).random(imager.sensor.shape), 3))
+
+    def loss(v):
+        return jnp.sum(backproject(image, eqx.tree_at(lambda i: i.sensor_distance, imager, v), grid) ** 2)
+
+    check_grads(loss, (imager.sensor_distance,), order=2, modes=["fwd", "rev"], eps=1e-5, rtol=1e-4)
+
+
+def test_scipy_solves_with_it():
+    from gs_jax.interop import as_scipy
+
+    A = ImagingOperator(*scene(voxels=(5, 4), pitch=0.2, depths=(20.0,)))
+    bridge, rng = as_scipy(A), np.random.default_rng(0)
+    x, y = (rng.normal(size=n) for n in bridge.shape[::-1])
+    assert np.vdot(bridge @ x, y) == pytest.approx(np.vdot(x, bridge.T @ y), rel=1e-12)
+    # Some voxels are seen by no lens.
+    seen = np.asarray(A.T.mv(jnp.ones(A.out_structure().shape))).ravel() > 0
+    np.testing.assert_allclose(lsmr(bridge, bridge @ x, atol=1e-13, btol=1e-13)[0][seen], x[seen], rtol=1e-8)
+
+
+@pytest.mark.integration
+def test_pylops_takes_it():
+    pylops = pytest.importorskip("pylops", reason="no pylops: pip install pylops")
+    from gs_jax.interop import as_scipy
+
+    assert pylops.utils.dottest(pylops.aslinearoperator(as_scipy(ImagingOperator(*scene()))))
+
+
+@pytest.mark.integration
+def test_scico_takes_it():
+    pytest.importorskip("scico", reason="no scico: pip install scico")
+    from gs_jax.interop import as_scico
+
+    A = as_scico(ImagingOperator(*scene(jnp.float32)))
+    x, y = (
+        jax.random.normal(jax.random.key(n), shape, A.dtype) for n, shape in enumerate((A.input_shape, A.output_shape))
+    )
+    np.testing.assert_allclose(jnp.vdot(A(x), y), jnp.vdot(x, A.adj(y)), rtol=1e-4)
+
+
+@pytest.mark.integration
+def test_deepinv_takes_it():
+    torch = pytest.importorskip("torch", reason="no PyTorch: pip install deepinv")
+    pytest.importorskip("deepinv", reason="no deepinv: pip install deepinv")
+    from gs_jax.interop import as_deepinv
+
+    A = ImagingOperator(*scene(jnp.float32))
+    physics, volume = as_deepinv(A), torch.rand(2, 1, *A.in_structure().shape, requires_grad=True)
+    image = torch.rand(2, 1, *A.out_structure().shape)
+    there, back = torch.vdot(physics.A(volume).ravel(), image.ravel()), physics.A_adjoint(image)
+    torch.testing.assert_close(there, torch.vdot(volume.ravel(), back.ravel()))
+    (slope,) = torch.autograd.grad(there, volume)
+    torch.testing.assert_close(slope, back)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax import Grid, backproject, forward_operator, optics_of
+from gs_jax import Grid, ImagingOperator, backproject, optics_of
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.benchmark.compare import obstacle
@@ -33,13 +33,13 @@ def small():
     imager, grid = scene(voxels=(9, 8), pitch=0.1, depths=(18.0, 20.0))
     psf = jnp.zeros((2, 3, 3)).at[:, 1, 1].set(1.0)
     truth = jnp.zeros(grid.volume_shape).at[1, 4, 3].set(1.0)
-    return imager, grid, psf, truth, forward_operator(imager, grid, psf).mv(truth)
+    return imager, grid, psf, truth, ImagingOperator(imager, grid, psf).mv(truth)
 
 
 @cache
 def in_one_loop():
     imager, grid, psf, *_ = small()
-    return jax.jit(lambda b: solve(forward_operator(imager, grid, psf), b, FISTA(steps=7)).x)
+    return jax.jit(lambda b: solve(ImagingOperator(imager, grid, psf), b, FISTA(steps=7)).x)
 
 
 class Log(Progress):
@@ -117,7 +117,7 @@ def test_list_richardson_lucy_multiplies_by_mean_ratios():
     # Its darkest percent is no light, so nothing is taken off.
     image = 1 + jax.random.uniform(jax.random.key(0), imager.sensor.shape)
     image = image.at[:3].set(0.0)
-    A = forward_operator(imager, grid)
+    A = ImagingOperator(imager, grid)
     x = jnp.where(A.T.mv(jnp.ones_like(image)) > 0, 1.0, 0)
     for _ in range(3):
         expected = A.mv(x)

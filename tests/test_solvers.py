@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 from scipy.optimize import nnls
 from skimage.restoration import richardson_lucy as of_skimage
 
-from gs_jax import Imager, MicrolensArray, forward, forward_operator
+from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.convolution import Convolution
@@ -47,7 +47,7 @@ def convolution():
 
 
 OPERATORS = {
-    "ray": lambda: forward_operator(*small()),
+    "ray": lambda: ImagingOperator(*small()),
     "blurred": lambda: blurred(*small()),
     "dense": dense,
     "convolution": convolution,
@@ -125,7 +125,7 @@ def by_geometry():
     imager, grid = scene(voxels=(4, 3), pitch=0.2, depths=(18.0, 20.0))
 
     def operator(centers, v):
-        return forward_operator(Imager(MicrolensArray(centers), imager.sensor, v, imager.field_radius), grid)
+        return ImagingOperator(Imager(MicrolensArray(centers), imager.sensor, v, imager.field_radius), grid)
 
     return operator, (imager.array.centers, imager.sensor_distance)
 
@@ -257,7 +257,7 @@ def test_richardson_lucy_is_scikit_images():
 
 @pytest.mark.integration
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
-    A = forward_operator(*small())
+    A = ImagingOperator(*small())
     truth = light(A)
     jitted = cache(lambda **options: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=40, **options))))
     run = lambda image, **options: jitted(**options)(image)
@@ -274,7 +274,7 @@ def test_richardson_lucy_with_background_acceleration_and_total_variation():
 
 @pytest.mark.integration
 def test_richardson_lucy_fits_a_slow_background():
-    A = forward_operator(*small())
+    A = ImagingOperator(*small())
     truth = light(A)
     shape = A.out_structure().shape
     slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))

@@ -13,7 +13,7 @@ from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, r
 from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.reconstruction.reprojection import reproject
-from gs_jax.reconstruction.system import System
+from gs_jax.reconstruction.system import Sight, System
 from gs_jax.solvers import unrolled
 from gs_jax.solvers.richardson_lucy import tent_background
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
@@ -34,7 +34,7 @@ def imager(pixels=(160, 160), pitch=0.03) -> Imager:
 def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     """Chief rays through nine lenses, and the exact image of random voxels."""
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
-    system = System(scope, grid, None, grid)
+    system = System(scope, grid, None, (Sight(scope, grid),))
     truth = jax.random.uniform(KEY, grid.volume_shape)
     light = system.operator.mv(truth)
     networks = networks or untrained(1, 2, 3, 4, key=KEY)

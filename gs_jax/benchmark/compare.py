@@ -26,7 +26,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.info import available_memory
 from ..base.progress import Progress
-from ..projection.operators import forward_operator
+from ..projection.operators import ImagingOperator
 from ..reconstruction.methods import BackProjection, ListRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
 from ..reconstruction.system import above_offset
@@ -86,7 +86,7 @@ def _dense(solver: RichardsonLucy | ADMM):
         shape = grid.volume_shape
         size, pixels = math.prod(shape), math.prod(imager.sensor.shape)
         unit = lambda voxel: jnp.zeros(size, jnp.float32).at[voxel].set(1).reshape(shape)
-        column = jax.jit(lambda voxel: forward_operator(imager, grid, jnp.asarray(psf)).mv(unit(voxel)).ravel())
+        column = jax.jit(lambda voxel: ImagingOperator(imager, grid, jnp.asarray(psf)).mv(unit(voxel)).ravel())
         matrix = np.empty((size, pixels), np.float32)
         for voxel in range(size):
             matrix[voxel] = column(voxel)
@@ -143,7 +143,7 @@ METHODS = {
 
 def objective(volume, image, bench: Bench, solver: FISTA | ADMM) -> float:
     """What a solver without total variation minimises, over that of an empty volume."""
-    A = forward_operator(bench.imager, bench.grid, jnp.asarray(bench.psf))
+    A = ImagingOperator(bench.imager, bench.grid, jnp.asarray(bench.psf))
     light = jnp.asarray(above_offset(image))
 
     @jax.jit

@@ -1,28 +1,32 @@
-"""The imaging system as a linear operator, volume to image."""
+"""The imaging system, and back-projection, as linear operators."""
 
+import equinox as eqx
 import jax
 import lineax as lx
+from jaxtyping import Array, Float
 
 from ..geometry import Imager
 from ..voxels import Grid
+from .backprojection import backproject
 from .forward_model import Optics, forward
 
 
-def forward_operator(imager: Imager, grid: Grid, optics: Optics = None) -> lx.AbstractLinearOperator:
+class ImagingOperator(lx.AbstractLinearOperator):
     """The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint.
 
-    Of pinholes the adjoint is `backproject`. Build it inside the jitted function that uses it: as an argument, each
-    new operator would recompile.
+    *Differentiable*. It is a pytree whose leaves are the numbers of the imager, the grid and the optics: as an argument
+    of a compiled function it does not compile anew when they change. Matrix-free; `lx.linear_solve`, `gs_jax.solve`,
+    `jax.vmap` and `jax.grad` take it.
 
     Parameters
     ----------
-    imager, grid, optics
-        As for `forward`.
-
-    Returns
-    -------
-    lineax.AbstractLinearOperator
-        From `grid.volume_shape` to `sensor.shape`, both of the imager's type. Matrix-free.
+    imager, grid
+        What images, and the voxels.
+    optics
+        As for `forward`, by fidelity: None are pinholes, of which the adjoint is `backproject`; a PSF at each depth;
+        or `FullOptics`. Chief rays, and the light that lenses cut from each other, are computed from the imager
+        whenever the operator is used, and differentiated. `optics` is a table that `gs_jax.optics_of` made beforehand,
+        of the imager as it was then: derivatives by the shape of lenses do not pass through it.
 
     Examples
     --------
@@ -30,9 +34,133 @@ def forward_operator(imager: Imager, grid: Grid, optics: Optics = None) -> lx.Ab
     >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
     >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
     >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> A = gs.forward_operator(scope, grid)
+    >>> A = gs.ImagingOperator(scope, grid)
     >>> A.in_structure().shape, A.out_structure().shape
     ((3, 41, 41), (200, 200))
     """
-    volume = jax.ShapeDtypeStruct(grid.volume_shape, imager.sensor_distance.dtype)
-    return lx.FunctionLinearOperator(lambda volume: forward(volume, imager, grid, optics), volume)
+
+    imager: Imager
+    grid: Grid
+    optics: Optics = None
+
+    def mv(self, vector: Float[Array, "depth y x"]) -> Float[Array, "row column"]:
+        """The image of a volume."""
+        return forward(vector, self.imager, self.grid, self.optics)
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of volumes."""
+        return _volume_of(self)
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of images."""
+        return _image_of(self)
+
+    def transpose(self) -> "Transposed":
+        """The exact adjoint, as `.T`."""
+        return Transposed(self)
+
+    def as_matrix(self) -> Float[Array, "pixel voxel"]:
+        """All of it in memory: of small systems."""
+        return _matrix(self)
+
+
+class BackprojectionOperator(lx.AbstractLinearOperator):
+    """The paper's back-projection as a `lineax` operator, image to volume.
+
+    *Differentiable*; a pytree as `ImagingOperator`; of pinholes it is that operator's transpose.
+
+    Parameters
+    ----------
+    imager, grid, method, normalize
+        As for `backproject`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> B = gs.BackprojectionOperator(scope, gs.Grid.over(scope.sensor, depths=[20.0], pitch=0.1), normalize=True)
+    >>> B.in_structure().shape, B.out_structure().shape
+    ((200, 200), (1, 41, 41))
+    """
+
+    imager: Imager
+    grid: Grid
+    method: str = eqx.field(static=True, default="linear")
+    normalize: bool = eqx.field(static=True, default=False)
+
+    def mv(self, vector: Float[Array, "row column"]) -> Float[Array, "depth y x"]:
+        """The volume of an image."""
+        return backproject(vector, self.imager, self.grid, method=self.method, normalize=self.normalize)
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of images."""
+        return _image_of(self)
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of volumes."""
+        return _volume_of(self)
+
+    def transpose(self) -> "Transposed":
+        """The exact adjoint, as `.T`."""
+        return Transposed(self)
+
+    def as_matrix(self) -> Float[Array, "voxel pixel"]:
+        """All of it in memory: of small systems."""
+        return _matrix(self)
+
+
+class Transposed(lx.AbstractLinearOperator):
+    """The transpose of one of these operators."""
+
+    operator: ImagingOperator | BackprojectionOperator
+
+    def mv(self, vector: Float[Array, "..."]) -> Float[Array, "..."]:
+        (found,) = jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)
+        return found
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        return self.operator.out_structure()
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        return self.operator.in_structure()
+
+    def transpose(self) -> ImagingOperator | BackprojectionOperator:
+        return self.operator
+
+    def as_matrix(self) -> Float[Array, "out in"]:
+        return self.operator.as_matrix().T
+
+
+def _volume_of(operator):
+    return jax.ShapeDtypeStruct(operator.grid.volume_shape, operator.imager.sensor_distance.dtype)
+
+
+def _image_of(operator):
+    return jax.ShapeDtypeStruct(operator.imager.sensor.shape, operator.imager.sensor_distance.dtype)
+
+
+def _matrix(operator):
+    return lx.FunctionLinearOperator(operator.mv, operator.in_structure()).as_matrix()
+
+
+def _no(_) -> bool:
+    return False
+
+
+# What lineax asks of an operator, by dispatch on its class.
+for _kind in (ImagingOperator, BackprojectionOperator, Transposed):
+    for _asks in (
+        lx.is_symmetric,
+        lx.is_diagonal,
+        lx.is_tridiagonal,
+        lx.is_lower_triangular,
+        lx.is_upper_triangular,
+        lx.is_positive_semidefinite,
+        lx.is_negative_semidefinite,
+        lx.has_unit_diagonal,
+    ):
+        _asks.register(_kind)(_no)
+    for _same in (lx.linearise, lx.conj):
+        _same.register(_kind)(lambda operator: operator)
+    lx.materialise.register(_kind)(lambda operator: lx.MatrixLinearOperator(operator.as_matrix()))

@@ -15,9 +15,7 @@ from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.cores import apparent_depths
 from ..optics.focus import warn_if_blurred
-from ..optics.kinds import kind_weights, lenses_by_kind, of_kinds
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS
@@ -28,7 +26,7 @@ from ..voxels import Grid
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 from .sharding import backproject_by_all
-from .system import System, explainable, model_of, slow_waves
+from .system import Sight, System, explainable, model_of, sights_of, slow_waves
 
 Image = Num[Array | np.ndarray, "row column"]
 Volume = Float32[np.ndarray, "depth y x"]
@@ -170,8 +168,7 @@ def reconstructor(
     Raises
     ------
     InputError
-        If `method` is no method, or none for lenses that differ, there is no such optics, or a depth is blurred over
-        more than 128 pixels ("near").
+        If `method` is no method, there is no such optics, or a depth is blurred over more than 128 pixels ("near").
 
     Warns
     -----
@@ -181,26 +178,20 @@ def reconstructor(
     by_name = isinstance(optics, str)
     _check(method, optics, imager, grid)
     on_cores = by_name and optics != "pinhole"
-    if on_cores and not imager.array.alike:
-        if isinstance(method, BackProjection):
-            return _back_projector_of_kinds(imager, grid, method)
-        if isinstance(method, ListRichardsonLucy | Unrolled):
-            allowed = "a method that uses the adjoint, such as RichardsonLucy or FISTA"
-            raise InputError(f"method: found {type(method).__name__} and lenses that differ, allowed: {allowed}.")
-        # Others use the operator's own adjoint: no depth is the apparent one of all lenses.
-        on_cores = False
-    seen = grid.at(apparent_depths(imager, grid.depths)) if on_cores else grid
-    if isinstance(method, BackProjection):
-        return lambda image, progress: _back_projected(image, imager, seen, method, progress)
-    model = model_of(imager, grid, optics, progress or Progress())
     # Of these, back-projection stands for the adjoint.
     unmatched = isinstance(method, ListRichardsonLucy | Unrolled)
+    if isinstance(method, BackProjection):
+        return _back_projector(sights_of(imager, grid) if on_cores else (Sight(imager, grid),), method)
+    model = model_of(imager, grid, optics, progress or Progress())
     if unmatched and by_name:
         what = "the pixels that back-projection reads"
         warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
     least_squares = not isinstance(method, ListRichardsonLucy | RichardsonLucy)
     slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
-    system = System(model.imager, grid, model.optics, seen if unmatched else None, slow)
+    seen = None
+    if unmatched:
+        seen = sights_of(imager, grid) if on_cores else (Sight(imager, grid),)
+    system = System(model.imager, grid, model.optics, seen, slow)
     return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
 
 
@@ -231,17 +222,15 @@ def _explained(image, model, system, method, stop_at_noise, progress):
     return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
 
 
-def _back_projector_of_kinds(imager, grid, method):
-    """Each kind of lens is read where its own cores land, and counts as it is bright and sharp at each depth."""
-    depths = np.asarray(grid.depths, np.float64)
-    each = of_kinds(imager, lenses_by_kind(imager))
-    side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
-    weights = kind_weights(each, depths, side)[..., None, None].astype(np.float32)
-    parts = [(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in zip(each, weights, strict=True)]
+def _back_projector(seen, method):
+    """Each type of lens is read where its own cores land."""
+    if len(seen) == 1:
+        return lambda image, progress: _back_projected(image, seen[0].imager, seen[0].grid, method, progress)
     plain = dataclasses.replace(method, normalize=False)
 
     def volume_of(image, progress):
-        total = lambda image: sum(w * _back_projected(image, one, seen, plain, progress) for one, seen, w in parts)
+        each = lambda image, one: one.weight * _back_projected(image, one.imager, one.grid, plain, progress)
+        total = lambda image: sum(each(image, one) for one in seen)
         volume = np.asarray(total(image), np.float32)
         if not method.normalize:
             return volume

@@ -12,11 +12,12 @@ from ..base.arrays import check_finite
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..io.readout import Readout
+from ..optics.cores import apparent_depths
 from ..optics.full import FullOptics
-from ..optics.kinds import KindOptics
+from ..optics.kinds import KindOptics, kind_weights, lenses_by_kind, of_kinds
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
-from ..projection.operators import forward_operator
+from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.unmatched import Unmatched
 from ..suppression.background import between, square_levels
 from ..voxels import Grid
@@ -75,6 +76,29 @@ def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "r
     return image - np.asarray(max(float(np.percentile(image, _DARKEST)), 0.0), image.dtype)
 
 
+class Sight(NamedTuple):
+    """How lenses of one type are read: the voxels of which chief rays land where their cores do.
+
+    `weight`: how much they count at each depth, `(depth, 1, 1)`; None if there is one type.
+    """
+
+    imager: Imager
+    grid: Grid
+    weight: Float[Array | np.ndarray, "depth 1 1"] | None = None
+
+
+def sights_of(imager: Imager, grid: Grid) -> tuple[Sight, ...]:
+    """Where the cores of each type of lens lie, and how much a type counts by how bright and sharp it is there."""
+    depths = np.asarray(grid.depths, np.float64)
+    if imager.array.alike:
+        return (Sight(imager, grid.at(apparent_depths(imager, depths))),)
+    each = of_kinds(imager, lenses_by_kind(imager))
+    side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
+    weights = kind_weights(each, depths, side)[..., None, None].astype(np.float32)
+    pairs = zip(each, weights, strict=True)
+    return tuple(Sight(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in pairs)
+
+
 class System(eqx.Module):
     """What a solver inverts: the microscope, and how.
 
@@ -83,7 +107,7 @@ class System(eqx.Module):
     imager, grid, optics
         As for `forward`.
     seen
-        If given, back-projection from these voxels stands for the adjoint.
+        If given, back-projection of these stands for the adjoint.
     slow
         So many of the image's longest cosine waves each way are left out of account, with `seen` by least squares
         alone.
@@ -92,16 +116,25 @@ class System(eqx.Module):
     imager: Imager
     grid: Grid
     optics: Optics
-    seen: Grid | None = None
+    seen: tuple[Sight, ...] | None = None
     slow: int = eqx.field(static=True, default=0)
 
     @property
     def operator(self) -> lx.AbstractLinearOperator | Unmatched:
-        A = forward_operator(self.imager, self.grid, self.optics)
+        A = ImagingOperator(self.imager, self.grid, self.optics)
         squares = lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
         if self.seen is not None:
-            return Unmatched(A, forward_operator(self.imager, self.seen).T, squares)
+            return Unmatched(A, self._back(A, self.seen), squares)
         return squares
+
+    def _back(self, A: ImagingOperator, seen: tuple[Sight, ...]) -> lx.AbstractLinearOperator:
+        # In the pixels of this system.
+        sensor = lambda one: eqx.tree_at(lambda i: i.sensor, one.imager, self.imager.sensor)
+        each = [(BackprojectionOperator(sensor(one), one.grid), one.weight) for one in seen]
+        if len(each) == 1:
+            return each[0][0]
+        total = lambda image: sum(jnp.asarray(weight, image.dtype) * B.mv(image) for B, weight in each)
+        return lx.FunctionLinearOperator(total, A.out_structure())
 
     def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
         """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""

@@ -141,7 +141,7 @@ class ADMM(eqx.Module):
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 19:23, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
-    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
+    >>> found = gs.solve(gs.ImagingOperator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
     >>> print(bool(found.x.min() >= 0))
     True
     """

@@ -59,7 +59,7 @@ class FISTA(eqx.Module):
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 19, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
-    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.FISTA(steps=30, sparsity=0.01))
+    >>> found = gs.solve(gs.ImagingOperator(scope, grid), image, gs.FISTA(steps=30, sparsity=0.01))
     >>> print(bool(found.costs[-1] < found.costs[0]), bool(found.x.min() >= 0))
     True True
     """

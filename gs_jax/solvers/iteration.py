@@ -74,8 +74,9 @@ class Solution(eqx.Module):
 def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
     """Explain an image: all steps of a solver, or as many as its tolerance asks for.
 
-    It may be called inside `jit`; build `A` there too, as an operator that comes as an argument recompiles. Without a
-    tolerance the solution is differentiable with respect to the image, what `A` holds and the solver's weights.
+    *Differentiable*: without a tolerance, by the image, what `A` holds and the solver's weights. It may be called
+    inside `jit`, to which `gs_jax.ImagingOperator` comes as an argument; `gs_jax.reconstruct` is the host's function,
+    from a capture to a volume.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> S
     >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
     >>> import numpy as np
     >>> image = gs.forward(np.ones(grid.volume_shape), scope, grid)
-    >>> found = gs.solve(gs.forward_operator(scope, grid), image, gs.RichardsonLucy(steps=5))
+    >>> found = gs.solve(gs.ImagingOperator(scope, grid), image, gs.RichardsonLucy(steps=5))
     >>> found.x.shape, found.costs.shape
     ((3, 41, 41), (5,))
     """

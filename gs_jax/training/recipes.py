@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, Float32
 
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..optics.cores import apparent_depths
-from ..reconstruction.system import System, above_offset
+from ..reconstruction.system import System, above_offset, sights_of
 from ..solvers.unrolled import State, Unrolled, untrained
 from ..suppression.unet import UNet, multislice_network, paper_network
 from .examples import SCENES, Kind, example, tables
@@ -107,10 +106,9 @@ def _simulator(seed: int, kind: Kind):
         for number in numbers:
             image, imager, grid, truth = example(seed, number, kind)
             optics = optics or tables(imager, np.asarray(grid.depths, np.float64), kind)
-            seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
             light = above_offset(image)
             unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
-            system = System(imager, grid, optics, seen)
+            system = System(imager, grid, optics, sights_of(imager, grid))
             cases.append(Case(light / unit, system, truth / unit, _started(networks, system, light / unit)))
         return cases
 
