@@ -180,6 +180,14 @@ def kinds(array: MicrolensArray) -> list[Int[np.ndarray, " lens"]]:
     return [np.flatnonzero(kind.ravel() == number) for number in np.argsort(first)]
 
 
+def type_of_lens(array: MicrolensArray) -> Int[np.ndarray, " lens"]:
+    """The number of each lens's type, in the order of `kinds`. Host code."""
+    types = np.zeros(len(array.centers), int)
+    for number, which in enumerate(kinds(array)):
+        types[which] = number
+    return types
+
+
 def sag(
     squared_radius: Scalars, radius_of_curvature: Scalar, conic_constant: Scalar, terms: Iterable[Scalar]
 ) -> Scalars:

@@ -122,8 +122,8 @@ def calibrate(
     Raises
     ------
     InputError
-        If points and captures do not fit together, a pixel is not finite, lenses differ, no pattern of lenses is seen,
-        or the spots do not determine what is to be fitted.
+        If points and captures do not fit together, a pixel is not finite, lenses are to be found that differ, no
+        pattern of lenses is seen, or the spots do not determine what is to be fitted.
 
     Examples
     --------
@@ -138,7 +138,9 @@ def calibrate(
     >>> print(round(float(found.imager.sensor_distance), 1), round(float(found.imager.rotation), 3), found.mirrored)
     5.9 0.02 False
     """
-    imager.array.check_alike()
+    if find_lenses and not imager.array.alike:
+        found = "found lenses that differ, which are to be found"
+        raise InputError(f"find_lenses: {found}, allowed: for lenses that are alike; of others their list says which.")
     progress = progress or Progress()
     captures = np.arange(len(points)) if captures is None else captures
     sources = Sources(np.array(points, np.float64), np.asarray(captures))

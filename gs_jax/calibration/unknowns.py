@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import Imager
-from ..lenses import MicrolensArray
+from ..lenses import MicrolensArray, type_of_lens
+from ..optics.kinds import lenses_by_kind, of_kinds
 from .spots import core_offsets
 
 # Fields at which exact rays are traced, the degree of what is laid through them, and depths at most.
@@ -45,13 +46,14 @@ FITTABLE = (*FITTED, "scale", "depth_offset", "lenses")
 class Offsets(NamedTuple):
     """How far cores are from chief rays at some depths, as coefficients of odd powers of the field, mm.
 
-    `slope` is how they change with the sensor's distance, from `sensor_distance` on.
+    `slope` is how they change with the sensor's distance, from `sensor_distance` on. `type_of` is each lens's type.
     """
 
     depths: Float[Array, " depth"]
-    here: Float[Array, "depth power"]
-    slope: Float[Array, "depth power"]
+    here: Float[Array, "type depth power"]
+    slope: Float[Array, "type depth power"]
     sensor_distance: Float[Array, ""]
+    type_of: Int[Array, " lens"]
 
 
 class Known(NamedTuple):
@@ -140,10 +142,11 @@ def weighed(state: Unknowns, given: tuple[Known, Float[Array, ""]]):
 def _due(imager: Imager, points, lenses, offsets: Offsets) -> Float[Array, "spot 2"]:
     views = imager.views(points, lenses)
     field2 = jnp.sum(views.offset**2, -1) / imager.field_radius**2
-    at = lambda column: jnp.interp(points[:, 2], offsets.depths, column)
+    of_type = jax.vmap(lambda column: jnp.interp(points[:, 2], offsets.depths, column))
+    at = lambda columns: of_type(columns)[offsets.type_of[lenses], jnp.arange(len(lenses))]
     along = jnp.zeros_like(field2)
-    for power in reversed(range(offsets.here.shape[1])):
-        here, slope = at(offsets.here[:, power]), at(offsets.slope[:, power])
+    for power in reversed(range(offsets.here.shape[2])):
+        here, slope = at(offsets.here[..., power]), at(offsets.slope[..., power])
         along = along * field2 + here + (imager.sensor_distance - offsets.sensor_distance) * slope
     return views.spot + views.offset / imager.field_radius * along[:, None]
 
@@ -157,16 +160,19 @@ def offsets_of(imager: Imager, depths: Float[np.ndarray, " source"]) -> Offsets:
     farther = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
     here, beyond = (core_powers(each, nodes) for each in (imager, farther))
     tables = nodes, here, (beyond - here) / (v * _STEP), v
-    return Offsets(*(jnp.asarray(table, imager.sensor_distance.dtype) for table in tables))
+    types = type_of_lens(imager.array)
+    return Offsets(*(jnp.asarray(table, imager.sensor_distance.dtype) for table in tables), jnp.asarray(types))
 
 
-def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "depth power"]:
-    """How far cores are from chief rays by exact rays, as coefficients of odd powers of the field, mm."""
+def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:
+    """How far cores of each type of lens are from chief rays by exact rays, as coefficients of odd powers of the field,
+    mm."""
     fields = np.linspace(0, imager.field_radius, _FIELDS)
     # A tilt turns the field a little; the lens is the same.
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
     powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
-    return np.linalg.lstsq(powers, core_offsets(level, depths, fields).T)[0].T
+    fitted = lambda one: np.linalg.lstsq(powers, core_offsets(one, depths, fields).T)[0].T
+    return np.stack([fitted(one) for one in of_kinds(level, lenses_by_kind(level))])
 
 
 @jax.jit

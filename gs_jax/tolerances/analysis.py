@@ -14,7 +14,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..designs.design import Design
 from ..designs.microscope import Microscope
-from ..designs.sheet import microscope_of
+from ..designs.sheet import microscopes_of
 from ..layouts.cells import check_positive
 from .amounts import Tolerances
 from .devices import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
@@ -23,6 +23,8 @@ from .points import Bench, bench_of, depth_errors
 
 # Depths of a caller who names none; devices at a time, and those of them whose rays are in memory together.
 _DEPTHS, _BATCH, _TOGETHER = 5, 64, 8
+# Directions in which lenses that differ are cut off by their neighbours: enough for the mean clear aperture to 1e-3.
+_EDGES = 64
 # What a device may be by default: so much wider spots, so much of the Strehl ratio where that says anything.
 WIDER, KEPT, LEAST_STREHL = 1.2, 0.8, 0.1
 
@@ -85,7 +87,9 @@ class Outcome(NamedTuple):
 
 
 class _Question(NamedTuple):
-    microscope: Microscope
+    """`microscopes`: of each type of lens. `pixel`: of the printer, mm."""
+
+    microscopes: tuple[Microscope, ...]
     bench: Bench
     pixel: Float[Array, ""]
 
@@ -130,22 +134,21 @@ def tolerance(
     Raises
     ------
     InputError
-        If lenses are ideal or differ, points are seen by fewer than two lenses, or an
-        argument is not allowed.
+        If lenses are ideal, points are seen by fewer than two lenses, or an argument is not allowed.
     """
     progress = progress or Progress()
     asked = np.linspace(*design.imaging.working_distance_mm, _DEPTHS) if depths is None else np.array(depths, float)
     _check(design, asked, draws, max_width, min_strehl, max_depth_error)
-    microscope = microscope_of(design, asked)
+    microscopes = tuple(dataclasses.replace(one, directions=_EDGES) for one in microscopes_of(design, asked))
     with progress.step("Tracing cores"):
-        bench = bench_of(microscope.imager, asked, sources)
-    question = _Question(microscope, bench, jnp.asarray(tolerances.pixel_um / 1000))
+        bench = bench_of(design.imager(), asked, sources)
+    question = _Question(microscopes, bench, jnp.asarray(tolerances.pixel_um / 1000))
     spreads, lenses = spreads_of(tolerances), len(design.array.centers_mm)
     with progress.step("Gradients"):
         alone = _by_gradient(question, spreads)
     with progress.step("Nominal"):
         nominal, levels = _nominal_and_levels(question, spreads)
-    limits = _limits(microscope, nominal, max_width, min_strehl, max_depth_error)
+    limits = _limits(microscopes, nominal, max_width, min_strehl, max_depth_error)
     others = [name for name, field in RULED.items() if float(getattr(spreads, field)) > 0]
     variants = [spreads, *(without(spreads, name) for name in others)]
     units = jax.vmap(lambda key: drawn(key, lenses))(jax.random.split(jax.random.key(seed), draws))
@@ -162,8 +165,6 @@ def _check(design, depths, draws, *targets) -> None:
     if design.lens.focal_length_mm is not None:
         found = f"found {design.lens.focal_length_mm:g}"
         raise InputError(f"`lens.focal_length_mm`: {found}, allowed: none, as ideal lenses have no surface.")
-    if not design.imager().array.alike:
-        raise InputError("`array`: found lenses that differ, allowed: lenses that are alike.")
     if not depths.size or not np.isfinite(depths).all() or not (depths > 0).all():
         raise InputError(f"`depths` must be one or more positive lengths, mm, got {depths.tolist()}.")
     if draws < 1:
@@ -176,9 +177,15 @@ def _check(design, depths, draws, *targets) -> None:
 @eqx.filter_jit
 def _measured(question: _Question, errors: Errors) -> Measures:
     """Of several devices."""
-    sharpness = lambda each: log_sharpness(question.microscope, each, question.pixel)
-    of_one = lambda each: Measures(*sharpness(each), *depth_errors(question.bench, each))
+    of_one = lambda each: Measures(*_sharpness(question, each), *depth_errors(question.bench, each))
     return jax.lax.map(of_one, errors, batch_size=_TOGETHER)
+
+
+def _sharpness(question: _Question, errors: Errors) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:
+    """`log_sharpness` of the type of lens that is best at each depth."""
+    each = [log_sharpness(one, errors, question.pixel) for one in question.microscopes]
+    widths, ratios = (jnp.stack(parts) for parts in zip(*each, strict=True))
+    return jnp.min(widths, 0), jnp.max(ratios, 0)
 
 
 @eqx.filter_jit
@@ -187,7 +194,7 @@ def _slopes(question: _Question, nothing: Errors) -> tuple[dict[str, Array], ...
     named = {field: getattr(nothing, field) for name, field in RULED.items() if name not in LEVELS}
     shapes = {field: value for field, value in named.items() if field != "centers"}
     changed = lambda values: dataclasses.replace(nothing, **values)
-    images = lambda values: log_sharpness(question.microscope, changed(values), question.pixel)
+    images = lambda values: _sharpness(question, changed(values))
     depths = lambda values: depth_errors(question.bench, changed(values))
     return (*jax.jacfwd(images)(shapes), *jax.jacfwd(depths)(named))
 
@@ -195,8 +202,9 @@ def _slopes(question: _Question, nothing: Errors) -> tuple[dict[str, Array], ...
 def _of_devices(question: _Question, errors: Errors, done=lambda: None) -> Measures:
     """In batches of one size, so that one program is compiled."""
     found, count = [], len(errors.radius)
-    for start in range(0, count, _BATCH):
-        index = np.minimum(np.arange(start, start + _BATCH), count - 1)
+    size = min(_BATCH, count)
+    for start in range(0, count, size):
+        index = np.minimum(np.arange(start, start + size), count - 1)
         batch = _measured(question, jax.tree.map(lambda part, index=index: part[index], errors))
         found.append(Measures(*(np.asarray(part, np.float64)[: count - start] for part in batch)))
         done()
@@ -238,13 +246,14 @@ def together(alone: dict[str, Measures]) -> Measures:
     return Measures(*(np.sqrt(square + shift**2) for square, shift in zip(squares, shifts, strict=True)))
 
 
-def _limits(microscope: Microscope, nominal: Measures, width, strehl, depth_error) -> Limits:
-    everywhere = np.ones(len(microscope.depths))
+def _limits(microscopes: tuple[Microscope, ...], nominal: Measures, width, strehl, depth_error) -> Limits:
+    everywhere = np.ones(len(microscopes[0].depths))
+    axial = np.min([np.asarray(one.axial_resolution, np.float64) for one in microscopes], axis=0)
     designed = np.exp(nominal.log_strehl)
     return Limits(
         WIDER * np.exp(nominal.log_width) if width is None else width * everywhere,
         np.where(designed >= LEAST_STREHL, KEPT * designed, 0.0) if strehl is None else strehl * everywhere,
-        np.asarray(microscope.axial_resolution, np.float64) if depth_error is None else depth_error * everywhere,
+        axial if depth_error is None else depth_error * everywhere,
     )
 
 

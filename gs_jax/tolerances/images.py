@@ -34,7 +34,7 @@ def log_sharpness(
         Of the printer, mm.
     """
     # Where lenses are does not change images.
-    errors = dataclasses.replace(errors, centers=jnp.zeros_like(errors.centers))
+    errors = dataclasses.replace(errors, centers=jnp.zeros_like(nominal.imager.array.centers))
     imager = built(nominal.imager, errors)
     widths, ratios = jax.vmap(lambda height: _at(nominal, imager, height))(_heights(nominal.imager, imager))
     array, radius = imager.array, nominal.clear_diameter / 2
