@@ -25,7 +25,7 @@ from scipy import stats
 from experiments import lens_scenes
 from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
-from gs_jax import Grid, RichardsonLucy, optimize, random_layout, reconstruct
+from gs_jax import Grid, RichardsonLucy, random_layout, reconstruct, run_study
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.study import Study
 from gs_jax.designs.builtin import geomscope
@@ -79,7 +79,7 @@ def study_of(span: tuple[float, float], planes: int, kinds: int, steps: int) -> 
 
 def best(design: Design, study: Study) -> dict:
     """The least error, dB, and where."""
-    end = optimize(design, study)
+    end = run_study(design, study)
     return {"loss_db": 20 * float(np.log10(end.after[0].high)), "design": end.design}
 
 

@@ -50,13 +50,17 @@ The operators themselves, differentiable:
     backproject          Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction")
     backproject_adjoint  The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from
     forward              The image of a volume, summed lens by lens: Eq. (2), or with all of the light
-    forward_operator     The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
+    ImagingOperator      The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
+    BackprojectionOperator  The paper's back-projection as a `lineax` operator, image to volume
     optics_of            What `forward` takes to image planes at some depths, as true as is wanted
     solve                Explain an image: all steps of a solver, or as many as its tolerance asks for
 
 Better designs, and their molds:
 
-    optimize             Search for a design that does what a study wants
+    optimize             Search for the imager of the least loss; *host*
+    free                 Which numbers of an imager a search may change
+    objectives           What a microscope is judged by, as functions of an imager and depths; all *differentiable*
+    run_study            Search for a design that does what a study wants
     read_study           The study in a TOML file
     make_mold            Writes the mold of a design, or the array, to print; and a picture and a report beside it
 

@@ -1,8 +1,10 @@
+from . import objectives as objectives
 from ._version import __version__ as __version__
 from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
 from .calibration.fit import calibrate as calibrate
-from .codesign.search import optimize as optimize
+from .codesign.optimum import free as free, optimize as optimize
+from .codesign.search import run_study as run_study
 from .codesign.study import read_study as read_study
 from .designs.builtin import geomscope as geomscope
 from .designs.design import Design as Design, read_design as read_design, write_design as write_design
@@ -18,7 +20,10 @@ from .pictures.projections import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward
 from .projection.levels import optics_of as optics_of
-from .projection.operators import forward_operator as forward_operator
+from .projection.operators import (
+    BackprojectionOperator as BackprojectionOperator,
+    ImagingOperator as ImagingOperator,
+)
 from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct

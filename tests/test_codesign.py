@@ -9,7 +9,7 @@ from gs_jax.codesign import search, stages
 from gs_jax.codesign.checkpoint import Log, read_checkpoint
 from gs_jax.codesign.outcome import before_and_after, check_outputs, picture, write_outcome
 from gs_jax.codesign.parameters import start_values
-from gs_jax.codesign.search import optimize
+from gs_jax.codesign.search import run_study
 from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.stages import problem_of, random_start
 from gs_jax.codesign.study import Study, read_study
@@ -38,7 +38,7 @@ def table1():
 
 @pytest.fixture(scope="module")
 def outcome(table1):
-    return optimize(table1, study(starts=2))
+    return run_study(table1, study(starts=2))
 
 
 @pytest.mark.integration
@@ -89,7 +89,7 @@ def interrupted(table1, question, path, monkeypatch, *, writes):
 
     monkeypatch.setattr(search, "write_checkpoint", counted)
     with pytest.raises(KeyboardInterrupt):
-        optimize(table1, question, checkpoint=path, every=0.0)
+        run_study(table1, question, checkpoint=path, every=0.0)
     monkeypatch.setattr(search, "write_checkpoint", write)
 
 
@@ -101,11 +101,11 @@ def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
     terms = [{"name": "thickness_mm", "minimise": 5.0}, TERMS[0]]
     free = {"sensor_distance_mm": [2.0, 6.0]}
     question = study(starts=2, stages=stages, terms=terms, free=free, depth_count=2)
-    whole = optimize(table1, question)
+    whole = run_study(table1, question)
     path = tmp_path / "a.checkpoint"
     interrupted(table1, question, path, monkeypatch, writes=writes)
     assert len(read_checkpoint(path, question, table1)[0].steps) == writes
-    resumed = optimize(table1, question, checkpoint=path, resume=True)
+    resumed = run_study(table1, question, checkpoint=path, resume=True)
     assert resumed.design == whole.design and resumed.log == whole.log
 
 
@@ -113,21 +113,21 @@ def test_what_is_resumed_ends_the_same(table1, tmp_path, monkeypatch, writes):
 def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path = tmp_path / "a.checkpoint"
     with pytest.raises(InputError, match="cannot be read"):
-        optimize(table1, study(), checkpoint=path, resume=True)
+        run_study(table1, study(), checkpoint=path, resume=True)
     path.write_bytes(b"{}\n")
     with pytest.raises(InputError, match="no checkpoint of a search"):
-        optimize(table1, study(), checkpoint=path, resume=True)
+        run_study(table1, study(), checkpoint=path, resume=True)
     path.write_bytes(b'{"format": "gs-jax checkpoint 3", "of": "", "log": {"steps": 1, "ends": 2}}\n')
     with pytest.raises(InputError, match="no checkpoint of a search"):
-        optimize(table1, study(), checkpoint=path, resume=True)
+        run_study(table1, study(), checkpoint=path, resume=True)
     interrupted(table1, study(), path, monkeypatch, writes=1)
     whole = path.read_bytes()
     path.write_bytes(whole[:-30])
     with pytest.raises(InputError, match="a.checkpoint: not a whole and valid checkpoint"):
-        optimize(table1, study(), checkpoint=path, resume=True)
+        run_study(table1, study(), checkpoint=path, resume=True)
     path.write_bytes(whole)
     with pytest.raises(InputError, match="of another study or design"):
-        optimize(table1, study(seed=1), checkpoint=path, resume=True)
+        run_study(table1, study(seed=1), checkpoint=path, resume=True)
 
 
 def test_random_starts(table1):
@@ -146,7 +146,7 @@ def test_lens_centres_can_be_free():
     centers = ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))
     design = design.model_copy(update={"array": design.array.model_copy(update={"centers_mm": centers})})
     question = study(free={"centers_mm": [-4.0, 4.0]}, terms=[{"name": "spacing_mm", "at_least": 2.0}])
-    found = optimize(design, question)
+    found = run_study(design, question)
     assert not found.before[0].met and found.after[0].met
     assert np.abs(found.design.array.centers_mm).max() < 4
 
@@ -154,7 +154,7 @@ def test_lens_centres_can_be_free():
 def test_a_thin_lens_has_no_radius_to_free(table1):
     thin = table1.model_copy(update={"lens": table1.lens.model_copy(update={"focal_length_mm": 4.65})})
     with pytest.raises(InputError, match="free.radius_of_curvature_mm"):
-        optimize(thin, study())
+        run_study(thin, study())
 
 
 def test_a_single_lens(table1):
@@ -162,15 +162,15 @@ def test_a_single_lens(table1):
     array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),), "size_mm": (2.0, 2.0)})
     single = table1.model_copy(update={"array": array})
     free = {"sensor_distance_mm": [2.0, 7.0]}
-    found = optimize(single, study(free=free, terms=[TERMS[1]]))
+    found = run_study(single, study(free=free, terms=[TERMS[1]]))
     with pytest.raises(InputError, match="free.pitch_mm.*one lens"):
-        optimize(single, study())
+        run_study(single, study())
     assert found.after[0].met and found.design.array == array
 
 
 def test_depths_stay_before_the_plate(table1):
     with pytest.raises(InputError, match=r"depth_span_mm.*below 41"):
-        optimize(table1, study(free={"depth_span_mm": [0.5, 60.0]}))
+        run_study(table1, study(free={"depth_span_mm": [0.5, 60.0]}))
 
 
 def test_the_record_is_that_of_the_start_that_won():
@@ -186,7 +186,7 @@ def test_the_record_is_that_of_the_start_that_won():
 def test_both_limits_of_a_term_are_recorded(table1):
     terms = [{"name": "occupancy", "at_most": 0.5}, {"name": "occupancy", "at_least": 0.2}]
     question = study(terms=terms, free={"sensor_distance_mm": [2.0, 6.0]})
-    found = optimize(table1, question)
+    found = run_study(table1, question)
     last = found.log.steps[-1]
     np.testing.assert_allclose(last["occupancy at_most"], found.after[0].high, rtol=1e-3)
     np.testing.assert_allclose(last["occupancy at_least"], found.after[0].low, rtol=1e-3)
@@ -196,7 +196,7 @@ def test_both_limits_of_a_term_are_recorded(table1):
 def test_no_start_that_ends_anywhere(table1, monkeypatch):
     monkeypatch.setattr(stages, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
     with pytest.raises(InputError, match="no start came to a finite cost"):
-        optimize(table1, study())
+        run_study(table1, study())
 
 
 def test_files_and_objects_are_the_same(table1, tmp_path):
@@ -204,10 +204,10 @@ def test_files_and_objects_are_the_same(table1, tmp_path):
     write_design(tmp_path / "a.toml", table1)
     text = "[free]\nsensor_distance_mm = [2.0, 6.0]\n[[terms]]\nname = 'occupancy'\nat_most = 0.5\n"
     (tmp_path / "b.toml").write_text(text + "[[stages]]\nsolver = 'levenberg-marquardt'\n")
-    found = optimize(str(tmp_path / "a.toml"), tmp_path / "b.toml")
+    found = run_study(str(tmp_path / "a.toml"), tmp_path / "b.toml")
     assert found.parent == table1 and found.study == read_study(tmp_path / "b.toml")
-    assert found.design == optimize(table1, found.study).design
+    assert found.design == run_study(table1, found.study).design
     array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
     (tmp_path / "b.toml").write_text((tmp_path / "b.toml").read_text().replace("sensor_distance", "pitch"))
     with pytest.raises(InputError, match="b.toml: `free.pitch_mm`"):
-        optimize(table1.model_copy(update={"array": array}), tmp_path / "b.toml")
+        run_study(table1.model_copy(update={"array": array}), tmp_path / "b.toml")

@@ -12,7 +12,7 @@ from gs_jax import random_layout
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, new_design, parent_of, start_values
-from gs_jax.codesign.search import optimize
+from gs_jax.codesign.search import run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study
@@ -178,7 +178,7 @@ def test_gradients():
 def test_one_kind_is_as_before():
     """`kinds = 1` changes nothing, to the last digit."""
     few = {"stages": [{"solver": "lbfgsb", "steps": 3}], "terms": [{"name": "psf_width_um", "minimise": 100.0}]}
-    plain, one = (optimize(conics(4, 2.4), study(**few, **kinds)) for kinds in ({}, {"kinds": 1}))
+    plain, one = (run_study(conics(4, 2.4), study(**few, **kinds)) for kinds in ({}, {"kinds": 1}))
     assert plain.log == one.log and plain.design.lens == one.design.lens
 
 
@@ -186,8 +186,8 @@ def test_one_kind_is_as_before():
 def searches():
     """The same search of one kind, and of two from where that ended."""
     free = {"radius_of_curvature_mm": [1.0, 3.0], "sensor_distance_mm": [2.0, 6.0]}
-    one = optimize(conics(), study(free=free))
-    return one, optimize(one.design, study(free=free, kinds=2))
+    one = run_study(conics(), study(free=free))
+    return one, run_study(one.design, study(free=free, kinds=2))
 
 
 @pytest.mark.integration

@@ -10,7 +10,7 @@ from gs_jax.__main__ import commands
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import stages
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
-from gs_jax.codesign.search import optimize
+from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.designs.builtin import geomscope
 from gs_jax.designs.design import write_design
@@ -99,7 +99,7 @@ SPLIT = STUDY | {
 
 @pytest.mark.integration
 def test_stages_keep_what_the_one_before_found():
-    """Stages that free different parameters; each search ends where `optimize` does with the same limit."""
+    """Stages that free different parameters; each search ends where `run_study` does with the same limit."""
     start = geomscope(sensor_distance_mm=4.0)
     sizes = []
     found = trade_off(start, Study.model_validate(SPLIT), each=lambda front: sizes.append(len(front.points)))
@@ -109,7 +109,7 @@ def test_stages_keep_what_the_one_before_found():
         assert point.feasible and offset.high <= 0.2 and depth.low >= wanted
         limit = {"name": "depth_of_field_mm", "at_least": wanted, "weight": 30.0}
         alone = Study.model_validate(SPLIT | {"pareto": [], "terms": [*SPLIT["terms"][:2], limit]})
-        np.testing.assert_allclose(light.low, optimize(start, alone).after[1].low, rtol=1e-2)
+        np.testing.assert_allclose(light.low, run_study(start, alone).after[1].low, rtol=1e-2)
 
 
 @pytest.mark.integration

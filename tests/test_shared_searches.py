@@ -9,7 +9,7 @@ import pytest
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.pareto import as_json, trade_off
-from gs_jax.codesign.search import optimize
+from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study
 from gs_jax.designs.builtin import geomscope
 from gs_jax.training.examples import SCENES
@@ -50,11 +50,11 @@ def assert_same(found, wanted):
 
 @pytest.fixture(scope="module")
 def alone():
-    return optimize(geomscope(sensor_distance_mm=4.0), SEVERAL)
+    return run_study(geomscope(sensor_distance_mm=4.0), SEVERAL)
 
 
 def test_starts_of_a_search(two, alone, tmp_path):
-    found = optimize(geomscope(sensor_distance_mm=4.0), SEVERAL, workers=two, checkpoint=tmp_path / "c")
+    found = run_study(geomscope(sensor_distance_mm=4.0), SEVERAL, workers=two, checkpoint=tmp_path / "c")
     assert_same(found, alone)
 
 
@@ -77,10 +77,10 @@ class Interrupted(Progress):
 def test_an_interrupted_search_goes_on_whoever_runs_it(two, alone, tmp_path, first, then):
     how = {"checkpoint": tmp_path / "c", "every": 0.0}
     with pytest.raises(KeyboardInterrupt):
-        optimize(
+        run_study(
             geomscope(sensor_distance_mm=4.0), SEVERAL, progress=Interrupted(), workers=two if first else None, **how
         )
-    again = optimize(geomscope(sensor_distance_mm=4.0), SEVERAL, resume=True, workers=two if then else None, **how)
+    again = run_study(geomscope(sensor_distance_mm=4.0), SEVERAL, resume=True, workers=two if then else None, **how)
     assert_same(again, alone)
 
 
@@ -98,7 +98,7 @@ def test_terms_of_ones_own(two, monkeypatch):
     def found(name, target):
         only = {"free": {"sensor_distance_mm": [2.0, 6.5]}, "starts": 2, "stages": [{"solver": "levenberg-marquardt"}]}
         study = Study.model_validate(STUDY | only | {"pareto": [], "terms": [{"name": name, "equal": target}]})
-        return optimize(geomscope(), study, workers=two).design.imaging.sensor_distance_mm
+        return run_study(geomscope(), study, workers=two).design.imaging.sensor_distance_mm
 
     times = 3
     own = Term("thrice the sensor's distance", lambda c: times * c.imager.sensor_distance)

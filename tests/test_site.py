@@ -61,11 +61,12 @@ def test_commands_exist_with_their_options(path):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", ["gradients", "solver"])
+@pytest.mark.parametrize("name", ["frameworks", "gradients", "solver"])
 def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    names = {"__name__": name}
     for block in blocks(DOCS / "howto" / f"{name}.md", "python"):
-        exec(compile(block, name, "exec"), {"__name__": name})
+        exec(compile(block, name, "exec"), names)
 
 
 def test_the_study_of_the_first_ten_minutes_is_one():

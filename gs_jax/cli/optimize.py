@@ -46,7 +46,7 @@ def command(design: Path, study: Path, resume: bool, output: Path, force: bool, 
     kept[checkpoint] = RESUMABLE
     with Progress() as progress, workers:
         how = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
-        outcome = search.optimize(design, study, **how)
+        outcome = search.run_study(design, study, **how)
     write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study))
     checkpoint.unlink(missing_ok=True)
     Console().print(before_and_after(outcome))

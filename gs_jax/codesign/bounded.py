@@ -2,18 +2,26 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
-with warnings.catch_warnings():
-    warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
-    import jaxopt
 
+class LBFGSB(NamedTuple):
+    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), which keeps bounds by itself.
 
-def lbfgsb(objective: Callable[..., Float[Array, ""]]) -> jaxopt.LBFGSB:
-    """A smooth objective within bounds (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), step by step:
-    `init_state(x, bounds)`, `update(x, state, bounds)`.
-
-    Scale the variables to about one before: the first step is as long as the gradient.
+    `tolerance`: of the cost and of the parameters; by default what their type allows.
     """
-    return jaxopt.LBFGSB(objective, maxiter=1, tol=0.0, implicit_diff=False)
+
+    tolerance: float | None = None
+
+    def of(self, objective: Callable[..., Float[Array, ""]]) -> Any:
+        """A smooth objective step by step: `init_state(x, bounds)`, `update(x, state, bounds)`.
+
+        Scale the variables to about one before: the first step is as long as the gradient.
+        """
+        # Here, so that the other solvers do without a package that is no longer maintained.
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
+            import jaxopt
+        return jaxopt.LBFGSB(objective, maxiter=1, tol=0.0, implicit_diff=False)

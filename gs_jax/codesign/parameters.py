@@ -25,7 +25,7 @@ from ..designs.design import Design
 from ..designs.microscope import Microscope
 from ..geometry import Imager
 from ..io.tables import one_line
-from ..lenses import EACH
+from ..lenses import EACH, type_of_lens
 from ..optics.aperture import Cells, cells_of, pitch
 from ..optics.kinds import lenses_by_kind
 
@@ -193,10 +193,7 @@ def of_lenses(parent: Parent, value: Float[Array, "..."]) -> Float[Array, "..."]
     """A value for each lens, of one for each kind; one of all lenses stays."""
     if value.ndim == 0:
         return value
-    kind = np.zeros(len(parent.imager.array.centers), int)
-    for number, which in enumerate(parent.lenses):
-        kind[list(which)] = number
-    return value[kind]
+    return value[type_of_lens(parent.imager.array)]
 
 
 def new_design(design: Design, parent: Parent, values: Values) -> Design:

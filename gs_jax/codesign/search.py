@@ -62,7 +62,7 @@ def opened(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple
         yield started(found, question), question
 
 
-def optimize(
+def run_study(
     design: Design | PathLike,
     study: Study | PathLike,
     *,
@@ -114,16 +114,16 @@ def optimize(
     ... solver = "levenberg-marquardt"
     ... steps = 20
     ... ''')
-    >>> outcome = gs.optimize(gs.geomscope(), "study.toml")
+    >>> outcome = gs.run_study(gs.geomscope(), "study.toml")
     >>> print(round(outcome.design.imaging.sensor_distance_mm, 1))  # where a thin lens images the middle
     6.0
     """
     with opened(design, study) as (parent, question):
         path = None if checkpoint is None else Path(checkpoint)
-        return _optimize(parent, question, progress, path, resume, every, workers)
+        return _run_study(parent, question, progress, path, resume, every, workers)
 
 
-def _optimize(
+def _run_study(
     design: Design,
     study: Study,
     progress: Progress | None,

@@ -16,11 +16,15 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..base.errors import InputError
+from .bounded import LBFGSB
 from .study import StageTable
 
 # A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
 # of a key that is new in every step, for what is random.
 Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
+
+Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | optax.GradientTransformation | LBFGSB
 
 CONVERGED = "converged: neither the cost nor the parameters change any more"
 MET = "all targets are met"
@@ -48,28 +52,37 @@ class Stepper(NamedTuple):
     advance: Callable[[State, PyTree], State]
 
 
-def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: StageTable, key: Key[Array, ""]) -> Stepper:
-    """A solver of least squares, `cost = |residual|^2 / 2`, compiled once for any start.
+def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solver, key: Key[Array, ""]) -> Stepper:
+    """A solver as steps, compiled once for any start.
 
     Parameters
     ----------
     residual
-        One number for each thing that is wanted.
+        One number for each thing that is wanted, of which the cost is `|residual|^2 / 2`; or the cost itself, a scalar.
     free, given
-        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for L-BFGS-B they
+        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for `LBFGSB` they
         are between 0 and 1.
-    stage
-        Which solver. Adam is for a residual that is random: it gets a new key in each step, its rate falls to zero by a
-        cosine over the stage's steps, and it never converges.
+    solver
+        Solvers of optax never converge: they are for what is random, which gets a new key in each step.
     key
         The steps' keys follow from it.
     """
-    tolerance = 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6
-    cost = lambda free, args: jnp.sum(residual(free, *args) ** 2) / 2
-    if stage.solver == "lbfgsb":
-        return _within_box(cost, key, tolerance)
-    solver: Any = _solver(stage, tolerance)
-    least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+
+    def cost(free, args):
+        found = residual(free, *args)
+        return found if jnp.ndim(found) == 0 else jnp.sum(found**2) / 2
+
+    if isinstance(solver, LBFGSB):
+        return _within_box(cost, key, solver)
+    if isinstance(solver, optax.GradientTransformation):
+        solver = optx.OptaxMinimiser(solver, _tolerance(), _tolerance())
+    least_squares, goes_on = (
+        isinstance(solver, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
+    )
+    if least_squares and jnp.ndim(jax.eval_shape(residual, free, given, key)) == 0:
+        found = f"found a loss that is one number for {type(solver).__name__}"
+        raise InputError(f"{found}, allowed: residuals, an array; or a minimiser such as optimistix.BFGS.")
+    solver: Any = solver
     target = (lambda free, args: residual(free, *args)) if least_squares else cost
     args = given, key
     function = eqx.filter_closure_convert(lambda free, args: (target(free, args), None), free, args)
@@ -90,16 +103,14 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, stage: Stage
         with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
             new, inner, _ = solver.step(function, state.free, args, options, inner, frozenset())
         done, result = solver.terminate(function, new, args, options, inner, frozenset())
-        done = (done | (result != optx.RESULTS.successful)) & (stage.solver != "adam")
+        done = (done | (result != optx.RESULTS.successful)) & (not goes_on)
         return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1, done)
 
     return Stepper(begin, advance)
 
 
-def _within_box(cost, key, tolerance) -> Stepper:
-    from .bounded import lbfgsb  # here, so that the other solvers do without a package that is no longer maintained
-
-    solver = lbfgsb(cost)
+def _within_box(cost, key, kept: LBFGSB) -> Stepper:
+    solver, tolerance = kept.of(cost), kept.tolerance or _tolerance()
     box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))
 
     @jax.jit
@@ -154,15 +165,21 @@ def run(
         each(state)
 
 
-def _solver(stage: StageTable, tolerance: float):
+def solver_of(stage: StageTable) -> Solver:
+    """The solver that a stage names. Adam's rate falls to zero by a cosine over the stage's steps."""
     match stage.solver:
         case "levenberg-marquardt":
-            return optx.LevenbergMarquardt(tolerance, tolerance)
+            return optx.LevenbergMarquardt(_tolerance(), _tolerance())
         case "bfgs":
-            return optx.BFGS(tolerance, tolerance)
+            return optx.BFGS(_tolerance(), _tolerance())
         case "lbfgs":
-            return optx.LBFGS(tolerance, tolerance)
+            return optx.LBFGS(_tolerance(), _tolerance())
+        case "lbfgsb":
+            return LBFGSB()
         case "adam":
             # What is random is only found as well as the last steps are small.
-            rate = optax.cosine_decay_schedule(stage.learning_rate, stage.steps)
-            return optx.OptaxMinimiser(optax.adam(rate), tolerance, tolerance)
+            return optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps))
+
+
+def _tolerance() -> float:
+    return 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6

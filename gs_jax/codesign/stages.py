@@ -23,7 +23,7 @@ from .bounds import Bounds, Box
 from .checkpoint import Log, restored
 from .objectives import TERMS, with_terms
 from .parameters import Parent, Values, candidate, parent_of, start_values
-from .solve import NOT_FINITE, State, Stepper, run, stepper
+from .solve import NOT_FINITE, State, Stepper, run, solver_of, stepper
 from .study import MOST_KINDS, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
 
@@ -117,7 +117,7 @@ def make_stage(problem: Problem, index: int) -> Stage:
         number=index,
         table=table,
         labels=labels(terms, study),
-        steps=stepper(residuals, to_free(values), (targets_of(terms), values), table, key),
+        steps=stepper(residuals, to_free(values), (targets_of(terms), values), solver_of(table), key),
         free=to_free,
         values=to_values,
         watch=jax.jit(watch),

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from ..base.progress import Progress
 from ..codesign.outcome import as_records, write_outcome
-from ..codesign.search import optimize
+from ..codesign.search import run_study
 from ..designs.builtin import geomscope
 from ..designs.design import Design, write_design
 from ..designs.problems import findings
@@ -85,7 +85,7 @@ def _optimise(folder: Path, progress: Progress) -> list[dict]:
     write_text(folder / "study.toml", template("study.toml"), [".toml"])
     printed = geomscope(sensor_distance_mm=4.0)
     write_design(folder / "printed.toml", printed)
-    outcome = optimize(printed, folder / "study.toml", progress=progress)
+    outcome = run_study(printed, folder / "study.toml", progress=progress)
     write_outcome(folder / "optimized.toml", outcome, parent="printed.toml", source="study.toml")
     return as_records(outcome)
 

@@ -1,0 +1,201 @@
+"""Search for the imager that a loss of your own is least for; studies are this with terms by name."""
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ..base.errors import InputError
+from ..geometry import Imager
+from ..lenses import EACH, type_of_lens
+from .bounded import LBFGSB
+from .bounds import Bounds, Box
+from .solve import CONVERGED, NOT_FINITE, Solver, run, stepper
+
+Values = dict[str, Float[Array, "..."]]
+
+_OF_ARRAY = (
+    "centers",
+    "radius_of_curvature",
+    "aperture_diameter",
+    "conic_constant",
+    "aspheric_terms",
+    "refractive_index",
+    "substrate_thickness",
+)
+_OF_IMAGER = ("sensor_distance", "rotation", "shift", "tilt", "wavelength")
+
+
+class Free(NamedTuple):
+    """Which numbers of an imager are free; `gs_jax.free` makes it."""
+
+    names: tuple[str, ...]
+
+    def values(self, imager: Imager) -> Values:
+        """The free numbers by name. What lenses have of their own is one number for each kind of lens."""
+        first = lambda name, value: value if (kind := _kind(imager, name)) is None else value[_firsts(kind)]
+        return {name: first(name, value) for name, value in self._of(imager)}
+
+    def replaced(self, imager: Imager, values: Values) -> Imager:
+        """The imager with other numbers; `imager` says which lens is of which kind, so its own are not traced."""
+        kinds = [_kind(imager, name) for name in self.names]
+        each = zip((values[name] for name in self.names), kinds, strict=True)
+        numbers = [value if kind is None else value[kind] for value, kind in each]
+        return eqx.tree_at(lambda i: [_leaf(i, name) for name in self.names], imager, numbers)
+
+    def _of(self, imager):
+        for name in self.names:
+            if (value := _leaf(imager, name)) is None:
+                raise InputError(f"free: found {name}, which this imager has not, allowed: with a tilt, maybe of zero.")
+            yield name, value
+
+
+def free(*names: str) -> Free:
+    """Which numbers of an imager a search may change.
+
+    Parameters
+    ----------
+    names
+        Fields of `Imager` and of `MicrolensArray`: `"sensor_distance"`, `"rotation"`, `"shift"`, `"tilt"`,
+        `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
+        `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`. Of lenses that differ, radius, aperture and
+        conic constant are free for each kind, and which lens is of which kind stays.
+
+    Raises
+    ------
+    InputError
+        If there is no such field, or none is named.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> gs.free("centers", "sensor_distance").names
+    ('centers', 'sensor_distance')
+    """
+    known = (*_OF_IMAGER, *_OF_ARRAY)
+    if wrong := [name for name in names if name not in known]:
+        raise InputError(f"free: found {wrong[0]!r}, allowed: {', '.join(known)}.")
+    if not names:
+        raise InputError(f"free: found no name, allowed: one or more of {', '.join(known)}.")
+    return Free(tuple(dict.fromkeys(names)))
+
+
+class Optimum(NamedTuple):
+    """What `gs_jax.optimize` found.
+
+    `imager`: the best. `value`: its loss, of residuals half the sum of their squares. `result`: of
+    `optimistix.RESULTS`, whether the solver converged, ran out of steps, or came to what is not finite. `stats`:
+    `"num_steps"`, and `"values"`, the loss after each.
+    """
+
+    imager: Imager
+    value: Float[Array, ""]
+    result: optx.RESULTS
+    stats: dict[str, Any]
+
+
+def optimize(
+    loss: Callable[[Imager], Float[Array, "..."]],
+    imager: Imager,
+    *,
+    free: Free,
+    solver: Solver | None = None,
+    bounds: Mapping[str, tuple[Any, Any]] = MappingProxyType({}),
+    steps: int = 256,
+    callback: Callable[[int, float, Imager], None] | None = None,
+) -> Optimum:
+    """Search for the imager of the least loss; *host*.
+
+    Parameters
+    ----------
+    loss
+        From an imager to one number, or to an array of residuals, half the sum of whose squares is minimised.
+        Traced and differentiated: `gs_jax.objectives` are made for it.
+    imager
+        To start from. Double precision (`jax_enable_x64`) finds a minimum to a billionth, single stops far from it.
+    free
+        What may change, of `gs_jax.free`.
+    solver
+        Of optimistix, a minimiser, or for residuals one of least squares; of optax, which runs all steps; or
+        `gs_jax.codesign.bounded.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
+    bounds
+        Lowest and highest value by name, numbers or arrays. Kept by a change of variables; a start beyond them is taken
+        within.
+    steps
+        The most to take.
+    callback
+        Called after each step with its number, the loss and the imager.
+
+    Raises
+    ------
+    InputError
+        If bounds are of what is not free, or are none, or `loss` is one number for a solver of least squares.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, jax.numpy as jnp
+    >>> scope = gs.geomscope().imager()
+    >>> loss = lambda scope: (scope.magnification(20.0) - 0.25) ** 2
+    >>> found = gs.optimize(loss, scope, free=gs.free("sensor_distance"), bounds={"sensor_distance": (4.0, 8.0)})
+    >>> print(round(float(found.imager.magnification(20.0)), 2))
+    0.25
+    """
+    solver = optx.BFGS(1e-8, 1e-8) if solver is None else solver
+    maps = {
+        name: _map(name, free, bounds, isinstance(solver, LBFGSB)) for name in {**dict.fromkeys(free.names), **bounds}
+    }
+    values = free.values(imager)
+    start = {name: maps[name].free(value) for name, value in values.items()}
+    at = lambda moved: free.replaced(imager, {name: maps[name].value(moved[name]) for name in free.names})
+    steps_of = stepper(lambda moved, given, key: loss(at(moved)), start, None, solver, jax.random.key(0))
+    losses = []
+
+    def after(state):
+        losses.append(float(state.cost))
+        if callback is not None:
+            callback(int(state.step), losses[-1], at(state.free))
+
+    state, reason = run(steps_of, steps_of.begin(start, None), None, limit=steps, enough=-math.inf, each=after)
+    results = {CONVERGED: optx.RESULTS.successful, NOT_FINITE: optx.RESULTS.nonlinear_divergence}
+    result = results.get(reason, optx.RESULTS.nonlinear_max_steps_reached)
+    return Optimum(at(state.free), state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
+
+
+class _Unbounded:
+    """Values as they are."""
+
+    value = free = staticmethod(lambda x: x)
+
+
+def _map(name, free, bounds, box):
+    if name not in free.names:
+        raise InputError(f"bounds: found some of {name}, allowed: of what is free, {', '.join(free.names)}.")
+    if name not in bounds:
+        if box:
+            raise InputError(f"bounds: found none of {name}, allowed: of all that is free, for LBFGSB.")
+        return _Unbounded
+    low, high = (np.asarray(end, float) for end in bounds[name])
+    if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+        raise InputError(f"bounds: found {low} to {high} of {name}, allowed: low below high, both finite.")
+    return (Box if box else Bounds)(low, high)
+
+
+def _leaf(imager, name):
+    return getattr(imager.array if name in _OF_ARRAY else imager, name)
+
+
+def _kind(imager, name) -> np.ndarray | None:
+    """The number of each lens's kind, where lenses have a number of their own."""
+    if name not in EACH or _leaf(imager, name).ndim == 0:
+        return None
+    return type_of_lens(imager.array)
+
+
+def _firsts(kind: np.ndarray) -> np.ndarray:
+    return np.unique(kind, return_index=True)[1]

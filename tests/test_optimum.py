@@ -1,0 +1,195 @@
+"""Searches with a loss of one's own: an imager in, an imager out; and a network trained with the geometry."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from jax.test_util import check_grads
+
+import gs_jax as gs
+from gs_jax import InputError, objectives
+from gs_jax.codesign.bounded import LBFGSB
+
+DEPTHS = np.array([18.0, 20.0, 22.0])
+
+
+def small(**lens) -> gs.Imager:
+    array = gs.MicrolensArray([[-1.0, -0.4], [0.3, 1.1], [1.2, -0.9]], aperture_diameter=1.5, size=(4.0, 4.0), **lens)
+    return gs.Imager(array, gs.Sensor((170, 170), 0.02), sensor_distance=5.0, field_radius=1.5)
+
+
+def in_focus(scope: gs.Imager):
+    """The sensor where a thin lens images 20 mm, in residuals."""
+    off = 1 / scope.array.focal_length - 1 / scope.reduced_sensor_distance - 1 / scope.reduced_depth(20.0)
+    return jnp.stack([10 * off, scope.array.radius_of_curvature - 2.1])
+
+
+FREE = gs.free("sensor_distance", "radius_of_curvature")
+BOUNDS = {"sensor_distance": (4.0, 9.0), "radius_of_curvature": (1.5, 3.0)}
+
+
+@pytest.mark.parametrize(
+    ("loss", "solver", "bounds"),
+    [
+        (in_focus, optx.LevenbergMarquardt(1e-10, 1e-10), {}),
+        (in_focus, optx.BFGS(1e-10, 1e-10), BOUNDS),
+        (lambda scope: jnp.sum(in_focus(scope) ** 2), LBFGSB(), BOUNDS),
+        (lambda scope: jnp.sum(in_focus(scope) ** 2), optax.adam(0.05), BOUNDS),
+        (in_focus, None, {"radius_of_curvature": (1.5, 3.0)}),
+    ],
+    ids=["least-squares", "bfgs", "bounded", "optax", "default"],
+)
+def test_all_solvers_come_to_the_same_imager(loss, solver, bounds):
+    seen = []
+    callback = lambda step, value, scope: seen.append((step, value, float(scope.sensor_distance)))
+    found = gs.optimize(loss, small(), free=FREE, solver=solver, bounds=bounds, steps=400, callback=callback)
+    exact = 1 / (0.43 / 2.1 - 1 / (20 + 1 / 1.43))
+    adam = isinstance(solver, optax.GradientTransformation)
+    assert float(found.imager.sensor_distance) == pytest.approx(exact, rel=1e-2 if adam else 1e-5)
+    assert float(found.imager.array.radius_of_curvature) == pytest.approx(2.1, rel=1e-2 if adam else 1e-5)
+    assert (found.result == optx.RESULTS.successful) != adam and found.value < (1e-2 if adam else 1e-12)
+    assert found.stats["num_steps"] == len(seen) == len(found.stats["values"]) and seen[-1][1] == float(found.value)
+    np.testing.assert_array_equal(found.imager.array.centers, small().array.centers)
+
+
+def test_bounds_are_kept_and_steps_are_counted():
+    away = lambda scope: (scope.sensor_distance - 10) ** 2
+    found = gs.optimize(away, small(), free=gs.free("sensor_distance"), bounds={"sensor_distance": (4.0, 6.0)}, steps=3)
+    assert 5.5 < float(found.imager.sensor_distance) < 6 and found.stats["num_steps"] == 3
+    assert found.result == optx.RESULTS.nonlinear_max_steps_reached
+    lost = gs.optimize(lambda scope: jnp.log(-scope.sensor_distance), small(), free=gs.free("sensor_distance"))
+    assert lost.result == optx.RESULTS.nonlinear_divergence
+
+
+def test_kinds_of_lenses_stay_kinds():
+    scope = small(radius_of_curvature=[2.0, 2.2, 2.0])
+    free = gs.free("radius_of_curvature", "centers")
+    assert free.values(scope)["radius_of_curvature"].shape == (2,)
+    loss = lambda scope: jnp.sum((scope.array.radius_of_curvature - jnp.array([2.4, 2.6, 2.4])) ** 2)
+    found = gs.optimize(loss, scope, free=free, solver=optx.BFGS(1e-10, 1e-10)).imager
+    np.testing.assert_allclose(found.array.radius_of_curvature, [2.4, 2.6, 2.4], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: gs.free("pitch"), "free: found 'pitch', allowed: sensor_distance, rotation"),
+        (lambda: gs.free(), "free: found no name"),
+        (lambda: gs.optimize(in_focus, small(), free=gs.free("tilt")), "tilt, which this imager has not"),
+        (lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"shift": (0, 1)}), "bounds: found some of shift"),
+        (lambda: gs.optimize(in_focus, small(), free=FREE, solver=LBFGSB()), "bounds: found none of sensor_distance"),
+        (
+            lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"sensor_distance": (6.0, 5.0)}),
+            "found 6.0 to 5.0 of sensor_distance, allowed: low below high",
+        ),
+        (
+            lambda: gs.optimize(lambda s: s.wavelength, small(), free=FREE, solver=optx.LevenbergMarquardt(1e-3, 1e-3)),
+            "a loss that is one number for LevenbergMarquardt, allowed: residuals",
+        ),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+OBJECTIVES = {
+    "spot_width": objectives.spot_width,
+    "encircled_radius": objectives.encircled_radius,
+    "strehl": objectives.strehl,
+    "lateral_resolution": objectives.lateral_resolution,
+    "axial_resolution": objectives.axial_resolution,
+    "depth_of_field": objectives.depth_of_field,
+    "blur": objectives.blur,
+    "occupancy": objectives.occupancy,
+    "light": objectives.light,
+    "lenses_per_point": lambda scope, depths: objectives.lenses_per_point(scope),
+    "coverage": lambda scope, depths: objectives.coverage(scope),
+    "spacing": lambda scope, depths: objectives.spacing(scope),
+}
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_objectives_have_the_gradients_of_finite_differences(name):
+    """By aperture, centres and all else that they depend on."""
+
+    def value(distance, radius, aperture, centers):
+        where = lambda i: (i.sensor_distance, i.array.radius_of_curvature, i.array.aperture_diameter, i.array.centers)
+        return OBJECTIVES[name](eqx.tree_at(where, small(), (distance, radius, aperture, centers)), DEPTHS)
+
+    # The sensor where nothing is in focus: there a blur has a kink.
+    numbers = (jnp.asarray(5.3), jnp.asarray(2.0), jnp.asarray(1.5), small().array.centers)
+    assert jnp.isfinite(value(*numbers)).all()
+    check_grads(value, numbers, order=1, modes=["rev"], eps=1e-6, rtol=1e-3, atol=1e-6)
+
+
+def test_objectives_of_lenses_that_differ_are_of_all_or_refused():
+    scope = small(radius_of_curvature=[2.0, 2.2, 2.0])
+    assert objectives.occupancy(scope, DEPTHS).shape == (3,)
+    with pytest.raises(InputError, match="lenses that differ"):
+        objectives.spot_width(scope, DEPTHS)
+
+
+def test_an_objective_of_ones_own_to_a_file(tmp_path):
+    scope, depths = gs.geomscope(sensor_distance_mm=4.5).replace(centers_mm=small().array.centers).imager(), DEPTHS
+    my_cost = lambda scope: (scope.sensor_distance - 5.0) ** 2
+    loss = lambda scope: gs.objectives.spot_width(scope, depths).max() + 0.001 * my_cost(scope)
+    found = gs.optimize(
+        loss,
+        scope,
+        free=gs.free("sensor_distance", "radius_of_curvature", "aperture_diameter"),
+        bounds={"sensor_distance": (4.0, 7.0), "radius_of_curvature": (1.5, 3.0), "aperture_diameter": (0.6, 2.0)},
+        solver=optx.BFGS(1e-6, 1e-6),
+        steps=12,
+    )
+    assert found.value < 0.5 * loss(scope)
+    gs.write_design(tmp_path / "mine.toml", gs.Design.from_imager(found.imager, name="mine"))
+    assert gs.read_design(tmp_path / "mine.toml").imager().sensor_distance == found.imager.sensor_distance
+
+
+def test_a_layout_of_ones_own_to_a_mold(tmp_path):
+    my_points = 1.4 * np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
+    report = gs.make_mold(gs.geomscope().replace(centers_mm=my_points, size_mm=(6.0, 6.0)), tmp_path / "mine.stl")
+    assert report["verification"]["lenses"] == 9
+
+
+def test_geometry_and_a_network_are_trained_together():
+    """One compiled step, for all steps."""
+    scope, grid = small(), gs.Grid(DEPTHS, (15, 15), 0.12)
+    rng = np.random.default_rng(0)
+    truth = jnp.asarray(rng.random((4, *grid.volume_shape)))
+    images = jax.vmap(gs.ImagingOperator(scope, grid).mv)(truth)
+    net = eqx.nn.Conv2d(3, 3, 3, padding=1, key=jax.random.key(0))
+    traced = []
+
+    def loss(params, images):
+        traced.append(None)
+        scope, net = params
+        A = gs.ImagingOperator(scope, grid)
+        return jnp.mean((jax.vmap(net)(jax.vmap(A.T.mv)(images)) - truth) ** 2)
+
+    optimiser = optax.adam(1e-2)
+    start = dataclasses.replace(scope, sensor_distance=5.3)
+    params, static = eqx.partition((start, net), eqx.is_inexact_array)
+    state = optimiser.init(params)
+
+    @jax.jit
+    def step(params, state, images):
+        value, slope = jax.value_and_grad(lambda params: loss(eqx.combine(params, static), images))(params)
+        with jax.numpy_dtype_promotion("standard"):  # optax multiplies floats and whole numbers
+            updates, state = optimiser.update(slope, state)
+        return optax.apply_updates(params, updates), state, value
+
+    values = []
+    for _ in range(30):
+        params, state, value = step(params, state, images)
+        values.append(float(value))
+    assert len(traced) == 1 and values[-1] < 0.5 * values[0] and math.isfinite(values[-1])
+    moved = eqx.combine(params, static)[0]
+    assert moved.sensor_distance != 5.3 and not np.allclose(moved.array.centers, scope.array.centers)
