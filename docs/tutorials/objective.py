@@ -105,8 +105,8 @@ found = gs.optimize(
     steps=STEPS,
 )
 for name, imager in (("before", scope), ("after", found.imager)):
-    width = 1000 * gs.objectives.spot_width(imager, depths).max()
-    print(f"{name:6} v = {float(imager.sensor_distance):.2f} mm, widest spot {float(width):.0f} um")
+    widest = 1000 * gs.objectives.spot_width(imager, depths).max()
+    print(f"{name:6} v = {float(imager.sensor_distance):.2f} mm, widest spot {float(widest):.0f} um")
 print(found.result == optx.RESULTS.successful, found.stats["num_steps"], "steps")
 gs.Design.from_imager(found.imager, name="mine", working_distance_mm=(18.0, 21.0))
 

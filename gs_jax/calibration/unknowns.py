@@ -160,8 +160,8 @@ def offsets_of(imager: Imager, depths: Float[np.ndarray, " source"]) -> Offsets:
     farther = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
     here, beyond = (core_powers(each, nodes) for each in (imager, farther))
     tables = nodes, here, (beyond - here) / (v * _STEP), v
-    types = type_of_lens(imager.array)
-    return Offsets(*(jnp.asarray(table, imager.sensor_distance.dtype) for table in tables), jnp.asarray(types))
+    at, here, slope, distance = (jnp.asarray(table, imager.sensor_distance.dtype) for table in tables)
+    return Offsets(at, here, slope, distance, jnp.asarray(type_of_lens(imager.array)))
 
 
 def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:

@@ -74,21 +74,21 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
 
     if isinstance(solver, LBFGSB):
         return _within_box(cost, key, solver)
+    steps: Any = solver
     if isinstance(solver, optax.GradientTransformation):
-        solver = optx.OptaxMinimiser(solver, _tolerance(), _tolerance())
+        steps = optx.OptaxMinimiser(solver, _tolerance(), _tolerance())
     least_squares, goes_on = (
-        isinstance(solver, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
+        isinstance(steps, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
     )
     if least_squares and jnp.ndim(jax.eval_shape(residual, free, given, key)) == 0:
-        found = f"found a loss that is one number for {type(solver).__name__}"
+        found = f"found a loss that is one number for {type(steps).__name__}"
         raise InputError(f"{found}, allowed: residuals, an array; or a minimiser such as optimistix.BFGS.")
-    solver: Any = solver
     target = (lambda free, args: residual(free, *args)) if least_squares else cost
     args = given, key
     function = eqx.filter_closure_convert(lambda free, args: (target(free, args), None), free, args)
     out, _ = eqx.filter_eval_shape(function, free, args)
     options: dict[str, Any] = {}
-    init = lambda free, args: solver.init(function, free, args, options, out, None, frozenset())
+    init = lambda free, args: steps.init(function, free, args, options, out, None, frozenset())
     static = eqx.filter(init(free, args), eqx.is_array, inverse=True)
 
     @jax.jit
@@ -101,8 +101,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         args = given, jax.random.fold_in(key, state.step)
         inner = eqx.combine(state.solver, static)
         with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
-            new, inner, _ = solver.step(function, state.free, args, options, inner, frozenset())
-        done, result = solver.terminate(function, new, args, options, inner, frozenset())
+            new, inner, _ = steps.step(function, state.free, args, options, inner, frozenset())
+        done, result = steps.terminate(function, new, args, options, inner, frozenset())
         done = (done | (result != optx.RESULTS.successful)) & (not goes_on)
         return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1, done)
 
