@@ -172,13 +172,6 @@ def test_vmap_over_images_and_over_imagers():
     np.testing.assert_allclose(gradients[1], jax.grad(loss)(distances[1], images[0]), rtol=1e-12)
 
 
-def test_second_derivatives_are_refused_in_words():
-    imager, grid = scene(voxels=(4, 3), pitch=0.2)
-    total = lambda v: jnp.sum(backproject(image_of(imager.sensor), Imager(imager.array, imager.sensor, v, 0.45), grid))
-    with pytest.raises(NotImplementedError, match="first derivatives"):
-        jax.grad(jax.grad(total))(imager.sensor_distance)
-
-
 @pytest.mark.integration
 def test_many_depths_go_in_groups():
     """37 depths are three groups of 13, of which two are padding."""
