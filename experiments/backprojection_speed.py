@@ -97,6 +97,17 @@ def bilinear_form(centers, sensor_distance, s: Inputs):
     return jnp.vdot(backproject(s.image, moved, s.grid), s.volume)
 
 
+def hessian_vector_product(centers, sensor_distance, s: Inputs):
+    """Of the sum of a volume's squares, along a direction of centres and sensor distance."""
+    here, along = (centers, sensor_distance), (jnp.ones_like(centers), jnp.ones_like(sensor_distance))
+
+    def squares(centers, sensor_distance):
+        moved = eqx.tree_at(lambda i: (i.array.centers, i.sensor_distance), s.imager, (centers, sensor_distance))
+        return jnp.vdot(backproject(s.image, moved, s.grid) ** 2, s.volume)
+
+    return jax.jvp(jax.grad(squares, (0, 1)), here, along)[1]
+
+
 class Contestant(NamedTuple):
     function: Callable
     arguments: Callable[[Inputs], tuple]
@@ -116,6 +127,7 @@ CONTESTANTS = {
     "gs_jax, adjoint": Contestant(backproject_adjoint, lambda s: (s.volume, s.imager, s.grid)),
     "gs_jax, gradient": Contestant(jax.jit(jax.grad(bilinear_form, argnums=(0, 1))), _whole),
     "gs_jax, value and gradient": Contestant(jax.jit(jax.value_and_grad(bilinear_form, argnums=(0, 1))), _whole),
+    "gs_jax, Hessian-vector product": Contestant(jax.jit(hessian_vector_product), _whole),
 }
 SAME_RESULT = ("gs_jax", "numba, the paper's loop", "numba, lens patches", "NumPy")
 IN_STUDY = ("gs_jax", "gs_jax, adjoint", "numba, lens patches")

@@ -1,6 +1,8 @@
 """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses.
 
-Lengths are in millimetres, lateral points `(x, y)`, volumes `[depth, row, column]`.
+Lengths are in millimetres, lateral points `(x, y)`, volumes `[depth, row, column]`. Each name says what it is in one
+word: *differentiable*, for all that JAX transforms; *compiled*, for `jit` and `vmap`, without gradients; *host*, for
+numbers and not for what JAX traces; *file*, which it reads or writes.
 
 The microscope:
 
@@ -57,7 +59,7 @@ The operators themselves, differentiable:
 
 Better designs, and their molds:
 
-    optimize             Search for the imager of the least loss; *host*
+    optimize             Search for the imager of the least loss
     free                 Which numbers of an imager a search may change
     objectives           What a microscope is judged by, as functions of an imager and depths; all *differentiable*
     run_study            Search for a design that does what a study wants

@@ -77,6 +77,8 @@ def field_limit(field_radius):
 class Sensor(eqx.Module):
     """A camera sensor of square pixels, in the plane `z = -v` behind the lenses.
 
+    *Differentiable.*
+
     Parameters
     ----------
     shape
@@ -147,6 +149,8 @@ class Views(NamedTuple):
 
 class Imager(eqx.Module):
     """A microlens array in front of a sensor, and the light: the one geometry of the package.
+
+    *Differentiable.*
 
     Parameters
     ----------

@@ -38,10 +38,9 @@ def as_scipy(A: lx.AbstractLinearOperator) -> Any:
     there, back, into, out = _both_ways(A)
     on_host = lambda function, shape: lambda flat: np.asarray(function(flat.reshape(shape).astype(into.dtype))).ravel()
     matvec, rmatvec = on_host(there, into.shape), on_host(back, out.shape)
-    flat: Any = (
-        LinearOperator  # whose stubs know the class that is subclassed, not the call that makes one of functions
-    )
-    return flat((_size(out), _size(into)), matvec=matvec, rmatvec=rmatvec, dtype=np.dtype(into.dtype))
+    # SciPy's stubs know the class that is subclassed, not the call that makes one of functions.
+    of_functions: Any = LinearOperator
+    return of_functions((_size(out), _size(into)), matvec=matvec, rmatvec=rmatvec, dtype=np.dtype(into.dtype))
 
 
 def as_scico(A: lx.AbstractLinearOperator) -> Any:

@@ -27,6 +27,8 @@ Scalars = Any
 class MicrolensArray(eqx.Module):
     """Plano-convex microlenses on one plate, their vertices in one plane.
 
+    *Differentiable.*
+
     A surface is a conic with even polynomial terms: it falls `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A_4 r^4 + ...`
     below its vertex, `c = 1/R` (ISO 10110-12).
 

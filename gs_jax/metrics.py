@@ -27,6 +27,8 @@ class Quality(NamedTuple):
 def quality(estimate: Volume, truth: Volume) -> Quality:
     """PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best.
 
+    *Host.*
+
     Reconstructions have no absolute scale, so the estimate is first multiplied by
     `max(<estimate, truth> / <estimate, estimate>, 0)`, the gain of least MSE; an estimate of zeros stays zero. The
     data range is the truth's largest value. SSIM is taken plane by plane (7 x 7 window, uniform, as in scikit-image)
@@ -82,6 +84,8 @@ class Localization(NamedTuple):
 
 def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: float = 0.4) -> Localization:
     """Match found points with true ones, each at most once, and score them.
+
+    *Host.*
 
     A pair may be `lateral` mm apart in the plane and `axial` mm in depth. As many pairs as possible are made, and
     among these matchings the closest, by the distance in units of the two limits.

@@ -12,6 +12,8 @@ from .geometry import Sensor
 class Grid(eqx.Module):
     """Voxels of the object space; centred on the axis, unless it has another origin.
 
+    *Differentiable.*
+
     Parameters
     ----------
     depths

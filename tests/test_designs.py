@@ -477,7 +477,7 @@ def test_a_design_of_an_imager_says_what_is_sharp():
     sheet = datasheet(design, [in_focus])
     assert found == pytest.approx((sheet["near_limit_mm"][0], sheet["far_limit_mm"][0]), abs=2e-3)
     with pytest.raises(
-        InputError, match=r"imager: found no depth in focus, allowed: with `working_distance_mm` only\."
+        InputError, match="working_distance_mm: found none, and no depth that is in focus, allowed: near"
     ):
         Design.from_imager(design.replace(sensor_distance_mm=4.0).imager(), name="mine")
     endless = dataclasses.replace(design.imager().array, size=(math.inf, math.inf))

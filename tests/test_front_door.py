@@ -63,6 +63,13 @@ def test_every_public_function_documents_its_arguments_or_needs_no_words():
             assert "Parameters\n" in (inspect.getdoc(value) or ""), name
 
 
+def test_every_name_says_in_one_word_what_it_is():
+    for name in set(gs.__all__) - {"__version__", "InputError", "Progress"}:
+        text = inspect.getdoc(getattr(gs, name)) or ""
+        words = re.findall(r"\*(differentiable|compiled|host|file)\b", text, re.IGNORECASE)
+        assert len(set(map(str.lower, words))) == 1, name
+
+
 def test_importing_the_package_is_quick_work():
     """Names are loaded when they are asked for: the package alone imports neither JAX nor NumPy."""
     code = "import sys, gs_jax; print({'jax', 'numpy', 'matplotlib'} & set(sys.modules))"

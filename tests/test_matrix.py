@@ -19,6 +19,7 @@ from gs_jax import Design, Grid, InputError
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
 from gs_jax.designs.sheet import datasheet
+from gs_jax.optics.refraction import on_host
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
 from gs_jax.report.page import write_report
@@ -170,6 +171,30 @@ def metrics(case: Case, _) -> None:
         assert np.all(np.asarray(case.sheet[name]) > 0), name
 
 
+def one_map(case: Case, _) -> None:
+    """The rays of grids, axis by axis, are those of `Imager.views`: each spot is shared by four pixels."""
+    voxels = Grid(case.grid.depths, (2, 3), 0.31 * case.imager.field_radius, case.grid.origin)
+    places = np.stack(np.meshgrid(case.depths, voxels.y, voxels.x, indexing="ij"), -1).reshape(-1, 3)[:, ::-1]
+    light = np.random.default_rng(0).random(voxels.volume_shape)
+    host = on_host(case.imager)
+    views = host.views_of_all(places)
+    spots, weight = host.sensor.to_pixels(views.spot), np.asarray(host.brightness(views)) * light.ravel()
+    low, image = np.floor(spots).astype(int), np.zeros(case.imager.sensor.shape)
+    on = (low >= 0).all(-1) & (low + 1 < np.array(image.shape)).all(-1)
+    for corner in np.ndindex(2, 2):
+        share = np.prod(np.where(corner, spots - low, 1 - spots + low), -1)
+        np.add.at(image, tuple((low[on] + corner).T), (share * weight)[on])
+    # Rays that meet the last row or column exactly are none here. Coordinates are float32.
+    found = gs.ImagingOperator(case.imager, voxels).mv(jnp.asarray(light, case.imager.sensor_distance.dtype))
+    np.testing.assert_allclose(found, image, atol=2e-3 * image.max())
+
+
+def from_imager(case: Case, _) -> None:
+    given = case.design.model_copy(update={"provenance": {}})
+    depths = given.imaging.working_distance_mm
+    assert Design.from_imager(case.imager, name=given.name, working_distance_mm=depths) == given
+
+
 def tolerances(case: Case, _) -> None:
     outcome = tolerance(case.design, depths=case.depths, draws=16)
     assert np.isfinite(outcome.devices.log_width).all() and np.isfinite(outcome.devices.calibrated).all()
@@ -189,6 +214,11 @@ def optimise(case: Case, _) -> None:
     found = gs.run_study(case.design, study)
     assert found.design.imaging.sensor_distance_mm < v
     assert found.design.lens == case.design.lens and found.design.array == case.design.array
+    # And without a study.
+    overlap = lambda scope: jnp.sum(gs.objectives.occupancy(scope, np.array(case.depths)))
+    limits = {"sensor_distance": (0.8 * v, 1.2 * v)}
+    best = gs.optimize(overlap, case.imager, free=gs.free("sensor_distance"), bounds=limits, steps=3)
+    assert float(best.imager.sensor_distance) < v and float(best.value) < float(overlap(case.imager))
 
 
 def mold(case: Case, folder: Path) -> None:
@@ -206,6 +236,8 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     **{method: partial(inverted, method) for method in METHODS},
     "calibrate": calibrate,
     "metrics": metrics,
+    "map": one_map,
+    "design": from_imager,
     "optimise": optimise,
     "tolerance": tolerances,
     "mold": mold,
@@ -223,7 +255,7 @@ WARNED = {("geomscope-table1", task) for task in ("points", "list-rl", "unrolled
 
 # `make test` runs one task of each kind for every device, these in turn and these always; `make integration` the rest.
 IN_TURN = (tuple(METHODS), ("points", "calibrate"))
-ALWAYS = ("metrics", "mold", "optimise")
+ALWAYS = ("design", "map", "metrics", "mold", "optimise")
 # What people are told to use first; a report takes long, so once.
 ALSO = (
     ("geomscope-asphere", "points"),

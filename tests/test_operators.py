@@ -68,6 +68,15 @@ def test_the_transpose_is_the_adjoint_and_maps_over_batches(name):
     np.testing.assert_allclose(jax.vmap(A.mv)(both), jnp.stack([A.mv(x), 2 * A.mv(x)]), atol=1e-9)
 
 
+def test_materialised_it_still_takes_volumes():
+    A = ImagingOperator(*scene(voxels=(5, 4), pitch=0.2, depths=(20.0,)))
+    x, y = (jax.random.normal(jax.random.key(n), s.shape) for n, s in enumerate((A.in_structure(), A.out_structure())))
+    dense = lx.materialise(A)
+    np.testing.assert_allclose(dense.mv(x), A.mv(x), atol=1e-12)
+    np.testing.assert_allclose(dense.T.mv(y), A.T.mv(y), atol=1e-12)
+    assert A.as_matrix().shape == (y.size, x.size) and A.T.as_matrix().shape == (x.size, y.size)
+
+
 def test_it_is_an_argument_that_compiles_once():
     imager, grid = scene()
     image, traced = jnp.ones(imager.sensor.shape), []

@@ -81,7 +81,10 @@ def test_kinds_of_lenses_stay_kinds():
     [
         (lambda: gs.free("pitch"), "free: found 'pitch', allowed: sensor_distance, rotation"),
         (lambda: gs.free(), "free: found no name"),
-        (lambda: gs.optimize(in_focus, small(), free=gs.free("tilt")), "tilt, which this imager has not"),
+        (
+            lambda: gs.optimize(in_focus, small(), free=gs.free("tilt")),
+            "tilt of an imager without one, allowed: with one",
+        ),
         (lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"shift": (0, 1)}), "bounds: found some of shift"),
         (lambda: gs.optimize(in_focus, small(), free=FREE, solver=LBFGSB()), "bounds: found none of sensor_distance"),
         (

@@ -96,6 +96,8 @@ def calibrate(
 ) -> Calibration:
     """Finds a microscope's geometry in captures of point sources, from a design that is about right.
 
+    *Host.*
+
     The spots of each capture are matched to the lenses at any rotation, mirrored or not, with a sensor distance within
     a quarter of the design's. Then what `fit` names is fitted by Levenberg-Marquardt to the spots within the field
     radius, with a robust loss. Where spots are is predicted by exact rays: what aberrations do is not fitted away.
@@ -122,8 +124,8 @@ def calibrate(
     Raises
     ------
     InputError
-        If points and captures do not fit together, a pixel is not finite, lenses are to be found that differ, no
-        pattern of lenses is seen, or the spots do not determine what is to be fitted.
+        If points and captures do not fit together, a pixel is not finite, `find_lenses` is asked for and lenses
+        differ, no pattern of lenses is seen, or the spots do not determine what is to be fitted.
 
     Examples
     --------
@@ -139,8 +141,7 @@ def calibrate(
     5.9 0.02 False
     """
     if find_lenses and not imager.array.alike:
-        found = "found lenses that differ, which are to be found"
-        raise InputError(f"find_lenses: {found}, allowed: for lenses that are alike; of others their list says which.")
+        raise InputError("find_lenses: found lenses that differ, allowed: lenses that are alike.")
     progress = progress or Progress()
     captures = np.arange(len(points)) if captures is None else captures
     sources = Sources(np.array(points, np.float64), np.asarray(captures))

@@ -165,8 +165,7 @@ def offsets_of(imager: Imager, depths: Float[np.ndarray, " source"]) -> Offsets:
 
 
 def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:
-    """How far cores of each type of lens are from chief rays by exact rays, as coefficients of odd powers of the field,
-    mm."""
+    """By exact rays, how far the cores of each type of lens are from chief rays: coefficients as of `Offsets`."""
     fields = np.linspace(0, imager.field_radius, _FIELDS)
     # A tilt turns the field a little; the lens is the same.
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)

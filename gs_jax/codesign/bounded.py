@@ -2,18 +2,13 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxtyping import Array, Float
 
 
-class LBFGSB(NamedTuple):
-    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), which keeps bounds by itself.
-
-    `tolerance`: of the cost and of the parameters; by default what their type allows.
-    """
-
-    tolerance: float | None = None
+class LBFGSB:
+    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), which keeps bounds by itself."""
 
     def of(self, objective: Callable[..., Float[Array, ""]]) -> Any:
         """A smooth objective step by step: `init_state(x, bounds)`, `update(x, state, bounds)`.

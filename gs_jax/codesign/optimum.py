@@ -16,7 +16,7 @@ from ..geometry import Imager
 from ..lenses import EACH, type_of_lens
 from .bounded import LBFGSB
 from .bounds import Bounds, Box
-from .solve import CONVERGED, NOT_FINITE, Solver, run, stepper
+from .solve import CONVERGED, NOT_FINITE, Solver, least_change, run, stepper
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -52,12 +52,14 @@ class Free(NamedTuple):
     def _of(self, imager):
         for name in self.names:
             if (value := _leaf(imager, name)) is None:
-                raise InputError(f"free: found {name}, which this imager has not, allowed: with a tilt, maybe of zero.")
+                raise InputError(f"free: found {name} of an imager without one, allowed: with one, which may be zero.")
             yield name, value
 
 
 def free(*names: str) -> Free:
     """Which numbers of an imager a search may change.
+
+    *Host.*
 
     Parameters
     ----------
@@ -110,7 +112,9 @@ def optimize(
     steps: int = 256,
     callback: Callable[[int, float, Imager], None] | None = None,
 ) -> Optimum:
-    """Search for the imager of the least loss; *host*.
+    """Search for the imager of the least loss.
+
+    *Host.*
 
     Parameters
     ----------
@@ -125,8 +129,8 @@ def optimize(
         Of optimistix, a minimiser, or for residuals one of least squares; of optax, which runs all steps; or
         `gs_jax.codesign.bounded.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
     bounds
-        Lowest and highest value by name, numbers or arrays. Kept by a change of variables; a start beyond them is taken
-        within.
+        Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
+        beyond it is moved inside.
     steps
         The most to take.
     callback
@@ -135,7 +139,8 @@ def optimize(
     Raises
     ------
     InputError
-        If bounds are of what is not free, or are none, or `loss` is one number for a solver of least squares.
+        If a bound is of what is not free, or is not below the other, `LBFGSB` lacks a bound, or `loss` is one number
+        and the solver is one of least squares.
 
     Examples
     --------
@@ -146,7 +151,7 @@ def optimize(
     >>> print(round(float(found.imager.magnification(20.0)), 2))
     0.25
     """
-    solver = optx.BFGS(1e-8, 1e-8) if solver is None else solver
+    solver = optx.BFGS(least_change(), least_change()) if solver is None else solver
     maps = {
         name: _map(name, free, bounds, isinstance(solver, LBFGSB)) for name in {**dict.fromkeys(free.names), **bounds}
     }

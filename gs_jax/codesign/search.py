@@ -74,6 +74,8 @@ def run_study(
 ) -> Outcome:
     """Search for a design that does what a study wants.
 
+    *Host.*
+
     Searches end within a billionth of the minimum in double precision (`jax_enable_x64`); single stops far from it.
 
     Parameters

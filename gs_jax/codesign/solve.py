@@ -76,7 +76,7 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         return _within_box(cost, key, solver)
     steps: Any = solver
     if isinstance(solver, optax.GradientTransformation):
-        steps = optx.OptaxMinimiser(solver, _tolerance(), _tolerance())
+        steps = optx.OptaxMinimiser(solver, least_change(), least_change())
     least_squares, goes_on = (
         isinstance(steps, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
     )
@@ -110,7 +110,7 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
 
 
 def _within_box(cost, key, kept: LBFGSB) -> Stepper:
-    solver, tolerance = kept.of(cost), kept.tolerance or _tolerance()
+    solver, tolerance = kept.of(cost), least_change()
     box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))
 
     @jax.jit
@@ -169,11 +169,11 @@ def solver_of(stage: StageTable) -> Solver:
     """The solver that a stage names. Adam's rate falls to zero by a cosine over the stage's steps."""
     match stage.solver:
         case "levenberg-marquardt":
-            return optx.LevenbergMarquardt(_tolerance(), _tolerance())
+            return optx.LevenbergMarquardt(least_change(), least_change())
         case "bfgs":
-            return optx.BFGS(_tolerance(), _tolerance())
+            return optx.BFGS(least_change(), least_change())
         case "lbfgs":
-            return optx.LBFGS(_tolerance(), _tolerance())
+            return optx.LBFGS(least_change(), least_change())
         case "lbfgsb":
             return LBFGSB()
         case "adam":
@@ -181,5 +181,6 @@ def solver_of(stage: StageTable) -> Solver:
             return optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps))
 
 
-def _tolerance() -> float:
+def least_change() -> float:
+    """The change of costs and parameters at which a search ends, relative: what their type allows."""
     return 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6

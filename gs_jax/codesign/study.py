@@ -167,6 +167,8 @@ def labels(terms: Sequence[TermTable], study: Study) -> list[str]:
 def read_study(path: str | os.PathLike[str]) -> Study:
     """The study in a TOML file.
 
+    *File.*
+
     Raises
     ------
     InputError

@@ -8,6 +8,8 @@ from .tables import ArrayTable, ImagingTable, LensTable, SensorTable
 def geomscope(*, sensor_distance_mm: float = 5.8) -> Design:
     """The paper's microscope (Table 1), with a random layout of our own of the same statistics.
 
+    *Host.*
+
     Parameters
     ----------
     sensor_distance_mm

@@ -31,6 +31,8 @@ from .tables import ArrayTable, CalibrationTable, ImagingTable, LensTable, Senso
 class Design(Table):
     """A microscope, with the tables and keys of its file.
 
+    *Host.*
+
     Examples
     --------
     >>> import gs_jax as gs
@@ -113,12 +115,12 @@ class Design(Table):
     def from_imager(
         cls, imager: Imager, *, name: str, working_distance_mm: tuple[float, float] | None = None
     ) -> "Design":
-        """The design of an imager, to be written to a file; `imager()` gives it back, to rounding of degrees.
+        """The design of an imager; its `imager()` is equal, but for rounding of angles.
 
         Parameters
         ----------
         imager
-            Of real numbers: on a plate of finite size, in range of what files allow.
+            On a plate of finite size, its numbers within the range of design files.
         name
             What reports call the design.
         working_distance_mm
@@ -147,7 +149,7 @@ class Design(Table):
         Parameters
         ----------
         **values
-            By key, without its table: `centers_mm`, `sensor_distance_mm`, `shape`, ...; arrays may be arrays.
+            By key, without the name of its table: `centers_mm`, `sensor_distance_mm`, `shape`, ... Lists may be arrays.
 
         Raises
         ------
@@ -211,6 +213,8 @@ def _shape(lens: LensTable) -> str:
 def read_design(path: str | os.PathLike[str]) -> Design:
     """The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`.
 
+    *File.*
+
     Raises
     ------
     InputError
@@ -253,6 +257,8 @@ def checked_design(path: str | os.PathLike[str], data: dict[str, Any]) -> Design
 
 def write_design(path: str | os.PathLike[str], design: Design) -> None:
     """Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal.
+
+    *File.*
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The tables of a design file from an imager: units of files, and numbers without the rounding of binary ones."""
+"""The tables of a design file from an imager: in the file's units, by the fewest decimals that give its numbers."""
 
 from typing import Any
 
@@ -69,8 +69,8 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
             ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
     front = float(imager.reduced_depth(0.0))
     if not ends or not np.isfinite(ends).all() or min(ends) <= front:
-        found = "no depth in focus" if not ends else "no end of what is sharp"
-        raise InputError(f"imager: found {found}, allowed: with `working_distance_mm` only.")
+        found = "no depth that is in focus" if not ends else "sharp depths without an end"
+        raise InputError(f"working_distance_mm: found none, and {found}, allowed: nearest and farthest object, mm.")
     return round(min(ends) - front, 4), round(max(ends) - front, 4)
 
 

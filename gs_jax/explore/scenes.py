@@ -37,11 +37,11 @@ def ghosts_of(imager: Imager, near: float, far: float) -> Ghosts:
     depth; all else is its blur at other depths, and ghosts, which are other lenses' images. Lenses count within the
     field radius.
     """
-    centers, m = np.asarray(imager.centers, float), float(imager.magnification((near + far) / 2))
+    centers = np.asarray(imager.centers, float)
     x0, x1, y1, y0 = imager.sensor.extent
     half = np.array(imager.array.size) / 2
     box = (min(x0, -half[0]), min(y0, -half[1]), max(x1, half[0]), max(y1, half[1]))
-    images = np.asarray(chief_ray(centers, np.zeros(2), m))
+    images = np.asarray(imager.project(np.array([[0.0, 0.0, (near + far) / 2]])), float)[:, 0]
     on = (images >= (x0, y0)).all(1) & (images <= (x1, y1)).all(1)
     images = images[on & (np.hypot(*centers.T) <= imager.field_radius)]
     edges = [np.linspace(box[1], box[3], _CELLS + 1), np.linspace(box[0], box[2], _CELLS + 1)]

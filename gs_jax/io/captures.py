@@ -53,6 +53,8 @@ def read_capture(
 ) -> Capture:
     """A capture `(row, column)` in the file's own type: uint8, uint16 or float32.
 
+    *File.*
+
     Parameters
     ----------
     path
@@ -138,6 +140,8 @@ def write_capture(
     path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"], provenance: Provenance | None = None
 ) -> None:
     """Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all.
+
+    *File.*
 
     Parameters
     ----------

@@ -19,6 +19,8 @@ POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
     """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`.
 
+    *File.*
+
     Further columns after these are left out.
 
     Raises
@@ -54,6 +56,8 @@ def write_points(
     provenance: Provenance | None = None,
 ) -> None:
     """Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal.
+
+    *File.*
 
     Parameters
     ----------

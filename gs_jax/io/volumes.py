@@ -49,6 +49,8 @@ def write_volume(
 ) -> None:
     """Writes a volume as float32, never rescaled or clipped, whole or not at all.
 
+    *File.*
+
     Parameters
     ----------
     path
@@ -86,6 +88,8 @@ def write_volume(
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
     """A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths.
+
+    *File.*
 
     Raises
     ------

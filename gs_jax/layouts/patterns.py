@@ -49,6 +49,8 @@ def random_layout(
 ) -> Float[np.ndarray, "lens 2"]:
     """A random layout with a wanted pitch and no hole between the lenses.
 
+    *Host.*
+
     Random points are relaxed a little and then moved in small steps: each lens to or from its nearest
     neighbour, so that the distances get the wanted mean and SD, and the lenses around a hole into it. Where
     this gets stuck, random kicks that fade help. The paper does not say how its layout was found; the method

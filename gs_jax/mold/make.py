@@ -48,6 +48,8 @@ def make_mold(
 ) -> dict[str, Any]:
     """Writes the mold of a design, or the array, to print; and a picture and a report beside it.
 
+    *File.*
+
     The file is read back and its lenses are measured.
 
     Parameters

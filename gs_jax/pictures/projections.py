@@ -42,6 +42,8 @@ def show(
 ) -> Figure:
     """Maximum projections of a volume along z, y and x, to scale in mm, with points as circles.
 
+    *Host.*
+
     Parameters
     ----------
     volume, grid

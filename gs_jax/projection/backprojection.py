@@ -28,6 +28,8 @@ def backproject(
 ) -> Float[Array, "depth y x"]:
     """Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction").
 
+    *Differentiable.*
+
     Differentiable once, in both modes, with respect to the image, the imager and the grid's depths and
     origin.
 
@@ -90,6 +92,8 @@ def backproject_adjoint(
     volume: Num[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
 ) -> Float[Array, "row column"]:
     """The exact adjoint of `backproject`: each voxel adds to the pixels that it is read from.
+
+    *Differentiable.*
 
     Its linear version is the image of a volume by pinholes: Eq. (2) with a point for PSF_o.
     Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths and

@@ -28,6 +28,8 @@ def forward(
 ) -> Float[Array, "row column"]:
     """The image of a volume, summed lens by lens: Eq. (2), or with all of the light.
 
+    *Differentiable.*
+
     Each voxel is a point at its centre. With a PSF this is Eq. (2) without its zones: every lens images a voxel at the
     chief ray's pixel (scale `s_z`, magnification `M_z`), weighted by the envelope C, and spread by PSF_o of its depth.
     The paper takes C from the centre of the voxel's zone instead of from the voxel, which is the only difference. As in

@@ -26,6 +26,8 @@ def optics_of(
 ) -> Optics:
     """What `forward` takes to image planes at some depths, as true as is wanted.
 
+    *Host.*
+
     Parameters
     ----------
     imager, depths

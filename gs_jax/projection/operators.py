@@ -23,10 +23,10 @@ class ImagingOperator(lx.AbstractLinearOperator):
     imager, grid
         What images, and the voxels.
     optics
-        As for `forward`, by fidelity: None are pinholes, of which the adjoint is `backproject`; a PSF at each depth;
-        or `FullOptics`. Chief rays, and the light that lenses cut from each other, are computed from the imager
-        whenever the operator is used, and differentiated. `optics` is a table that `gs_jax.optics_of` made beforehand,
-        of the imager as it was then: derivatives by the shape of lenses do not pass through it.
+        As for `forward`. With None each lens is a pinhole, and the transpose is `backproject`. A PSF at each depth, or
+        `FullOptics`, is a table that `gs_jax.optics_of` makes beforehand: it stays what it is when the imager changes,
+        and no derivative by the shape of the lenses passes through it. Chief rays, and with `FullOptics` the clear
+        areas, are computed from the imager at each use and differentiated.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class ImagingOperator(lx.AbstractLinearOperator):
 
     def as_matrix(self) -> Float[Array, "pixel voxel"]:
         """All of it in memory: of small systems."""
-        return _matrix(self)
+        return _function(self).as_matrix()
 
 
 class BackprojectionOperator(lx.AbstractLinearOperator):
@@ -107,7 +107,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
 
     def as_matrix(self) -> Float[Array, "voxel pixel"]:
         """All of it in memory: of small systems."""
-        return _matrix(self)
+        return _function(self).as_matrix()
 
 
 class Transposed(lx.AbstractLinearOperator):
@@ -140,8 +140,8 @@ def _image_of(operator):
     return jax.ShapeDtypeStruct(operator.imager.sensor.shape, operator.imager.sensor_distance.dtype)
 
 
-def _matrix(operator):
-    return lx.FunctionLinearOperator(operator.mv, operator.in_structure()).as_matrix()
+def _function(operator):
+    return lx.FunctionLinearOperator(operator.mv, operator.in_structure())
 
 
 def _no(_) -> bool:
@@ -163,4 +163,4 @@ for _kind in (ImagingOperator, BackprojectionOperator, Transposed):
         _asks.register(_kind)(_no)
     for _same in (lx.linearise, lx.conj):
         _same.register(_kind)(lambda operator: operator)
-    lx.materialise.register(_kind)(lambda operator: lx.MatrixLinearOperator(operator.as_matrix()))
+    lx.materialise.register(_kind)(lambda operator: lx.materialise(_function(operator)))

@@ -29,6 +29,8 @@ def deconvolve(
 ) -> Float32[np.ndarray, "row column"]:
     """The scene that an image shows, seen through a system that is everywhere alike.
 
+    *Host.*
+
     Points beside the sensor whose light falls on it are reconstructed, too, and then cut off (Antipa et al., Optica 5,
     1, 2018). Both the image and the PSF are taken above their darkest percent, the camera's offset.
 

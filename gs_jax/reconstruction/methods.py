@@ -17,6 +17,8 @@ from ..solvers.unrolled import Unrolled
 class BackProjection(eqx.Module):
     """`backproject`, the paper's reconstruction: one step, no PSF.
 
+    *Host.*
+
     Parameters
     ----------
     interpolation
@@ -51,6 +53,8 @@ class BackProjection(eqx.Module):
 
 class ListRichardsonLucy(eqx.Module):
     """Richardson-Lucy on the pixel-voxel lists of back-projection.
+
+    *Host.*
 
     Each voxel is multiplied by the mean ratio of what was seen to what is expected, weighted by the envelope, over the
     pixels that back-projection would read: `backproject(ratio, ..., normalize=True)`. What is expected is the

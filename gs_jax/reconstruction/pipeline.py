@@ -85,6 +85,8 @@ def reconstruct(
 ) -> Volume:
     """The volume that an image shows.
 
+    *Host.*
+
     Back-projection takes the image as it is, some planes at a time, on all devices there are. The other methods explain
     the light above the camera's offset: the image's darkest percent, or nothing if that is negative, as it was taken
     off already. They run step by step, and can be interrupted after each; the second call with the same shapes compiles

@@ -47,6 +47,8 @@ def reproject(
 ) -> Reprojection:
     """Image a volume again, and compare with the capture that it was reconstructed from.
 
+    *Host.*
+
     It is compared as `reconstruct` sees it: above the camera's offset, pixels as wide as voxels, and without what the
     optics takes for background.
 

@@ -24,6 +24,8 @@ Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "r
 class Camera(eqx.Module):
     """What turns electrons into counts.
 
+    *Compiled.*
+
     Parameters
     ----------
     gain
@@ -69,6 +71,8 @@ def expose(
     peak_electrons: Number | Float[Array, ""],
 ) -> UInt8[Array, "row column"] | UInt16[Array, "row column"]:
     """The counts of one exposure.
+
+    *Compiled.*
 
     The image is scaled, Poisson noise drawn, the well filled at most, Gaussian read noise added, and the sum
     divided by the gain, put on the offset, rounded and clipped to the converter's range. Each row has its own

@@ -204,6 +204,8 @@ def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitt
 def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> Float[Array, "depth y x"]:
     """The volume that a scene makes on a grid: emitters are shared out linearly along x, y, z.
 
+    *Host.*
+
     The weights of an emitter between voxel centres keep its total and its centroid. In the outer half of a voxel
     at the grid's edge all goes to that voxel, and what lies beyond is left out. Of a single depth, the voxels are
     as thick as `grid.pitch`. Differentiable with respect to the emitters and the depths.

@@ -56,6 +56,8 @@ def simulate(
 ) -> Float[np.ndarray, "row column"]:
     """The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s.
 
+    *Host.*
+
     Parameters
     ----------
     scene

@@ -107,6 +107,8 @@ class State(NamedTuple):
 class ADMM(eqx.Module):
     """ADMM: least squares with total variation and sparsity, not negative, for any operator.
 
+    *Differentiable.*
+
     The x-step is done by conjugate gradients that start from the last x; each applies the operator and its adjoint
     once, and nothing else does. The steps are over-relaxed, and the penalty adapts: it starts at the mean of the
     diagonal of `A'A` and is doubled or halved, a bounded number of times, where the primal residual is ten times the

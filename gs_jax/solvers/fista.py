@@ -34,6 +34,8 @@ class State(NamedTuple):
 class FISTA(eqx.Module):
     """FISTA: least squares with sparsity, not negative, for any operator.
 
+    *Differentiable.*
+
     It restarts whenever the momentum points uphill (O'Donoghue and Candes, Found. Comput. Math. 15, 715, 2015). A dark
     image gives zeros.
 

@@ -78,6 +78,8 @@ class State(NamedTuple):
 class Unrolled(eqx.Module):
     """Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package.
 
+    *Differentiable.*
+
     `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
     power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
     accelerated Richardson-Lucy with `A` and `B`. Both fit a slow background, too. After that come conjugate gradients

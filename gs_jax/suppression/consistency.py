@@ -70,9 +70,9 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
         image a point beyond the sensor do not see it.
     """
     # In NumPy: other numbers of points need no other program.
-    host, centers = on_host(imager), np.asarray(imager.centers, np.float64)
+    host = on_host(imager)
     beside = points[:, :2] - host.lean(points[:, 2])
-    tree = KDTree(centers)
+    tree = KDTree(host.centers)
     most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
     # With two or more there is an axis of lenses.
     distance, lens = tree.query(beside, k=max(most, 2), distance_upper_bound=imager.field_radius)

@@ -75,6 +75,8 @@ def find_points(
 ) -> Points:
     """Finds the points that a capture shows: those that nearly all of their lenses see.
 
+    *Host.*
+
     1. The background is taken off the image (`consistency.signal`).
     2. The logarithms of what exceeds the noise are back-projected onto voxels of two pixels. A sum of logarithms is
        high where all lenses are lit, not where one is bright. Its local maxima, then searched between the voxels, are

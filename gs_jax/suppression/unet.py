@@ -139,6 +139,8 @@ def suppress(
 ) -> Float32[np.ndarray, "depth y x"]:
     """What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero.
 
+    *Host.*
+
     What the network sees is in its own unit (`standardized`), what it gives back in the volume's, above each plane's
     background. The first and last slices are repeated where the network looks beyond them, and planes are mirrored at
     their edges. A plane is handled in tiles that overlap by as much as the network can see: the result does not depend
