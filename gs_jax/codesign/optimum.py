@@ -39,8 +39,14 @@ class Free(NamedTuple):
 
     def values(self, imager: Imager) -> Values:
         """The free numbers by name. What lenses have of their own is one number for each kind of lens."""
-        first = lambda name, value: value if (kind := _kind(imager, name)) is None else value[_firsts(kind)]
-        return {name: first(name, value) for name, value in self._of(imager)}
+        if missing := [name for name in self.names if _leaf(imager, name) is None]:
+            found = f"found {missing[0]} of an imager without one"
+            raise InputError(f"free: {found}, allowed: with one, which may be zero.")
+        values = {name: _leaf(imager, name) for name in self.names}
+        for name in self.names:
+            if (kind := _kind(imager, name)) is not None:
+                values[name] = values[name][np.unique(kind, return_index=True)[1]]
+        return values
 
     def replaced(self, imager: Imager, values: Values) -> Imager:
         """The imager with other numbers; `imager` says which lens is of which kind, so its own are not traced."""
@@ -48,12 +54,6 @@ class Free(NamedTuple):
         each = zip((values[name] for name in self.names), kinds, strict=True)
         numbers = [value if kind is None else value[kind] for value, kind in each]
         return eqx.tree_at(lambda i: [_leaf(i, name) for name in self.names], imager, numbers)
-
-    def _of(self, imager):
-        for name in self.names:
-            if (value := _leaf(imager, name)) is None:
-                raise InputError(f"free: found {name} of an imager without one, allowed: with one, which may be zero.")
-            yield name, value
 
 
 def free(*names: str) -> Free:
@@ -200,7 +200,3 @@ def _kind(imager, name) -> np.ndarray | None:
     if name not in EACH or _leaf(imager, name).ndim == 0:
         return None
     return type_of_lens(imager.array)
-
-
-def _firsts(kind: np.ndarray) -> np.ndarray:
-    return np.unique(kind, return_index=True)[1]
