@@ -12,6 +12,8 @@ Examples
 [1.11]
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -21,7 +23,7 @@ from .designs.microscope import Microscope
 from .designs.spots import encircled_radius as _encircled_radius, psf_width
 from .geometry import Imager
 
-Depths = Float[ArrayLike, " depth"]
+Depths = Float[ArrayLike, " depth"] | Sequence[float]
 
 
 def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:

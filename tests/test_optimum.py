@@ -1,7 +1,9 @@
 """Searches with a loss of one's own: an imager in, an imager out; and a network trained with the geometry."""
 
 import dataclasses
+import inspect
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -76,9 +78,22 @@ def test_kinds_of_lenses_stay_kinds():
     np.testing.assert_allclose(found.array.radius_of_curvature, [2.4, 2.6, 2.4], atol=1e-6)
 
 
+UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotations
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: UNCHECKED(in_focus, gs.geomscope(), free=FREE), "imager: found .*allowed: an Imager, as"),
+        (
+            lambda: UNCHECKED(in_focus, small(), free="shift"),
+            "free: found 'shift', allowed: what `gs_jax.free` makes",
+        ),
+        (
+            lambda: UNCHECKED(in_focus, small(), free=FREE, solver="bfgs"),
+            "solver: found 'bfgs', allowed: a solver of",
+        ),
+        (lambda: gs.optimize(in_focus, small(), free=FREE, steps=0), "steps: found 0, allowed: 1 or more"),
         (lambda: gs.free("pitch"), "free: found 'pitch', allowed: sensor_distance, rotation"),
         (lambda: gs.free(), "free: found no name"),
         (
@@ -130,6 +145,11 @@ def test_objectives_have_the_gradients_of_finite_differences(name):
     numbers = (jnp.asarray(5.3), jnp.asarray(2.0), jnp.asarray(1.5), small().array.centers)
     assert jnp.isfinite(value(*numbers)).all()
     check_grads(value, numbers, order=1, modes=["rev"], eps=1e-6, rtol=1e-3, atol=1e-6)
+
+
+def test_depths_behind_the_array_are_refused():
+    with pytest.raises(ValueError, match="`depths` must be positive and finite, got -3.0"):
+        objectives.spot_width(small(), np.array([20.0, -3.0]))
 
 
 def test_objectives_of_lenses_that_differ_are_of_all_or_refused():

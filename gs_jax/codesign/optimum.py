@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..base.errors import InputError
+from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..lenses import EACH, type_of_lens
 from .bounded import LBFGSB
@@ -139,8 +139,8 @@ def optimize(
     Raises
     ------
     InputError
-        If a bound is of what is not free, or is not below the other, `LBFGSB` lacks a bound, or `loss` is one number
-        and the solver is one of least squares.
+        If an argument is of another kind, a bound is of what is not free or is not below the other, `LBFGSB` lacks a
+        bound, or `loss` is one number and the solver is one of least squares.
 
     Examples
     --------
@@ -152,6 +152,7 @@ def optimize(
     0.25
     """
     solver = optx.BFGS(least_change(), least_change()) if solver is None else solver
+    _check(imager, free, solver, steps)
     maps = {
         name: _map(name, free, bounds, isinstance(solver, LBFGSB)) for name in {**dict.fromkeys(free.names), **bounds}
     }
@@ -170,6 +171,18 @@ def optimize(
     results = {CONVERGED: optx.RESULTS.successful, NOT_FINITE: optx.RESULTS.nonlinear_divergence}
     result = results.get(reason, optx.RESULTS.nonlinear_max_steps_reached)
     return Optimum(at(state.free), state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
+
+
+def _check(imager, free, solver, steps):
+    for name, found, wanted, words in (
+        ("imager", imager, Imager, "an Imager, as `design.imager()` is"),
+        ("free", free, Free, "what `gs_jax.free` makes"),
+        ("solver", solver, Solver, "a solver of optimistix or optax, or LBFGSB()"),
+    ):
+        if not isinstance(found, wanted):
+            raise InputError(f"{name}: found {short_repr(found)}, allowed: {words}.")
+    if steps < 1:
+        raise InputError(f"steps: found {steps}, allowed: 1 or more.")
 
 
 class _Unbounded:

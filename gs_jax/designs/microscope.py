@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.converters import as_float
+from ..base.converters import POSITIVE, as_float, check_fields
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..optics import aberrations, theory
@@ -52,7 +52,7 @@ class Microscope(eqx.Module):
     Raises
     ------
     ValueError
-        If the plate is infinite: it has no density of lenses.
+        If the plate is infinite, which has no density of lenses, or a depth is not positive and finite.
     """
 
     imager: Imager
@@ -70,6 +70,7 @@ class Microscope(eqx.Module):
     def __check_init__(self):
         if not math.isfinite(math.prod(self.imager.array.size)):
             raise ValueError(f"`imager.array.size` must be finite, got {self.imager.array.size}.")
+        check_fields(self, depths=POSITIVE)
 
     @property
     def plate(self) -> Float[Array, "2"]:
