@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
@@ -43,7 +44,7 @@ class ImagingOperator(lx.AbstractLinearOperator):
     grid: Grid
     optics: Optics = None
 
-    def mv(self, vector: Float[Array, "depth y x"]) -> Float[Array, "row column"]:
+    def mv(self, vector: Float[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume."""
         return forward(vector, self.imager, self.grid, self.optics)
 
@@ -89,7 +90,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     method: str = eqx.field(static=True, default="linear")
     normalize: bool = eqx.field(static=True, default=False)
 
-    def mv(self, vector: Float[Array, "row column"]) -> Float[Array, "depth y x"]:
+    def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
         return backproject(vector, self.imager, self.grid, method=self.method, normalize=self.normalize)
 
@@ -115,7 +116,7 @@ class Transposed(lx.AbstractLinearOperator):
 
     operator: ImagingOperator | BackprojectionOperator
 
-    def mv(self, vector: Float[Array, "..."]) -> Float[Array, "..."]:
+    def mv(self, vector: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
         (found,) = jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)
         return found
 
