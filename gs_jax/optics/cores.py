@@ -200,9 +200,16 @@ def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> flo
     pitch = min(pitch, _SHARP * chief * float(np.max(fields)))
 
     def squares(stretch, rays=rays):
-        ring = (2 / pitch * _from_map(rays, fields, chief * stretch)).astype(int).ravel()
-        total = np.bincount(ring, rays.light.ravel())
-        return -(total**2 / (2 * np.arange(total.size) + 1)).sum()
+        # Shared by two rings: what is counted in one alone jumps, and rounding would decide where the largest sum is.
+        place = (2 / pitch * _from_map(rays, fields, chief * stretch)).ravel()
+        ring, light = place.astype(int), rays.light.ravel()
+        outer = light * (place - ring)
+        count = ring.max() + 2
+        total = np.bincount(ring, light - outer, count) + np.bincount(ring + 1, outer, count)
+        # The area that a ring's share is of, a triangle across: in the middle a cone.
+        area = 2.0 * np.arange(count)
+        area[0] = 1 / 3
+        return -(total**2 / area).sum()
 
     tried = np.linspace(1 - _FARTHEST, 1 + _FARTHEST, _STEPS)
     some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
