@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gs_jax.designs.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable, write_design
+from gs_jax.design.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable, write_design
 from gs_jax.layouts.patterns import random_layout
 
 HERE = Path(__file__).parent

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import write_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import write_design
 
 HERE = Path(__file__).parent
 

@@ -28,12 +28,12 @@ from matplotlib.figure import Figure
 from experiments.common import Report, main, table
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax.apps.benchmark.measure import peak_mib, timed
+from gs_jax.apps.benchmark.report import markdown_table
 from gs_jax.base.info import describe
 from gs_jax.base.memory import status_mib
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.measure import peak_mib, timed
-from gs_jax.benchmark.report import markdown_table
 from gs_jax.layouts.patterns import random_layout
 
 PAPER_S = 18.0

@@ -25,13 +25,13 @@ from matplotlib.figure import Figure
 
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
+from gs_jax.apps.benchmark.report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.report import markdown_table
 from gs_jax.calibration.fit import Calibration, calibrate, residuals_of
 from gs_jax.calibration.outcome import picture
 from gs_jax.calibration.scene import calibrate_by_scene
 from gs_jax.calibration.unknowns import FITTABLE
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
 from gs_jax.projection.points import full_image_of_points

@@ -24,7 +24,7 @@ from experiments.ray_tracer import traced
 from gs_jax import Imager
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.spots import find_spots
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
 
 DEPTHS = (18.0, 19.0, 20.0, 21.0, 22.0, 23.0, 24.0, 26.0)

@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
+from gs_jax.apps.benchmark.measure import timed
 from gs_jax.base.info import describe
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.measure import timed
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.convolution_admm import ConvolutionADMM
 from gs_jax.solvers.fista import FISTA

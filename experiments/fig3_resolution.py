@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.profiles import around_the_axis, dip, fwhm, through_peak
 from gs_jax.base.progress import Progress
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
 from gs_jax.simulation.scene import simulate_points
 

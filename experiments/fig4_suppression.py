@@ -21,16 +21,16 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.point_density import scene
 from experiments.profiles import local_maxima
 from gs_jax import Grid
+from gs_jax.apps.benchmark.measure import timed
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image, label_of
-from gs_jax.benchmark.measure import timed
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
+from gs_jax.detection.clustering import find_clusters
+from gs_jax.detection.locate import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
-from gs_jax.suppression.clustering import find_clusters
-from gs_jax.suppression.locate import find_points
 
 SHOWN = (18.0, 20.0, 22.0)  # mm
 # How wide a point is drawn.

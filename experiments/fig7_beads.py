@@ -22,12 +22,12 @@ from experiments.point_density import scores
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
+from gs_jax.detection.locate import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.locate import find_points
 
 # mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
 SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002

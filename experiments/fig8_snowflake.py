@@ -27,17 +27,17 @@ from scipy.ndimage import gaussian_filter
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
+from gs_jax.apps.demo.scene import words
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image, label_of
-from gs_jax.demo.scene import words
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
+from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.simulation.phantoms import rasterize, snowflake
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.unet import pretrained, suppress
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04

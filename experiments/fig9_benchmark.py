@@ -32,13 +32,16 @@ from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, Unrolled, reproject
+from gs_jax.apps.benchmark.measure import timed
+from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark.scenes import spots
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image, label_of
-from gs_jax.benchmark.measure import timed
-from gs_jax.benchmark.report import markdown_table
-from gs_jax.benchmark.scenes import spots
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
+from gs_jax.detection.clustering import find_clusters
+from gs_jax.detection.locate import find_points
+from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
@@ -47,9 +50,6 @@ from gs_jax.reconstruction.pipeline import COARSE, reconstruct, voxel_grid
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake
 from gs_jax.solvers.unrolled import read_unrolled
-from gs_jax.suppression.clustering import find_clusters
-from gs_jax.suppression.locate import find_points
-from gs_jax.suppression.unet import pretrained, suppress
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20

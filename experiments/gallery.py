@@ -31,10 +31,10 @@ from experiments import (
 )
 from experiments.backprojection_speed import Job, race
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
+from gs_jax.apps.benchmark import report as benchmark
+from gs_jax.apps.benchmark.compare import run as run_benchmark, slopes
+from gs_jax.apps.benchmark.report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark import report as benchmark
-from gs_jax.benchmark.compare import run as run_benchmark, slopes
-from gs_jax.benchmark.report import markdown_table
 
 
 class Claim(NamedTuple):

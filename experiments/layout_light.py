@@ -27,14 +27,14 @@ from gs_jax import (
     quality,
     reconstruct,
 )
+from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.training.examples import FIELD_RADIUS, Kind, tables
+from gs_jax.apps.training.scenes import PLANES, random_scene, shared_out
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.report import markdown_table
 from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
 from gs_jax.projection.levels import optics_of
 from gs_jax.simulation.camera import electrons
-from gs_jax.training.examples import FIELD_RADIUS, Kind, tables
-from gs_jax.training.scenes import PLANES, random_scene, shared_out
 
 KIND = Kind(288, 0.018, 0.064, 7, binning=4)
 DEPTHS = 20.0 + 0.5 * (np.arange(KIND.planes) - KIND.planes // 2)

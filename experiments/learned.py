@@ -26,15 +26,15 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from gs_jax import Unrolled, optics_of, quality, reconstruct, suppress
+from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.training.examples import Example, Kind, example
+from gs_jax.apps.training.recipes import UNROLLED
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.report import markdown_table
+from gs_jax.detection.unet import pretrained
 from gs_jax.projection.forward_model import forward
 from gs_jax.reconstruction.methods import METHODS, Method
 from gs_jax.solvers.unrolled import read_unrolled
-from gs_jax.suppression.unet import pretrained
-from gs_jax.training.examples import Example, Kind, example
-from gs_jax.training.recipes import UNROLLED
 
 # Not that of the training.
 SEED = 1

@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray
+from gs_jax.apps.benchmark.report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.report import markdown_table
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design, read_design
 from gs_jax.mold.measurement import quality, verify
 from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
 from gs_jax.mold.pictures import draw_solid

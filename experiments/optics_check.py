@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
 from gs_jax.optics.aberrations import independent_rms, of_array

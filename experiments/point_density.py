@@ -19,14 +19,14 @@ from experiments.common import OPTIONAL_PATH, Report, main, table
 from experiments.profiles import local_maxima
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design, read_design
+from gs_jax.detection.locate import find_points
 from gs_jax.metrics import localization
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.locate import find_points
 
 # Points, and captures of so many.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}

@@ -20,7 +20,7 @@ from experiments.common import Report, main, table
 from experiments.profiles import fwhm
 from gs_jax import Grid, Imager, Sensor, backproject
 from gs_jax.base.progress import Progress
-from gs_jax.designs.design import Design, read_design
+from gs_jax.design.design import Design, read_design
 from gs_jax.optics.aperture import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
 from gs_jax.simulation.scene import simulate_points

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from experiments.common import Report, main, points_of, table
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.reconstruction.pipeline import reconstruct
 

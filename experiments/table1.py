@@ -10,11 +10,11 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from experiments.common import Report, main, table
+from gs_jax.apps.benchmark.report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.report import markdown_table
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design
-from gs_jax.designs.sheet import datasheet
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design
+from gs_jax.design.sheet import datasheet
 from gs_jax.layouts.cells import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from gs_jax import simulate
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, write_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design, write_design
 from gs_jax.io.captures import Wanted
 from gs_jax.io.correction import prepare, read_frame
 from gs_jax.io.recordings import opened_recording

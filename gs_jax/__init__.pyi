@@ -6,9 +6,12 @@ from .calibration.fit import calibrate as calibrate
 from .codesign.optimum import free as free, optimize as optimize
 from .codesign.search import run_study as run_study
 from .codesign.study import read_study as read_study
-from .designs.builtin import geomscope as geomscope
-from .designs.design import Design as Design, read_design as read_design, write_design as write_design
+from .design.builtin import geomscope as geomscope
+from .design.design import Design as Design, read_design as read_design, write_design as write_design
+from .detection.locate import find_points as find_points
+from .detection.unet import suppress as suppress
 from .geometry import Imager as Imager, Sensor as Sensor
+from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.points import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
@@ -36,8 +39,5 @@ from .solvers.fista import FISTA as FISTA
 from .solvers.iteration import solve as solve
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.unrolled import Unrolled as Unrolled
-from .suppression.locate import find_points as find_points
-from .suppression.unet import suppress as suppress
-from .voxels import Grid as Grid
 
 __all__: list[str]

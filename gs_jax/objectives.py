@@ -19,8 +19,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .base.converters import as_float
 from .codesign import objectives as terms
-from .designs.microscope import Microscope
-from .designs.spots import encircled_radius as _encircled_radius, psf_width
+from .design.microscope import Microscope
+from .design.spots import encircled_radius as _encircled_radius, psf_width
 from .geometry import Imager
 
 Depths = Float[ArrayLike, " depth"] | Sequence[float]

@@ -67,7 +67,7 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
     """
     from .cli.captures import CaptureOptions
     from .cli.inversion import plan
-    from .designs.design import read_design
+    from .design.design import read_design
     from .io.napari import points_layer, step_of, volume_layer
 
     try:
@@ -273,7 +273,7 @@ def sample() -> list[Any]:
     """A capture of forty beads between 18 and 22 mm by `geomscope`, with the noise of a camera."""
     import jax
 
-    from .designs.design import read_design
+    from .design.design import read_design
     from .simulation.camera import Camera, expose
     from .simulation.phantoms import random_points
     from .simulation.scene import simulate

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from gs_jax.suppression.background import between, mirrored, smoothed, square_levels
+from gs_jax.detection.background import between, mirrored, smoothed, square_levels
 
 # One pixel beside a whole square, less than one, and as small as sensors are.
 SHAPES = [(97, 160), (64, 33), (31, 20), (2, 5), (5, 2)]

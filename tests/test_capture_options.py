@@ -8,7 +8,7 @@ from PIL import Image
 
 from gs_jax.__main__ import commands
 from gs_jax.base.errors import InputError
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.volumes import read_volume
 
@@ -169,7 +169,7 @@ def test_deconvolve_reads_the_same_way(folder):
 
 def test_a_region_in_a_design():
     """Its lenses may lie beyond it, one excepted."""
-    from gs_jax.designs.design import Design
+    from gs_jax.design.design import Design
 
     data = read_design("design/geomscope.toml").model_dump()
     data["sensor"] = {"shape": (800, 900), "pixel_pitch_um": 4.5, "origin_mm": (-2.0, 3.0)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 
 from .test_designs import MISSING, message_of, written
 

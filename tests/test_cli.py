@@ -8,7 +8,7 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.io.points import read_points
 from gs_jax.io.volumes import read_volume, write_volume

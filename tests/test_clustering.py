@@ -5,8 +5,8 @@ import pytest
 from skimage.measure import label
 
 from gs_jax import Grid
-from gs_jax.benchmark.scenes import spots
-from gs_jax.suppression.clustering import find_clusters
+from gs_jax.apps.benchmark.scenes import spots
+from gs_jax.detection.clustering import find_clusters
 
 
 def volume_grid(shape=(5, 40, 40)) -> Grid:

@@ -16,9 +16,9 @@ from gs_jax.codesign.search import run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design
-from gs_jax.designs.sheet import datasheet
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design
+from gs_jax.design.sheet import datasheet
 from gs_jax.layouts.dealing import dealt
 from gs_jax.optics.aperture import clear_diameter
 

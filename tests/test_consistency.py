@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.stats import binom
 
-from gs_jax.suppression.consistency import (
+from gs_jax.detection.consistency import (
     Readings,
     Signal,
     agreed_level,

@@ -11,11 +11,11 @@ from jax.test_util import check_grads
 from rich.console import Console
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import read_design
-from gs_jax.designs.microscope import Microscope
-from gs_jax.designs.problems import findings
-from gs_jax.designs.sheet import datasheet, summary, tables
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import read_design
+from gs_jax.design.microscope import Microscope
+from gs_jax.design.problems import findings
+from gs_jax.design.sheet import datasheet, summary, tables
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
 from gs_jax.optics.aperture import cells_of, clear_diameter, pitch

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Sensor, geomscope
+from gs_jax.detection import evidence
+from gs_jax.detection.consistency import signal
+from gs_jax.detection.evidence import point_evidence
+from gs_jax.detection.locate import searched_voxels
 from gs_jax.optics.cores import apparent_depths
 from gs_jax.optics.focus import LEAST_SHARP, sharpness
-from gs_jax.suppression import evidence
-from gs_jax.suppression.consistency import signal
-from gs_jax.suppression.evidence import point_evidence
-from gs_jax.suppression.locate import searched_voxels
 
 from .test_locate import capture_of, find, many, small
 

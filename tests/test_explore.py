@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, backproject, read_design
+from gs_jax.apps.explore import judging, scenes
+from gs_jax.apps.explore.judging import bench_of, checked_values, design_of, judge, violations
+from gs_jax.apps.explore.scenes import ghosts_of, small_reconstruction
+from gs_jax.apps.explore.server import Server
+from gs_jax.apps.explore.session import Session
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
-from gs_jax.designs.design import Design
-from gs_jax.designs.sheet import datasheet
-from gs_jax.explore import judging, scenes
-from gs_jax.explore.judging import bench_of, checked_values, design_of, judge, violations
-from gs_jax.explore.scenes import ghosts_of, small_reconstruction
-from gs_jax.explore.server import Server
-from gs_jax.explore.session import Session
+from gs_jax.design.design import Design
+from gs_jax.design.sheet import datasheet
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run

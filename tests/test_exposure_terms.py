@@ -15,7 +15,7 @@ from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.codesign.precision import crowded_bound
 from gs_jax.codesign.transfer import lens_electrons, lit_density, spots, transfer_power
-from gs_jax.designs.builtin import geomscope
+from gs_jax.design.builtin import geomscope
 from gs_jax.optics.psf import diffraction_psf
 
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))

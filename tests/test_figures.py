@@ -11,7 +11,7 @@ from experiments.backprojection_speed import Job, inputs
 from experiments.profiles import dip, fwhm, local_maxima
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
 from gs_jax.base.progress import Progress
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 
 from .helpers import needs
 

@@ -13,7 +13,8 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Sensor, forward, optics_of, reconstruct
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
+from gs_jax.detection.locate import find_points
 from gs_jax.geometry import falloff
 from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring_edges, ring_share, spread
 from gs_jax.optics.full import full_optics
@@ -21,7 +22,6 @@ from gs_jax.optics.light import clear_area, mean_zones, spot_rays, transmitted, 
 from gs_jax.optics.unit import unit_rays
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
-from gs_jax.suppression.locate import find_points
 
 DEPTHS = (18.0, 21.0)
 

@@ -6,8 +6,8 @@ import pytest
 from gs_jax.codesign import layout_terms
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
-from gs_jax.designs.design import Design
-from gs_jax.designs.tables import ArrayTable, ImagingTable, LensTable, SensorTable
+from gs_jax.design.design import Design
+from gs_jax.design.tables import ArrayTable, ImagingTable, LensTable, SensorTable
 from gs_jax.geometry import field_limit
 from gs_jax.layouts.patterns import hexagonal_layout
 

@@ -14,16 +14,16 @@ from experiments import point_density
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import read_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import read_design
+from gs_jax.detection.clustering import find_clusters
+from gs_jax.detection.evidence import point_evidence
+from gs_jax.detection.locate import find_points
 from gs_jax.metrics import localization
 from gs_jax.optics.light import clear_area
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.scene import simulate_points
-from gs_jax.suppression.clustering import find_clusters
-from gs_jax.suppression.evidence import point_evidence
-from gs_jax.suppression.locate import find_points
 
 from .helpers import needs
 

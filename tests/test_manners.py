@@ -18,7 +18,9 @@ from matplotlib.figure import Figure
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.cli import deconvolve, options
 from gs_jax.cli.interrupt import RESUMABLE, message
-from gs_jax.designs.design import read_design, write_design
+from gs_jax.design.design import read_design, write_design
+from gs_jax.detection.unet import pretrained, write_weights
+from gs_jax.grid import Grid
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.disk import atomic_write, write_json, write_text
 from gs_jax.io.figures import write_figure
@@ -31,8 +33,6 @@ from gs_jax.projection.levels import LEVELS
 from gs_jax.reconstruction.deconvolution import TV
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.simulation.scene import OPTICS
-from gs_jax.suppression.unet import pretrained, write_weights
-from gs_jax.voxels import Grid
 
 from .test_cli import RECONSTRUCT, folder, run
 
@@ -198,7 +198,7 @@ HEARD = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)
 BUSY = f"""
 {HEARD}
 import ctypes, gs_jax.__main__ as cli
-from gs_jax.designs.design import read_design, write_design
+from gs_jax.design.design import read_design, write_design
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.disk import atomic_write, write_json, write_text
 from gs_jax.io.figures import write_figure

@@ -16,14 +16,14 @@ import pytest
 
 import gs_jax as gs
 from gs_jax import Design, Grid, InputError
+from gs_jax.apps.report.page import write_report
+from gs_jax.apps.tolerance.analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
-from gs_jax.designs.sheet import datasheet
+from gs_jax.design.sheet import datasheet
 from gs_jax.optics.refraction import on_host
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
-from gs_jax.report.page import write_report
-from gs_jax.tolerances.analysis import tolerance
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").glob("*.toml"))
 LENSES, PIXELS = 24, 600

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from gs_jax import MicrolensArray
 from gs_jax.base.errors import InputError
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.mold.caps import cap_sag, caps_of, surface
 from gs_jax.mold.checks import check_solid
 from gs_jax.mold.measurement import verify

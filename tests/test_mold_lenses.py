@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.integrate import quad
 
 from gs_jax import MicrolensArray
-from gs_jax.designs.design import Design
+from gs_jax.design.design import Design
 from gs_jax.mold.caps import DRAFT, Cap, cap_sag, caps_of, visible_reaches
 from gs_jax.mold.checks import check_design, check_solid
 from gs_jax.mold.facets import facet_cap

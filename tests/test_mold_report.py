@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from experiments import mold_check
 from gs_jax.base.errors import InputError
 from gs_jax.cli.mold import command as mold
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import Design, read_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make
 from gs_jax.mold.checks import Finding, check_design, refuse_errors

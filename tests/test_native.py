@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.projection import bilinear, convolve, native
+from gs_jax.projection import bilinear, convolve
 from gs_jax.projection.bilinear import Shapes
 from gs_jax.projection.convolve import Sizes
+from gs_jax.projection.cpu import native
 from gs_jax.projection.rays import Envelope, RingLight, trace
 
 from .helpers import scene

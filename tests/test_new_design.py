@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 from gs_jax.__main__ import commands
 from gs_jax.cli import new_design
-from gs_jax.designs.design import Design, design_text, read_design
-from gs_jax.designs.keys import commented, design_keys, problem, schema
-from gs_jax.designs.start import plate_of, radius_of
+from gs_jax.design.design import Design, design_text, read_design
+from gs_jax.design.keys import commented, design_keys, problem, schema
+from gs_jax.design.start import plate_of, radius_of
 
 from .test_cli import folder, run
 from .test_designs import BASE, edited

@@ -9,8 +9,8 @@ from jax.test_util import check_grads
 
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.sheet import datasheet
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.sheet import datasheet
 from gs_jax.layouts.cells import largest_hole, nearest_neighbour_distances
 from gs_jax.optics.psf import diffraction_psf
 

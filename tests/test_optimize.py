@@ -8,8 +8,8 @@ from click.testing import CliRunner
 from gs_jax.base.errors import InputError
 from gs_jax.cli.optimize import command as optimize
 from gs_jax.cli.pareto import command as pareto
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import read_design, write_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import read_design, write_design
 
 STUDY = """
 design = "table1.toml"

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.calibration_errors import run
 from gs_jax.__main__ import COMMANDS, commands
-from gs_jax.designs.keys import design_keys
+from gs_jax.design.keys import design_keys
 
 ROOT = Path(__file__).parents[1]
 DESIGN = ROOT / "design"

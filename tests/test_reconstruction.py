@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, ImagingOperator, backproject, optics_of
+from gs_jax.apps.benchmark.compare import obstacle
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.benchmark.compare import obstacle
 from gs_jax.optics.window import psf_of_depth
 from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
 from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid

@@ -15,7 +15,7 @@ import zarr
 
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
 from gs_jax.io import ngff, volume_series
 from gs_jax.io.captures import Wanted
 from gs_jax.io.napari import reader

@@ -11,16 +11,16 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
+from gs_jax.apps.report import device, facts, spots, views
+from gs_jax.apps.report.chart import line_chart
+from gs_jax.apps.report.page import write_report
 from gs_jax.base.errors import InputError
-from gs_jax.designs.builtin import geomscope
-from gs_jax.designs.design import read_design
+from gs_jax.design.builtin import geomscope
+from gs_jax.design.design import read_design
 from gs_jax.io.points import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.pictures.encode import thinned
 from gs_jax.pictures.planes import slices
-from gs_jax.report import device, facts, spots, views
-from gs_jax.report.chart import line_chart
-from gs_jax.report.page import write_report
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run

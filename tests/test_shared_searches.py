@@ -6,15 +6,15 @@ import jax
 import numpy as np
 import pytest
 
+from gs_jax.apps.training.examples import SCENES
+from gs_jax.apps.training.recipes import unrolled_cases
+from gs_jax.apps.training.slices import stacks
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study
-from gs_jax.designs.builtin import geomscope
-from gs_jax.training.examples import SCENES
-from gs_jax.training.recipes import unrolled_cases
-from gs_jax.training.slices import stacks
+from gs_jax.design.builtin import geomscope
 
 from .test_pareto import STUDY
 from .test_training import TINY

@@ -6,19 +6,19 @@ import optax
 import pytest
 from click.testing import CliRunner
 
+from gs_jax.apps.training import scenes, slices
+from gs_jax.apps.training.examples import Kind
+from gs_jax.apps.training.loop import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.apps.training.recipes import slices_loss
+from gs_jax.apps.training.slices import Stack, paper_batch, patches, simulated_stack, stacks
 from gs_jax.base.errors import InputError
 from gs_jax.cli.reconstruct import command as reconstruct_command
 from gs_jax.cli.train import command
-from gs_jax.designs.design import read_design
+from gs_jax.design.design import read_design
+from gs_jax.detection.unet import UNet, read_weights, suppress
 from gs_jax.io.captures import write_capture
 from gs_jax.io.volumes import read_volume
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.suppression.unet import UNet, read_weights, suppress
-from gs_jax.training import scenes, slices
-from gs_jax.training.examples import Kind
-from gs_jax.training.loop import Recipe, read_checkpoint, start, train, write_checkpoint
-from gs_jax.training.recipes import slices_loss
-from gs_jax.training.slices import Stack, paper_batch, patches, simulated_stack, stacks
 
 from .test_cli import DESIGN
 
@@ -184,7 +184,7 @@ def test_stacks_are_kept(tmp_path):
 @pytest.fixture
 def toy_command(monkeypatch):
     module = sys.modules["gs_jax.cli.train"]
-    monkeypatch.setattr("gs_jax.training.recipes.paper_recipe", toy)
+    monkeypatch.setattr("gs_jax.apps.training.recipes.paper_recipe", toy)
     monkeypatch.setattr(module, "_EVERY", 2)
 
     def invoke(*arguments):
@@ -236,7 +236,7 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
         return paper_batch(rng, 16)
 
     with monkeypatch.context() as patched:
-        patched.setattr(sys.modules["gs_jax.training.recipes"], "paper_recipe", lambda: toy(batch=batch))
+        patched.setattr(sys.modules["gs_jax.apps.training.recipes"], "paper_recipe", lambda: toy(batch=batch))
         assert toy_command("--steps", 5, "-o", broken).exit_code == 1
     assert not broken.exists() and broken.with_suffix(".checkpoint").exists()
     assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0

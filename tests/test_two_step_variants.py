@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.two_step_variants import COUNT, SIZE, Gated, Stack, batch, channels, cleaned
-from gs_jax.suppression.unet import multislice_network
+from gs_jax.detection.unet import multislice_network
 
 pytestmark = pytest.mark.integration
 

@@ -10,7 +10,7 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax.base.errors import InputError
-from gs_jax.suppression.unet import (
+from gs_jax.detection.unet import (
     PRETRAINED,
     UNet,
     multislice_network,
@@ -106,7 +106,7 @@ def test_tiles_leave_no_seam(monkeypatch, offsets):
     network, volume = small(offsets=offsets), stack(2, 45, 62)
     whole = suppress(volume, network)
     jax.clear_caches()
-    monkeypatch.setattr("gs_jax.suppression.unet._CORE", 16)
+    monkeypatch.setattr("gs_jax.detection.unet._CORE", 16)
     # The same sums: only the order of the convolution's terms may differ.
     np.testing.assert_allclose(suppress(volume, network), whole, atol=1e-5 * whole.max())
 

@@ -10,6 +10,9 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
+from gs_jax.apps.training.examples import SCENES, Kind, example
+from gs_jax.apps.training.loop import start, train
+from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
 from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.reconstruction.reprojection import reproject
@@ -17,9 +20,6 @@ from gs_jax.reconstruction.system import Sight, System
 from gs_jax.solvers import unrolled
 from gs_jax.solvers.richardson_lucy import tent_background
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
-from gs_jax.training.examples import SCENES, Kind, example
-from gs_jax.training.loop import start, train
-from gs_jax.training.recipes import UNROLLED, Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
 
 KEY = jax.random.key(0)
 TINY = Kind(64, 0.06, 0.25, 3, binning=4)

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from ..base.errors import InputError
-from ..designs.checks import reach
-from ..designs.design import Design
-from ..designs.tables import CalibrationTable
+from ..design.checks import reach
+from ..design.design import Design
+from ..design.tables import CalibrationTable
 from ..io.provenance import Provenance
 from ..io.tables import one_line
 from .fit import Calibration

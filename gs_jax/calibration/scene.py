@@ -10,9 +10,9 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..detection.locate import find_points
 from ..geometry import Imager
-from ..suppression.locate import find_points
-from ..voxels import Grid
+from ..grid import Grid
 from .fit import Calibration, refine, spots_in
 from .matching import near_of
 from .sources import Sources

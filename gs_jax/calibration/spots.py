@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float64, Shaped
 from skimage.feature import peak_local_max
 
+from ..detection.consistency import signal
 from ..geometry import Imager
 from ..optics.light import SpotRays, spot_rays, zones
-from ..suppression.consistency import signal
 
 # Of the window, pixels: standard deviation, half its side; how often it is moved at most, and when it rests.
 _WINDOW, _HALF, _MOVES, _RESTS = 1.5, 4, 300, 1e-4

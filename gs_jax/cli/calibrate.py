@@ -76,7 +76,7 @@ def command(
     from ..calibration.scene import FITTED as OF_SCENES, calibrate_by_scene
     from ..calibration.sources import Sources
     from ..calibration.unknowns import FITTED
-    from ..designs.design import read_design, write_design
+    from ..design.design import read_design, write_design
     from ..io.figures import write_figure
     from ..io.positions import read_positions
     from ..reconstruction.pipeline import voxel_grid

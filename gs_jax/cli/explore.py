@@ -32,10 +32,10 @@ def command(design: Path, study: Path | None, output: Path | None, port: int, br
     """
     import webbrowser
 
+    from ..apps.explore.server import Server
+    from ..apps.explore.session import Session
     from ..codesign.study import read_study
-    from ..designs.design import read_design
-    from ..explore.server import Server
-    from ..explore.session import Session
+    from ..design.design import read_design
 
     saves = output or Path(f"{design.stem}-new.toml")
     check_output(saves, [".toml"])

@@ -13,7 +13,7 @@ from .options import shipped_designs
 def command(file: Path | None, designs: bool):
     """Show versions, devices and memory; or of a FILE that gs-jax wrote, which command made it and of what."""
     if designs:
-        from ..designs.design import read_design
+        from ..design.design import read_design
 
         # The name of the file is what a command takes; the second line of a design says what its array is.
         found = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}

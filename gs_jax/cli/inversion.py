@@ -74,7 +74,7 @@ def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress,
             found, evidence, warning = _points(image, imager, grid, sharp(), progress)
         volume = _volume_of_points(found, grid) if suppress == "points" else volume_of(image, progress)
         if suppress == "clusters":
-            from ..suppression.clustering import find_clusters
+            from ..detection.clustering import find_clusters
 
             with progress.step("Clustering"):
                 found = find_clusters(volume, grid)
@@ -118,10 +118,10 @@ def _points(image, imager, grid, sharp, progress):
     """Points, the columns of a file that speak for them, and a warning where they are not to be trusted."""
     import numpy as np
 
+    from ..detection.consistency import signal
+    from ..detection.evidence import point_evidence
+    from ..detection.locate import NOT_TRUSTED, find_points
     from ..optics.focus import blur_of
-    from ..suppression.consistency import signal
-    from ..suppression.evidence import point_evidence
-    from ..suppression.locate import NOT_TRUSTED, find_points
 
     light = signal(image)
     points = find_points(light, imager, grid, progress=progress)
@@ -132,7 +132,7 @@ def _points(image, imager, grid, sharp, progress):
 
 def _network(weights: Path | None):
     """What cleans a volume: our network, or that of a file."""
-    from ..suppression.unet import read_weights, suppress
+    from ..detection.unet import read_weights, suppress
 
     return partial(suppress, network=read_weights(weights) if weights else None)
 

@@ -21,7 +21,7 @@ def command(
     count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path, force: bool
 ):
     """Make a random layout of lenses, for the key `centers_file` of a design."""
-    from ..designs.centers import write_centers
+    from ..design.centers import write_centers
     from ..layouts.cells import coverage, nearest_neighbour_distances
     from ..layouts.patterns import random_layout
 

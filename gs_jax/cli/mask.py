@@ -19,7 +19,7 @@ def command(design: Path, output: Path):
     mold from above: from the plano side of the lenses. DXF and SVG are
     in mm, GDSII in um (it needs `pip install 'gs-jax[gds]'`). Beside the drawing, .json says where it comes from.
     """
-    from ..designs.design import design_text, read_design
+    from ..design.design import design_text, read_design
     from ..io.disk import check_output
     from ..mold.mask import MASK_SUFFIXES, mask_plan, write_mask
 

@@ -21,9 +21,9 @@ def command(design: Path, output: Path | None, depths: list[float] | None, confu
     """
     from rich.console import Console
 
-    from ..designs.design import read_design
-    from ..designs.problems import findings
-    from ..designs.sheet import datasheet, summary, tables
+    from ..design.design import read_design
+    from ..design.problems import findings
+    from ..design.sheet import datasheet, summary, tables
 
     if output:
         check_output(output, [".json"])

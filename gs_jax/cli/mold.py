@@ -72,7 +72,7 @@ def command(
     side does, the array lies turned over about x, with its y against the design's. A picture (.png) and a report
     (.json, .txt) of the same name are written beside it; what was written is read back and measured.
     """
-    from ..designs.design import design_text, read_design
+    from ..design.design import design_text, read_design
     from ..mold.make import make_mold, report_text
     from ..mold.solids import MoldShape
 

@@ -38,7 +38,7 @@ def at_terminal() -> bool:
 
 def _print_schema(context: click.Context, param: click.Parameter, value: bool) -> None:
     if value:
-        from ..designs.keys import schema
+        from ..design.keys import schema
 
         click.echo(json.dumps(schema(), indent=2))
         context.exit()
@@ -97,8 +97,8 @@ def command(output: Path, centers: Path | None, name: str | None, force: bool, *
     At a terminal it asks for what the options do not say. Elsewhere nothing is asked: what has no default must be
     given. Lens centres are read from a file (--centers) or made (--count).
     """
-    from ..designs.design import checked_design
-    from ..designs.keys import commented
+    from ..design.design import checked_design
+    from ..design.keys import commented
     from ..io.disk import write_text
 
     check_output(output, [".toml"])
@@ -161,7 +161,7 @@ def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -
 
 def _lenses(known: dict[str, Any], asking: bool) -> None:
     """Camera and lens."""
-    from ..designs.start import radius_of
+    from ..design.start import radius_of
 
     for key in ("pixel_pitch_um", "shape", "refractive_index"):
         _fill(known, key, asking)
@@ -182,7 +182,7 @@ def _lenses(known: dict[str, Any], asking: bool) -> None:
 
 def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
     """Lens centres and the plate's size: of a file, or made."""
-    from ..designs.start import generated_centers
+    from ..design.start import generated_centers
 
     while asking and file is None and "count" not in known:
         answer = click.prompt("file of lens centres (empty: make a random layout)", "", show_default=False).strip()
@@ -206,8 +206,8 @@ def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
 
 def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     """The file's centres, once it is known how it is meant."""
-    from ..designs.centers import lens_columns, read_centers, unit_of_file
-    from ..designs.start import check_origin_said, check_unit_said
+    from ..design.centers import lens_columns, read_centers, unit_of_file
+    from ..design.start import check_origin_said, check_unit_said
 
     columns, unit, origin = (known.get(f"centers_{key}") for key in ("columns", "unit", "origin"))
     size = tuple(known["size_mm"]) if "size_mm" in known else None
@@ -236,7 +236,7 @@ def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
 
 def _crop(known: dict[str, Any], asking: bool) -> int:
     """Leaves out lenses without an image on the sensor, if that is wanted, and the plate about them; how many."""
-    from ..designs.start import plate_of, within_reach
+    from ..design.start import plate_of, within_reach
 
     kept = within_reach(known)
     beyond = len(kept) - int(kept.sum())
@@ -254,7 +254,7 @@ def _crop(known: dict[str, Any], asking: bool) -> int:
 
 def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
     """Adds what is not known yet: asked for, or the default."""
-    from ..designs.start import DEFAULTS
+    from ..design.start import DEFAULTS
 
     if key in known:
         return
@@ -269,9 +269,9 @@ def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
 
 def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> Any:
     """An answer that is allowed; what looks like a slip of a unit is asked about."""
-    from ..designs.keys import design_keys, problem
-    from ..designs.plausible import USUAL, meant, slip
-    from ..designs.start import clash
+    from ..design.keys import design_keys, problem
+    from ..design.plausible import USUAL, meant, slip
+    from ..design.start import clash
 
     key = design_keys()[path]
     hint = f"usually {key.usual}" if key.usual else key.allowed

@@ -76,7 +76,7 @@ class DesignFile(click.ParamType):
 
 def shipped_designs() -> list[Path]:
     """The designs that come with the package; of a checkout, those in its folder."""
-    inside = Path(__file__).parents[1] / "designs" / "shipped"
+    inside = Path(__file__).parents[1] / "design" / "shipped"
     return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
 
 

@@ -28,7 +28,7 @@ def command(study: Path, out: Path, workers: Workers):
     from ..base.errors import errors_name_file
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
     from ..codesign.study import parent_path, read_study
-    from ..designs.design import design_text, read_design
+    from ..design.design import design_text, read_design
     from ..io.figures import write_figure
     from ..io.provenance import KEY
 

@@ -118,17 +118,17 @@ def command(
     gs-jax reconstruct part.tif my.toml --roi 1024,512,2048,2048 --binning 2
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
-    from ..designs.design import design_text, read_design
+    from ..design.design import design_text, read_design
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
-    from ..projection.native import once
+    from ..projection.cpu.native import once
     from .inversion import imaged_again, plan
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
         check_output(points, [".csv"])
     if track:
-        from ..suppression.tracking import linker
+        from ..detection.tracking import linker
 
         if not points:
             raise InputError("--track: found no --points, allowed: with POINTS.csv, which has the particles.")

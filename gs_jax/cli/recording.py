@@ -199,8 +199,8 @@ def _request(names, provenance) -> dict[str, str]:
 
 def _write_points(path, series, track, provenance) -> str:
     """Writes the points of all frames, and gives their number, and that of particles, in words."""
+    from ..detection.tracking import tracked
     from ..io.points import write_points_in_time
-    from ..suppression.tracking import tracked
 
     points, particles = 0, 0
 

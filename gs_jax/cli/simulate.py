@@ -60,7 +60,7 @@ def command(
     import jax
     import numpy as np
 
-    from ..designs.design import design_text, read_design
+    from ..design.design import design_text, read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
     from ..simulation.camera import Camera, expose
     from ..simulation.scene import read_scene, simulate

@@ -5,10 +5,10 @@ from typing import Any
 
 import click
 
+from ..apps.tolerance.amounts import Tolerances
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output, write_json
-from ..tolerances.amounts import Tolerances
 from .files import check_may_write, provenance_of
 from .options import DESIGN, UM, Depths, Number
 
@@ -66,13 +66,13 @@ def command(
     import numpy as np
     from rich.console import Console
 
-    from ..designs.design import design_text, read_design
+    from ..apps.tolerance.analysis import tolerance
+    from ..apps.tolerance.outcome import as_json, picture, sentences, tables
+    from ..apps.tolerance.reading import read_tolerances
+    from ..design.design import design_text, read_design
     from ..io.figures import write_figure
     from ..io.positions import read_positions
     from ..io.provenance import KEY
-    from ..tolerances.analysis import tolerance
-    from ..tolerances.outcome import as_json, picture, sentences, tables
-    from ..tolerances.reading import read_tolerances
 
     # Least squares of a few numbers in many steps: single precision leaves micrometres.
     jax.config.update("jax_enable_x64", True)

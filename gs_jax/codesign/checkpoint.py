@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 
 from ..base.errors import InputError
-from ..designs.design import Design
+from ..design.design import Design
 from ..io.disk import atomic_write, check_input, decoding
 from .solve import State
 from .study import Study

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..designs.microscope import Microscope
+from ..design.microscope import Microscope
 from .linear_error import lost_power
 from .precision import crowded_bound
 

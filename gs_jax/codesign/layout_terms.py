@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..designs.microscope import Microscope
+from ..design.microscope import Microscope
 from ..geometry import field_limit
-from ..voxels import Grid
+from ..grid import Grid
 from .comb import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import localization_bound

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_sqrt
-from ..designs.microscope import Microscope
+from ..design.microscope import Microscope
 from ..geometry import envelope
 from .transfer import PLACE, directions, lit_density, transfer_power
 

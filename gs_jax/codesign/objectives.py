@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 
 from ..base.errors import short_repr
 from ..base.safe import safe_sqrt
-from ..designs.microscope import Microscope
-from ..designs.spots import encircled_radius, field_heights, psf_width
+from ..design.microscope import Microscope
+from ..design.spots import encircled_radius, field_heights, psf_width
 from ..optics import aberrations, theory
 from .exposure_terms import crowded, volume_error
 from .layout_terms import (

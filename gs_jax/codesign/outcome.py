@@ -13,8 +13,8 @@ from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
 from ..base.style import PALETTE
-from ..designs.checks import of_each
-from ..designs.design import Design, write_design
+from ..design.checks import of_each
+from ..design.design import Design, write_design
 from ..io.disk import check_output, write_json
 from ..io.figures import write_figure
 from ..io.provenance import Provenance

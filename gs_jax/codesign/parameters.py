@@ -19,10 +19,10 @@ from pydantic import ValidationError
 
 from ..base.converters import as_float
 from ..base.errors import InputError
-from ..designs.centers import LENS_KEYS
-from ..designs.checks import plate_as_air
-from ..designs.design import Design
-from ..designs.microscope import Microscope
+from ..design.centers import LENS_KEYS
+from ..design.checks import plate_as_air
+from ..design.design import Design
+from ..design.microscope import Microscope
 from ..geometry import Imager
 from ..io.tables import one_line
 from ..lenses import EACH, type_of_lens

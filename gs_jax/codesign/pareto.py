@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..designs.design import Design
+from ..design.design import Design
 from .checkpoint import Log
 from .objectives import unit_of, with_terms
 from .parameters import NAMES, Values, significant, start_values

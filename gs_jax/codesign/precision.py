@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..designs.microscope import Microscope
+from ..design.microscope import Microscope
 from ..geometry import envelope
 from .fisher import PRIOR
 from .linear_error import noise_density

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from ..base.errors import errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..designs.design import Design, read_design
+from ..design.design import Design, read_design
 from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values
 from .solve import State

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..designs.design import Design
+from ..design.design import Design
 from ..lenses import kinds
 from .bounds import Bounds, Box
 from .checkpoint import Log, restored

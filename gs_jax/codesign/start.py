@@ -3,8 +3,8 @@
 import numpy as np
 
 from ..base.errors import InputError
-from ..designs.checks import plate_as_air
-from ..designs.design import Design
+from ..design.checks import plate_as_air
+from ..design.design import Design
 from ..layouts.dealing import dealt
 from ..lenses import kinds as kinds_of
 from .study import Study

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..designs.microscope import Microscope
+from ..design.microscope import Microscope
 from .objectives import TERMS
 from .study import TermTable
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.safe import safe_sqrt
-from ..designs.microscope import Microscope
-from ..designs.spots import field_heights
+from ..design.microscope import Microscope
+from ..design.spots import field_heights
 from ..geometry import envelope
 from ..optics.unit import pupil_disc, unit_rays
 

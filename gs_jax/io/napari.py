@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..base.errors import InputError
-from ..voxels import Grid
+from ..grid import Grid
 from .points import POINTS_HEADER, read_points
 from .viewers import display_range
 from .volume_series import Series, read_series

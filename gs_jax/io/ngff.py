@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError
-from ..voxels import Grid
+from ..grid import Grid
 from .provenance import KEY, Provenance
 from .viewers import display_range, title
 

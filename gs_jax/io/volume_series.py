@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..base.errors import InputError, short_repr
-from ..voxels import Grid
+from ..grid import Grid
 from .disk import atomic_write, decoding
 from .ngff import CHUNK, image_attributes, plain_depths, sharded
 from .provenance import Provenance

@@ -28,7 +28,7 @@ import tifffile
 from jaxtyping import Array, Float32, Shaped
 
 from ..base.errors import InputError, short_repr
-from ..voxels import Grid
+from ..grid import Grid
 from .disk import atomic_write, check_input, check_output, decoding
 from .ngff import chunked, first_um, image_attributes, plain_depths, um
 from .provenance import NAMESPACE, Provenance

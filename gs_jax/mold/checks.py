@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..designs.design import Design
+from ..design.design import Design
 from ..layouts.cells import cell_edges, coverage, largest_hole
 from ..lenses import MicrolensArray
 from .caps import STEEPEST, cap_sag, caps_of, surface, visible_reaches

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.progress import Progress
-from ..designs.design import Design, read_design
+from ..design.design import Design, read_design
 from ..io.disk import atomic_write, check_output, write_json, write_text
 from ..io.figures import write_figure
 from ..io.provenance import KEY, Provenance

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..base.errors import InputWarning
 from ..geometry import Imager
-from ..voxels import Grid
+from ..grid import Grid
 from .cores import core_shares
 from .kinds import lenses_by_kind, of_kinds
 

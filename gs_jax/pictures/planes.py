@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Num
 
-from ..voxels import Grid
+from ..grid import Grid
 from .encode import in_range, png, thinned
 
 # Number of slices, and pixels of a side.

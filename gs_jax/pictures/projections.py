@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Num
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from ..voxels import Grid
+from ..grid import Grid
 from .planes import circles, slices, slider
 
 # Darkest and brightest shown, percentiles: back-projection has a pedestal, which is no object, and a few bright voxels.

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
-from ..voxels import Grid
+from ..grid import Grid
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .rays import Envelope, Rays, trace
 

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from . import native
-from .native import native_on_cpu
+from .cpu import native
+from .cpu.native import native_on_cpu
 from .primitive import linear_call
 from .rays import Axis, Envelope, Rays, RingLight
 

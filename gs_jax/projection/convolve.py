@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
 from ..optics.exit_pupil import phasor
-from . import native
-from .native import native_on_cpu
+from .cpu import native
+from .cpu.native import native_on_cpu
 from .primitive import linear_call
 
 

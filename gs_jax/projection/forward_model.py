@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
+from ..grid import Grid
 from ..optics.full import FullOptics
 from ..optics.kinds import KindOptics, of_kinds
-from ..voxels import Grid
 from .backprojection import as_volume, backproject_adjoint
 from .convolve import convolved, image_in_groups, with_margin
 from .full import full_image

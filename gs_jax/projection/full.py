@@ -11,10 +11,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
+from ..grid import Grid
 from ..optics.cores import ring_edges
 from ..optics.full import FullOptics, Halo
 from ..optics.light import clear_area
-from ..voxels import Grid
 from .bilinear import Shapes, volume_to_image
 from .convolve import convolved, doubled, image_in_groups, with_margin
 from .polar import apply, splat_table, spread_table

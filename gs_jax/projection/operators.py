@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
-from ..voxels import Grid
+from ..grid import Grid
 from .backprojection import backproject
 from .forward_model import Optics, forward
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..geometry import Imager, chief_ray, envelope, field_limit
+from ..grid import Grid
 from ..optics.cores import ring_light
-from ..voxels import Grid
 
 # Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
 # where the envelope and all its derivatives vanish.

@@ -15,6 +15,7 @@ from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
+from ..grid import Grid
 from ..optics.focus import warn_if_blurred
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
@@ -22,7 +23,6 @@ from ..projection.levels import LEVELS
 from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
-from ..voxels import Grid
 from .discrepancy import misfit_of_noise
 from .methods import BackProjection, ListRichardsonLucy, Method
 from .sharding import backproject_by_all

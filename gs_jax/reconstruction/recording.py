@@ -15,8 +15,8 @@ from jaxtyping import Float32
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
+from ..grid import Grid
 from ..io.volume_series import Note, VolumeSeries, opened_levels, write_frame
-from ..voxels import Grid
 
 Frame = TypeVar("Frame")
 Volume = Float32[np.ndarray, "depth row column"]

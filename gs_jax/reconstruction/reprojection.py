@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, Num
 from ..base.arrays import check_finite
 from ..base.progress import Progress
 from ..geometry import Imager
+from ..grid import Grid
 from ..projection.forward_model import Optics, forward
-from ..voxels import Grid
 from .system import explainable, model_of
 
 # Squares along a side of the sensor, unless it has fewer pixels.

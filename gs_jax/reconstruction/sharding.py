@@ -9,8 +9,8 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
+from ..grid import Grid
 from ..projection.backprojection import backproject
-from ..voxels import Grid
 
 
 def backproject_by_all(

@@ -10,7 +10,9 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import check_finite
 from ..base.progress import Progress
+from ..detection.background import between, square_levels
 from ..geometry import Imager
+from ..grid import Grid
 from ..io.readout import Readout
 from ..optics.cores import apparent_depths
 from ..optics.full import FullOptics
@@ -19,8 +21,6 @@ from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.unmatched import Unmatched
-from ..suppression.background import between, square_levels
-from ..voxels import Grid
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARKEST = 1

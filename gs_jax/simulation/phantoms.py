@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from PIL import Image, ImageDraw, ImageFont
 
 from ..base.errors import InputError, short_repr
+from ..grid import Grid
 from ..layouts.cells import Number, check_positive, half_size
-from ..voxels import Grid
 
 Emitters = Float[np.ndarray, "emitter 4"]
 

@@ -14,6 +14,7 @@ from ..base.errors import InputError, short_repr
 from ..base.info import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, Sensor
+from ..grid import Grid
 from ..io.points import read_points
 from ..io.volumes import read_volume
 from ..optics.full import full_optics, halo_nodes
@@ -22,7 +23,6 @@ from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
 from ..projection.points import STEPS, forward_points, full_image_of_points, stamps
-from ..voxels import Grid
 
 # Chief rays alone make no image of a point.
 OPTICS = tuple(level for level in LEVELS if level != "pinhole")

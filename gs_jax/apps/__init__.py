@@ -1,0 +1,1 @@
+"""Applications that stand on the library; nothing else imports them."""
