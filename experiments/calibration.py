@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import Calibration, calibrate, residuals_of
 from gs_jax.calibration.outcome import picture

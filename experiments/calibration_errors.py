@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from experiments.common import Report, main, table
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import chief_ray

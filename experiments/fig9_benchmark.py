@@ -32,9 +32,9 @@ from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, Unrolled, reproject
-from gs_jax.apps.benchmark.measure import timed
-from gs_jax.apps.benchmark.report import markdown_table
-from gs_jax.apps.benchmark.scenes import spots
+from gs_jax.apps.benchmark_measure import timed
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.benchmark_scenes import spots
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import draw_image, label_of

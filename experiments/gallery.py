@@ -31,9 +31,9 @@ from experiments import (
 )
 from experiments.backprojection_speed import Job, race
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
-from gs_jax.apps.benchmark import report as benchmark
-from gs_jax.apps.benchmark.compare import run as run_benchmark, slopes
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps import benchmark_report as benchmark
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.method_benchmark import run as run_benchmark, slopes
 from gs_jax.base.progress import Progress
 
 

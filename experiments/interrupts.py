@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from gs_jax import geomscope, write_capture, write_design
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 
 # Seconds within which a command must end, and the longest wait before it is interrupted: most end by themselves later.

@@ -27,9 +27,9 @@ from gs_jax import (
     quality,
     reconstruct,
 )
-from gs_jax.apps.benchmark.report import markdown_table
-from gs_jax.apps.training.examples import FIELD_RADIUS, Kind, tables
-from gs_jax.apps.training.scenes import PLANES, random_scene, shared_out
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.training.random_scenes import PLANES, random_scene, shared_out
+from gs_jax.apps.training.simulated_captures import FIELD_RADIUS, Kind, tables
 from gs_jax.base.precision import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout, square_layout

@@ -26,9 +26,9 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from gs_jax import Unrolled, optics_of, quality, reconstruct, suppress
-from gs_jax.apps.benchmark.report import markdown_table
-from gs_jax.apps.training.examples import Example, Kind, example
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.training.recipes import UNROLLED
+from gs_jax.apps.training.simulated_captures import Example, Kind, example
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import pretrained

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from experiments.common import Report, main, table
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.base.style import PALETTE
 from gs_jax.codesign.objectives import TERMS

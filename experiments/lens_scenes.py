@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, RichardsonLucy, Sensor, reconstruct
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.lenses import EACH

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design

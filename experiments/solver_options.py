@@ -19,7 +19,7 @@ import numpy as np
 from experiments.common import Report, main, table
 from experiments.fig9_benchmark import SCENES, Scene
 from gs_jax import ListRichardsonLucy, RichardsonLucy, Unrolled, quality, reconstruct
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS, Method
 

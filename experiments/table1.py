@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from experiments.common import Report, main, table
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design

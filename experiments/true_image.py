@@ -26,7 +26,7 @@ import numpy as np
 from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, forward
-from gs_jax.apps.benchmark.report import markdown_table
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture

@@ -26,18 +26,18 @@ from jaxtyping import Array, Float
 from experiments.common import Report, main, table
 from experiments.learned import interval
 from gs_jax import backproject, quality
-from gs_jax.apps.benchmark.report import markdown_table
-from gs_jax.apps.training.examples import Kind, example
-from gs_jax.apps.training.loop import Recipe, start, train
+from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.training.recipes import slices_loss
-from gs_jax.apps.training.slices import PLANES, Batch
+from gs_jax.apps.training.simulated_captures import Kind, example
+from gs_jax.apps.training.training_loop import Recipe, start, train
+from gs_jax.apps.training.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import UNet, multislice_network, standardized
 from gs_jax.optics.cores import apparent_depths
 
 KIND = Kind(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8
-# As `gs_jax.apps.training.slices`: what errors are relative to at least.
+# As `gs_jax.apps.training.training_slices`: what errors are relative to at least.
 _GHOSTS, _LEAST_ENERGY = 0.05, 1e-3
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps.benchmark import compare, report
-from gs_jax.apps.benchmark.compare import METHODS, obstacle, run, slopes
-from gs_jax.apps.benchmark.scenes import Case, bench, peaks, scores, spots
+from gs_jax.apps import benchmark_report as report, method_benchmark as compare
+from gs_jax.apps.benchmark_scenes import Case, bench, peaks, scores, spots
+from gs_jax.apps.method_benchmark import METHODS, obstacle, run, slopes
 
 from .helpers import scene
 
@@ -115,7 +115,7 @@ def test_command(found, tmp_path, monkeypatch):
     from gs_jax.cli.benchmark import command
     from gs_jax.cli.info import command as info
 
-    monkeypatch.setattr("gs_jax.apps.benchmark.compare.run", lambda each, progress: found)
+    monkeypatch.setattr("gs_jax.apps.method_benchmark.run", lambda each, progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])
     assert result.exit_code == 0 and "benchmark.json" in result.output
     written = tmp_path / "new" / "benchmark.json"

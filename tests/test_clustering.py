@@ -5,7 +5,7 @@ import pytest
 from skimage.measure import label
 
 from gs_jax import Grid
-from gs_jax.apps.benchmark.scenes import spots
+from gs_jax.apps.benchmark_scenes import spots
 from gs_jax.detection.clustering import find_clusters
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, backproject, read_design
-from gs_jax.apps.explore import judging, scenes
-from gs_jax.apps.explore.judging import bench_of, checked_values, design_of, judge, violations
-from gs_jax.apps.explore.scenes import ghosts_of, small_reconstruction
+from gs_jax.apps.explore import evaluation as judging, preview as scenes
+from gs_jax.apps.explore.evaluation import bench_of, checked_values, design_of, judge, violations
+from gs_jax.apps.explore.preview import ghosts_of, small_reconstruction
 from gs_jax.apps.explore.server import Server
 from gs_jax.apps.explore.session import Session
 from gs_jax.base.errors import InputError

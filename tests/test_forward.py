@@ -8,7 +8,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
-from gs_jax.apps.benchmark.measure import peak_mib
+from gs_jax.apps.benchmark_measure import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.projection.points import STEPS, forward_points, stamps
 

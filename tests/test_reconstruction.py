@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, ImagingOperator, backproject, optics_of
-from gs_jax.apps.benchmark.compare import obstacle
+from gs_jax.apps.method_benchmark import obstacle
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.window import psf_of_depth

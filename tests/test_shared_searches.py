@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from gs_jax.apps.training.examples import SCENES
 from gs_jax.apps.training.recipes import unrolled_cases
-from gs_jax.apps.training.slices import stacks
+from gs_jax.apps.training.simulated_captures import SCENES
+from gs_jax.apps.training.training_slices import stacks
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.pareto import as_json, trade_off

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
 from gs_jax.apps.report.facts import tolerance_facts
-from gs_jax.apps.tolerance.amounts import Tolerances
-from gs_jax.apps.tolerance.analysis import Outcome, _of_devices, _Question, together, tolerance
-from gs_jax.apps.tolerance.devices import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
+from gs_jax.apps.tolerance.depth_recovery import Bench, bench_of, depth_errors
+from gs_jax.apps.tolerance.device_model import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
 from gs_jax.apps.tolerance.images import log_sharpness
-from gs_jax.apps.tolerance.outcome import as_json, changes, costs, picture, sentences
-from gs_jax.apps.tolerance.points import Bench, bench_of, depth_errors
 from gs_jax.apps.tolerance.reading import read_tolerances
 from gs_jax.apps.tolerance.surface import lens_squares, step_squares
+from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Question, together, tolerance
+from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
+from gs_jax.apps.tolerance.tolerance_spec import Tolerances
 from gs_jax.cli.tolerance import command
 from gs_jax.design.microscope import Microscope
 from gs_jax.design.sheet import microscopes_of

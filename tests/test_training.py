@@ -6,11 +6,11 @@ import optax
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps.training import scenes, slices
-from gs_jax.apps.training.examples import Kind
-from gs_jax.apps.training.loop import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.apps.training import random_scenes as scenes, training_slices as slices
 from gs_jax.apps.training.recipes import slices_loss
-from gs_jax.apps.training.slices import Stack, paper_batch, patches, simulated_stack, stacks
+from gs_jax.apps.training.simulated_captures import Kind
+from gs_jax.apps.training.training_loop import Recipe, read_checkpoint, start, train, write_checkpoint
+from gs_jax.apps.training.training_slices import Stack, paper_batch, patches, simulated_stack, stacks
 from gs_jax.base.errors import InputError
 from gs_jax.cli.reconstruct import command as reconstruct_command
 from gs_jax.cli.train import command

@@ -10,9 +10,9 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
-from gs_jax.apps.training.examples import SCENES, Kind, example
-from gs_jax.apps.training.loop import start, train
 from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
+from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
+from gs_jax.apps.training.training_loop import start, train
 from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
 from gs_jax.reconstruction.reprojection import reproject

@@ -14,8 +14,8 @@ from .interrupt import PARTIAL, kept
 @click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
-    from ..apps.benchmark.compare import run
-    from ..apps.benchmark.report import write, write_records
+    from ..apps.benchmark_report import write, write_records
+    from ..apps.method_benchmark import run
 
     folder = make_folder(out)
     numbers, provenance = folder / "benchmark.json", provenance_of()

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from ..apps.tolerance.amounts import Tolerances
+from ..apps.tolerance.tolerance_spec import Tolerances
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.disk import check_output, write_json
@@ -66,9 +66,9 @@ def command(
     import numpy as np
     from rich.console import Console
 
-    from ..apps.tolerance.analysis import tolerance
-    from ..apps.tolerance.outcome import as_json, picture, sentences, tables
     from ..apps.tolerance.reading import read_tolerances
+    from ..apps.tolerance.tolerance_analysis import tolerance
+    from ..apps.tolerance.tolerance_report import as_json, picture, sentences, tables
     from ..design.design import design_text, read_design
     from ..io.figures import write_figure
     from ..io.positions import read_positions

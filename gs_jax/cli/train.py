@@ -37,9 +37,9 @@ def command(network: str, steps: int | None, seed: int, resume: bool, output: Pa
     """
     import numpy as np
 
-    from ..apps.training.loop import read_checkpoint, start, train as run, write_checkpoint
     from ..apps.training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
-    from ..apps.training.slices import stacks
+    from ..apps.training.training_loop import read_checkpoint, start, train as run, write_checkpoint
+    from ..apps.training.training_slices import stacks
     from ..detection.unet import write_weights
     from ..solvers.unrolled import write_unrolled
 

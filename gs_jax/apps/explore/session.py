@@ -14,7 +14,7 @@ from ...pictures.encode import in_range, png
 from ..report.chart import line_chart
 from ..report.device import layout
 from ..report.page import render
-from .judging import (
+from .evaluation import (
     SPOT_DEPTHS,
     SPOT_FIELDS,
     Bench,
@@ -28,7 +28,7 @@ from .judging import (
     knobs_of,
     violations,
 )
-from .scenes import Small, ghosts_of, small_reconstruction
+from .preview import Small, ghosts_of, small_reconstruction
 
 # Kept designs at most; of a file's name, numbers at most.
 _KEPT, _MOST_NAMES = 50, 10_000

@@ -11,7 +11,7 @@ from ...design.spots import psf_width
 from ...geometry import Imager
 from ...optics.axial import axial_strehl
 from ...optics.theory import FWHM
-from .devices import Errors, built
+from .device_model import Errors, built
 from .surface import lens_squares, log_strehl_of_height
 
 

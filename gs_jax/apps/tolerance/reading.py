@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from ...base.errors import InputError
 from ...io.disk import read_text
 from ...io.tables import one_line
-from .amounts import Tolerances
+from .tolerance_spec import Tolerances
 
 
 def read_tolerances(path: str | os.PathLike[str]) -> Tolerances:

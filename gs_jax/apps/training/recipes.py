@@ -17,9 +17,9 @@ from ...base.workers import Workers
 from ...detection.unet import UNet, multislice_network, paper_network
 from ...reconstruction.system import System, above_offset, sights_of
 from ...solvers.unrolled import State, Unrolled, untrained
-from .examples import SCENES, Kind, example, tables
-from .loop import Recipe
-from .slices import Batch, Stack, paper_batch, patches
+from .simulated_captures import SCENES, Kind, example, tables
+from .training_loop import Recipe
+from .training_slices import Batch, Stack, paper_batch, patches
 
 # What the unrolled networks see: pixels are sums of 4 x 4, voxels as wide as those by default.
 UNROLLED = Kind(288, 0.018, 0.064, 7, binning=4)

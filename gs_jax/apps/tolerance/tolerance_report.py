@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from .analysis import LEAST_STREHL, Measures, Outcome, together
-from .devices import RULED
+from .device_model import RULED
+from .tolerance_analysis import LEAST_STREHL, Measures, Outcome, together
 
 # How an amount is said: the fields of `Tolerances`, and what comes after each.
 _AMOUNTS = {

@@ -16,10 +16,10 @@ from ...design.design import Design
 from ...design.microscope import Microscope
 from ...design.sheet import microscopes_of
 from ...layouts.cells import check_positive
-from .amounts import Tolerances
-from .devices import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
+from .depth_recovery import Bench, bench_of, depth_errors
+from .device_model import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
 from .images import log_sharpness
-from .points import Bench, bench_of, depth_errors
+from .tolerance_spec import Tolerances
 
 # Depths of a caller who names none; devices at a time, and those of them whose rays are in memory together.
 _DEPTHS, _BATCH, _TOGETHER = 5, 64, 8
@@ -119,7 +119,7 @@ def tolerance(
         Where devices are judged, from the plate, mm; by default five over the working distance.
     sources
         Places `(x, y, z)` of the point sources by which devices are calibrated, mm, one a capture; see
-        `gs_jax.apps.tolerance.points.bench_of` for the default.
+        `gs_jax.apps.tolerance.depth_recovery.bench_of` for the default.
     max_width
         Of spots in the object, mm; by default 1.2 times the design's, depth by depth.
     min_strehl

@@ -20,8 +20,8 @@ from ...detection.unet import standardized
 from ...io.disk import atomic_write, decoding, make_folder
 from ...optics.cores import apparent_depths
 from ...projection.backprojection import backproject
-from .examples import SCENES, Kind, example
-from .scenes import drawn
+from .random_scenes import drawn
+from .simulated_captures import SCENES, Kind, example
 
 # The paper's training: slices in a set, how the others blur (voxels a slice) and count (factor a slice), and the noise.
 # It gives the ten and the 5 %; the rest is in a supplement that is not available, and ours.
@@ -69,7 +69,7 @@ def paper_batch(rng: np.random.Generator, size: int = 64) -> Batch:
 
 
 def simulated_stack(seed: int, number: int, kinds: Sequence[Kind] = KINDS) -> Stack:
-    """An example of `gs_jax.apps.training.examples`, back-projected where the bright cores are.
+    """An example of `gs_jax.apps.training.simulated_captures`, back-projected where the bright cores are.
 
     Parameters
     ----------

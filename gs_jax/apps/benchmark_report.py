@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...base.info import describe
-from ...base.style import line_of
-from ...io.disk import atomic_write, write_json, write_text
-from ...io.figures import write_figure
-from ...io.provenance import KEY, Provenance
-from .compare import STEPS, slopes
+from ..base.info import describe
+from ..base.style import line_of
+from ..io.disk import atomic_write, write_json, write_text
+from ..io.figures import write_figure
+from ..io.provenance import KEY, Provenance
+from .method_benchmark import STEPS, slopes
 
 COLUMNS = (
     *("method", "pairs", "seconds", "compile_seconds", "peak_mib", "psnr_db", "ssim", "mse", "f1", "seed"),

@@ -23,22 +23,22 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 
-from ...base.errors import InputError
-from ...base.info import available_memory
-from ...base.progress import Progress
-from ...detection.clustering import find_clusters
-from ...detection.locate import find_points
-from ...detection.unet import pretrained, suppress
-from ...projection.operators import ImagingOperator
-from ...reconstruction.methods import BackProjection, ListRichardsonLucy
-from ...reconstruction.pipeline import reconstruct
-from ...reconstruction.system import above_offset
-from ...solvers.admm import ADMM
-from ...solvers.fista import FISTA
-from ...solvers.iteration import least_weight_of_darkness, solve
-from ...solvers.richardson_lucy import RichardsonLucy
-from .measure import peak_mib, timed
-from .scenes import Bench, Case, bench, case, scores, spots
+from ..base.errors import InputError
+from ..base.info import available_memory
+from ..base.progress import Progress
+from ..detection.clustering import find_clusters
+from ..detection.locate import find_points
+from ..detection.unet import pretrained, suppress
+from ..projection.operators import ImagingOperator
+from ..reconstruction.methods import BackProjection, ListRichardsonLucy
+from ..reconstruction.pipeline import reconstruct
+from ..reconstruction.system import above_offset
+from ..solvers.admm import ADMM
+from ..solvers.fista import FISTA
+from ..solvers.iteration import least_weight_of_darkness, solve
+from ..solvers.richardson_lucy import RichardsonLucy
+from .benchmark_measure import peak_mib, timed
+from .benchmark_scenes import Bench, Case, bench, case, scores, spots
 
 # 1e6 to 2e9 pairs as in the paper, then on to its full scale (5120^2 pixels times 4 million voxels: 1e14).
 SIDES = (32, 56, 100, 212, 1024, 3200)

@@ -31,7 +31,7 @@ from ...calibration.unknowns import (
 )
 from ...geometry import Imager
 from ...optics.refraction import on_host
-from .devices import Errors, built, no_errors
+from .device_model import Errors, built, no_errors
 
 # Lenses that must see a point: one says no depth.
 _FEWEST = 2

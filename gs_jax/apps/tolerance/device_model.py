@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from ...geometry import Imager
-from .amounts import Tolerances
+from .tolerance_spec import Tolerances
 
 # What a tolerance is called, and the fields of `Errors` that it rules.
 RULED = {

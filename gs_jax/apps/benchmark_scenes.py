@@ -9,18 +9,18 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from skimage.feature import peak_local_max
 
-from ...base.precision import in_float32
-from ...base.progress import Progress
-from ...design.builtin import geomscope
-from ...geometry import Imager, Sensor
-from ...grid import Grid
-from ...lenses import MicrolensArray
-from ...metrics import localization, quality
-from ...optics.aperture import clear_diameter
-from ...optics.psf import geometric_psf
-from ...optics.theory import FWHM
-from ...simulation.camera import Camera, electrons, expose
-from ...simulation.scene import simulate_points
+from ..base.precision import in_float32
+from ..base.progress import Progress
+from ..design.builtin import geomscope
+from ..geometry import Imager, Sensor
+from ..grid import Grid
+from ..lenses import MicrolensArray
+from ..metrics import localization, quality
+from ..optics.aperture import clear_diameter
+from ..optics.psf import geometric_psf
+from ..optics.theory import FWHM
+from ..simulation.camera import Camera, electrons, expose
+from ..simulation.scene import simulate_points
 
 WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
 # Emitters across a particle.

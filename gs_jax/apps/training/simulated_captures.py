@@ -20,7 +20,7 @@ from ...optics.full import FullOptics, full_optics, halo_nodes
 from ...optics.halo import HaloGrid
 from ...projection.forward_model import forward
 from ...simulation.camera import Camera, electrons, expose
-from .scenes import PLANES as SCENE_PLANES, random_scene, shared_out
+from .random_scenes import PLANES as SCENE_PLANES, random_scene, shared_out
 
 # Scenes that one microscope images: its tables take longer than an image.
 SCENES = 8

@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 from ...geometry import Imager, Sensor, chief_ray, envelope
 from ...grid import Grid
 from ...simulation.phantoms import random_points
-from .judging import SIZE, Bench, Values, imager_of, spot_of, unit_of
+from .evaluation import SIZE, Bench, Values, imager_of, spot_of, unit_of
 
 # Cells of a map of ghosts, across; pixels of a small sensor, across; planes and points of the scene, and voxels across.
 # Depths of such a map.

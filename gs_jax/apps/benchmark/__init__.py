@@ -1,1 +1,0 @@
-"""Methods compared: time, memory and quality (Fig. 9)."""
