@@ -30,9 +30,8 @@ from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.apps.benchmark_measure import peak_mib, timed
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.info import describe
-from gs_jax.base.memory import status_mib
-from gs_jax.base.precision import in_float32
+from gs_jax.base.arrays import in_float32
+from gs_jax.base.machine import describe, status_mib
 from gs_jax.base.progress import Progress
 from gs_jax.layouts.patterns import random_layout
 

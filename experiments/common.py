@@ -20,11 +20,10 @@ from rich.table import Table
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.base.style import PALETTE
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
-from gs_jax.io.disk import make_folder, write_json, write_text
-from gs_jax.io.figures import write_figure
+from gs_jax.io.files import make_folder, write_figure, write_json, write_text
+from gs_jax.pictures.style import PALETTE
 
 OPTIONAL_PATH = {"type": Path, "nargs": "?"}
 # Of every picture of an experiment.

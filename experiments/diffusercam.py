@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_measure import timed
-from gs_jax.base.info import describe
+from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.convolution_admm import ConvolutionADMM

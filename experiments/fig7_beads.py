@@ -21,10 +21,10 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.point_density import scores
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
-from gs_jax.base.style import draw_image
 from gs_jax.design.design import Design
 from gs_jax.detection.locate import find_points
 from gs_jax.io.captures import read_capture
+from gs_jax.pictures.style import draw_image
 from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.scene import simulate_points

@@ -29,11 +29,11 @@ from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
 from gs_jax.apps.demo.scene import words
 from gs_jax.base.progress import Progress
-from gs_jax.base.style import draw_image, label_of
 from gs_jax.design.design import Design
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
+from gs_jax.pictures.style import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.simulation.phantoms import rasterize, snowflake

@@ -37,7 +37,6 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.benchmark_scenes import spots
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.base.style import draw_image, label_of
 from gs_jax.design.design import read_design
 from gs_jax.detection.clustering import find_clusters
 from gs_jax.detection.locate import find_points
@@ -45,6 +44,7 @@ from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
+from gs_jax.pictures.style import draw_image, label_of
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, reconstruct, voxel_grid
 from gs_jax.simulation.camera import Camera, expose

@@ -24,7 +24,7 @@ from experiments.backprojection_speed import Inputs, Job, inputs, timed
 from experiments.common import Report, main, table
 from experiments.true_image import TWO_RINGS
 from gs_jax import Imager, ImagingOperator, RichardsonLucy, backproject_adjoint, forward
-from gs_jax.base.info import describe
+from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import envelope

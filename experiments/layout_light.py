@@ -30,7 +30,7 @@ from gs_jax import (
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.training.random_scenes import PLANES, random_scene, shared_out
 from gs_jax.apps.training.simulated_captures import FIELD_RADIUS, Kind, tables
-from gs_jax.base.precision import in_float32
+from gs_jax.base.arrays import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
 from gs_jax.projection.levels import optics_of

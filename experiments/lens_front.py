@@ -26,7 +26,6 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.base.style import PALETTE
 from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
@@ -34,6 +33,7 @@ from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.checks import plate_as_air
 from gs_jax.design.design import Design, read_design
+from gs_jax.pictures.style import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"
 SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))

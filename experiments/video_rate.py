@@ -18,8 +18,8 @@ from gs_jax import simulate
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, write_design
+from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Wanted
-from gs_jax.io.correction import prepare, read_frame
 from gs_jax.io.recordings import opened_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries
 from gs_jax.reconstruction.pipeline import reconstructor, voxel_grid

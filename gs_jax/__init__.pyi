@@ -13,7 +13,7 @@ from .detection.unet import suppress as suppress
 from .geometry import Imager as Imager, Sensor as Sensor
 from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
-from .io.points import read_points as read_points, write_points as write_points
+from .io.point_tables import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
 from .layouts.patterns import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray

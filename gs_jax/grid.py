@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .base.converters import FINITE, POSITIVE, as_float, as_shape, check_fields
+from .base.arrays import FINITE, POSITIVE, as_float, as_shape, check_fields
 from .geometry import Sensor
 
 

@@ -10,8 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .base.arrays import library_of
-from .base.converters import FINITE, NOT_NEGATIVE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, check_fields
+from .base.arrays import (
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Rule,
+    as_float,
+    as_float_or_none,
+    as_pair,
+    check_fields,
+    library_of,
+)
 from .base.errors import InputError
 
 # Side of the lenses that faces the object.

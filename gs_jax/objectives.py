@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .base.converters import as_float
+from .base.arrays import as_float
 from .codesign import objectives as terms
 from .design.microscope import Microscope
 from .design.spots import encircled_radius as _encircled_radius, psf_width

@@ -98,8 +98,8 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
 
 def _corrected(name, pixels, sensor):
     """A layer's pixels as those of a file: checked, and hot ones repaired; and what is wrong with them."""
+    from .io.camera import prepare, read_frame
     from .io.captures import DTYPES, checked
-    from .io.correction import prepare, read_frame
 
     pixels = np.asarray(pixels)
     if pixels.shape != sensor.shape or pixels.dtype.name not in DTYPES:

@@ -24,7 +24,7 @@ from gs_jax.calibration.start import begin_without_lenses
 from gs_jax.calibration.unknowns import FITTABLE, FITTED
 from gs_jax.cli.calibrate import _NAMES
 from gs_jax.design.builtin import geomscope
-from gs_jax.io.positions import read_positions
+from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 
 from .helpers import needs

@@ -7,7 +7,7 @@ import pytest
 from experiments.calibration import device
 from gs_jax.calibration.fit import calibrate
 from gs_jax.calibration.outcome import picture
-from gs_jax.io.readout import Readout
+from gs_jax.io.camera import Readout
 
 from .test_calibration import POINTS, captures
 

@@ -10,7 +10,7 @@ from gs_jax import Grid
 from gs_jax.__main__ import main
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.io.points import read_points
+from gs_jax.io.point_tables import read_points
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs
@@ -303,7 +303,7 @@ def test_an_internal_fault_is_not_swallowed(folder, monkeypatch, capsys):
     def fault(*_, **__):
         raise ValueError("not the user's")
 
-    monkeypatch.setattr("gs_jax.io.correction.read_corrected", fault)
+    monkeypatch.setattr("gs_jax.io.camera.read_corrected", fault)
     monkeypatch.setattr(sys, "argv", ["gs-jax", *RECONSTRUCT, "-o", "v.tif"])
     with pytest.raises(ValueError, match="not the user's"):
         main()

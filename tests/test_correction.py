@@ -9,9 +9,17 @@ import tifffile
 
 from gs_jax import Grid, Sensor, backproject, read_capture, read_design
 from gs_jax.base.errors import InputError
-from gs_jax.io.bad_pixels import hot_in_capture, hot_in_dark, repaired
-from gs_jax.io.correction import Correction, correct, gain_of, read_corrected, saturated
-from gs_jax.io.readout import Readout
+from gs_jax.io.camera import (
+    Correction,
+    Readout,
+    correct,
+    gain_of,
+    hot_in_capture,
+    hot_in_dark,
+    read_corrected,
+    repaired,
+    saturated,
+)
 
 from .helpers import CAPTURES, scene
 

@@ -23,8 +23,8 @@ from PIL import Image
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.disk import atomic_write, check_output, read_table, write_json
-from gs_jax.io.points import POINTS_HEADER, read_points, write_points
+from gs_jax.io.files import atomic_write, check_output, write_json
+from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_table, write_points
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import examples, needs
@@ -313,7 +313,7 @@ def test_plain_tables_are_read_as_all_others(tmp_path, header, lines, end):
     path.write_text(header + end.join(lines), encoding="utf-8", newline="")
     found = read_or_refusal(path)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gs_jax.io.disk._plain_table", lambda *_: None)
+        patch.setattr("gs_jax.io.point_tables._plain_table", lambda *_: None)
         assert read_or_refusal(path) == found
 
 

@@ -22,9 +22,8 @@ from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
 from gs_jax.grid import Grid
 from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.disk import atomic_write, write_json, write_text
-from gs_jax.io.figures import write_figure
-from gs_jax.io.points import write_points
+from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
+from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.mold.mask import Mask, write_mask
 from gs_jax.mold.mesh_files import Mesh, write_mesh
@@ -200,9 +199,9 @@ BUSY = f"""
 import ctypes, gs_jax.__main__ as cli
 from gs_jax.design.design import read_design, write_design
 from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.disk import atomic_write, write_json, write_text
-from gs_jax.io.figures import write_figure
-from gs_jax.io.points import write_points
+from gs_jax.io.files import atomic_write, write_json, write_text
+from gs_jax.io.files import write_figure
+from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.mold.mask import Mask, write_mask
 from gs_jax.mold.mesh_files import Mesh, write_mesh
@@ -270,7 +269,7 @@ def test_help_says_what_each_command_does():
 
 
 def test_what_is_being_written_is_removed_with_the_process(tmp_path):
-    from gs_jax.io.disk import remove_temporaries
+    from gs_jax.io.files import remove_temporaries
 
     with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.json") as temporary:
         temporary.write_text("{")

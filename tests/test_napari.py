@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid
-from gs_jax.io.points import write_points
+from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.reconstruction import pipeline
 

@@ -8,7 +8,7 @@ import sys
 import psutil
 import pytest
 
-from gs_jax.base import memory, progress as module
+from gs_jax.base import machine as memory, progress as module
 from gs_jax.base.progress import QUIET, VERBOSE, Ended, Progress, Watched, shown
 
 from .test_cli import RECONSTRUCT, folder

@@ -11,7 +11,7 @@ from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.napari import reader
-from gs_jax.io.points import read_points, write_points
+from gs_jax.io.point_tables import read_points, write_points
 from gs_jax.io.provenance import made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.io.weights import read_weights, write_weights

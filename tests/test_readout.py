@@ -19,7 +19,8 @@ from gs_jax import (
     read_points,
 )
 from gs_jax.base.errors import InputError
-from gs_jax.io.readout import PATTERNS, Readout, channel_of
+from gs_jax.io.camera import Readout
+from gs_jax.io.captures import PATTERNS, channel_of
 
 from .helpers import CAPTURES, scene
 

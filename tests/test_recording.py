@@ -16,7 +16,7 @@ import zarr
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.io import ngff, volume_series
+from gs_jax.io import volume_series, volumes as ngff
 from gs_jax.io.captures import Wanted
 from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
@@ -369,7 +369,7 @@ def test_memory_is_flat(folder):
     code = (
         "import sys; sys.argv = ['gs-jax', *sys.argv[1:]]\n"
         "from gs_jax.__main__ import main\n"
-        "from gs_jax.base.memory import most_memory\n"
+        "from gs_jax.base.machine import most_memory\n"
         "try:\n    main()\nfinally:\n    print(most_memory())"
     )
     peaks = []

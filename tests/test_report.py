@@ -17,7 +17,7 @@ from gs_jax.apps.report.page import write_report
 from gs_jax.base.errors import InputError
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
-from gs_jax.io.points import write_points
+from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.pictures.encode import thinned
 from gs_jax.pictures.planes import slices

@@ -8,7 +8,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.detection.locate import find_points
 from gs_jax.io.captures import read_capture
-from gs_jax.io.points import read_points
+from gs_jax.io.point_tables import read_points
 from gs_jax.metrics import localization
 
 from .helpers import CAPTURES

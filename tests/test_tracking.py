@@ -10,7 +10,7 @@ import tifffile
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 from gs_jax.detection.tracking import MISSING, linked
-from gs_jax.io.points import read_points
+from gs_jax.io.point_tables import read_points
 
 from .test_cli import folder, run
 from .test_recording import command

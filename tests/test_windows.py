@@ -5,7 +5,7 @@ from pathlib import Path, PureWindowsPath
 
 import pytest
 
-from gs_jax.io.disk import _temporary_beside
+from gs_jax.io.files import _temporary_beside
 
 from .test_imports import MODULES, names
 

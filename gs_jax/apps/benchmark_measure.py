@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..base.memory import status_mib
+from ..base.machine import status_mib
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:

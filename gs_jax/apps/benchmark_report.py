@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..base.info import describe
-from ..base.style import line_of
-from ..io.disk import atomic_write, write_json, write_text
-from ..io.figures import write_figure
+from ..base.machine import describe
+from ..io.files import atomic_write, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
+from ..pictures.style import line_of
 from .method_benchmark import STEPS, slopes
 
 COLUMNS = (

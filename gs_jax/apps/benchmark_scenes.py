@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from skimage.feature import peak_local_max
 
-from ..base.precision import in_float32
+from ..base.arrays import in_float32
 from ..base.progress import Progress
 from ..design.builtin import geomscope
 from ..geometry import Imager, Sensor

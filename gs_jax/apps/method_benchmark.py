@@ -24,7 +24,7 @@ import lineax as lx
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.info import available_memory
+from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..detection.clustering import find_clusters
 from ..detection.locate import find_points

@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from .memory import most_memory
+from .machine import most_memory
 
 # Seconds between two lines; what takes longer than a minute is announced.
 _EVERY, _LONG = 10.0, 60.0

@@ -13,7 +13,7 @@ from ..design.checks import reach
 from ..design.design import Design
 from ..design.tables import CalibrationTable
 from ..io.provenance import Provenance
-from ..io.tables import one_line
+from ..io.toml import one_line
 from .fit import Calibration
 
 # Length of the longest arrow in a picture, in sides of the sensor.

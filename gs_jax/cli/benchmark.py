@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..io.disk import make_folder
+from ..io.files import make_folder
 from .files import provenance_of
 from .interrupt import PARTIAL, kept
 

@@ -6,7 +6,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.disk import check_output
+from ..io.files import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN
@@ -77,8 +77,8 @@ def command(
     from ..calibration.sources import Sources
     from ..calibration.unknowns import FITTED
     from ..design.design import read_design, write_design
-    from ..io.figures import write_figure
-    from ..io.positions import read_positions
+    from ..io.files import write_figure
+    from ..io.point_tables import read_positions
     from ..reconstruction.pipeline import voxel_grid
 
     if from_scene == (positions is not None) or (from_scene and (find_lenses or len(captures) > 1)):

@@ -84,8 +84,7 @@ class CaptureOptions:
     """What the options say, and what was done to the captures that were read with them."""
 
     def __init__(self, page=None, channel=None, bayer=None, roi=None, binning=1, *, dark, flat, bad_pixels, offset):
-        from ..io.correction import Correction
-        from ..io.readout import Readout
+        from ..io.camera import Correction, Readout
 
         self.page, self.readout = page, Readout(roi, binning, bayer, channel)
         mask = bad_pixels if bad_pixels in ("auto", "none") else Path(bad_pixels)
@@ -111,7 +110,7 @@ class CaptureOptions:
 
     def read(self, path: Path, *, is_spot: bool = False):
         """The image of a capture, corrected; of one spot, the mean of all pages, and no pixel of it is too sharp."""
-        from ..io.correction import read_corrected
+        from ..io.camera import read_corrected
 
         page, correction = self.page, self.correction
         if is_spot:
@@ -130,8 +129,8 @@ class CaptureOptions:
         """
         import numpy as np
 
+        from ..io.camera import prepare, read_frame
         from ..io.captures import Wanted
-        from ..io.correction import prepare, read_frame
 
         shape, readout = self.readout.region(self.sensor).shape, self.readout
         wanted = Wanted(shape, None, readout.channel, readout.bayer)

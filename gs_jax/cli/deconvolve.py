@@ -6,7 +6,7 @@ import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..io.disk import check_output
+from ..io.files import check_output
 from .captures import CaptureOptions, picture_options
 from .files import check_may_write, provenance_of
 from .options import Number

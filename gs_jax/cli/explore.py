@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from ..base.progress import Progress
-from ..io.disk import check_output
+from ..io.files import check_output
 from .files import provenance_of
 from .options import DESIGN
 

@@ -22,7 +22,7 @@ def command(file: Path | None, designs: bool):
 
         found = read_provenance(file) or {"provenance": f"{file} says nothing of where it comes from."}
     else:
-        from ..base.info import describe
+        from ..base.machine import describe
 
         found = describe()
     width = max(map(len, found))

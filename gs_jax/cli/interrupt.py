@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..io.disk import remove_temporaries
+from ..io.files import remove_temporaries
 
 # Seconds that Python has to end by itself: to close files, and to say what it wants to say.
 PATIENCE = 1.0

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from ..io.disk import check_output
+from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
 from .options import MM
 

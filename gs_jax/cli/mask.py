@@ -20,7 +20,7 @@ def command(design: Path, output: Path):
     in mm, GDSII in um (it needs `pip install 'gs-jax[gds]'`). Beside the drawing, .json says where it comes from.
     """
     from ..design.design import design_text, read_design
-    from ..io.disk import check_output
+    from ..io.files import check_output
     from ..mold.mask import MASK_SUFFIXES, mask_plan, write_mask
 
     check_output(output, MASK_SUFFIXES)

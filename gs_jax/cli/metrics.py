@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from ..io.disk import check_output, write_json
+from ..io.files import check_output, write_json
 from .files import check_may_write
 from .options import DESIGN, UM, Depths
 

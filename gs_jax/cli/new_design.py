@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from ..base.errors import InputError, errors_name_file
-from ..io.disk import check_output
+from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
 
 # Options that are keys of the file, by the place of the key. In the order in which they are asked for.
@@ -99,7 +99,7 @@ def command(output: Path, centers: Path | None, name: str | None, force: bool, *
     """
     from ..design.design import checked_design
     from ..design.keys import commented
-    from ..io.disk import write_text
+    from ..io.files import write_text
 
     check_output(output, [".toml"])
     check_may_write(output, inputs=(centers,), force=force)

@@ -6,7 +6,7 @@ import click
 
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..io.disk import check_output, make_folder, write_json
+from ..io.files import check_output, make_folder, write_json
 from .files import check_may_write, provenance_of
 from .interrupt import PARTIAL, kept
 from .options import worker_options
@@ -29,7 +29,7 @@ def command(study: Path, out: Path, workers: Workers):
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
     from ..codesign.study import parent_path, read_study
     from ..design.design import design_text, read_design
-    from ..io.figures import write_figure
+    from ..io.files import write_figure
     from ..io.provenance import KEY
 
     # Searches end within a billionth of the minimum; single precision stops far from it.

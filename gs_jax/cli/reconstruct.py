@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..io.disk import check_output
+from ..io.files import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, SUPPRESSIONS, UM, Depths, Number, depth_range, worker_options
@@ -186,7 +186,7 @@ def command(
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=design_text(microscope)))
             write_volume(output, volume, grid, provenance)
             if points and found is not None:
-                from ..io.points import write_points
+                from ..io.point_tables import write_points
 
                 write_points(points, found, evidence, provenance=provenance)
     camera.say()

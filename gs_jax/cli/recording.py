@@ -121,8 +121,8 @@ def reconstruct_recording(
 
     `making`, `again`: as for `frames_of`; they can be pickled.
     """
-    from ..io.ngff import plain_depths
     from ..io.volume_series import VolumeSeries
+    from ..io.volumes import plain_depths
     from ..reconstruction.recording import reconstruct_frames, reconstruct_frames_by
 
     if workers.elsewhere:
@@ -200,7 +200,7 @@ def _request(names, provenance) -> dict[str, str]:
 def _write_points(path, series, track, provenance) -> str:
     """Writes the points of all frames, and gives their number, and that of particles, in words."""
     from ..detection.tracking import tracked
-    from ..io.points import write_points_in_time
+    from ..io.point_tables import write_points_in_time
 
     points, particles = 0, 0
 

@@ -6,7 +6,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.disk import check_output
+from ..io.files import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, provenance_of
 from .options import DESIGN
@@ -56,7 +56,7 @@ def command(
 
         given["volume"], given["grid"] = read_volume(volume)
     if points:
-        from ..io.points import read_points
+        from ..io.point_tables import read_points
 
         given["points"] = read_points(points)
     if capture:

@@ -7,7 +7,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.disk import check_output
+from ..io.files import check_output
 from .files import check_may_write, provenance_of
 from .options import DESIGN, PSFS, SIMULATED, Number
 

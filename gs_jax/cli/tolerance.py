@@ -8,7 +8,7 @@ import click
 from ..apps.tolerance.tolerance_spec import Tolerances
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.disk import check_output, write_json
+from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
 from .options import DESIGN, UM, Depths, Number
 
@@ -70,8 +70,8 @@ def command(
     from ..apps.tolerance.tolerance_analysis import tolerance
     from ..apps.tolerance.tolerance_report import as_json, picture, sentences, tables
     from ..design.design import design_text, read_design
-    from ..io.figures import write_figure
-    from ..io.positions import read_positions
+    from ..io.files import write_figure
+    from ..io.point_tables import read_positions
     from ..io.provenance import KEY
 
     # Least squares of a few numbers in many steps: single precision leaves micrometres.

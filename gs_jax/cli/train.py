@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..io.disk import check_output, write_json
+from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
 from .interrupt import RESUMABLE, kept
 from .options import worker_options

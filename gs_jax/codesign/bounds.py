@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..base.converters import as_float
+from ..base.arrays import as_float
 
 # How near to a bound a start may be, as a fraction of the range: on the bound the map has no slope, and no way back.
 _NEAREST = 0.01

@@ -12,7 +12,7 @@ import equinox as eqx
 
 from ..base.errors import InputError
 from ..design.design import Design
-from ..io.disk import atomic_write, check_input, decoding
+from ..io.files import atomic_write, check_input, decoding
 from .solve import State
 from .study import Study
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.safe import safe_sqrt
+from ..base.arrays import safe_sqrt
 from ..design.microscope import Microscope
 from ..geometry import envelope
 from .transfer import PLACE, directions, lit_density, transfer_power

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..base.arrays import safe_sqrt
 from ..base.errors import short_repr
-from ..base.safe import safe_sqrt
 from ..design.microscope import Microscope
 from ..design.spots import encircled_radius, field_heights, psf_width
 from ..optics import aberrations, theory

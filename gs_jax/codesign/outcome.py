@@ -12,13 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
-from ..base.style import PALETTE
 from ..design.checks import of_each
 from ..design.design import Design, write_design
-from ..io.disk import check_output, write_json
-from ..io.figures import write_figure
+from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import kinds
+from ..pictures.style import PALETTE
 from .objectives import TERMS, unit_of
 from .search import Outcome, PathLike
 from .stages import best_end

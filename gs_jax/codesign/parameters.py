@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 from pydantic import ValidationError
 
-from ..base.converters import as_float
+from ..base.arrays import as_float
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
 from ..design.checks import plate_as_air
 from ..design.design import Design
 from ..design.microscope import Microscope
 from ..geometry import Imager
-from ..io.tables import one_line
+from ..io.toml import one_line
 from ..lenses import EACH, type_of_lens
 from ..optics.aperture import Cells, cells_of, pitch
 from ..optics.kinds import lenses_by_kind

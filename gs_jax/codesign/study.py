@@ -27,8 +27,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, short_repr
-from ..io.disk import read_text
-from ..io.tables import Table, one_line
+from ..io.files import read_text
+from ..io.toml import Table, one_line
 from ..lenses import Orientation
 from .objectives import check_term
 from .parameters import NAMES

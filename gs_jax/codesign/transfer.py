@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.safe import safe_sqrt
+from ..base.arrays import safe_sqrt
 from ..design.microscope import Microscope
 from ..design.spots import field_heights
 from ..geometry import envelope

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from pydantic import Field, ValidationError
 
 from ..base.errors import InputError
-from ..io.columns import read_columns
-from ..io.disk import write_text
+from ..io.files import write_text
+from ..io.point_tables import read_columns
 from ..io.provenance import Provenance, write_sidecar
-from ..io.tables import Table, one_line
+from ..io.toml import Table, one_line
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000

@@ -18,8 +18,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
 from ..geometry import Imager, Sensor
-from ..io.disk import read_text, write_text
-from ..io.tables import Table, one_line
+from ..io.files import read_text, write_text
+from ..io.toml import Table, one_line
 from ..lenses import MicrolensArray
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .checks import check_whole, of_each

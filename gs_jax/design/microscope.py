@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.converters import POSITIVE, as_float, check_fields
+from ..base.arrays import POSITIVE, as_float, check_fields
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..optics import aberrations, theory

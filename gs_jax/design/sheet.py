@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from ..base.converters import as_float
+from ..base.arrays import as_float
 from ..base.errors import InputError, short_repr
 from ..layouts.cells import check_positive, nearest_neighbour_distances
 from ..optics import aberrations

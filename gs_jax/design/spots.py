@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.safe import safe_sqrt
+from ..base.arrays import safe_sqrt
 from ..geometry import envelope
 from ..optics import theory
 from ..optics.unit import pupil_disc, unit_rays

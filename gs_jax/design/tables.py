@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field, Tag
 
 from ..geometry import LONGEST, SHORTEST
-from ..io.tables import EACH, ONE, Table, one_or_each
+from ..io.toml import EACH, ONE, Table, one_or_each
 from ..lenses import Orientation
 from .centers import MAX_LENSES
 

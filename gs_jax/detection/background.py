@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-from ..base.threads import in_threads
+from ..base.machine import in_threads
 
 # Side of the squares that have one background and one noise, pixels: wider than a spot, narrower than haze. As many
 # rows are in a band.

@@ -19,14 +19,15 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from ..base.errors import InputError, short_repr
-from .disk import atomic_write, check_input, check_output, decoding
+from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance, write_sidecar
-from .readout import CHANNELS, channel_of, sites
 from .tiff import declared_mosaic, decode_plane, decode_png, page_count
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
 
 MAX_PIXELS = 10**9
+CHANNELS = ("red", "green", "blue")
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 DTYPES = ("uint8", "uint16", "float32")
 _RGB, _MOSAIC = "colour (RGB)", 32803
 _COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
@@ -67,7 +68,7 @@ def read_capture(
         "red", "green" or "blue" of a colour image, or of the mosaic that `bayer` says it is.
     bayer
         Colours of the first pixels of a mosaic, row by row, such as "RGGB"; the capture is then of its cells of 2 x 2
-        pixels, as `gs_jax.io.readout.Readout` says, and its pixels are where `Readout.sensor` says.
+        pixels, as `gs_jax.io.camera.Readout` says, and its pixels are where `Readout.sensor` says.
 
     Raises
     ------
@@ -329,3 +330,28 @@ _FORMATS = {
     ".npy": _Format(_read_npy, _write_npy),
 }
 CAPTURE_SUFFIXES = tuple(_FORMATS)
+
+
+def sites(bayer: str, channel: str | None) -> list[tuple[int, int]]:
+    """`(row, column)` in a cell of the pixels of a channel.
+
+    Raises
+    ------
+    InputError
+        If there is no such pattern or channel.
+    """
+    if bayer not in PATTERNS:
+        raise InputError(f"--bayer: found {short_repr(bayer)}, allowed: {', '.join(PATTERNS)}.")
+    if channel not in CHANNELS:
+        raise InputError(
+            f"--bayer {bayer}: found {f'--channel {channel}' if channel else 'no --channel'}, allowed: "
+            f"--channel {', '.join(CHANNELS)}."
+        )
+    return [divmod(place, 2) for place, colour in enumerate(bayer) if colour == channel[0].upper()]
+
+
+def channel_of(mosaic: Shaped[np.ndarray, "row column"], bayer: str, channel: str | None) -> Shaped[np.ndarray, "y x"]:
+    """The image of a mosaic's cells in one colour: see `Readout`. Green is float32; errors as `sites`."""
+    rows, columns = (n // 2 * 2 for n in mosaic.shape)
+    parts = [mosaic[row:rows:2, column:columns:2] for row, column in sites(bayer, channel)]
+    return parts[0] if len(parts) == 1 else np.asarray(np.mean(parts, axis=0, dtype=np.float32))

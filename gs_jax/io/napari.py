@@ -14,10 +14,9 @@ from jaxtyping import Array, Float, Num
 
 from ..base.errors import InputError
 from ..grid import Grid
-from .points import POINTS_HEADER, read_points
-from .viewers import display_range
+from .point_tables import POINTS_HEADER, read_points
 from .volume_series import Series, read_series
-from .volumes import VOLUME_SUFFIXES, read_volume
+from .volumes import VOLUME_SUFFIXES, display_range, read_volume
 
 Layer = tuple[Any, dict[str, Any], str]
 

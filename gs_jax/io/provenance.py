@@ -21,7 +21,7 @@ from PIL import Image
 
 from .._version import __version__
 from ..base.errors import InputError, short_repr
-from .disk import check_input, decoding, read_text, write_json
+from .files import check_input, decoding, read_text, write_json
 
 Provenance = Mapping[str, str]
 

@@ -16,7 +16,7 @@ from jaxtyping import Shaped
 
 from ..base.errors import InputError
 from .captures import CAPTURE_SUFFIXES, Wanted, check_colour, check_declared, checked, frames, opened_tiff, tiff_page
-from .disk import check_input, decoding
+from .files import check_input, decoding
 
 Images = Iterator[Shaped[np.ndarray, "row column"]]
 

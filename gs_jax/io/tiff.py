@@ -9,7 +9,7 @@ import tifffile
 from PIL import Image, ImageFile
 
 from ..base.errors import InputError
-from .disk import decoding
+from .files import decoding
 
 # TIFF's number of a description, and of the tag after it, whose place a second one takes.
 _DESCRIPTION, _AFTER = 270, 271

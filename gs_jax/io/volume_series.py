@@ -20,9 +20,9 @@ from jaxtyping import Float32
 
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
-from .disk import atomic_write, decoding
-from .ngff import CHUNK, image_attributes, plain_depths, sharded
+from .files import atomic_write, decoding
 from .provenance import Provenance
+from .volumes import CHUNK, image_attributes, plain_depths, sharded
 
 JOURNAL = "frames.jsonl"
 Note = dict[str, Any]

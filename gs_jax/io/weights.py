@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..base.errors import short_repr
-from .disk import atomic_write, check_input, check_output, decoding
+from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance
 
 _MOST_BYTES = 2**27

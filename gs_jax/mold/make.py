@@ -9,8 +9,7 @@ import numpy as np
 
 from ..base.progress import Progress
 from ..design.design import Design, read_design
-from ..io.disk import atomic_write, check_output, write_json, write_text
-from ..io.figures import write_figure
+from ..io.files import atomic_write, check_output, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
 from .caps import caps_of, part_centers
 from .checks import Finding, check_design, check_solid, refuse_errors

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
-from ..io.disk import atomic_write, check_output
+from ..io.files import atomic_write, check_output
 from ..io.provenance import Provenance, write_sidecar
 from ..lenses import MicrolensArray
 from .caps import caps_of

@@ -20,7 +20,7 @@ from trimesh.exchange.stl import export_stl
 
 from .._version import __version__
 from ..base.errors import InputError
-from ..io.disk import atomic_write, check_input, check_output, decoding
+from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import KEY, Provenance
 
 # Of a file to be read back: 50 bytes a facet, a few million facets.

@@ -28,7 +28,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..base.safe import safe_quotient, safe_sqrt
+from ..base.arrays import safe_quotient, safe_sqrt
 from ..lenses import MicrolensArray
 from .theory import Real, Result
 

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..base.safe import safe_sqrt
+from ..base.arrays import safe_sqrt
 from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses that are handled at once.

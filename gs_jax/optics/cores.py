@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 
+from ..base.machine import in_threads
 from ..base.progress import Progress
-from ..base.threads import in_threads
 from ..geometry import Imager, falloff
 from .light import SpotRays, Zones, mean_zones, spot_rays
 from .psf import GOLDEN_ANGLE

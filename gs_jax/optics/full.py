@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
+from ..base.machine import in_threads
 from ..base.progress import Progress
-from ..base.threads import in_threads
 from ..geometry import Imager
 from .cores import RINGS, Cores, core_tables, drawn
 from .halo import HaloGrid, halo_grid, halo_table

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..base.safe import Real, safe_quotient
+from ..base.arrays import Real, safe_quotient
 
 Result = Float[Array, "..."]
 

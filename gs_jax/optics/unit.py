@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..base.safe import safe_sqrt
+from ..base.arrays import safe_sqrt
 from ..geometry import Imager
 from .refraction import Refraction, as_air, dot, refracted, secant, slope_in_glass
 

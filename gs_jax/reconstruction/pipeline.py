@@ -12,7 +12,7 @@ from jaxtyping import Array, Float32, Num
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
-from ..base.info import available_memory
+from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid

@@ -13,7 +13,7 @@ from ..base.progress import Progress
 from ..detection.background import between, square_levels
 from ..geometry import Imager
 from ..grid import Grid
-from ..io.readout import Readout
+from ..io.camera import Readout
 from ..optics.cores import apparent_depths
 from ..optics.full import FullOptics
 from ..optics.kinds import KindOptics, kind_weights, lenses_by_kind, of_kinds

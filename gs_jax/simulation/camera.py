@@ -10,7 +10,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from ..base.converters import NOT_NEGATIVE, POSITIVE, as_float, check_fields
+from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields
 from ..layouts.cells import Number
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.

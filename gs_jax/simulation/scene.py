@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
-from ..base.info import available_memory
+from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, Sensor
 from ..grid import Grid
-from ..io.points import read_points
+from ..io.point_tables import read_points
 from ..io.volumes import read_volume
 from ..optics.full import full_optics, halo_nodes
 from ..optics.kinds import lenses_by_kind, of_kinds, relative_areas

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num, PyTree
 
-from ..base.safe import Real, divide
+from ..base.arrays import Real, divide
 from .iteration import as_image, check_options, least_weight_of_darkness, norm
 from .variation import differences, differences_adjoint, shrink, total_variation
 

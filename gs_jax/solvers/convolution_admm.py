@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..base.safe import Real, divide, safe_sqrt
+from ..base.arrays import Real, divide, safe_sqrt
 from .admm import Prior, Splitting, advance, or_one
 from .convolution import Convolution
 from .iteration import as_image, check_options

@@ -15,8 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 
+from ..base.arrays import safe_sqrt
 from ..base.errors import InputError
-from ..base.safe import safe_sqrt
 from .convolution import Convolution
 from .unmatched import Unmatched
 

@@ -13,8 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
+from ..base.arrays import Real, divide
 from ..base.errors import InputError
-from ..base.safe import Real, divide
 from .iteration import as_image, check_options, norm
 from .unmatched import Unmatched
 from .variation import differences, differences_adjoint, magnitude

@@ -17,8 +17,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num, PRNGKeyArray
 
+from ..base.arrays import divide
 from ..base.errors import InputError
-from ..base.safe import divide
 from ..io import weights
 from ..io.provenance import Provenance
 from .iteration import as_image, check_options, norm

@@ -21,9 +21,8 @@ from ...detection.locate import find_points
 from ...detection.unet import pretrained, suppress
 from ...grid import Grid
 from ...io.captures import write_capture
-from ...io.disk import make_folder, write_json, write_text
-from ...io.figures import write_figure
-from ...io.points import write_points
+from ...io.files import make_folder, write_figure, write_json, write_text
+from ...io.point_tables import write_points
 from ...io.volumes import write_volume
 from ...metrics import localization, quality
 from ...mold.make import make_mold

@@ -26,7 +26,7 @@ from ...design.design import Design
 from ...design.microscope import Microscope
 from ...design.spots import encircled_radius, psf_width
 from ...geometry import Imager, chief_ray
-from ...io.tables import one_line
+from ...io.toml import one_line
 from ...lenses import MicrolensArray
 from ...optics import aberrations
 from ...optics.psf import GOLDEN_ANGLE, diffraction_psf, window_fraction

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from ...base.style import round_length
 from ...design.design import Design
 from ...geometry import Imager
 from ...layouts.cells import cell_edges
 from ...mold.caps import cap_sag, caps_of, surface
+from ...pictures.style import round_length
 
 # Points across a section; of a map of lenses per point, in all of the layout's outlines; points of a map at a time.
 _PROFILE, _MAP, _OUTLINE, _TOGETHER = 801, 121, 12_000, 2000

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from ...base.errors import InputError
 from ...design.design import Design, span_of
 from ...design.sheet import confusion_of
-from ...io.disk import read_text
+from ...io.files import read_text
 
 # A spot so many times wider than promised is marked, as `gs_jax.design.problems` has it in words.
 _FAR = 2.0
@@ -193,7 +193,7 @@ def origin_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def versions() -> list[tuple[str, str]]:
     """Of what made the page."""
-    from ...base.info import describe
+    from ...base.machine import describe
 
     found = describe()
     return [(name, found[name]) for name in ("gs-jax", "python", "jax", "system")]

@@ -16,7 +16,7 @@ from ...design.problems import findings
 from ...design.sheet import datasheet
 from ...geometry import Imager
 from ...grid import Grid
-from ...io.disk import check_output, write_text
+from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
 from ...pictures.encode import in_range, palette, png
 from ...pictures.planes import slices, slider

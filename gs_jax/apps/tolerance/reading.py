@@ -6,8 +6,8 @@ import tomllib
 from pydantic import ValidationError
 
 from ...base.errors import InputError
-from ...io.disk import read_text
-from ...io.tables import one_line
+from ...io.files import read_text
+from ...io.toml import one_line
 from .tolerance_spec import Tolerances
 
 

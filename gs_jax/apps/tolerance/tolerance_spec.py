@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import Field
 
-from ...io.tables import Table
+from ...io.toml import Table
 
 
 def _amount(default: float, most: float, unit: str, title: str, *, least: float = 0.0) -> Any:

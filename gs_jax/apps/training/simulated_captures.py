@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
 
-from ...base.precision import in_float32
+from ...base.arrays import in_float32
 from ...geometry import Imager, Sensor
 from ...grid import Grid
 from ...layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout

@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ...base.errors import InputError
-from ...io.disk import atomic_write, check_input, decoding
+from ...io.files import atomic_write, check_input, decoding
 
 
 class Recipe(NamedTuple):

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from ...base.progress import Progress
 from ...base.workers import Workers
 from ...detection.unet import standardized
-from ...io.disk import atomic_write, decoding, make_folder
+from ...io.files import atomic_write, decoding, make_folder
 from ...optics.cores import apparent_depths
 from ...projection.backprojection import backproject
 from .random_scenes import drawn

@@ -1,9 +1,7 @@
 """How a file is read whole, or written whole or not at all; text, tables of numbers, and JSON."""
 
 import contextlib
-import csv
 import errno
-import io
 import json
 import logging
 import math
@@ -18,9 +16,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import Float64
-
 from ..base.errors import InputError, short_repr
 
 AnyPath = TypeVar("AnyPath", bound=PurePath)
@@ -30,8 +25,6 @@ MAX_TEXT_BYTES = 2**26
 _ATTEMPTS, _PAUSE = 30, 0.05
 # What is being written.
 _TEMPORARY: set[Path] = set()
-# Of a number in a table: a float64 with all its digits and a separator has up to 25. What plain numbers are made of.
-_NUMBER_BYTES, _PLAIN = 32, b"0123456789+-.eE, \t\r\n"
 
 # What the root of an image in Zarr may hold. A store with anything else in it (labels, a plate, notes) is
 # somebody's work and is not replaced.
@@ -259,59 +252,7 @@ def _plain(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def read_table(path: str | os.PathLike[str], header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
-    """The numbers of a CSV file whose first line is `header`; without rows it is `(0, column)`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, has another header, a line with too many or too few values, a value that is not
-        a finite number, or more than `max_rows` rows.
-    """
-    names = header.split(",")
-    text = read_text(path, max(MAX_TEXT_BYTES, max_rows * len(names) * _NUMBER_BYTES))
-    if (table := _plain_table(text, header, max_rows)) is not None:
-        return table
-    lines = csv.reader(io.StringIO(text, newline=""))
-    numbers = []
-    try:
-        found = next(lines, [])
-        if found != names:
-            raise InputError(f"{path}: found the header {short_repr(','.join(found))}, allowed: {header}.")
-        for line in lines:
-            if line:
-                numbers.append(_numbers(f"{path}: line {lines.line_num}", names, line))
-            if len(numbers) > max_rows:
-                raise InputError(f"{path}: found more than {max_rows} rows below {header}, allowed: up to that many.")
-    except csv.Error as error:
-        raise InputError(f"{path}: line {lines.line_num} is not CSV below the header {header}: {error}.") from error
-    return np.array(numbers, dtype=float).reshape(-1, len(names))
-
-
-def _plain_table(text: str, header: str, max_rows: int) -> np.ndarray | None:
-    """A table of nothing but plain numbers, read fast; None if it is another, or a line of it is to be refused."""
-    first, _, body = text.partition("\n")
-    if first.rstrip("\r") != header or not body.strip() or body.encode().translate(None, _PLAIN):
-        return None
-    with contextlib.suppress(ValueError):
-        table = np.loadtxt(io.StringIO(body, newline=""), delimiter=",", ndmin=2)
-        if table.shape[1] == header.count(",") + 1 and len(table) <= max_rows and np.isfinite(table).all():
-            return table
-    return None
-
-
-def _numbers(place: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:
-    if len(cells) != len(names):
-        raise InputError(f"{place}: found {len(cells)} values, allowed: {len(names)} ({','.join(names)}).")
-    return [finite_number(f"{place}, {name}", cell) for name, cell in zip(names, cells, strict=True)]
-
-
-def finite_number(place: str, cell: str) -> float:
-    """The number that a cell of a table is; `InputError`, which names the place, if it is none."""
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or "_" in cell:  # Python reads 1_000; nobody else does
-        raise InputError(f"{place}: found {short_repr(cell)}, allowed: a finite number.")
-    return value
+def write_figure(path: str | os.PathLike[str], figure: Any) -> None:
+    """Writes a figure as PNG at its own resolution, whole or not at all; `InputError` as `check_output`."""
+    with atomic_write(check_output(path, [".png"])) as temporary:
+        figure.savefig(temporary, format="png")

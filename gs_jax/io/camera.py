@@ -11,9 +11,7 @@ from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from ..base.errors import InputError, errors_name_file
 from ..geometry import Sensor
-from .bad_pixels import hot_in_capture, hot_in_dark, repaired
-from .captures import DTYPES, averaged, frames
-from .readout import Readout, channel_of
+from .captures import DTYPES, averaged, channel_of, frames, sites
 
 # A pixel with less than this share of the flat field's median has no light to speak of.
 _LEAST_GAIN = 0.05
@@ -28,6 +26,89 @@ _PIXELS = 500_000
 MASK_DTYPES = (*DTYPES, "bool")
 # So much of a mask may be bad: more is one that marks what is good.
 _MOST_BAD = 0.5
+
+
+class Readout(NamedTuple):
+    """How a camera delivered a capture, so that the design of its whole sensor serves.
+
+    The frame stays that of the whole sensor: points and volumes have the same coordinates as from a whole capture.
+
+    Parameters
+    ----------
+    roi
+        `(row, column, rows, columns)` of the region that was read out, in pixels of the whole sensor, counted from 0.
+        None: all of it.
+    binning
+        So many pixels each way were made one, from the region's first on; what is left at its end is lost.
+    bayer
+        Colours of the capture's first pixels, row by row, where it is a mosaic: one of `PATTERNS`.
+    channel
+        Of a mosaic or a colour image: one of `CHANNELS`. Of a mosaic, an image of its cells of 2 x 2 pixels. Nothing is
+        interpolated: red and blue are the one pixel of the cell, where it is; green is the mean of the cell's two,
+        whose middle is the cell's.
+
+    Examples
+    --------
+    >>> sensor = Readout(roi=(1024, 512, 2048, 2048), binning=2).sensor(scope.sensor)
+    """
+
+    roi: tuple[int, int, int, int] | None = None
+    binning: int = 1
+    bayer: str | None = None
+    channel: str | None = None
+
+    def region(self, sensor: Sensor) -> Sensor:
+        """The pixels that the camera read out of a whole sensor: `shape` is that of the file.
+
+        Raises
+        ------
+        InputError
+            If the region is not on the sensor, less than 2 x 2 pixels are left, or the mosaic is binned.
+        """
+        row, column, rows, columns = self.roi or (0, 0, *sensor.shape)
+        if not (0 <= row <= sensor.shape[0] - rows and 0 <= column <= sensor.shape[1] - columns):
+            found = f"rows {row} to {row + rows - 1} and columns {column} to {column + columns - 1}"
+            whole = f"{sensor.shape[0]} x {sensor.shape[1]}"
+            raise InputError(f"--roi: found {found}, allowed: within the sensor of {whole} (rows x columns, from 0).")
+        if self.bayer and self.binning > 1:
+            raise InputError(
+                f"--binning {self.binning}: found --bayer {self.bayer}, allowed: a mosaic without binning."
+            )
+        return _part(sensor, (row, column), (rows, columns), self.binning)
+
+    def sensor(self, sensor: Sensor) -> Sensor:
+        """The pixels of the image that is made of such a capture; errors as `region`, or as `sites`."""
+        region = self.region(sensor)
+        if not self.bayer:
+            return region
+        cells = _part(region, (0, 0), region.shape, 2)
+        y, x = np.mean(sites(self.bayer, self.channel), axis=0)
+        x, y = (float(at - 0.5) * region.pixel_pitch + middle for at, middle in zip((x, y), cells.origin, strict=True))
+        return Sensor(cells.shape, cells.pixel_pitch, (x, y))
+
+    def words(self) -> list[str]:
+        """What was read out, a line each."""
+        said = []
+        if self.channel:
+            mosaic = f"the mosaic {self.bayer}, an image of its cells of 2 x 2 pixels"
+            said.append(f"{self.channel} of {mosaic if self.bayer else 'a colour image'}")
+        if self.roi:
+            row, column, rows, columns = self.roi
+            said.append(f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1} of the sensor")
+        if self.binning > 1:
+            said.append(f"pixels binned {self.binning} x {self.binning}")
+        return said
+
+
+def _part(sensor: Sensor, first: tuple[int, int], shape: tuple[int, int], side: int) -> Sensor:
+    """Squares of `side` pixels, as many as fit whole into the part of a sensor that begins at `first`."""
+    count = tuple(n // side for n in shape)
+    if min(count) < 2:
+        found = f"{count[0]} x {count[1]} pixels that are left"
+        raise InputError(f"--roi, --binning: found {found}, allowed: 2 x 2 or more.")
+    middle = [at + n * side / 2 - whole / 2 for at, n, whole in zip(first, count, sensor.shape, strict=True)]
+    y, x = (at * sensor.pixel_pitch + origin for at, origin in zip(middle, sensor.origin[::-1], strict=True))
+    return Sensor(count, side * sensor.pixel_pitch, (x, y))
 
 
 class Correction(NamedTuple):
@@ -300,3 +381,78 @@ def _counted(bad, where, counted):
     if count := int(bad.sum()):
         counted.append(f"{count} {where}")
     return bad
+
+
+# A pixel of a dark frame is hot if it is so many standard deviations brighter than the median of its neighbourhood of
+# 5 x 5; a count is rounded by half of one.
+_HOT, _ROUNDING = 10.0, 0.5
+# In a capture, a pixel is hot if it is brighter than all is dark by so many standard deviations, and none of its eight
+# neighbours has more than this share of what it has. In 24 ray-traced captures of points, whose spots are a pixel wide
+# at half their height, the brightest neighbour of a spot has 7 % or more, binned or not.
+_BRIGHT, _NEIGHBOUR = 100.0, 0.03
+
+
+def hot_in_dark(dark: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "row column"]:
+    """Which pixels of a dark frame are hot. Slow changes over the sensor, as an amplifier's glow, do not count."""
+    dark = np.asarray(dark, np.float32)
+    middle = float(np.median(dark))
+    deviation = max(1.4826 * float(np.median(np.abs(dark - middle))), _ROUNDING)
+    hot = dark > middle + _HOT * deviation
+    for some in _in_parts(np.argwhere(hot)):
+        local = np.median(_around(dark, some, 2), axis=1)
+        hot[tuple(some.T)] = dark[tuple(some.T)] > local + _HOT * deviation
+    return hot
+
+
+def hot_in_capture(image: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "row column"]:
+    """Which single pixels of a capture no light can have made: a spot, however sharp, shows in its neighbours.
+
+    Pixels that have their neighbours beside them; not those of a mosaic. It finds only what is far above the noise.
+    """
+    image = np.asarray(image)
+    # Levels of a part of the pixels are as good.
+    some = np.asarray(image[::3, ::3], np.float32)
+    level = float(np.median(some))
+    noise = float(np.sqrt(2 * np.mean(np.minimum(some - level, 0) ** 2)))
+    # Images without noise have bright pixels, too.
+    least = (float(image.max()) - level) / 100 if image.dtype.kind == "f" else _BRIGHT * _ROUNDING
+    hot = image > level + max(_BRIGHT * noise, least)
+    for some in _in_parts(np.argwhere(hot)):
+        brightest = np.delete(_around(image, some, 1), 4, axis=1).max(1)
+        hot[tuple(some.T)] = brightest - level < _NEIGHBOUR * (image[tuple(some.T)] - level)
+    return hot
+
+
+def repaired(
+    image: Num[np.ndarray, "row column"], bad: Bool[np.ndarray, "row column"]
+) -> Float32[np.ndarray, "row column"]:
+    """An image with bad pixels filled by the median of their good neighbours of 3 x 3, larger defects from their edge.
+
+    Raises
+    ------
+    ValueError
+        If there is no good pixel.
+    """
+    image, bad = np.array(image, np.float32), bad.copy()
+    if bad.all():
+        raise ValueError("`bad` must leave a pixel, got none.")
+    places = np.argwhere(bad)
+    while len(places):
+        near = np.where(_around(bad, places, 1), np.nan, _around(image, places, 1))
+        reached = ~np.isnan(near).all(1)
+        filled = tuple(places[reached].T)
+        image[filled], bad[filled] = np.nanmedian(near[reached], axis=1), False
+        places = places[~reached]
+    return image
+
+
+def _in_parts(places):
+    """A few at a time, for the memory of their neighbourhoods."""
+    return np.array_split(places, len(places) // 100_000 + 1)
+
+
+def _around(image, places, reach):
+    """The pixels of the square around each place, `(place, pixel)`; at the image's edge, the edge's."""
+    offsets = np.stack(np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"), -1).reshape(1, -1, 2)
+    near = np.clip(places[:, None] + offsets, 0, np.array(image.shape) - 1)
+    return image[near[..., 0], near[..., 1]]
