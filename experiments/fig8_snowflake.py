@@ -27,7 +27,7 @@ from scipy.ndimage import gaussian_filter
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from experiments.true_image import bars, strokes
 from gs_jax import Grid, Imager
-from gs_jax.apps.demo.scene import words
+from gs_jax.apps.example_pipeline import words
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.unet import pretrained, suppress

@@ -22,19 +22,20 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
+from gs_jax.mold.export import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold.make import draw_solid
 from gs_jax.mold.measurement import quality, verify
-from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold.pictures import draw_solid
 from gs_jax.mold.solids import (
     MoldShape,
     array_solid,
+    array_volume,
     cast_solid,
     engravings,
     mold_block,
     mold_solid,
+    mold_volume,
     plate_thickness,
 )
-from gs_jax.mold.volumes import array_volume, mold_volume
 
 CENTERS = Path(__file__).parents[2] / "shared/data/oracle/dev/P1.toml"
 CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)

@@ -19,7 +19,7 @@ from .layouts.patterns import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
-from .pictures.projections import show as show
+from .pictures.volume_pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward
 from .projection.levels import optics_of as optics_of

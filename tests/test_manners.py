@@ -25,8 +25,7 @@ from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
-from gs_jax.mold.mask import Mask, write_mask
-from gs_jax.mold.mesh_files import Mesh, write_mesh
+from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
 from gs_jax.optics.window import PSFS
 from gs_jax.projection.levels import LEVELS
 from gs_jax.reconstruction.deconvolution import TV
@@ -203,8 +202,8 @@ from gs_jax.io.files import atomic_write, write_json, write_text
 from gs_jax.io.files import write_figure
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
-from gs_jax.mold.mask import Mask, write_mask
-from gs_jax.mold.mesh_files import Mesh, write_mesh
+from gs_jax.mold.export import Mask, write_mask
+from gs_jax.mold.export import Mesh, write_mesh
 def busy(*_, **__):
     with atomic_write("half.tif") as temporary:
         temporary.write_bytes(b"half")

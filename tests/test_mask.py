@@ -12,7 +12,7 @@ from ezdxf.filemanagement import readfile
 from gs_jax import InputError, MicrolensArray
 from gs_jax.__main__ import commands
 from gs_jax.io.provenance import read_provenance
-from gs_jax.mold.mask import mask_plan, write_mask
+from gs_jax.mold.export import mask_plan, write_mask
 from gs_jax.mold.solids import MoldShape, mark_plans, mold_block
 
 DESIGNS = Path(__file__).parents[1] / "design"

@@ -12,21 +12,24 @@ from hypothesis import given, settings, strategies as st
 from gs_jax import MicrolensArray
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.mold.caps import cap_sag, caps_of, surface
-from gs_jax.mold.checks import check_solid
+from gs_jax.mold.export import printable
+from gs_jax.mold.lenslets import cap_sag, caps_of, surface
+from gs_jax.mold.manufacturability import check_solid
 from gs_jax.mold.measurement import verify
-from gs_jax.mold.mesh_files import printable
 from gs_jax.mold.solids import (
     ENGRAVED,
     MoldShape,
     array_solid,
+    array_volume,
+    caps_volume,
     cast_solid,
     engravings,
     mold_block,
     mold_solid,
+    mold_volume,
     plate_thickness,
+    volume_tolerance,
 )
-from gs_jax.mold.volumes import array_volume, caps_volume, mold_volume, volume_tolerance
 
 from .helpers import aperture_edge, needs
 

@@ -9,12 +9,11 @@ import trimesh
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
-from gs_jax.mold.checks import check_solid
+from gs_jax.mold.export import Mesh, printable, read_mesh, write_mesh
 from gs_jax.mold.make import judge
+from gs_jax.mold.manufacturability import check_solid
 from gs_jax.mold.measurement import quality, verify
-from gs_jax.mold.mesh_files import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold.solids import MoldShape, array_solid, engravings, mold_block, mold_solid
-from gs_jax.mold.volumes import array_volume
+from gs_jax.mold.solids import MoldShape, array_solid, array_volume, engravings, mold_block, mold_solid
 
 from .test_mold import CHORD, lenses, random_lenses
 

@@ -12,16 +12,22 @@ from scipy.integrate import quad
 
 from gs_jax import MicrolensArray
 from gs_jax.design.design import Design
-from gs_jax.mold.caps import DRAFT, Cap, cap_sag, caps_of, visible_reaches
-from gs_jax.mold.checks import check_design, check_solid
-from gs_jax.mold.facets import facet_cap
-from gs_jax.mold.make import judge, make_mold
-from gs_jax.mold.mask import mask_plan
+from gs_jax.mold.export import mask_plan, printable
+from gs_jax.mold.lenslets import DRAFT, Cap, cap_sag, caps_of, facet_cap, visible_reaches
+from gs_jax.mold.make import judge, make_mold, preview
+from gs_jax.mold.manufacturability import check_design, check_solid
 from gs_jax.mold.measurement import quality, verify
-from gs_jax.mold.mesh_files import printable
-from gs_jax.mold.pictures import preview
-from gs_jax.mold.solids import MoldShape, array_solid, coarsest_chord, mold_solid, plate_thickness
-from gs_jax.mold.volumes import array_volume, caps_volume, mold_volume, volume_tolerance
+from gs_jax.mold.solids import (
+    MoldShape,
+    array_solid,
+    array_volume,
+    caps_volume,
+    coarsest_chord,
+    mold_solid,
+    mold_volume,
+    plate_thickness,
+    volume_tolerance,
+)
 
 from .test_mold_files import behind
 from .test_mold_report import design

@@ -16,10 +16,9 @@ from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
 from gs_jax.layouts.cells import coverage
 from gs_jax.mold import make
-from gs_jax.mold.checks import Finding, check_design, refuse_errors
 from gs_jax.mold.make import make_mold
-from gs_jax.mold.solids import MoldShape, plate_thickness
-from gs_jax.mold.volumes import array_volume
+from gs_jax.mold.manufacturability import Finding, check_design, refuse_errors
+from gs_jax.mold.solids import MoldShape, array_volume, plate_thickness
 
 DESIGN = """
 name = "small $x"

@@ -15,7 +15,7 @@ from gs_jax.io.point_tables import read_points, write_points
 from gs_jax.io.provenance import made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.io.weights import read_weights, write_weights
-from gs_jax.mold.mesh_files import Mesh, read_mesh, write_mesh
+from gs_jax.mold.export import Mesh, read_mesh, write_mesh
 
 ORIGIN = {"software": "gs_jax 1", "command": "gs-jax 'a <b> & \"c\"'", "design": 'name = "µ"\n\n[sensor]\n'}
 VOXELS = np.random.default_rng(0).random((3, 5, 4), np.float32)

@@ -11,16 +11,15 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.apps.report import device, facts, spots, views
-from gs_jax.apps.report.chart import line_chart
+from gs_jax.apps.report import drawings, report_tables, views
+from gs_jax.apps.report.drawings import line_chart
 from gs_jax.apps.report.page import write_report
 from gs_jax.base.errors import InputError
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
-from gs_jax.pictures.encode import thinned
-from gs_jax.pictures.planes import slices
+from gs_jax.pictures.volume_pictures import slices, thinned
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run
@@ -201,7 +200,7 @@ def test_wrong_input_is_one_line(made, tmp_path, monkeypatch, capsys, arguments,
 
 def test_tolerances_of_another_kind_are_refused():
     with pytest.raises(InputError, match="gs-jax tolerance"):
-        facts.tolerance_facts(TOLERANCE | {"drawn": {}})
+        report_tables.tolerance_facts(TOLERANCE | {"drawn": {}})
 
 
 @pytest.mark.parametrize(
@@ -215,7 +214,7 @@ def test_tolerances_of_another_kind_are_refused():
     ],
 )
 def test_folders_are_left_out(text, kept):
-    assert facts.without_folders(text) == kept
+    assert report_tables.without_folders(text) == kept
 
 
 def test_the_largest_volumes_stay_small():
@@ -246,7 +245,7 @@ def test_the_cloud_is_where_the_voxels_are():
 def test_lenses_that_see_a_point():
     """Counted one by one, at some points."""
     imager = geomscope().imager()
-    seen = device.lenses_seen(imager, 20.0)
+    seen = drawings.lenses_seen(imager, 20.0)
     left, top, right, bottom = seen.box
     rows, columns = seen.lenses.shape
     for row, column in ((0, 0), (60, 60), (100, 17)):
@@ -263,9 +262,9 @@ def test_the_contrast_of_a_perfect_lens():
     data["lens"] |= {"focal_length_mm": 4.6, "aperture_diameter_mm": 0.3}
     imager = type(design).model_validate(data).imager()
     depth = 1 / (1 / 4.6 - 1 / 5.8) - 1 / 1.43
-    found = spots.spots_of(imager, np.array([depth]), 0.3, 0.05)
-    curve = spots.contrast(found.images[0, 0], float(found.caught[0, 0]), 0.0045, float(imager.magnification(depth)))
-    ideal = spots.perfect(curve.frequency, imager, depth, 0.3)
+    found = drawings.spots_of(imager, np.array([depth]), 0.3, 0.05)
+    curve = drawings.contrast(found.images[0, 0], float(found.caught[0, 0]), 0.0045, float(imager.magnification(depth)))
+    ideal = drawings.perfect(curve.frequency, imager, depth, 0.3)
     # Light beside the window, and a pupil of squares.
     np.testing.assert_allclose(curve.contrast, ideal.contrast, atol=0.02)
 

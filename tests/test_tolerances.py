@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
-from gs_jax.apps.report.facts import tolerance_facts
+from gs_jax.apps.report.report_tables import tolerance_facts
 from gs_jax.apps.tolerance.depth_recovery import Bench, bench_of, depth_errors
 from gs_jax.apps.tolerance.device_model import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
 from gs_jax.apps.tolerance.images import log_sharpness

@@ -9,7 +9,7 @@ from matplotlib import pyplot as plt
 from matplotlib.patches import Circle
 
 import gs_jax as gs
-from gs_jax.mold.mask import mask_plan
+from gs_jax.mold.export import mask_plan
 from gs_jax.mold.solids import MoldShape
 
 LENSES = 40

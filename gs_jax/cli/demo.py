@@ -11,7 +11,7 @@ from ..base.progress import Progress
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
 def command(out: Path):
     """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
-    from ..apps.demo.story import run
+    from ..apps.example_pipeline import run
 
     with Progress() as progress:
         report = run(out, progress)

@@ -21,7 +21,7 @@ def command(design: Path, output: Path):
     """
     from ..design.design import design_text, read_design
     from ..io.files import check_output
-    from ..mold.mask import MASK_SUFFIXES, mask_plan, write_mask
+    from ..mold.export import MASK_SUFFIXES, mask_plan, write_mask
 
     check_output(output, MASK_SUFFIXES)
     check_may_write(output, inputs=(design,))

@@ -44,8 +44,8 @@ def command(
     check_may_write(output, inputs=(design, volume, points, capture, tolerance, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
         raise InputError(f"{volume}: found it in the place of VOLUME, allowed: .ome.tif or .zarr; points by --points.")
-    from ..apps.report.facts import read_tolerance
     from ..apps.report.page import write_report
+    from ..apps.report.report_tables import read_tolerance
     from ..design.design import design_text, read_design
     from ..io.provenance import read_provenance
 

@@ -12,9 +12,8 @@ from jaxtyping import Float, Int
 
 from ..geometry import Imager
 from ..lenses import MicrolensArray
-from .caps import Cap, caps_of, part_centers, surface
-from .facets import NODES, WEIGHTS
-from .mesh_files import Mesh
+from .export import Mesh
+from .lenslets import NODES, WEIGHTS, Cap, caps_of, part_centers, surface
 
 # A facet belongs to a lens if its corners are so close to the lens's surface and its normal so close to the surface's.
 _NEAR = 0.02

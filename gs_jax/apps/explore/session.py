@@ -10,9 +10,8 @@ import numpy as np
 from ...base.errors import InputError
 from ...codesign.study import Study
 from ...design.design import Design, write_design
-from ...pictures.encode import in_range, png
-from ..report.chart import line_chart
-from ..report.device import layout
+from ...pictures.volume_pictures import in_range, png
+from ..report.drawings import layout, line_chart
 from ..report.page import render
 from .evaluation import (
     SPOT_DEPTHS,

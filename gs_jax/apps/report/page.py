@@ -18,10 +18,9 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
-from ...pictures.encode import in_range, palette, png
-from ...pictures.planes import slices, slider
-from . import device, facts, spots, views
-from .chart import line_chart
+from ...pictures.volume_pictures import in_range, palette, png, slices, slider
+from . import drawings, report_tables, views
+from .drawings import line_chart
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
@@ -81,7 +80,7 @@ def write_report(
     path, progress = check_output(path, [".html"]), progress or Progress()
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
-    tolerances = facts.tolerance_facts(tolerance) if tolerance else None
+    tolerances = report_tables.tolerance_facts(tolerance) if tolerance else None
     said = dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {})
     context: dict[str, Any] = {"design": design, "notes": said, "paper": PAPER}
     context["colours"] = {name: palette(name) for name in ("magma", "viridis")}
@@ -125,14 +124,14 @@ def _asset(folder: str, name: str) -> str:
 
 def _made_of(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     own = {key: value for key, value in design.provenance.items() if not key.startswith("calibrated_")}
-    tables = {"this page": facts.origin_rows(provenance or {}), "the design": facts.origin_rows(own)}
-    tables |= {facts.name_of(name): facts.origin_rows(found) for name, found in origins.items()}
+    tables = {"this page": report_tables.origin_rows(provenance or {}), "the design": report_tables.origin_rows(own)}
+    tables |= {report_tables.name_of(name): report_tables.origin_rows(found) for name, found in origins.items()}
     return {
-        "versions": facts.versions(),
+        "versions": report_tables.versions(),
         "origins": {name: rows for name, rows in tables.items() if rows},
-        "text_of_design": facts.without_folders(design_text(design)),
-        "calibration": facts.calibration_rows(design),
-        "calibration_summary": facts.calibration_summary(design),
+        "text_of_design": report_tables.without_folders(design_text(design)),
+        "calibration": report_tables.calibration_rows(design),
+        "calibration_summary": report_tables.calibration_summary(design),
         "capture": None,
         "volume": None,
         "points": None,
@@ -148,12 +147,12 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     imager, depths = design.imager(), np.array(sheet["depth_mm"])
     middle = float(depths[len(depths) // 2])
     with progress.step("Drawing"):
-        seen = device.lenses_seen(imager, middle)
-        drawn = {"section": device.section(design), "layout": _layout(imager, seen)}
+        seen = drawings.lenses_seen(imager, middle)
+        drawn = {"section": drawings.section(design), "layout": _layout(imager, seen)}
     with progress.step("Spots"):
         diameter = sheet["focal_length_mm"] / sheet["f_number"]
         radius = np.max(np.array(sheet["spot_radius_um"]) * sheet["magnification"]) / 1000
-        found = spots.spots_of(imager, depths, diameter, float(radius))
+        found = drawings.spots_of(imager, depths, diameter, float(radius))
     width = {
         "spot, exact rays": (depths, sheet["spot_width_um"]),
         "promised (Eq. 5)": (depths, sheet["lateral_resolution_um"]),
@@ -162,9 +161,9 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     }
     return {
         "sheet": sheet,
-        "sheet_rows": facts.sheet_rows(design, sheet),
+        "sheet_rows": report_tables.sheet_rows(design, sheet),
         "findings": said,
-        "device": facts.device_facts(design, sheet),
+        "device": report_tables.device_facts(design, sheet),
         "section": drawn["section"],
         "layout": drawn["layout"],
         "seen": {"depth": middle, "most": int(seen.lenses.max()), "mean": float(_over_plate(seen, design).mean())},
@@ -178,12 +177,12 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _layout(imager: Imager, seen: device.Seen) -> str:
+def _layout(imager: Imager, seen: drawings.Seen) -> str:
     picture = png(in_range(seen.lenses, 0.0, max(float(seen.lenses.max()), 1.0)), "viridis")
-    return device.layout(imager, picture, seen.box, "the number of lenses that see each point")
+    return drawings.layout(imager, picture, seen.box, "the number of lenses that see each point")
 
 
-def _over_plate(seen: device.Seen, design: Design) -> np.ndarray:
+def _over_plate(seen: drawings.Seen, design: Design) -> np.ndarray:
     """Counts where the plate is."""
     left, top, right, bottom = seen.box
     rows, columns = seen.lenses.shape
@@ -193,7 +192,7 @@ def _over_plate(seen: device.Seen, design: Design) -> np.ndarray:
     return seen.lenses[np.ix_(np.abs(y) <= half_y, np.abs(x) <= half_x)]
 
 
-def _spot_pictures(found: spots.Spots, imager: Imager) -> dict[str, Any]:
+def _spot_pictures(found: drawings.Spots, imager: Imager) -> dict[str, Any]:
     root = np.sqrt(found.images / found.images.max((2, 3), keepdims=True))
     cells = [
         [
@@ -212,28 +211,28 @@ def _spot_pictures(found: spots.Spots, imager: Imager) -> dict[str, Any]:
     }
 
 
-def _contrast_by_depth(found: spots.Spots, imager: Imager, diameter: float) -> str:
+def _contrast_by_depth(found: drawings.Spots, imager: Imager, diameter: float) -> str:
     lines = {f"{z:.4g} mm": _contrast(found, imager, i, 0) for i, z in enumerate(found.depths)}
     middle = float(found.depths[len(found.depths) // 2])
     frequency = lines[next(iter(lines))].frequency
-    lines[f"perfect, {middle:.4g} mm"] = spots.perfect(frequency, imager, middle, diameter)
+    lines[f"perfect, {middle:.4g} mm"] = drawings.perfect(frequency, imager, middle, diameter)
     return _contrast_chart(lines, "On the axis, by depth")
 
 
-def _contrast_by_field(found: spots.Spots, imager: Imager) -> str:
+def _contrast_by_field(found: drawings.Spots, imager: Imager) -> str:
     # Where it is sharpest.
     best = int(np.argmax((found.images.max((2, 3)) * found.caught)[:, 0]))
     lines = {f"{h:.3g} mm beside the axis": _contrast(found, imager, best, j) for j, h in enumerate(found.heights)}
     return _contrast_chart(lines, f"Over the field, at {found.depths[best]:.4g} mm")
 
 
-def _contrast(found: spots.Spots, imager: Imager, depth: int, height: int) -> spots.Contrast:
+def _contrast(found: drawings.Spots, imager: Imager, depth: int, height: int) -> drawings.Contrast:
     magnification = float(imager.magnification(jnp.asarray(found.depths[depth])))
     image, caught = found.images[depth, height], float(found.caught[depth, height])
-    return spots.contrast(image, caught, imager.sensor.pixel_pitch, magnification)
+    return drawings.contrast(image, caught, imager.sensor.pixel_pitch, magnification)
 
 
-def _contrast_chart(lines: dict[str, spots.Contrast], title: str) -> str:
+def _contrast_chart(lines: dict[str, drawings.Contrast], title: str) -> str:
     return line_chart(
         {name: (line.frequency, line.contrast) for name, line in lines.items()},
         x="frequency in the object, 1/mm",

@@ -7,10 +7,9 @@ from jaxtyping import Float, Num
 
 from ...grid import Grid
 from ...lenses import MicrolensArray
-from ...mold.pictures import coarse_solid
+from ...mold.make import coarse_solid
 from ...mold.solids import MoldShape
-from ...pictures.encode import in_range, packed, png, thinned
-from ...pictures.planes import brightness
+from ...pictures.volume_pictures import brightness, in_range, packed, png, thinned
 
 # Bytes of all slices before they are compressed; pixels of a projection's side; voxels in space, and a side's.
 SLICE_BYTES, _SIDE, _VOXELS, _CUBE = 6_000_000, 720, 60_000, 200

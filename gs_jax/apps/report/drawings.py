@@ -1,16 +1,133 @@
-"""The microscope as drawings: cut open, to scale; and its layout with how many lenses see each point. SVG."""
+"""Line charts as SVG, in the colours of the page that they stand in.
 
+Colours and fonts are the page's style sheet's, so that a chart is dark on a dark page and black on paper.
+"""
+
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...design.design import Design
 from ...geometry import Imager
 from ...layouts.cells import cell_edges
-from ...mold.caps import cap_sag, caps_of, surface
+from ...mold.lenslets import cap_sag, caps_of, surface
+from ...optics.psf import diffraction_psf, window_fraction
 from ...pictures.style import round_length
+
+# Of the picture, pixels of a desktop's screen, which a phone shows nearly as large; room for numbers and labels.
+_WIDTH, _HEIGHT = 440, 290
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 12, 12, 44
+# Line styles: those that colours alone would leave to good eyes.
+_DASHES = ("", "7 4", "2 3", "9 3 2 3", "4 4", "1 4", "12 4")
+
+Numbers = Sequence[float | None] | np.ndarray
+Line = tuple[Numbers, Numbers]
+
+
+def line_chart(
+    lines: Mapping[str, Line],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    log: bool = False,
+    marks: bool = False,
+    bounds: tuple[float, float] | None = None,
+) -> str:
+    """The chart.
+
+    Parameters
+    ----------
+    lines
+        By name, places along x and y; what is None or not finite is left out.
+    x, y
+        Labels of the axes.
+    title
+        For those who cannot see it.
+    log
+        The axis y is logarithmic.
+    marks
+        A dot at each place.
+    bounds
+        Of the axis y; what the lines need by default, from 0 on unless it is logarithmic.
+    """
+    drawn = {name: _finite(line, log) for name, line in lines.items()}
+    places = np.concatenate(list(drawn.values()), axis=1)
+    if not places.size:
+        return f'<p class="note">{escape(title)}: no finite number to draw.</p>'
+    (left, right), (low, high) = _limits(places[0], False), bounds or _limits(places[1], log)
+    if not log and bounds is None:
+        low = min(low, 0.0)
+    scale = np.log10 if log else np.asarray
+    across = lambda v: _LEFT + (_WIDTH - _LEFT - _RIGHT) * (np.asarray(v) - left) / (right - left)
+    span = float(scale(high) - scale(low))
+    up = lambda v: _TOP + (_HEIGHT - _TOP - _BOTTOM) * (1 - (scale(v) - float(scale(low))) / span)
+    parts = [f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">']
+    for tick in _ticks(left, right, False):
+        at = float(across(tick))
+        parts.append(f'<path class="grid" d="M{at:.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>')
+        parts.append(f'<text x="{at:.1f}" y="{_HEIGHT - _BOTTOM + 16}" text-anchor="middle">{tick:g}</text>')
+    for tick in _ticks(low, high, log):
+        at = float(up(tick))
+        parts.append(f'<path class="grid" d="M{_LEFT} {at:.1f}H{_WIDTH - _RIGHT}"/>')
+        parts.append(f'<text x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{tick:g}</text>')
+    parts.append(f'<path class="axis" d="M{_LEFT} {_TOP}V{_HEIGHT - _BOTTOM}H{_WIDTH - _RIGHT}"/>')
+    middle = (_LEFT + _WIDTH - _RIGHT) / 2
+    parts.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 8}" text-anchor="middle">{escape(x)}</text>')
+    turned = f"translate(13 {(_TOP + _HEIGHT - _BOTTOM) / 2:.0f}) rotate(-90)"
+    parts.append(f'<text transform="{turned}" text-anchor="middle">{escape(y)}</text>')
+    for number, (line_x, line_y) in enumerate(drawn.values()):
+        inside = np.clip(line_y, low, high)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(line_x), up(inside), strict=True))
+        kind = f'class="line c{number % 7}" stroke-dasharray="{_DASHES[number % len(_DASHES)]}"'
+        parts.append(f'<polyline {kind} points="{points}"/>')
+        if marks:
+            dots = "".join(
+                f'<circle class="dot c{number % 7}" cx="{a:.1f}" cy="{b:.1f}" r="3"/>'
+                for a, b in zip(across(line_x), up(inside), strict=True)
+            )
+            parts.append(dots)
+    return "".join(parts) + "</svg>" + _legend(list(lines))
+
+
+def _legend(names: list[str]) -> str:
+    entry = (
+        '<li><svg class="key" viewBox="0 0 30 8" aria-hidden="true"><path class="line c{kind}" '
+        'stroke-dasharray="{dash}" d="M0 4H30"/></svg>{name}</li>'
+    )
+    items = [entry.format(kind=i % 7, dash=_DASHES[i % len(_DASHES)], name=escape(n)) for i, n in enumerate(names)]
+    return f'<ul class="legend">{"".join(items)}</ul>'
+
+
+def _finite(line: Line, log: bool) -> np.ndarray:
+    both = np.array([[np.nan if v is None else float(v) for v in values] for values in line], float)
+    kept = np.isfinite(both).all(0) & ((both[1] > 0) | (not log))
+    return both[:, kept]
+
+
+def _limits(values: np.ndarray, log: bool) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    if low == high:
+        return (low / 2, high * 2) if log else (low - (abs(low) or 1.0) / 10, high + (abs(high) or 1.0) / 10)
+    return (low / 1.15, high * 1.15) if log else (low, high + (high - low) * 0.04)
+
+
+def _ticks(low: float, high: float, log: bool) -> list[float]:
+    if log and high / low > 300:
+        found = LogLocator(subs=(1.0,)).tick_values(low, high)
+    elif log:
+        found = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
+    else:
+        found = MaxNLocator(6).tick_values(low, high)
+    slack = 1e-9 * (high - low)
+    return [float(f"{tick:.12g}") for tick in found if low - slack <= tick <= high + slack]
+
 
 # Points across a section; of a map of lenses per point, in all of the layout's outlines; points of a map at a time.
 _PROFILE, _MAP, _OUTLINE, _TOGETHER = 801, 121, 12_000, 2000
@@ -177,3 +294,79 @@ def _outlines(imager: Imager) -> str:
     direction = direction @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     corners = turned[:, None] + radius[..., None] * direction[None]
     return "".join("M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in each) + "Z" for each in corners)
+
+
+# Pixels of a window, and how many radii of 80 % of the light it is wide; samples in a pixel; of a modulation transfer
+# function, with the zeros about the window that make the curve smooth.
+_WINDOW, _WIDE, _MOST_SAMPLES, _PADDED = (25, 65), 2.6, 12, 512
+# Share of the field radius, and depths that are shown at most.
+FIELDS = (0.0, 0.5, 1.0)
+_DEPTHS = 5
+
+
+class Spots(NamedTuple):
+    """Spots on the sensor, `[depth, field, row, column]`, each with the sum 1.
+
+    `caught` is the share of the light through the lens that falls into the window; depths and heights are mm.
+    """
+
+    images: Float[np.ndarray, "depth field row column"]
+    caught: Float[np.ndarray, "depth field"]
+    depths: Float[np.ndarray, " depth"]
+    heights: Float[np.ndarray, " field"]
+
+
+def one_lens(imager: Imager, index: int = 0) -> Imager:
+    """The same with one kind of lens, where they differ."""
+    return imager if imager.array.alike else eqx.tree_at(lambda i: i.array, imager, imager.array.lens(index))
+
+
+def spots_of(imager: Imager, depths: Float[np.ndarray, " depth"], diameter: float, radius: float) -> Spots:
+    """Spots at a few depths over those given, mm, and over the field, by diffraction.
+
+    `diameter` is that of the clear aperture, `radius` holds most of a spot's light on the sensor, mm.
+    """
+    imager, heights = one_lens(imager), np.array(FIELDS) * imager.field_radius
+    chosen = np.linspace(depths.min(), depths.max(), min(_DEPTHS, len(depths)))
+    # What falls outside of `samples / s` windows is folded back (`diffraction_psf`).
+    s = diameter * imager.sensor.pixel_pitch / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
+    samples = int(np.clip(np.ceil(1.3 * s), 2, _MOST_SAMPLES))
+    size = 2 * int(np.clip(_WIDE * radius / imager.sensor.pixel_pitch, *_WINDOW) // 2) + 1
+    axis = {"radius": jnp.asarray(diameter / 2), "samples": samples}
+    images, caught = np.empty((len(chosen), len(heights), size, size)), np.empty((len(chosen), len(heights)))
+    for row, depth in enumerate(chosen):
+        for column, height in enumerate(heights):
+            given = {"field": (jnp.asarray(height), jnp.asarray(0.0)), "size": size, **axis}
+            images[row, column] = diffraction_psf(imager, jnp.asarray(depth), **given)
+            caught[row, column] = window_fraction(imager, jnp.asarray(depth), **given)
+    return Spots(images, caught, chosen, heights)
+
+
+class Contrast(NamedTuple):
+    """A modulation transfer function: contrast at frequencies in the object, 1/mm; mean over x and y."""
+
+    frequency: Float[np.ndarray, " frequency"]
+    contrast: Float[np.ndarray, " frequency"]
+
+
+def contrast(image: Float[np.ndarray, "row column"], caught: float, pixel: float, magnification: float) -> Contrast:
+    """Of a spot on pixels, mm, up to the frequency that these resolve.
+
+    Light beside the window is counted as evenly spread, so that between zero and the first frequency of the window the
+    curve falls by it.
+    """
+    across = np.abs(np.fft.rfft(image.sum(0), _PADDED))
+    along = np.abs(np.fft.rfft(image.sum(1), _PADDED))
+    frequency = np.fft.rfftfreq(_PADDED, pixel) * magnification
+    values = caught * (across + along) / 2
+    values[0] = 1.0
+    return Contrast(frequency, values)
+
+
+def perfect(frequency: Float[np.ndarray, " frequency"], imager: Imager, depth: float, diameter: float) -> Contrast:
+    """That of a lens without errors in focus, round, of this diameter, mm, and of square pixels."""
+    v, magnification = float(imager.reduced_sensor_distance), float(imager.magnification(depth))
+    on_sensor = frequency / magnification
+    share = np.clip(on_sensor * float(imager.wavelength) * v / diameter, 0, 1)
+    lens = 2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2))
+    return Contrast(frequency, lens * np.abs(np.sinc(on_sensor * imager.sensor.pixel_pitch)))

@@ -15,11 +15,9 @@ from ..base.errors import InputError
 from ..design.design import Design
 from ..layouts.cells import cell_edges, coverage, largest_hole
 from ..lenses import MicrolensArray
-from .caps import STEEPEST, cap_sag, caps_of, surface, visible_reaches
-from .facets import estimated_facets
-from .mesh_files import Mesh
-from .solids import MAX_FACETS, MoldShape, coarsest_chord, plate_thickness, too_wide
-from .volumes import VOLUME_TOLERANCE
+from .export import Mesh
+from .lenslets import STEEPEST, cap_sag, caps_of, estimated_facets, surface, visible_reaches
+from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, coarsest_chord, plate_thickness, too_wide
 
 # Thinner sheets of cast silicone tear when they are peeled off, thinner prints warp.
 THINNEST_MM = 0.3

@@ -1,1 +1,0 @@
-"""The demonstration: a microscope is judged, improved and used, and its mold is made."""
