@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import gs_jax
-from gs_jax.solvers.iteration import Solver
+from gs_jax.solvers.base import Solver
 
 PACKAGE = Path(gs_jax.__file__).parent
 _GROUP = re.compile(r"^(\w[^\n]+):\n\n((?:    .+\n)+)", re.MULTILINE)

@@ -27,12 +27,10 @@ from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_measure import timed
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
-from gs_jax.solvers.convolution import Convolution
-from gs_jax.solvers.convolution_admm import ConvolutionADMM
+from gs_jax.solvers.base import differences, solve, total_variation
+from gs_jax.solvers.convolution import Convolution, ConvolutionADMM
 from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.iteration import solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
-from gs_jax.solvers.variation import differences, total_variation
 
 TV = 1e-4
 Image = Float[Array, "row column"]

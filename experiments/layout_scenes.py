@@ -19,7 +19,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
 from gs_jax.simulation.camera import Camera, electrons, expose
-from gs_jax.solvers.iteration import solve
+from gs_jax.solvers.base import solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 # Standard deviation of a blob and of the local background, mm.

@@ -30,13 +30,13 @@ from .projection.operators import (
 from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
-from .reconstruction.reprojection import reproject as reproject
+from .reconstruction.residual import reproject as reproject
 from .simulation.camera import Camera as Camera, expose as expose
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.scene import simulate as simulate
 from .solvers.admm import ADMM as ADMM
+from .solvers.base import solve as solve
 from .solvers.fista import FISTA as FISTA
-from .solvers.iteration import solve as solve
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.unrolled import Unrolled as Unrolled
 

@@ -66,9 +66,9 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
         As the command.
     """
     from .cli.captures import CaptureOptions
-    from .cli.inversion import plan
     from .design.design import read_design
     from .io.napari import points_layer, step_of, volume_layer
+    from .reconstruction.workflow import plan
 
     try:
         depths = Depths().convert(asked.depths, None, None)

@@ -9,11 +9,9 @@ from jax.test_util import check_grads
 from skimage.restoration import denoise_tv_chambolle
 
 from gs_jax.solvers.admm import ADMM
-from gs_jax.solvers.convolution import Convolution
-from gs_jax.solvers.convolution_admm import ConvolutionADMM
+from gs_jax.solvers.base import differences, differences_adjoint, shrink, solve, total_variation
+from gs_jax.solvers.convolution import Convolution, ConvolutionADMM
 from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.iteration import solve
-from gs_jax.solvers.variation import differences, differences_adjoint, shrink, total_variation
 
 
 def system(depths=1):

@@ -12,7 +12,7 @@ from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.provenance import read_provenance
 from gs_jax.reconstruction.deconvolution import deconvolve
-from gs_jax.solvers.convolution_admm import ConvolutionADMM
+from gs_jax.solvers.convolution import ConvolutionADMM
 
 SOLVERS = [
     ConvolutionADMM(steps=80, sparsity=0.0, tv=1e-4),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, forward, reconstruct
-from gs_jax.reconstruction.discrepancy import misfit_of_noise, noise_variance
+from gs_jax.reconstruction.residual import misfit_of_noise, noise_variance
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, divergence
 

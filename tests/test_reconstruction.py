@@ -15,13 +15,13 @@ from gs_jax.apps.method_benchmark import obstacle
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.window import psf_of_depth
+from gs_jax.reconstruction.inverse_problem import explainable, model_of
 from gs_jax.reconstruction.methods import METHODS, BackProjection, ListRichardsonLucy
 from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
-from gs_jax.reconstruction.reprojection import reproject
-from gs_jax.reconstruction.system import explainable, model_of
+from gs_jax.reconstruction.residual import reproject
 from gs_jax.simulation.scene import simulate_volume
+from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.iteration import solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 from .helpers import scene

@@ -18,7 +18,7 @@ _CODE = """
 import sys
 import numpy as np, jax
 from gs_jax import Grid, read_design, reconstruct
-from gs_jax.reconstruction.sharding import backproject_by_all
+from gs_jax.reconstruction.pipeline import backproject_by_all
 from gs_jax.reconstruction.methods import BackProjection
 
 imager = read_design("design.toml").imager()

@@ -14,9 +14,9 @@ from skimage.restoration import richardson_lucy as of_skimage
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.solvers.admm import ADMM
+from gs_jax.solvers.base import least_weight_of_darkness, solve
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
-from gs_jax.solvers.iteration import least_weight_of_darkness, solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, tent_background, tent_step
 
 from .helpers import scene

@@ -15,8 +15,8 @@ from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
 from gs_jax.apps.training.training_loop import start, train
 from gs_jax.base.progress import Progress
 from gs_jax.projection.points import full_image_of_points
-from gs_jax.reconstruction.reprojection import reproject
-from gs_jax.reconstruction.system import Sight, System
+from gs_jax.reconstruction.inverse_problem import Sight, System
+from gs_jax.reconstruction.residual import reproject
 from gs_jax.solvers import unrolled
 from gs_jax.solvers.richardson_lucy import tent_background
 from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled

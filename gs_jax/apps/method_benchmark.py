@@ -30,12 +30,12 @@ from ..detection.clustering import find_clusters
 from ..detection.locate import find_points
 from ..detection.unet import pretrained, suppress
 from ..projection.operators import ImagingOperator
+from ..reconstruction.inverse_problem import above_offset
 from ..reconstruction.methods import BackProjection, ListRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
-from ..reconstruction.system import above_offset
 from ..solvers.admm import ADMM
+from ..solvers.base import least_weight_of_darkness, solve
 from ..solvers.fista import FISTA
-from ..solvers.iteration import least_weight_of_darkness, solve
 from ..solvers.richardson_lucy import RichardsonLucy
 from .benchmark_measure import peak_mib, timed
 from .benchmark_scenes import Bench, Case, bench, case, scores, spots

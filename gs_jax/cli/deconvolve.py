@@ -30,7 +30,7 @@ def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None,
     """
     from ..io.captures import write_capture
     from ..reconstruction.deconvolution import TV, deconvolve
-    from ..solvers.convolution_admm import ConvolutionADMM
+    from ..solvers.convolution import ConvolutionADMM
     from ..solvers.fista import FISTA
     from ..solvers.richardson_lucy import RichardsonLucy
 

@@ -13,7 +13,7 @@ from ..io.files import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, SUPPRESSIONS, UM, Depths, Number, depth_range, worker_options
-from .recording import check_recording, in_words, reconstruct_recording, recording_options
+from .reconstruct_recording import check_recording, in_words, reconstruct_recording, recording_options
 
 
 @click.command(
@@ -122,7 +122,7 @@ def command(
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.cpu.native import once
-    from .inversion import imaged_again, plan
+    from ..reconstruction.workflow import imaged_again, plan
 
     check_output(output, VOLUME_SUFFIXES)
     if points:

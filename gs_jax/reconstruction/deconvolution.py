@@ -7,12 +7,11 @@ from jaxtyping import Array, Float32, Num
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
-from ..solvers.convolution import Convolution
-from ..solvers.convolution_admm import ConvolutionADMM
+from ..solvers.convolution import Convolution, ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
+from .inverse_problem import above_offset
 from .pipeline import iterated
-from .system import above_offset
 
 # Default weight of ADMM's total variation.
 TV = 1e-3

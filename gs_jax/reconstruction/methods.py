@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from ..base.errors import InputError
 from ..solvers.admm import ADMM
+from ..solvers.base import Solver
 from ..solvers.fista import FISTA
-from ..solvers.iteration import Solver
 from ..solvers.richardson_lucy import TENTS, RichardsonLucy
 from ..solvers.unrolled import Unrolled
 

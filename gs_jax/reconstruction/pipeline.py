@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float32, Num
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Float32, Num
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
@@ -20,13 +21,12 @@ from ..optics.focus import warn_if_blurred
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS
-from ..solvers.iteration import Solver
+from ..solvers.base import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
-from .discrepancy import misfit_of_noise
+from .inverse_problem import Sight, System, explainable, model_of, sights_of, slow_waves
 from .methods import BackProjection, ListRichardsonLucy, Method
-from .sharding import backproject_by_all
-from .system import Sight, System, explainable, model_of, sights_of, slow_waves
+from .residual import misfit_of_noise
 
 Image = Num[Array | np.ndarray, "row column"]
 Volume = Float32[np.ndarray, "depth y x"]
@@ -286,3 +286,22 @@ def _start(solver, light, system):
 @partial(jax.jit, donate_argnums=0)
 def _step(state, solver, light, system):
     return solver.step(system.operator, light, state)
+
+
+def backproject_by_all(
+    image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, **options
+) -> Float[Array, "depth y x"]:
+    """As `backproject`, whose arguments it takes; no device does more than one depth more than another."""
+    count = grid.depths.size
+    last = jnp.full(-count % jax.local_device_count(), grid.depths[-1])
+    return _shared(image, imager, grid, jnp.concatenate([grid.depths, last]), **options)[:count]
+
+
+@partial(jax.jit, static_argnames=("method", "normalize"))
+def _shared(image, imager, grid, depths, **options):
+    mesh, alike = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec()
+    some = PartitionSpec("depth")
+    part = lambda image, imager, grid, depths: backproject(image, imager, grid.at(depths), **options)
+    # The kernels do not say which of their results differ from device to device.
+    shared = jax.shard_map(part, mesh=mesh, in_specs=(alike, alike, alike, some), out_specs=some, check_vma=False)
+    return shared(image, imager, grid, depths)

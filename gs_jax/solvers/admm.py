@@ -21,8 +21,16 @@ from jax import lax
 from jaxtyping import Array, Float, Num, PyTree
 
 from ..base.arrays import Real, divide
-from .iteration import as_image, check_options, least_weight_of_darkness, norm
-from .variation import differences, differences_adjoint, shrink, total_variation
+from .base import (
+    as_image,
+    check_options,
+    differences,
+    differences_adjoint,
+    least_weight_of_darkness,
+    norm,
+    shrink,
+    total_variation,
+)
 
 # The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1), and so often
 # at most: a penalty that stays the same from some step on is what convergence is proven for.

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import Real, divide
-from .iteration import as_image, check_options, least_weight_of_darkness, norm
+from .base import as_image, check_options, least_weight_of_darkness, norm
 
 # Steps of the power method, and what it may fall short by: for operators without negative entries the largest
 # eigenvalue stands alone, and this many steps find it to about a percent.

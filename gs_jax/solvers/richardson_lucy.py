@@ -15,9 +15,7 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import Real, divide
 from ..base.errors import InputError
-from .iteration import as_image, check_options, norm
-from .unmatched import Unmatched
-from .variation import differences, differences_adjoint, magnitude
+from .base import Unmatched, as_image, check_options, differences, differences_adjoint, magnitude, norm
 
 # Tents that make a background slow, by default: wider than the halo of a spot.
 TENTS = 8

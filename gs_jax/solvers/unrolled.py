@@ -21,9 +21,8 @@ from ..base.arrays import divide
 from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
-from .iteration import as_image, check_options, norm
+from .base import Unmatched, as_image, check_options, norm
 from .richardson_lucy import TENTS, RichardsonLucy, State as LucyState, divergence, tent_background, tent_step
-from .unmatched import Unmatched
 
 # Channels that a network sees: the voxel after the step and before it, the largest and the mean over its column, how
 # far its lenses agree, what the step asked for, and how many lenses see it.

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Float32
 from ...base.progress import Progress
 from ...base.workers import Workers
 from ...detection.unet import UNet, multislice_network, paper_network
-from ...reconstruction.system import System, above_offset, sights_of
+from ...reconstruction.inverse_problem import System, above_offset, sights_of
 from ...solvers.unrolled import State, Unrolled, untrained
 from .simulated_captures import SCENES, Kind, example, tables
 from .training_loop import Recipe

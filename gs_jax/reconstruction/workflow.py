@@ -40,7 +40,7 @@ def plan(
     InputError
         Where options do not go together, or the volume does not fit into the memory.
     """
-    from ..reconstruction.pipeline import COARSE, voxel_grid
+    from .pipeline import COARSE, voxel_grid
 
     if suppress != "none" and method != "backproject":
         raise InputError(f"--suppress {suppress}: found --method {method}, allowed: backproject, for which it is made.")
@@ -59,7 +59,7 @@ def plan(
 
 def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress, points, weights) -> Callable:
     """From an image, and what shows how far it is, to what is `Made` of it; the same for all of its images is done."""
-    from ..reconstruction.pipeline import reconstructor
+    from .pipeline import reconstructor
 
     cleaned = _network(weights) if suppress == "unet" else None
     options = {"optics": optics, "stop_at_noise": stop_at_noise, "progress": progress}
@@ -89,15 +89,15 @@ def maker(imager, grid, inversion, progress, *, optics, stop_at_noise, suppress,
 
 def imaged_again(imager, grid, optics, volume, image, progress):
     """How far a volume that is imaged again is from its image."""
-    from ..reconstruction.reprojection import reproject
+    from .residual import reproject
 
     return reproject(volume, image, imager, grid, optics=optics, progress=progress)
 
 
 def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
     """The method of this name, with the options that were given, if it has them."""
-    from ..reconstruction.methods import METHODS as BY_NAME
     from ..solvers.unrolled import read_unrolled
+    from .methods import METHODS as BY_NAME
 
     method: Any = read_unrolled(weights) if weights and name == "unrolled" else BY_NAME[name](steps)
     given = {option: value for option, value in options.items() if value is not None}

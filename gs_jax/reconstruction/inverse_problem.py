@@ -20,7 +20,7 @@ from ..optics.kinds import KindOptics, kind_weights, lenses_by_kind, of_kinds
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import BackprojectionOperator, ImagingOperator
-from ..solvers.unmatched import Unmatched
+from ..solvers.base import Unmatched
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARKEST = 1

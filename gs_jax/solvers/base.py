@@ -15,12 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 
-from ..base.arrays import safe_sqrt
+from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
-from .convolution import Convolution
-from .unmatched import Unmatched
-
-System = lx.AbstractLinearOperator | Convolution | Unmatched
 
 
 @runtime_checkable
@@ -71,7 +67,7 @@ class Solution(eqx.Module):
     converged: Bool[Array, ""]
 
 
-def solve(A: System, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
+def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
     """Explain an image: all steps of a solver, or as many as its tolerance asks for.
 
     *Differentiable*: without a tolerance, by the image, what `A` holds and the solver's weights. It may be called
@@ -153,3 +149,75 @@ def norm(x: PyTree) -> Float[Array, ""]:
     """Euclidean norm of all leaves together; its gradient is 0 at 0."""
     square = sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(x))
     return safe_sqrt(jnp.asarray(square))
+
+
+class Unmatched(eqx.Module):
+    """An operator with another one in the place of its transpose: `A.mv` is `forward`'s, `A.T.mv` is `back`'s.
+
+    Enough of an operator for Richardson-Lucy, which comes to its end in fewer steps if what goes back is sharper than
+    the adjoint (Zeng and Gullberg, IEEE Trans. Med. Imaging 19, 548, 2000).
+
+    Parameters
+    ----------
+    forward, back
+        From volumes to images, and the other way.
+    squares
+        What least squares invert, with its own transpose, in the place of both; by default `forward`.
+    """
+
+    forward: lx.AbstractLinearOperator
+    back: lx.AbstractLinearOperator
+    squares: lx.AbstractLinearOperator | None = None
+
+    @property
+    def T(self) -> "Unmatched":
+        return Unmatched(self.back, self.forward)
+
+    def mv(self, vector):
+        return self.forward.mv(vector)
+
+    def in_structure(self):
+        return self.forward.in_structure()
+
+    def out_structure(self):
+        return self.forward.out_structure()
+
+
+def differences(x: Float[Array, "*shape"], *, wrap: bool) -> Float[Array, " axis *shape"]:
+    """Forward differences along each axis that is longer than 1; the last one is 0, or to the first if they wrap."""
+
+    def along(axis):
+        difference = jnp.roll(x, -1, axis) - x
+        return difference if wrap else difference.at[(slice(None),) * axis + (-1,)].set(0)
+
+    axes = long_axes(x.shape)
+    return jnp.stack([along(axis) for axis in axes]) if axes else jnp.zeros((0, *x.shape), x.dtype)
+
+
+def differences_adjoint(u: Float[Array, " axis *shape"], *, wrap: bool) -> Float[Array, "*shape"]:
+    """The exact adjoint of `differences`: minus the divergence."""
+    x = jax.ShapeDtypeStruct(u.shape[1:], u.dtype)
+    return jax.linear_transpose(lambda x: differences(x, wrap=wrap), x)(u)[0]
+
+
+def long_axes(shape: tuple[int, ...]) -> list[int]:
+    """Axes along which there are neighbours."""
+    return [axis for axis, size in enumerate(shape) if size > 1]
+
+
+def magnitude(u: Float[Array, " axis *shape"]) -> Float[Array, "*shape"]:
+    """Length of the vector of differences at each voxel; its gradient is 0 where they are."""
+    return safe_sqrt(jnp.sum(u**2, axis=0))
+
+
+def total_variation(u: Float[Array, " axis *shape"], *, isotropic: bool) -> Float[Array, ""]:
+    """Of the differences `u`: the sum of their lengths (isotropic) or of their absolute values."""
+    return jnp.sum(magnitude(u) if isotropic else jnp.abs(u))
+
+
+def shrink(u: Float[Array, " axis *shape"], threshold, *, isotropic: bool) -> Float[Array, " axis *shape"]:
+    """The proximal map of `threshold` times `total_variation`: soft thresholding, of vectors or of numbers."""
+    if not isotropic:
+        return u - jnp.clip(u, -threshold, threshold)
+    length = magnitude(u)
+    return u * divide(jnp.maximum(length - threshold, 0), length)[None]
