@@ -13,7 +13,7 @@ from ..io.files import check_output
 from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, LEVELS, METHODS, SUPPRESSIONS, UM, Depths, Number, depth_range, worker_options
-from .reconstruct_recording import check_recording, in_words, reconstruct_recording, recording_options
+from .recording_command import check_recording, in_words, reconstruct_recording, recording_options
 
 
 @click.command(
