@@ -20,27 +20,27 @@ from .cli.interrupt import end, ending_soon, kept, message, status_of
 
 # Of a message; what is at its end is the least.
 _LONGEST = 380
-# Each is `gs_jax/cli/NAME.py` (`_` for `-`), imported when it is asked for: some need seconds for what others do not.
-COMMANDS = (
-    "reconstruct",
-    "calibrate",
-    "simulate",
-    "deconvolve",
-    "metrics",
-    "new-design",
-    "layout",
-    "optimize",
-    "pareto",
-    "tolerance",
-    "benchmark",
-    "mold",
-    "mask",
-    "train",
-    "report",
-    "explore",
-    "demo",
-    "info",
-)
+# The module of each command in `gs_jax/cli`, imported when the command is used: some need seconds that others do not.
+COMMANDS = {
+    "reconstruct": "reconstruct",
+    "calibrate": "calibrate",
+    "simulate": "simulate",
+    "deconvolve": "deconvolve",
+    "metrics": "designs",
+    "new-design": "new_design",
+    "layout": "designs",
+    "optimize": "optimize",
+    "pareto": "optimize",
+    "tolerance": "fabrication",
+    "benchmark": "presentation",
+    "mold": "fabrication",
+    "mask": "fabrication",
+    "train": "train",
+    "report": "presentation",
+    "explore": "presentation",
+    "demo": "presentation",
+    "info": "designs",
+}
 
 
 def main(leave: Callable[[int], object] = sys.exit) -> None:
@@ -87,7 +87,8 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = import_module(f".cli.{cmd_name.replace('-', '_')}", __package__).command
+        module = import_module(f".cli.{COMMANDS[cmd_name]}", __package__)
+        command = getattr(module, f"{cmd_name.replace('-', '_')}_command")
         if not any(param.name == "quiet" for param in command.params):
             command.params += _LEVELS
         return command

@@ -65,7 +65,7 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
     InputError
         As the command.
     """
-    from .cli.captures import CaptureOptions
+    from .cli.options import CaptureOptions
     from .design.design import read_design
     from .io.napari import points_layer, step_of, volume_layer
     from .reconstruction.workflow import plan

@@ -112,8 +112,8 @@ def test_what_is_too_large_or_too_slow_is_left_out_in_words():
 
 
 def test_command(found, tmp_path, monkeypatch):
-    from gs_jax.cli.benchmark import command
-    from gs_jax.cli.info import command as info
+    from gs_jax.cli.designs import info_command as info
+    from gs_jax.cli.presentation import benchmark_command as command
 
     monkeypatch.setattr("gs_jax.apps.method_benchmark.run", lambda each, progress: found)
     result = CliRunner().invoke(command, ["--out", str(tmp_path / "new")])

@@ -16,7 +16,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from gs_jax.__main__ import COMMANDS, commands
-from gs_jax.cli import deconvolve, options
+from gs_jax.cli import options
+from gs_jax.cli.deconvolve import deconvolve_command
 from gs_jax.cli.interrupt import RESUMABLE, message
 from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
@@ -40,7 +41,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_names_are_those_of_the_library():
     assert options.METHODS == tuple(METHODS) and options.LEVELS == LEVELS
-    (tv,) = (option for option in deconvolve.command.params if option.name == "tv")
+    (tv,) = (option for option in deconvolve_command.params if option.name == "tv")
     assert isinstance(tv, click.Option) and f"[default: {TV:g} of admm]" in (tv.help or "")
     assert options.SIMULATED == OPTICS and options.PSFS == tuple(PSFS)
 

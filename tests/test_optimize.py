@@ -6,8 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
-from gs_jax.cli.optimize import command as optimize
-from gs_jax.cli.pareto import command as pareto
+from gs_jax.cli.optimize import optimize_command as optimize, pareto_command as pareto
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design, write_design
 

@@ -23,7 +23,7 @@ from gs_jax.apps.tolerance.surface import lens_squares, step_squares
 from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Question, together, tolerance
 from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
 from gs_jax.apps.tolerance.tolerance_spec import Tolerances
-from gs_jax.cli.tolerance import command
+from gs_jax.cli.fabrication import tolerance_command as command
 from gs_jax.design.microscope import Microscope
 from gs_jax.design.sheet import microscopes_of
 from gs_jax.design.spots import field_heights

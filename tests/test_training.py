@@ -12,8 +12,8 @@ from gs_jax.apps.training.simulated_captures import Kind
 from gs_jax.apps.training.training_loop import Recipe, read_checkpoint, start, train, write_checkpoint
 from gs_jax.apps.training.training_slices import Stack, paper_batch, patches, simulated_stack, stacks
 from gs_jax.base.errors import InputError
-from gs_jax.cli.reconstruct import command as reconstruct_command
-from gs_jax.cli.train import command
+from gs_jax.cli.reconstruct import reconstruct_command
+from gs_jax.cli.train import train_command as command
 from gs_jax.design.design import read_design
 from gs_jax.detection.unet import UNet, read_weights, suppress
 from gs_jax.io.captures import write_capture

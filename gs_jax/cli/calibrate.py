@@ -7,9 +7,8 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
-from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
-from .options import DESIGN
+from .options import DESIGN, CaptureOptions, capture_options
 
 _NAMES = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
 
@@ -51,7 +50,7 @@ class _Names(click.ParamType):
 @click.option("-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of residuals beside it.")
 @capture_options
 @force_option
-def command(
+def calibrate_command(
     design: Path,
     captures: tuple[Path, ...],
     positions: Path | None,

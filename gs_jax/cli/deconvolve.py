@@ -7,9 +7,8 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..io.files import check_output
-from .captures import CaptureOptions, picture_options
 from .files import check_may_write, provenance_of
-from .options import Number
+from .options import CaptureOptions, Number, picture_options
 
 
 @click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf.tif --tv 1e-3 -o scene.tif")
@@ -22,7 +21,9 @@ from .options import Number
 )
 @click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
 @picture_options
-def command(capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path, camera: CaptureOptions):
+def deconvolve_command(
+    capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path, camera: CaptureOptions
+):
     """Reconstruct the plane that CAPTURE shows, through a diffuser or another mask whose PSF is the file PSF.
 
     PSF is the image of a point on the axis, of any size, the mean of its pages; both may be TIFF, PNG or .npy, and are

@@ -91,7 +91,7 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
     help=("Print the JSON schema of design files, for editors, and exit."),
 )
 @force_option
-def command(output: Path, centers: Path | None, name: str | None, force: bool, **given: Any):
+def new_design_command(output: Path, centers: Path | None, name: str | None, force: bool, **given: Any):
     """Write the design file of your own microlens array and camera.
 
     At a terminal it asks for what the options do not say. Elsewhere nothing is asked: what has no default must be

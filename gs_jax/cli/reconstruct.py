@@ -10,9 +10,20 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output
-from .captures import CaptureOptions, capture_options
 from .files import check_may_write, force_option, provenance_of
-from .options import DESIGN, LEVELS, METHODS, SUPPRESSIONS, UM, Depths, Number, depth_range, worker_options
+from .options import (
+    DESIGN,
+    LEVELS,
+    METHODS,
+    SUPPRESSIONS,
+    UM,
+    CaptureOptions,
+    Depths,
+    Number,
+    capture_options,
+    depth_range,
+    worker_options,
+)
 from .recording_command import check_recording, in_words, reconstruct_recording, recording_options
 
 
@@ -79,7 +90,7 @@ from .recording_command import check_recording, in_words, reconstruct_recording,
 @worker_options
 @capture_options
 @force_option
-def command(
+def reconstruct_command(
     capture: Path,
     design: Path,
     depths: list[float],

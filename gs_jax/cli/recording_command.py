@@ -14,10 +14,9 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from .captures import CaptureOptions
 from .files import provenance_of
 from .interrupt import RESUMABLE, kept
-from .options import UM, Number, depth_range
+from .options import UM, CaptureOptions, Number, depth_range
 
 # Frames that failed and are named as they do; later ones are counted, and are all in the store.
 _NAMED = 10

@@ -37,7 +37,7 @@ COUNTS = Number(least=0.0, most=65535.0, unit="counts")
 @click.option("--bits", type=click.IntRange(1, 16), default=16, show_default=True, help="Of the converter.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
-def command(
+def simulate_command(
     scene: Path,
     design: Path,
     optics: str,

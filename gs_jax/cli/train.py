@@ -27,7 +27,7 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
 @worker_options
-def command(network: str, steps: int | None, seed: int, resume: bool, output: Path, workers: Workers):
+def train_command(network: str, steps: int | None, seed: int, resume: bool, output: Path, workers: Workers):
     """Train networks: for background suppression the paper's, or ours, which looks at seven slices; or for the unrolled
     inversion. Workers simulate the captures that networks are trained on.
 

@@ -1,5 +1,6 @@
-"""`gs-jax tolerance`: how well a microscope must be made."""
+"""`gs-jax mold`: a design to a part."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,120 @@ from ..base.progress import Progress
 from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
 from .options import DESIGN, UM, Depths, Number
+
+
+@click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
+@click.argument("design", type=DESIGN)
+@click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
+@click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
+@click.option(
+    "--chord-um",
+    type=Number(least=1e-3, most=1e3, unit="um"),
+    default=0.4,
+    show_default=True,
+    help="Largest distance between a facet and its lens.",
+)
+@click.option(
+    "--shrinkage-percent",
+    type=Number(least=0.0, most=20.0, unit="%"),
+    default=0.0,
+    show_default=True,
+    help="Of the cast material; the part is made larger by as much.",
+)
+@click.option(
+    "--draft-deg",
+    type=Number(least=0.0, most=30.0, unit="degrees"),
+    default=0.0,
+    show_default=True,
+    help="Of the walls' inner faces. Silicone needs none.",
+)
+@click.option(
+    "--headroom-mm",
+    type=Number(least=0.0, most=100.0, unit="mm"),
+    default=0.0,
+    show_default=True,
+    help="How much higher the walls are than the array is thick; 0 to cast flush under a glass plate.",
+)
+@click.option(
+    "--resolution-um",
+    type=Number(least=1e-2, most=1e3, unit="um"),
+    default=25.0,
+    show_default=True,
+    help="Smallest feature that the printer makes.",
+)
+@click.option(
+    "--layer-um", type=Number(least=1e-2, most=1e3, unit="um"), help="Thickness of the printer's layers, if it has any."
+)
+@click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
+def mold_command(
+    design: Path,
+    output: Path,
+    positive: bool,
+    chord_um: float,
+    shrinkage_percent: float,
+    draft_deg: float,
+    headroom_mm: float,
+    resolution_um: float,
+    layer_um: float | None,
+    label: bool,
+):
+    """Make the negative mold of the array of the file DESIGN, to print and to cast the array in.
+
+    Units are mm. Lenses look toward -z. If the plano side faces the object, x and y are the design's; if the curved
+    side does, the array lies turned over about x, with its y against the design's. A picture (.png) and a report
+    (.json, .txt) of the same name are written beside it; what was written is read back and measured.
+    """
+    from ..design.design import design_text, read_design
+    from ..mold.make import make_mold, report_text
+    from ..mold.solids import MoldShape
+
+    beside = (output.with_suffix(suffix) for suffix in (".png", ".json", ".txt"))
+    check_may_write(output, *beside, inputs=(design,))
+    microscope = read_design(design)
+    shape = MoldShape(
+        draft=math.radians(draft_deg),
+        headroom=headroom_mm,
+        shrinkage=shrinkage_percent / 100,
+        label=microscope.name if label else "",
+    )
+    with Progress() as progress, errors_name_file(design):
+        report = make_mold(
+            microscope,
+            output,
+            positive=positive,
+            shape=shape,
+            chord=chord_um / 1000,
+            resolution=resolution_um / 1000,
+            layer=layer_um and layer_um / 1000,
+            provenance=provenance_of(design, design=design_text(microscope)),
+            progress=progress,
+        )
+    click.echo(report_text(report), nl=False)
+
+
+@click.command("mask", epilog="Example: gs-jax mask design/geomscope-optimized.toml -o mask.dxf")
+@click.argument("design", type=DESIGN)
+@click.option("-o", "--output", type=Path, required=True, help="MASK.dxf, MASK.svg, or MASK.gds for GDSII.")
+def mask_command(design: Path, output: Path):
+    """Draw the opaque mask between the lenses of the file DESIGN, to have it made.
+
+    Openings are the lenses' clear discs; the sheet is as large as the mold, with its alignment marks, and seen as the
+    mold from above: from the plano side of the lenses. DXF and SVG are
+    in mm, GDSII in um (it needs `pip install 'gs-jax[gds]'`). Beside the drawing, .json says where it comes from.
+    """
+    from ..design.design import design_text, read_design
+    from ..io.files import check_output
+    from ..mold.export import MASK_SUFFIXES, mask_plan, write_mask
+
+    check_output(output, MASK_SUFFIXES)
+    check_may_write(output, inputs=(design,))
+    microscope = read_design(design)
+    with errors_name_file(design):
+        mask = mask_plan(microscope.imager().array)
+    write_mask(output, mask, provenance_of(design, design=design_text(microscope)))
+    alone, rings = len(mask.circles), len(mask.openings)
+    width, height = mask.outline.max(0) - mask.outline.min(0)
+    click.echo(f"{output}: {alone} round openings and {rings} others on a sheet of {width:g} x {height:g} mm")
 
 
 def _options(command):
@@ -44,7 +159,7 @@ def _options(command):
 )
 @click.option("--draws", type=click.IntRange(1, 10**6), default=1000, show_default=True, help="Devices to draw.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Which devices.")
-def command(
+def tolerance_command(
     design: Path,
     output: Path | None,
     file: Path | None,

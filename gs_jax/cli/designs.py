@@ -1,0 +1,104 @@
+"""`gs-jax layout`: random lens centres."""
+
+from pathlib import Path
+
+import click
+
+from ..io.files import check_output, write_json
+from .files import check_may_write, force_option, provenance_of
+from .options import DESIGN, MM, UM, Depths, shipped_designs
+
+
+@click.command("layout", epilog="Example: gs-jax layout --count 200 --size-mm 20 20 --pitch-mm 1.23 -o centers.csv")
+@click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
+@click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
+@click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
+@click.option("--diameter-mm", type=MM, default=2.0, show_default=True, help="Of the lenses; they leave no hole.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
+@force_option
+def layout_command(
+    count: int, size_mm: tuple[float, float], pitch_mm: float, diameter_mm: float, seed: int, output: Path, force: bool
+):
+    """Make a random layout of lenses, for the key `centers_file` of a design."""
+    from ..design.centers import write_centers
+    from ..layouts.cells import coverage, nearest_neighbour_distances
+    from ..layouts.patterns import random_layout
+
+    check_output(output, [".csv"])
+    check_may_write(output, inputs=(), force=force)
+    centers = random_layout(count, size_mm, pitch=pitch_mm, diameter=diameter_mm, seed=seed)
+    write_centers(output, centers, provenance_of())
+    distances = nearest_neighbour_distances(centers)
+    covered = coverage(centers, size_mm, diameter=diameter_mm)
+    spread = f"pitch {distances.mean():.3f} mm, SD {distances.std():.3f} mm, " if count > 1 else ""
+    click.echo(f"{output}: {count} lenses, {spread}{100 * covered:.1f} % of the plate covered")
+
+
+@click.command("metrics", epilog="Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
+@click.argument("design", type=DESIGN)
+@click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
+@click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
+def metrics_command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
+    """Show what the microscope of DESIGN promises (the paper's Eqs. 1-11), and what becomes of it.
+
+    DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+    """
+    from rich.console import Console
+
+    from ..design.design import read_design
+    from ..design.problems import findings
+    from ..design.sheet import datasheet, summary, tables
+
+    if output:
+        check_output(output, [".json"])
+        check_may_write(output, inputs=(design,))
+    confusion = confusion_um and confusion_um / 1000
+    microscope = read_design(design)
+    sheet = datasheet(microscope, depths, confusion=confusion)
+    if output:
+        write_json(output, sheet)
+    click.echo(summary(microscope, sheet))
+    click.echo(_calibration(microscope.provenance))
+    console = Console()
+    for table in tables(sheet):
+        console.print()
+        console.print(table)
+    click.echo()
+    for sentence in findings(microscope, sheet, confusion=confusion):
+        click.echo(f"- {sentence}")
+
+
+def _calibration(provenance) -> str:
+    """What `gs-jax calibrate` wrote into the file."""
+    if "calibrated_spots" not in provenance:
+        return "  not calibrated: the geometry is that of the design"
+    spots, captures = provenance["calibrated_spots"], provenance["calibrated_captures"]
+    rms, deviations = provenance["calibrated_rms_pixels"], provenance["standard_deviations"]
+    known = ", ".join(f"{name} +- {deviation:g}" for name, deviation in deviations.items())
+    return f"  calibrated by {spots} spots of {captures} captures, {rms:.3f} pixels RMS: {known}"
+
+
+@click.command("info", epilog="Examples: gs-jax info volume.ome.tif, gs-jax info --designs")
+@click.argument("file", type=Path, required=False)
+@click.option("--designs", is_flag=True, help="List the designs that come with the package, to be used by their names.")
+def info_command(file: Path | None, designs: bool):
+    """Show versions, devices and memory; or of a FILE that gs-jax wrote, which command made it and of what."""
+    if designs:
+        from ..design.design import read_design
+
+        # The name of the file is what a command takes; the second line of a design says what its array is.
+        found = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}
+    elif file:
+        from ..io.provenance import read_provenance
+
+        found = read_provenance(file) or {"provenance": f"{file} says nothing of where it comes from."}
+    else:
+        from ..base.machine import describe
+
+        found = describe()
+    width = max(map(len, found))
+    for name, value in found.items():
+        # The text of a design has many lines.
+        click.echo(f"{name:<{width}} {value}" if "\n" not in value else f"{name}\n\n{value}")

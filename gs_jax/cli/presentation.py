@@ -1,0 +1,151 @@
+"""`gs-jax report`: a design and what it showed, as a page."""
+
+from pathlib import Path
+
+import click
+
+from ..base.errors import InputError, errors_name_file
+from ..base.progress import Progress
+from ..io.files import check_output, make_folder
+from .files import check_may_write, provenance_of
+from .interrupt import PARTIAL, kept
+from .options import DESIGN, CaptureOptions, capture_options
+
+
+@click.command(
+    "report",
+    epilog="Example: gs-jax report my.toml volume.ome.tif --points beads.csv --capture beads.tif -o beads.html",
+)
+@click.argument("design", type=DESIGN)
+@click.argument("volume", type=Path, required=False)
+@click.option("-o", "--output", type=Path, required=True, help="REPORT.html.")
+@click.option("--points", type=Path, help="POINTS.csv: found points, for a table and a view in space.")
+@click.option("--capture", type=Path, help="CAPTURE.tif: what it was reconstructed from.")
+@click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
+@capture_options
+def report_command(
+    design: Path,
+    volume: Path | None,
+    output: Path,
+    points: Path | None,
+    capture: Path | None,
+    tolerance: Path | None,
+    camera: CaptureOptions,
+):
+    """Show the microscope of DESIGN, and what it showed, as one page that any browser opens, without a network.
+
+    VOLUME is what `gs-jax reconstruct` wrote. The page has the device to scale, the datasheet and what violates what,
+    spots and contrast through depth and field, the layout, the mold; the capture, the volume and the points where they
+    are given; what calibration and tolerances say; and which files all came from. It is less than 15 MB.
+
+    DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+    """
+    check_output(output, [".html"])
+    check_may_write(output, inputs=(design, volume, points, capture, tolerance, *camera.files))
+    if volume and volume.suffix.lower() in (".csv", ".toml"):
+        raise InputError(f"{volume}: found it in the place of VOLUME, allowed: .ome.tif or .zarr; points by --points.")
+    from ..apps.report.page import write_report
+    from ..apps.report.report_tables import read_tolerance
+    from ..design.design import design_text, read_design
+    from ..io.provenance import read_provenance
+
+    microscope = read_design(design)
+    given, origins = {}, {}
+    if volume:
+        from ..io.volumes import read_volume
+
+        given["volume"], given["grid"] = read_volume(volume)
+    if points:
+        from ..io.point_tables import read_points
+
+        given["points"] = read_points(points)
+    if capture:
+        camera.imager(microscope.imager())
+        given["image"] = camera.read(capture)
+    if tolerance:
+        given["tolerance"] = read_tolerance(tolerance)
+    for path in (volume, points, capture, tolerance):
+        if path:
+            origins[path.name] = read_provenance(path)
+    provenance = provenance_of(design, volume, points, capture, tolerance, design=design_text(microscope))
+    with Progress() as progress, errors_name_file(design):
+        write_report(
+            output, microscope, **given, origins=origins, provenance=camera.recorded(provenance), progress=progress
+        )
+    camera.say()
+    click.echo(f"{output}: {output.stat().st_size / 1e6:.1f} MB, opens in any browser")
+
+
+@click.command("explore", epilog="Example: gs-jax explore geomscope --study targets.toml -o mine.toml")
+@click.argument("design", type=DESIGN)
+@click.option("--study", type=Path, help="STUDY.toml, whose targets are judged, as in `gs-jax optimize`.")
+@click.option(
+    "-o",
+    "--output",
+    type=Path,
+    help="NEW.toml to save to; a number is added where it is there.  [default: NAME-new.toml]",
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of the page.  [default: one that is free]")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool):
+    """Move sensor distance, curvature, aperture, pitch, depths and field of DESIGN in a browser, and see what it does.
+
+    The page shows what violates a target, in words; spots, the layout with ghosts, the datasheet, a small simulated
+    reconstruction; keeps designs to compare with, and saves them. It is on this machine alone: nobody else can open it.
+    Ctrl-C ends it.
+
+    DESIGN is a file, or the name of one that comes with the package, such as geomscope.
+    """
+    import webbrowser
+
+    from ..apps.explore.server import Server
+    from ..apps.explore.session import Session
+    from ..codesign.study import read_study
+    from ..design.design import read_design
+
+    saves = output or Path(f"{design.stem}-new.toml")
+    check_output(saves, [".toml"])
+    microscope, targets = read_design(design), read_study(study) if study else None
+    with Progress() as progress:
+        with progress.step("Compiling"):
+            session = Session(microscope, targets, saves, provenance_of(design, study))
+            session.move({})
+    with Server(session, port) as server:
+        click.echo(f"{server.url} shows {microscope.name}; Ctrl-C ends it")
+        if browser:
+            webbrowser.open_new_tab(server.url)
+        server.serve_forever()
+
+
+@click.command("demo", epilog="Example: gs-jax demo --out demo")
+@click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
+def demo_command(out: Path):
+    """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
+    from ..apps.example_pipeline import run
+
+    with Progress() as progress:
+        report = run(out, progress)
+    click.echo(f"{report}: what was made, and what it shows")
+    click.echo(f"{report.with_suffix('.html')}: the microscope and what it showed, in a browser")
+
+
+@click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
+@click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
+def benchmark_command(out: Path):
+    """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
+    from ..apps.benchmark_report import write, write_records
+    from ..apps.method_benchmark import run
+
+    folder = make_folder(out)
+    numbers, provenance = folder / "benchmark.json", provenance_of()
+
+    def each(records):
+        write_records(numbers, records, provenance)
+        kept[numbers] = PARTIAL
+
+    with Progress() as progress:
+        records, left_out = run(each=each, progress=progress)
+    write(records, left_out, folder, provenance)
+    for missing in left_out:
+        click.echo(f"left out: {missing['method']} at {missing['pairs']:.1e} pairs: {missing['reason']}")
+    click.echo(f"{folder}: benchmark.json, .csv, .md and .png")
