@@ -34,7 +34,7 @@ from gs_jax.calibration.unknowns import FITTABLE
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
-from gs_jax.projection.points import full_image_of_points
+from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.pipeline import voxel_grid
 
 NAMES = ("sensor_distance_mm", "rotation_deg", "shift_x_mm", "shift_y_mm", "tilt_x_deg", "tilt_y_deg")

@@ -29,7 +29,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import envelope
 from gs_jax.optics.full import full_optics
-from gs_jax.projection.convolve import with_margin
+from gs_jax.projection.convolution import with_margin
 
 STUDY = {
     "depths": [Job(depths=n) for n in (1, 4, 13, 40)],

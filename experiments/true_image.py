@@ -35,7 +35,7 @@ from gs_jax.lenses import Orientation
 from gs_jax.optics.full import RINGS, full_optics
 from gs_jax.optics.unit import best_focus
 from gs_jax.optics.window import psf_of_depth
-from gs_jax.projection.points import full_image_of_points
+from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.simulation.phantoms import letters, random_points, rasterize
 from gs_jax.simulation.scene import simulate_points
 

@@ -10,9 +10,9 @@ import pytest
 from jax.test_util import check_grads
 from scipy.signal import fftconvolve
 
-from gs_jax.projection import convolve
-from gs_jax.projection.convolve import convolved, doubled
-from gs_jax.projection.cpu import native
+from gs_jax.projection import convolution as convolve
+from gs_jax.projection.convolution import convolved, doubled
+from gs_jax.projection.cpu import dispatch as native
 
 
 def problem(shape=(170, 205), size=9, count=2, dtype=jnp.float32, *, symmetric=False):

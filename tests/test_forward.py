@@ -10,7 +10,7 @@ from scipy.special import erf
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
 from gs_jax.apps.benchmark_measure import peak_mib
 from gs_jax.geometry import envelope
-from gs_jax.projection.points import STEPS, forward_points, stamps
+from gs_jax.projection.point_sources import STEPS, forward_points, stamps
 
 from .helpers import scene
 

@@ -20,7 +20,7 @@ from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring
 from gs_jax.optics.full import full_optics
 from gs_jax.optics.light import clear_area, mean_zones, spot_rays, transmitted, zones
 from gs_jax.optics.unit import unit_rays
-from gs_jax.projection.points import full_image_of_points
+from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 DEPTHS = (18.0, 21.0)

@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.projection import bilinear, convolve
+from gs_jax.projection import bilinear, convolution as convolve
 from gs_jax.projection.bilinear import Shapes
-from gs_jax.projection.convolve import Sizes
-from gs_jax.projection.cpu import native
+from gs_jax.projection.convolution import Sizes
+from gs_jax.projection.cpu import dispatch as native
 from gs_jax.projection.rays import Envelope, RingLight, trace
 
 from .helpers import scene
 
 NumbaError = pytest.importorskip("numba.core.errors").NumbaError
-bridge, shuffles = (import_module(f"gs_jax.projection.{name}") for name in ("bridge", "shuffles"))
+bridge, shuffles = (import_module(f"gs_jax.projection.cpu.{name}") for name in ("ffi", "shuffles"))
 
 # Voxels of all sizes, whose rays are 0.4 to 14 pixels apart: sixteen meet up to 32, 48, 64 or more pixels, and a pixel
 # is reached by two, four or more. Volumes that are narrower than sixteen; rays off the sensor; a sensor of odd shape.

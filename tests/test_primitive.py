@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.projection.primitive import linear_call
+from gs_jax.projection.linear_map import linear_call
 
 SCALE, MATRIX = 3, jax.random.normal(jax.random.key(0), (4, 3))
 X, Y = jnp.array([1.0, -2.0, 0.5]), jnp.array([0.3, 1.0, -1.0, 2.0])

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, find_points, forward
-from gs_jax.projection.points import forward_points, stamps
+from gs_jax.projection.point_sources import forward_points, stamps
 
 from .helpers import backproject_loop, scene
 

@@ -14,7 +14,7 @@ from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_case
 from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
 from gs_jax.apps.training.training_loop import start, train
 from gs_jax.base.progress import Progress
-from gs_jax.projection.points import full_image_of_points
+from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.inverse_problem import Sight, System
 from gs_jax.reconstruction.residual import reproject
 from gs_jax.solvers import unrolled

@@ -132,7 +132,7 @@ def reconstruct_command(
     from ..design.design import design_text, read_design
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
-    from ..projection.cpu.native import once
+    from ..projection.cpu.dispatch import once
     from ..reconstruction.workflow import imaged_again, plan
 
     check_output(output, VOLUME_SUFFIXES)

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .cpu import native
-from .cpu.native import native_on_cpu
-from .primitive import linear_call
+from .cpu import dispatch as native
+from .cpu.dispatch import native_on_cpu
+from .linear_map import linear_call
 from .rays import Axis, Envelope, Rays, RingLight
 
 # Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache, and the number of

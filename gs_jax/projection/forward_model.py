@@ -10,8 +10,8 @@ from ..grid import Grid
 from ..optics.full import FullOptics
 from ..optics.kinds import KindOptics, of_kinds
 from .backprojection import as_volume, backproject_adjoint
-from .convolve import convolved, image_in_groups, with_margin
-from .full import full_image
+from .convolution import convolved, image_in_groups, with_margin
+from .field_varying_model import full_image
 
 # Depths that share a transform back, for the memory of as many sharp images.
 _TOGETHER = 2

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..optics.halo import HaloGrid, polar_shares
-from .primitive import linear_call
+from .linear_map import linear_call
 
 # Rings of polar nodes, from the axis on, that are closer to each other than pixels are.
 _INNER = 4

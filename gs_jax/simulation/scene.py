@@ -22,7 +22,7 @@ from ..optics.kinds import lenses_by_kind, of_kinds, relative_areas
 from ..optics.window import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
-from ..projection.points import STEPS, forward_points, full_image_of_points, stamps
+from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
 
 # Chief rays alone make no image of a point.
 OPTICS = tuple(level for level in LEVELS if level != "pinhole")

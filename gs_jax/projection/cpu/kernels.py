@@ -12,9 +12,9 @@ copied as one number of 64 bits.
 
 import numpy as np
 
-from . import picks as p, rows as r, shuffles as s, vectors as v
+from . import gather as p, rows as r, shuffles as s, simd as v
 from .rows import BUFFERS, FIRST, ONE, PARTS, PER_BUFFER, ZERO
-from .vectors import BOOL, WIDTH, carray
+from .simd import BOOL, WIDTH, carray
 
 # Neighbouring voxels that reach the same pixels would wait for each other: they go to lines of their own, of which so
 # many are enough.

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import vectors as v
-from .vectors import WIDTH, carray, inline
+from . import simd as v
+from .simd import WIDTH, carray, inline
 
 # A job is a list of 64-bit numbers: eight of its own, then address, type and three sizes of each buffer.
 PARTS, BUFFERS, PER_BUFFER = 3, 8, 5

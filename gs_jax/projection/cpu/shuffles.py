@@ -5,8 +5,8 @@ from numba import types
 from numba.core import config
 from numba.core.codegen import get_host_cpu_features
 
-from .native import WIDTH
-from .vectors import FLOATS, I32, INTEGERS, VECTOR, intrinsic, pointer_to, splat
+from .dispatch import WIDTH
+from .simd import FLOATS, I32, INTEGERS, VECTOR, intrinsic, pointer_to, splat
 
 _FEATURES = getattr(config, "CPU_FEATURES", None)
 # Whether the processor picks sixteen of 32 numbers by their places at once (AVX-512).

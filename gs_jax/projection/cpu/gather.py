@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import rows as r, shuffles as s, vectors as v
+from . import rows as r, shuffles as s, simd as v
 from .rows import FAR, ONE, ZERO
-from .vectors import WIDTH, carray, inline
+from .simd import WIDTH, carray, inline
 
 # How many voxels of a row a pixel may be reached by, and the most pixels of a window.
 REACHES, WIDEST = 4, 4 * WIDTH

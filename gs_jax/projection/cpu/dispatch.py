@@ -105,7 +105,7 @@ def _load(name):
     if find_spec("numba") is None:  # as for a Python that is too new for it
         return None
     try:
-        from . import bridge
+        from . import ffi as bridge
 
         return bridge.number(name)
     # Of numba, llvmlite or XLA, which may be too new, or nowhere to keep what is compiled: XLA does without all that.

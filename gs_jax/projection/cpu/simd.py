@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import carray as _carray, extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from .native import WIDTH
+from .dispatch import WIDTH
 
 # What XLA calls the types of pixels; an image of ones is a bool.
 BOOL, UINT8, UINT16 = 1, 6, 7

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
 from ..optics.exit_pupil import phasor
-from .cpu import native
-from .cpu.native import native_on_cpu
-from .primitive import linear_call
+from .cpu import dispatch as native
+from .cpu.dispatch import native_on_cpu
+from .linear_map import linear_call
 
 
 def with_margin(imager: Imager, size: int) -> Imager:

@@ -16,9 +16,9 @@ from ..optics.cores import ring_edges
 from ..optics.full import FullOptics, Halo
 from ..optics.light import clear_area
 from .bilinear import Shapes, volume_to_image
-from .convolve import convolved, doubled, image_in_groups, with_margin
+from .convolution import convolved, doubled, image_in_groups, with_margin
+from .linear_map import linear_call
 from .polar import apply, splat_table, spread_table
-from .primitive import linear_call
 from .rays import RingLight, trace
 
 # Lenses whose halos are computed at once, which bounds the memory.

@@ -17,10 +17,10 @@ import numpy as np
 from llvmlite import ir
 from numba import cfunc, types
 
-from . import kernels, tiles
-from .native import TARGET
+from . import fftconv as tiles, kernels
+from .dispatch import TARGET
 from .rows import BUFFERS, PARTS, PER_BUFFER
-from .vectors import FAST, carray, inline, intrinsic, pointer
+from .simd import FAST, carray, inline, intrinsic, pointer
 
 KERNELS = {
     function.__name__: function for function in (kernels.gather, kernels.scatter, kernels.rays_bar, tiles.overlap_save)
@@ -220,5 +220,5 @@ def _compile(function, result, arguments) -> int:
 @cache
 def _sources() -> int:
     folder = Path(__file__).parent
-    names = ("bridge", "kernels", "picks", "rows", "shuffles", "tiles", "vectors")
+    names = ("ffi", "fftconv", "gather", "kernels", "rows", "shuffles", "simd")
     return crc32(b"".join((folder / f"{name}.py").read_bytes() for name in names))

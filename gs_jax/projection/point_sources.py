@@ -17,7 +17,7 @@ from ..geometry import Imager
 from ..optics.cores import Cores, core_tables, drawn, ring_edges
 from ..optics.full import CORE_REACH, halo_nodes, halo_of, kernel_size
 from ..optics.refraction import on_host
-from .full import halo_image
+from .field_varying_model import halo_image
 from .rays import Envelope, RingLight
 
 # Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.

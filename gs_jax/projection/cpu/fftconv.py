@@ -9,10 +9,10 @@ product with a spectrum that is given alike.
 
 import numpy as np
 
-from . import rows as r, vectors as v
+from . import rows as r, simd as v
 from .rows import BUFFERS, PARTS, PER_BUFFER, ZERO
 from .shuffles import transpose
-from .vectors import WIDTH, carray, function, inline
+from .simd import WIDTH, carray, function, inline
 
 # Buffers: a plan, cosines and sines, spectra; images follow, and sums of them.
 _PLAN, _TURNS, _SPECTRA, _IMAGES = range(4)
