@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gs_jax.design.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable, write_design
-from gs_jax.layouts.patterns import random_layout
+from gs_jax.layouts import random_layout
 
 HERE = Path(__file__).parent
 SIZE = (4.4, 4.4)

@@ -33,7 +33,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.arrays import in_float32
 from gs_jax.base.machine import describe, status_mib
 from gs_jax.base.progress import Progress
-from gs_jax.layouts.patterns import random_layout
+from gs_jax.layouts import random_layout
 
 PAPER_S = 18.0
 FIELD_MM = 5120 * 0.0045

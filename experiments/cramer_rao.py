@@ -25,9 +25,8 @@ from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.fisher import PRIOR, cramer_rao, localization_bound, mean_images, windows
-from gs_jax.layouts.cells import nearest_neighbour_distances
-from gs_jax.layouts.patterns import poisson_disc_layout
-from gs_jax.simulation.camera import poisson
+from gs_jax.layouts import nearest_neighbour_distances, poisson_disc_layout
+from gs_jax.simulation.synthetic import poisson
 
 PLATE, DISTANCE, DEPTH = (5.0, 5.0), 1.0, 20.0
 SIZE = 15

@@ -20,7 +20,7 @@ from experiments.profiles import around_the_axis, dip, fwhm, through_peak
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import simulate_points
 
 SCENES = {
     "a": [[0.0, 0.0, 20.0, 1.0]],

@@ -21,7 +21,7 @@ from gs_jax import Imager
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import simulate_points
 
 CAPTURES = {18.0: "P1_i_18_c.tif", 20.0: "P1_a.tif", 22.0: "P1_i_22_c.tif"}
 DEPTHS = tuple(np.arange(17, 25.01, 0.5).tolist())

@@ -29,7 +29,7 @@ from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
 from gs_jax.pictures.style import draw_image
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.camera import Camera, electrons, expose
+from gs_jax.simulation.synthetic import Camera, electrons, expose
 
 DEPTHS = (18.0, 18.64, 19.27, 19.91, 20.54, 21.18)  # mm, the paper's
 # mm: voxels, emitters, and the left and upper edges of the groups.

@@ -25,9 +25,8 @@ from gs_jax.design.design import Design
 from gs_jax.detection.locate import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.pictures.style import draw_image
-from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import beads
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
 # mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
 SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002

@@ -35,9 +35,8 @@ from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
 from gs_jax.pictures.style import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.camera import Camera, electrons, expose
 from gs_jax.simulation.phantoms import rasterize, snowflake
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_points
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04

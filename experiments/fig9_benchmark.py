@@ -47,8 +47,8 @@ from gs_jax.optics.theory import FWHM
 from gs_jax.pictures.style import draw_image, label_of
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, reconstruct, voxel_grid
-from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake
+from gs_jax.simulation.synthetic import Camera, expose
 from gs_jax.solvers.unrolled import read_unrolled
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")

@@ -28,7 +28,7 @@ from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import envelope
-from gs_jax.optics.full import full_optics
+from gs_jax.optics.field_varying import full_optics
 from gs_jax.projection.convolution import with_margin
 
 STUDY = {

@@ -29,8 +29,7 @@ from scipy import stats
 from experiments.common import Report, main, table
 from experiments.layout_scenes import METHODS, Centers, Study, judge, loss, overlap, psf_of
 from gs_jax.base.progress import Progress
-from gs_jax.layouts.cells import nearest_neighbour_distances
-from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout
+from gs_jax.layouts import hexagonal_layout, nearest_neighbour_distances, poisson_disc_layout
 from gs_jax.optics.psf import diffraction_psf, gaussian_psf
 from gs_jax.optics.theory import occupancy
 

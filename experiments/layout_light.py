@@ -32,9 +32,9 @@ from gs_jax.apps.training.random_scenes import PLANES, random_scene, shared_out
 from gs_jax.apps.training.simulated_captures import FIELD_RADIUS, Kind, tables
 from gs_jax.base.arrays import in_float32
 from gs_jax.base.progress import Progress
-from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
+from gs_jax.layouts import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
 from gs_jax.projection.levels import optics_of
-from gs_jax.simulation.camera import electrons
+from gs_jax.simulation.synthetic import electrons
 
 KIND = Kind(288, 0.018, 0.064, 7, binning=4)
 DEPTHS = 20.0 + 0.5 * (np.arange(KIND.planes) - KIND.planes // 2)

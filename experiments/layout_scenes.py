@@ -18,7 +18,7 @@ from gs_jax import Grid, Imager, ImagingOperator, MicrolensArray, Sensor, forwar
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.end_to_end import random_scene, reconstruct, reconstruction_loss
 from gs_jax.metrics import quality
-from gs_jax.simulation.camera import Camera, electrons, expose
+from gs_jax.simulation.synthetic import Camera, electrons, expose
 from gs_jax.solvers.base import solve
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 

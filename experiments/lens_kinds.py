@@ -27,9 +27,9 @@ from gs_jax.codesign.pareto import sweep_of, trade_off
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.design import Design, design_text, read_design
 from gs_jax.geometry import envelope
-from gs_jax.optics.aperture import clear_diameter
+from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
-from gs_jax.optics.unit import pupil_disc
+from gs_jax.optics.raytrace import pupil_disc
 
 FOLDER = Path(__file__).parents[1] / "design"
 # Orientation, and whether the conic constant is free.

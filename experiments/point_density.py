@@ -24,9 +24,8 @@ from gs_jax.design.design import Design, read_design
 from gs_jax.detection.locate import find_points
 from gs_jax.metrics import localization
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.simulation.camera import Camera, expose
 from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
 # Points, and captures of so many.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}

@@ -21,9 +21,9 @@ from experiments.profiles import fwhm
 from gs_jax import Grid, Imager, Sensor, backproject
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
-from gs_jax.optics.aperture import clear_diameter
+from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import simulate_points
 
 FOLDER = Path(__file__).parents[1] / "design"
 DESIGNS = ("geomscope", "geomscope-optimized")

@@ -15,7 +15,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
 from gs_jax.design.sheet import datasheet
-from gs_jax.layouts.cells import nearest_neighbour_distances
+from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 
 COLUMNS = ("what", "paper", "printed: v = 4 mm", "focused: v = 5.8 mm", "why")

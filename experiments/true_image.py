@@ -30,14 +30,14 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
-from gs_jax.layouts.patterns import random_layout
+from gs_jax.layouts import random_layout
 from gs_jax.lenses import Orientation
-from gs_jax.optics.full import RINGS, full_optics
-from gs_jax.optics.unit import best_focus
-from gs_jax.optics.window import psf_of_depth
+from gs_jax.optics.field_varying import RINGS, full_optics
+from gs_jax.optics.psf import psf_of_depth
+from gs_jax.optics.raytrace import best_focus
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.simulation.phantoms import letters, random_points, rasterize
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import simulate_points
 
 BINS = (1, 4, 16)
 # Of a full model that costs twice the near one.

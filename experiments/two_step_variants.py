@@ -33,7 +33,7 @@ from gs_jax.apps.training.training_loop import Recipe, start, train
 from gs_jax.apps.training.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import UNet, multislice_network, standardized
-from gs_jax.optics.cores import apparent_depths
+from gs_jax.optics.psf_core import apparent_depths
 
 KIND = Kind(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8

@@ -15,7 +15,7 @@ from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.point_tables import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
-from .layouts.patterns import random_layout as random_layout
+from .layouts import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
@@ -31,9 +31,8 @@ from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.residual import reproject as reproject
-from .simulation.camera import Camera as Camera, expose as expose
 from .simulation.phantoms import rasterize as rasterize
-from .simulation.scene import simulate as simulate
+from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
 from .solvers.admm import ADMM as ADMM
 from .solvers.base import solve as solve
 from .solvers.fista import FISTA as FISTA

@@ -240,7 +240,7 @@ class Imager(eqx.Module):
         """`z'`: from the object to the lens vertices as the optics sees it, mm.
 
         `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front. An imager of NumPy's
-        numbers (`gs_jax.optics.refraction.on_host`) gives NumPy's.
+        numbers (`gs_jax.optics.raytrace.on_host`) gives NumPy's.
         """
         return library_of(self.sensor_distance).asarray(depth) + self.array.air_in_front
 
@@ -294,7 +294,7 @@ class Imager(eqx.Module):
             Indices of `array.centers`.
         distortion
             By what the spot's distance from the image of the lens's axis is multiplied: 1 of a chief ray, and of a
-            spot's core what `gs_jax.optics.cores` finds.
+            spot's core what `gs_jax.optics.psf_core` finds.
         """
         xp = library_of(self.sensor_distance)
         depth, lenses = points[..., 2], xp.asarray(lenses)

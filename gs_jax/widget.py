@@ -274,9 +274,8 @@ def sample() -> list[Any]:
     import jax
 
     from .design.design import read_design
-    from .simulation.camera import Camera, expose
     from .simulation.phantoms import random_points
-    from .simulation.scene import simulate
+    from .simulation.synthetic import Camera, expose, simulate
 
     imager = read_design(DESIGN.convert("geomscope", None, None)).imager()
     light = simulate(random_points(40, (6.0, 6.0), (18.0, 22.0), seed=0), imager, optics="near", psf="geometric")

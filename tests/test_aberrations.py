@@ -19,8 +19,8 @@ from gs_jax.optics.aberrations import (
     seidel,
     strehl,
 )
+from gs_jax.optics.raytrace import wavefront
 from gs_jax.optics.theory import focus_distance
-from gs_jax.optics.unit import wavefront
 
 R, F, N, DEPTH, WAVELENGTH = 2.0, 2 / 0.43, 1.43, 20.7, 520e-6
 ORIENTATIONS = pytest.mark.parametrize("plano", [True, False])

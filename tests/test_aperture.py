@@ -7,8 +7,8 @@ from jax.test_util import check_grads
 from scipy.spatial.distance import cdist
 
 from gs_jax import MicrolensArray
-from gs_jax.layouts.cells import coverage, nearest_neighbour_distances
-from gs_jax.optics.aperture import aperture_area, clear_diameter, pitch
+from gs_jax.layouts import coverage, nearest_neighbour_distances
+from gs_jax.optics.apertures import aperture_area, clear_diameter, pitch
 
 from .helpers import aperture_edge
 

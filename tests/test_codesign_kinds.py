@@ -19,8 +19,8 @@ from gs_jax.codesign.study import Study
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
 from gs_jax.design.sheet import datasheet
-from gs_jax.layouts.dealing import dealt
-from gs_jax.optics.aperture import clear_diameter
+from gs_jax.layouts import dealt
+from gs_jax.optics.apertures import clear_diameter
 
 KINDS = [name for name, term in TERMS.items() if term.kinds]
 

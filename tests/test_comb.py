@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.codesign.comb import comb_spectrum, condition_number, lens_shortage, readback, sidelobes, spectral_flatness
 from gs_jax.geometry import envelope
-from gs_jax.layouts.patterns import hexagonal_layout, poisson_disc_layout
+from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
 
 SOURCES = np.array([[0.1, -0.2, 20.0], [0.3, 0.4, 18.0]])
 WIDTH = 0.02

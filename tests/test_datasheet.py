@@ -18,8 +18,8 @@ from gs_jax.design.problems import findings
 from gs_jax.design.sheet import datasheet, summary, tables
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
-from gs_jax.optics.aperture import cells_of, clear_diameter, pitch
-from gs_jax.optics.kinds import lenses_by_kind
+from gs_jax.optics.apertures import cells_of, clear_diameter, pitch
+from gs_jax.optics.lens_types import lenses_by_kind
 
 from .helpers import scene
 from .test_cli import run

@@ -10,8 +10,8 @@ from gs_jax.detection import evidence
 from gs_jax.detection.consistency import signal
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.locate import searched_voxels
-from gs_jax.optics.cores import apparent_depths
-from gs_jax.optics.focus import LEAST_SHARP, sharpness
+from gs_jax.optics.lens_types import LEAST_SHARP, sharpness
+from gs_jax.optics.psf_core import apparent_depths
 
 from .test_locate import capture_of, find, many, small
 

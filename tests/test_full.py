@@ -16,10 +16,21 @@ from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Se
 from gs_jax.design.design import read_design
 from gs_jax.detection.locate import find_points
 from gs_jax.geometry import falloff
-from gs_jax.optics.cores import apparent_depths, core_magnification, drawn, ring_edges, ring_share, spread
-from gs_jax.optics.full import full_optics
-from gs_jax.optics.light import clear_area, mean_zones, spot_rays, transmitted, zones
-from gs_jax.optics.unit import unit_rays
+from gs_jax.optics.field_varying import full_optics
+from gs_jax.optics.psf_core import (
+    apparent_depths,
+    clear_area,
+    core_magnification,
+    drawn,
+    mean_zones,
+    ring_edges,
+    ring_share,
+    spot_rays,
+    spread,
+    transmitted,
+    zones,
+)
+from gs_jax.optics.raytrace import unit_rays
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 

@@ -7,7 +7,7 @@ from scipy import integrate
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray, envelope
-from gs_jax.optics.unit import unit_rays
+from gs_jax.optics.raytrace import unit_rays
 
 from .helpers import scene
 

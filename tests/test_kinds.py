@@ -23,11 +23,11 @@ from gs_jax import (
 from gs_jax.detection.consistency import Signal, readings
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.kinds import Kind, readings_of
-from gs_jax.optics.kinds import kind_weights, lenses_by_kind, of_kinds
+from gs_jax.optics.lens_types import kind_weights, lenses_by_kind, of_kinds
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.methods import BackProjection, ListRichardsonLucy
 from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.scene import simulate
+from gs_jax.simulation.synthetic import simulate
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 from .test_full import grid, imager, volume

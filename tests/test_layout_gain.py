@@ -5,7 +5,7 @@ from scipy import stats
 from experiments.layout_gain import NAMES, PAIRS, apart, gain, gains, hexagonal, picture, rows, run, spread
 from experiments.layout_scenes import METHODS, Study
 from gs_jax.base.progress import Progress
-from gs_jax.layouts.cells import nearest_neighbour_distances
+from gs_jax.layouts import nearest_neighbour_distances
 
 pytestmark = pytest.mark.integration
 

@@ -9,7 +9,7 @@ from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.design.design import Design
 from gs_jax.design.tables import ArrayTable, ImagingTable, LensTable, SensorTable
 from gs_jax.geometry import field_limit
-from gs_jax.layouts.patterns import hexagonal_layout
+from gs_jax.layouts import hexagonal_layout
 
 CENTERS = ((-0.313, 0.437), (0.221, 0.119), (0.427, -0.341), (0.333, 0.416), (-0.429, -0.243))
 SLOW = [

@@ -5,8 +5,16 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.distance import cdist
 
-from gs_jax.layouts.cells import coverage, largest_hole, nearest_neighbour_distances
-from gs_jax.layouts.patterns import hexagonal_layout, lloyd_relaxed, poisson_disc_layout, random_layout, square_layout
+from gs_jax.layouts import (
+    coverage,
+    hexagonal_layout,
+    largest_hole,
+    lloyd_relaxed,
+    nearest_neighbour_distances,
+    poisson_disc_layout,
+    random_layout,
+    square_layout,
+)
 
 from .helpers import needs
 

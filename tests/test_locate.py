@@ -20,10 +20,9 @@ from gs_jax.detection.clustering import find_clusters
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.locate import find_points
 from gs_jax.metrics import localization
-from gs_jax.optics.light import clear_area
-from gs_jax.simulation.camera import Camera, expose
+from gs_jax.optics.psf_core import clear_area
 from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.scene import simulate_points
+from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
 from .helpers import needs
 

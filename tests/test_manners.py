@@ -27,11 +27,11 @@ from gs_jax.io.files import atomic_write, write_figure, write_json, write_text
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
-from gs_jax.optics.window import PSFS
+from gs_jax.optics.psf import PSFS
 from gs_jax.projection.levels import LEVELS
 from gs_jax.reconstruction.deconvolution import TV
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.simulation.scene import OPTICS
+from gs_jax.simulation.synthetic import OPTICS
 
 from .test_cli import RECONSTRUCT, folder, run
 

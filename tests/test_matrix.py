@@ -21,7 +21,7 @@ from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
 from gs_jax.design.sheet import datasheet
-from gs_jax.optics.refraction import on_host
+from gs_jax.optics.raytrace import on_host
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
 

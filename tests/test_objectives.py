@@ -11,7 +11,7 @@ from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.sheet import datasheet
-from gs_jax.layouts.cells import largest_hole, nearest_neighbour_distances
+from gs_jax.layouts import largest_hole, nearest_neighbour_distances
 from gs_jax.optics.psf import diffraction_psf
 
 # Off the raster of places, where a hole has a kink.

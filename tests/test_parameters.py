@@ -10,8 +10,8 @@ from gs_jax.base.errors import InputError
 from gs_jax.codesign.bounds import Bounds
 from gs_jax.codesign.parameters import NAMES, candidate, new_design, parent_of, start_values
 from gs_jax.design.builtin import geomscope
-from gs_jax.layouts.cells import coverage
-from gs_jax.optics.aperture import clear_diameter, pitch
+from gs_jax.layouts import coverage
+from gs_jax.optics.apertures import clear_diameter, pitch
 
 MOVING = {"centers_mm": (-10.0, 10.0)}
 

@@ -6,9 +6,9 @@ import pytest
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.optics.unit import pupil_disc, unit_rays
-from gs_jax.optics.window import PSFS, psf_of_depth
-from gs_jax.simulation.scene import simulate, simulate_points, simulate_volume
+from gs_jax.optics.psf import PSFS, psf_of_depth
+from gs_jax.optics.raytrace import pupil_disc, unit_rays
+from gs_jax.simulation.synthetic import simulate, simulate_points, simulate_volume
 
 
 def imager(sensor_distance=5.8, pixel=0.01):
@@ -87,7 +87,7 @@ def test_depths_are_taken_some_at_a_time(monkeypatch):
     points = np.column_stack([0 * z, 0 * z, z, np.ones_like(z)])
     options: dict[str, Any] = dict(kind="gaussian")
     whole = simulate_points(points, imager(), **options)
-    monkeypatch.setattr("gs_jax.simulation.scene._SLAB", 5)
+    monkeypatch.setattr("gs_jax.simulation.synthetic._SLAB", 5)
     np.testing.assert_allclose(simulate_points(points, imager(), **options), whole, atol=1e-12 * whole.max())
 
 

@@ -29,9 +29,8 @@ from gs_jax.design.sheet import microscopes_of
 from gs_jax.design.spots import field_heights
 from gs_jax.geometry import envelope
 from gs_jax.optics import theory
-from gs_jax.optics.axial import axial_strehl
-from gs_jax.optics.psf import strehl
-from gs_jax.optics.unit import pupil_disc
+from gs_jax.optics.psf import axial_strehl, strehl
+from gs_jax.optics.raytrace import pupil_disc
 
 from .test_cli import run
 

@@ -10,8 +10,8 @@ import pytest
 
 from gs_jax import MicrolensArray
 from gs_jax.lenses import kinds
-from gs_jax.optics.aperture import _edges, aperture_area
-from gs_jax.optics.light import zones
+from gs_jax.optics.apertures import _edges, aperture_area
+from gs_jax.optics.psf_core import zones
 
 from .test_aperture import layout
 

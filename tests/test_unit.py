@@ -7,8 +7,8 @@ from scipy.optimize import fminbound
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray
-from gs_jax.optics import refraction
-from gs_jax.optics.unit import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
+from gs_jax.optics import raytrace as refraction
+from gs_jax.optics.raytrace import best_focus, pupil_disc, unit_rays, wavefront, wavefront_rms
 
 WAVELENGTH = 520e-6
 FIELDS = [(0.0, 0.0), (1.0, -0.4), (0.0, 3.0)]

@@ -16,11 +16,10 @@ from ..geometry import Imager, Sensor
 from ..grid import Grid
 from ..lenses import MicrolensArray
 from ..metrics import localization, quality
-from ..optics.aperture import clear_diameter
+from ..optics.apertures import clear_diameter
 from ..optics.psf import geometric_psf
 from ..optics.theory import FWHM
-from ..simulation.camera import Camera, electrons, expose
-from ..simulation.scene import simulate_points
+from ..simulation.synthetic import Camera, electrons, expose, simulate_points
 
 WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
 # Emitters across a particle.

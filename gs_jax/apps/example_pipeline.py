@@ -29,13 +29,12 @@ from ..io.captures import write_capture
 from ..io.files import make_folder, write_figure, write_json, write_text
 from ..io.point_tables import write_points
 from ..io.volumes import write_volume
-from ..layouts.cells import nearest_neighbour_distances
+from ..layouts import nearest_neighbour_distances
 from ..metrics import Localization, Quality, localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
-from ..simulation.camera import Camera, expose
 from ..simulation.phantoms import letters, random_points, rasterize
-from ..simulation.scene import simulate
+from ..simulation.synthetic import Camera, expose, simulate
 from ..solvers.richardson_lucy import RichardsonLucy
 from .report.page import write_report
 

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..layouts.cells import nearest_neighbour_distances
+from ..layouts import nearest_neighbour_distances
 
 # The brightest spots that guesses are made from and tried on, of each source and at most, and lenses that make a pair.
 _FIRST, _TRIED, _MOST, _NEIGHBOURS = 5, 20, 3, 12

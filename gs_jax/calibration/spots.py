@@ -10,7 +10,7 @@ from skimage.feature import peak_local_max
 
 from ..detection.consistency import signal
 from ..geometry import Imager
-from ..optics.light import SpotRays, spot_rays, zones
+from ..optics.psf_core import SpotRays, spot_rays, zones
 
 # Of the window, pixels: standard deviation, half its side; how often it is moved at most, and when it rests.
 _WINDOW, _HALF, _MOVES, _RESTS = 1.5, 4, 300, 1e-4

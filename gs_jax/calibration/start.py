@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ..base.errors import InputError
 from ..geometry import Imager
 from ..lenses import MicrolensArray
-from ..optics.refraction import on_host
+from ..optics.raytrace import on_host
 from .matching import Similarity, match, match_shift, meeting_lenses, near_of
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of

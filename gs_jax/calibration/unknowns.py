@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import Imager
 from ..lenses import MicrolensArray, type_of_lens
-from ..optics.kinds import lenses_by_kind, of_kinds
+from ..optics.lens_types import lenses_by_kind, of_kinds
 from .spots import core_offsets
 
 # Fields at which exact rays are traced, the degree of what is laid through them, and depths at most.

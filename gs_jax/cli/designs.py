@@ -22,8 +22,7 @@ def layout_command(
 ):
     """Make a random layout of lenses, for the key `centers_file` of a design."""
     from ..design.centers import write_centers
-    from ..layouts.cells import coverage, nearest_neighbour_distances
-    from ..layouts.patterns import random_layout
+    from ..layouts import coverage, nearest_neighbour_distances, random_layout
 
     check_output(output, [".csv"])
     check_may_write(output, inputs=(), force=force)

@@ -62,8 +62,7 @@ def simulate_command(
 
     from ..design.design import design_text, read_design
     from ..io.captures import CAPTURE_SUFFIXES, write_capture
-    from ..simulation.camera import Camera, expose
-    from ..simulation.scene import read_scene, simulate
+    from ..simulation.synthetic import Camera, expose, read_scene, simulate
 
     check_output(output, CAPTURE_SUFFIXES)
     check_may_write(output, inputs=(scene, design))

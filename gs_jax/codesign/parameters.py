@@ -26,8 +26,8 @@ from ..design.microscope import Microscope
 from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH, type_of_lens
-from ..optics.aperture import Cells, cells_of, pitch
-from ..optics.kinds import lenses_by_kind
+from ..optics.apertures import Cells, cells_of, pitch
+from ..optics.lens_types import lenses_by_kind
 
 Values = dict[str, Float[Array, "..."]]
 

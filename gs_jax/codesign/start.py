@@ -5,7 +5,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..design.checks import plate_as_air
 from ..design.design import Design
-from ..layouts.dealing import dealt
+from ..layouts import dealt
 from ..lenses import kinds as kinds_of
 from .study import Study
 

@@ -13,7 +13,7 @@ from ..base.arrays import safe_sqrt
 from ..design.microscope import Microscope
 from ..design.spots import field_heights
 from ..geometry import envelope
-from ..optics.unit import pupil_disc, unit_rays
+from ..optics.raytrace import pupil_disc, unit_rays
 
 # What an exposure is counted for, mm.
 AWAY, PLACE = 20.0, 0.04

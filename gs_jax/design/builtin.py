@@ -1,6 +1,6 @@
 """The built-in designs, as the paper describes them."""
 
-from ..layouts.patterns import random_layout
+from ..layouts import random_layout
 from .design import Design
 from .tables import ArrayTable, ImagingTable, LensTable, SensorTable
 

@@ -8,7 +8,7 @@ from ..base.errors import InputError
 from ..geometry import Imager
 from ..lenses import kinds
 from ..optics import theory
-from ..optics.aperture import clear_diameter
+from ..optics.apertures import clear_diameter
 
 
 def tables_of(imager: Imager) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..optics import aberrations, theory
 from ..optics.aberrations import Wavefront
-from ..optics.aperture import Cells, clear_diameter, clear_diameters
-from ..optics.kinds import of_kinds
+from ..optics.apertures import Cells, clear_diameter, clear_diameters
+from ..optics.lens_types import of_kinds
 
 
 class Microscope(eqx.Module):
@@ -42,7 +42,7 @@ class Microscope(eqx.Module):
     exposure
         Electrons that a mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um.
     cells, directions
-        How clear apertures are found, as of `gs_jax.optics.aperture`: of lenses that are alike, and of others.
+        How clear apertures are found, as of `gs_jax.optics.apertures`: of lenses that are alike, and of others.
     lenses
         Which are of each kind, where they differ; none if all are alike. What follows from a lens's shape is of the
         `kinds` then, the rest also of the whole, whose clear diameter is the mean lens's.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..optics import aberrations, theory
-from ..optics.unit import unit_rays
+from ..optics.raytrace import unit_rays
 from .design import Design
 from .microscope import Microscope
 from .sheet import microscopes_of

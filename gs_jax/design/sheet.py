@@ -12,10 +12,10 @@ from rich.table import Table
 
 from ..base.arrays import as_float
 from ..base.errors import InputError, short_repr
-from ..layouts.cells import check_positive, nearest_neighbour_distances
+from ..layouts import check_positive, nearest_neighbour_distances
 from ..optics import aberrations
-from ..optics.aperture import cells_of
-from ..optics.kinds import lenses_by_kind
+from ..optics.apertures import cells_of
+from ..optics.lens_types import lenses_by_kind
 from .design import Design
 from .microscope import Microscope
 from .spots import encircled_radius, psf_width

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..base.arrays import safe_sqrt
 from ..geometry import envelope
 from ..optics import theory
-from ..optics.unit import pupil_disc, unit_rays
+from ..optics.raytrace import pupil_disc, unit_rays
 from .microscope import Microscope
 
 _FIELDS = 4

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..base.errors import InputError
-from ..layouts.cells import nearest_neighbour_distances
-from ..layouts.patterns import random_layout
+from ..layouts import nearest_neighbour_distances, random_layout
 from .checks import beside_sensor
 
 # The paper's material, plate and light.

@@ -16,7 +16,7 @@ from scipy.special import bdtrc
 
 from ..base.arrays import check_finite
 from ..geometry import Imager
-from ..optics.refraction import on_host
+from ..optics.raytrace import on_host
 from .background import between, smoothed, square_levels
 
 # Of the Gaussian that evens out where in a pixel a spot is, pixels: most that keeps spots 2.5 pixels apart apart.

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Float64, Int, Shaped
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.cores import apparent_depths
-from ..optics.focus import core_side
+from ..optics.lens_types import core_side
+from ..optics.psf_core import apparent_depths
 from .consistency import Signal, agreed_level, log_false_alarms, signal, survival
 from .kinds import kinds_of, readings_of
 from .locate import LIT, SHARE, count_of, searched_voxels

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from ..geometry import Imager
-from ..optics.cores import apparent_depths
-from ..optics.kinds import kind_weights, lenses_by_kind, of_kinds
+from ..optics.lens_types import kind_weights, lenses_by_kind, of_kinds
+from ..optics.psf_core import apparent_depths
 from .consistency import Readings, Signal, readings
 
 # A kind can see points where it brings at least this part of the light into a core that the best kind does.

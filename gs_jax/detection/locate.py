@@ -19,8 +19,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.cores import apparent_depths, core_shares
-from ..optics.focus import FIELDS, HALF_SIDE, core_side, warn_if_blurred
+from ..optics.lens_types import FIELDS, HALF_SIDE, core_side, warn_if_blurred
+from ..optics.psf_core import apparent_depths, core_shares
 from ..projection.backprojection import backproject
 from .background import in_bands
 from .consistency import (
@@ -87,7 +87,7 @@ def find_points(
     4. All is repeated once on what the image holds beside the points, for those in the shadow of brighter ones.
 
     No threshold depends on the scene, and nothing is random. Points are looked for where the bright cores of the spots
-    land, by exact rays (`gs_jax.optics.cores.apparent_depths`).
+    land, by exact rays (`gs_jax.optics.psf_core.apparent_depths`).
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def find_points(
     Warns
     -----
     InputWarning
-        If the microscope is out of focus at the grid's depths (`gs_jax.optics.focus`). Of an image, not of a
+        If the microscope is out of focus at the grid's depths (`gs_jax.optics.lens_types`). Of an image, not of a
         `Signal`, which is for many images of one microscope.
 
     Examples

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..design.design import Design
-from ..layouts.cells import cell_edges, coverage, largest_hole
+from ..layouts import cell_edges, coverage, largest_hole
 from ..lenses import MicrolensArray
 from .export import Mesh
 from .lenslets import STEEPEST, cap_sag, caps_of, estimated_facets, surface, visible_reaches

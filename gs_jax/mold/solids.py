@@ -23,7 +23,7 @@ from matplotlib.textpath import TextPath
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..layouts.cells import ROUNDING, cell_edges, half_size, in_mm, nearest_neighbour_distances
+from ..layouts import ROUNDING, cell_edges, half_size, in_mm, nearest_neighbour_distances
 from ..lenses import MicrolensArray
 from .lenslets import DRAFT, Cap, cap_sag, caps_of, estimated_facets, facet_cap, surface, visible_reaches
 

@@ -1,25 +1,154 @@
-"""The point spread function of one lens unit on the sensor: PSF_o of Eq. (2).
+"""The exit pupil of a lens unit: the field to be transformed to the sensor.
 
-`diffraction_psf` is scalar diffraction with the exact wavefront of `gs_jax.optics.unit`; `geometric_psf` counts rays
+Huygens' principle sums `exp(2 pi i (L + |P - B|) / wavelength)` over the points B of the convex surface, with the
+path L from the object to B. For each B, `|P - B| - (P - P_0)^2 / (2 rho)`, with the chief ray's end P_0 and its length
+rho, is made linear in P about the point where the ray from B lands. What is left out is of the second order in
+the distance from there, and that is small: light is near its ray. So both limits are right, the Fresnel integral of a
+lens with a small angle and the ray density of one with strong aberrations, and the sum becomes a Fourier transform.
+
+The point spread function of one lens unit on the sensor: PSF_o of Eq. (2).
+
+`diffraction_psf` is scalar diffraction with the exact wavefront; `geometric_psf` counts rays
 and `gaussian_psf` is a Gaussian, for a fraction of the time. They return `(size, size)` pixels `[row, column]` with
 the sum 1, however little of the light falls into the window (`window_fraction` says how much). In the middle is the
 chief ray of `gs_jax.geometry`, not the true one: what the map gets wrong (distortion, coma) is in the PSF.
 
-The field of `gs_jax.optics.exit_pupil` goes to the sensor by a Fourier transform, done by two small matrix products
+The field of `gs_jax.optics.psf` goes to the sensor by a Fourier transform, done by two small matrix products
 (Soummer et al., Opt. Express 15, 15935, 2007).
+
+PSFs of many depths in one window, which holds the rays of all.
+
+To add a kind of PSF, write its function beside those of `gs_jax.optics.psf` and name it in `PSFS`.
+
+The Strehl ratio of a lens unit on its axis by one line of rays: fast enough for thousands of lenses.
+
+`gs_jax.optics.psf.strehl` has any field, any aperture and the peak wherever it is, for as much as a thousand times the
+work. A spot on the axis is round, and what `gs_jax.optics.psf` sums over the exit pupil is an integral over its
+radius `u`: with the phase `phi` of the path there, and light that is even over the lens, hence the amplitude
+`sqrt(r dr / (u du))` of the lens's radius `r`, the field in the middle is `int exp(2 pi i phi / wavelength)
+sqrt(u u'/r) r dr`.
 """
 
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
+from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
-from .exit_pupil import ExitPupil, inside, phasor, trace_exit_pupil
+from .apertures import clear_diameter
+from .raytrace import Point, chief_length, direction_cosines, pupil_disc, pupil_radius, unit_rays
 from .theory import airy_deviation
-from .unit import Point, pupil_disc, pupil_radius, unit_rays
+
+# The grid in the exit pupil reaches this much beyond the lens's own radius, for the pupil's distortion.
+_PUPIL_MARGIN = 1.08
+# The ray from a point of the exit pupil: degree of the polynomials that start the search, and its steps.
+_DEGREE = 7
+_PUPIL_STEPS = 1
+# How far from its place, in radii, a ray may come: the error of its phase is of the second order in that.
+_CLOSE = 0.02
+
+
+class ExitPupil(NamedTuple):
+    """The exit pupil on a square grid.
+
+    `coordinate`: along each side, mm. `field` and its modulus `amplitude`. `chief`: where the chief ray meets the
+    sensor, `(x, y)` from the lens's axis, mm; `distance`: its length behind the vertex as the sensor sees it, mm.
+    """
+
+    coordinate: Float[Array, " sample"]
+    field: Complex[Array, "sample sample"]
+    amplitude: Float[Array, "sample sample"]
+    chief: Float[Array, "2"]
+    distance: Float[Array, ""]
+
+
+def trace_exit_pupil(imager: Imager, depth, field, radius, edges, count: int) -> ExitPupil:
+    """The lens seen from the sensor: for each point of a grid the ray that comes from there, and its phase.
+
+    The coordinate is `u = D - rho (e - e_0)` with the ray's end D from the chief ray's, its direction cosines e and
+    the chief ray's length rho: the point of the lens, but for the third order. The phase is that of the path
+    less `e D - D^2 / (2 rho)`. By Hamilton's theorem its slope is `-D / rho`, which makes up for what `_lens_points`
+    leaves. Parameters are `gs_jax.optics.psf.diffraction_psf`'s, with `count` samples along a side.
+    """
+    radius = pupil_radius(imager, radius)
+    reach = _PUPIL_MARGIN * radius
+    chief = unit_rays(imager, depth, np.zeros(2), field)
+    distance = chief_length(imager, chief)
+
+    def trace(points):
+        rays = unit_rays(imager, depth, points, field)
+        end, cosines = rays.landing - chief.landing[None], direction_cosines(rays.tangent)
+        return rays, end, cosines, end - distance * (cosines - direction_cosines(chief.tangent)[None])
+
+    known, weights = pupil_disc(radius)
+    rays, _, _, found = trace(known)
+    coordinate = reach * jnp.asarray(np.linspace(-1, 1, count), radius.dtype)
+    wanted = jnp.stack(jnp.meshgrid(coordinate, coordinate), -1).reshape(-1, 2)
+    points, along_x, along_y = _lens_points(known / reach, found / reach, jnp.where(rays.valid, weights, 0), count)
+    points = reach * points
+    for _ in range(_PUPIL_STEPS):
+        rays, _, _, found = trace(points)
+        missing = jnp.where(rays.valid[:, None], wanted - found, 0)
+        points = points + along_x * missing[:, :1] + along_y * missing[:, 1:]
+    rays, end, cosines, found = trace(points)
+    path = rays.path - jnp.sum(end * cosines, -1) + jnp.sum(end * (end / 2 - wanted + found), -1) / distance
+    # Around the lens the search may end at another ray: nothing comes from there.
+    lit = rays.valid & (jnp.sum((wanted - found) ** 2, -1) < (_CLOSE * radius) ** 2)
+    share = inside(points, radius, edges, coordinate[1] - coordinate[0])
+    # Light that is even over the lens is denser where the exit pupil is narrower.
+    density = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
+    lit = lit & (density > 0)
+    amplitude = jnp.where(lit, share * jnp.sqrt(jnp.where(lit, density, 1)), 0)
+    phase = jnp.where(lit, 2 * np.pi / imager.wavelength * path, 0)
+    amplitude, phase = amplitude.reshape(count, count), phase.reshape(count, count)
+    return ExitPupil(coordinate, phasor(amplitude, phase), amplitude, chief.landing, distance)
+
+
+def _lens_points(known: Array, found: Array, weights: Array, count: int) -> list[Float[Array, "point 2"]]:
+    """Points of the lens for a `count` x `count` grid over [-1, 1] of the exit pupil, and their derivatives by x and y.
+
+    Polynomials of total degree `_DEGREE`, fitted to pairs of points `known` on the lens and `found` in the exit pupil.
+    """
+    x, y = (_chebyshev(c) for c in found.T)
+    rows, columns = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
+    basis = y[:, rows] * x[:, columns]
+    weighted = basis * weights[:, None]
+    fit = jnp.linalg.solve(weighted.T @ basis, weighted.T @ known)
+    table = jnp.zeros((2, _DEGREE + 1, _DEGREE + 1), known.dtype).at[:, rows, columns].set(fit.T)
+    side = jnp.asarray(np.linspace(-1, 1, count), known.dtype)
+    value, slope = jax.jvp(_chebyshev, (side,), (jnp.ones_like(side),))
+    pairs = ((value, value), (value, slope), (slope, value))
+    return [(row @ table @ column.T).reshape(2, -1).T for row, column in pairs]
+
+
+def _chebyshev(x: Float[Array, " point"]) -> Float[Array, "point degree"]:
+    terms = [jnp.ones_like(x), x]
+    for _ in range(_DEGREE - 1):
+        terms.append(2 * x * terms[-1] - terms[-2])
+    return jnp.stack(terms, -1)
+
+
+def inside(points: Float[Array, "point 2"], radius: Array, edges, step: Array) -> Float[Array, " point"]:
+    """How far points of the lens are within the aperture: from 0 to 1 over one step, for the sake of gradients."""
+    inward = radius - jnp.sqrt(jnp.maximum(jnp.sum(points**2, -1), step**2))
+    if edges is not None:
+        edges = jnp.asarray(edges, radius.dtype)
+        length = jnp.sqrt(jnp.sum(edges**2, -1))
+        for edge, at in zip(edges, length, strict=True):
+            inward = jnp.minimum(inward, at - points @ (edge / at))
+    return jnp.clip(inward / step + 0.5, 0, 1)
+
+
+def phasor(length: ArrayLike, phase: Array) -> Complex[Array, "..."]:
+    """`length exp(i phase)`, in the phase's precision."""
+    return jax.lax.complex(length * jnp.cos(phase), length * jnp.sin(phase))
+
 
 _RAYS = 2**15
 # Turn of Vogel's spiral, which spreads any number of points evenly over a disc.
@@ -261,3 +390,93 @@ def _map(imager: Imager, depth, field, dtype) -> Array:
 def _check(size: int) -> None:
     if size < 1 or size % 2 == 0:
         raise ValueError(f"`size` must be odd and positive, got {size}.")
+
+
+PSFS = {"diffraction": diffraction_psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
+# Window of the PSF: room for the diffraction around the rays, and the most that the rays may reach, pixels.
+_WINDOW_MARGIN, _FARTHEST = 16, 128
+# Rays along the aperture's radius that are asked how far they reach.
+_ZONES = 65
+
+
+def psf_of_depth(
+    imager: Imager, depths: Sequence[float] | np.ndarray, kind: str, steps: int = 1
+) -> Callable[..., Float[Array, "row column"]]:
+    """Function from a depth to its PSF, in a window that holds the rays of all depths.
+
+    Rays that the lens reflects totally do not count.
+
+    Parameters
+    ----------
+    imager
+        Its mean clear aperture is taken.
+    depths
+        Between the nearest and the farthest of them, mm.
+    kind
+        Of the PSF: a key of `PSFS`.
+    steps
+        As many pixels of the sensor as make a pixel that is meant: the margins of the window grow with them.
+
+    Raises
+    ------
+    InputError
+        If the rays reach farther than 128 pixels.
+    """
+    radius = clear_diameter(imager.array) / 2
+    # All zones: near the focus of the rim's rays those of other zones land farther out.
+    fan = radius * jnp.linspace(0, 1, _ZONES)[:, None] * jnp.array([[1.0, 0.0]])
+    ends = [unit_rays(imager, depth, fan) for depth in (min(depths), max(depths))]
+    reaches = [float(jnp.where(rays.valid, jnp.abs(rays.landing[:, 0]), 0).max()) for rays in ends]
+    pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
+    if not pixels <= _FARTHEST:
+        depth = (min(depths), max(depths))[int(np.argmax(reaches))]
+        raise InputError(
+            f"found an object at {depth:g} mm, blurred over {pixels:.3g} pixels of the sensor each way, "
+            f"allowed: {_FARTHEST}."
+        )
+    size = steps * (2 * math.ceil(pixels + _WINDOW_MARGIN) + 1)
+    make = PSFS[kind]
+    if kind == "diffraction":  # as fine as the aperture diffracts
+        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.reduced_sensor_distance))
+        make = partial(make, samples=math.ceil(sharp))
+    return lambda depth: make(imager, depth, size=size, radius=radius)
+
+
+# Of Gauss and Legendre's rule in the squared radius: the path may change by dozens of waves.
+_NODES = 64
+
+
+def axial_strehl(
+    imager: Imager, depth: Float[ArrayLike, ""], *, radius: Float[ArrayLike, ""] | None = None
+) -> Float[Array, ""]:
+    """Irradiance in the middle of the spot of a point on the axis, over that without aberrations and defocus.
+
+    Where the Strehl ratio is above 0.1 the middle is the peak; a spot far out of focus may be brighter around it.
+
+    Parameters
+    ----------
+    imager
+        The lens, the light and the sensor's distance.
+    depth
+        `z` of the object point, mm.
+    radius
+        Of the clear aperture, mm. Half the aperture's diameter by default.
+    """
+    radius = pupil_radius(imager, radius)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    at = radius * jnp.asarray(np.sqrt((nodes + 1) / 2), radius.dtype)
+    distance = chief_length(imager, unit_rays(imager, depth, np.zeros(2)))
+
+    def trace(at):
+        rays = unit_rays(imager, depth, jnp.stack([at, jnp.zeros_like(at)], -1))
+        tangent, end = rays.tangent[:, 0], rays.landing[:, 0]
+        sine = tangent / jnp.sqrt(1 + tangent**2)
+        return end - distance * sine, (rays.path - end * sine + end**2 / (2 * distance), rays.valid)
+
+    seen, denser, (path, valid) = jax.jvp(trace, (at,), (jnp.ones_like(at),), has_aux=True)
+    squared = seen * denser / at
+    lit = valid & (squared > 0)
+    amplitude = jnp.where(lit, jnp.asarray(weights, at.dtype) * jnp.sqrt(jnp.where(lit, squared, 1)), 0)
+    phase = jnp.where(lit, 2 * np.pi / imager.wavelength * path, 0)
+    light = jnp.sum(amplitude * jnp.cos(phase)) ** 2 + jnp.sum(amplitude * jnp.sin(phase)) ** 2
+    return light / jnp.sum(amplitude) ** 2

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.full import FullOptics
-from ..optics.kinds import KindOptics, of_kinds
+from ..optics.field_varying import FullOptics
+from ..optics.lens_types import KindOptics, of_kinds
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import convolved, image_in_groups, with_margin
 from .field_varying_model import full_image

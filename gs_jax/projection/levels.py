@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.full import full_optics, halo_nodes
-from ..optics.kinds import KindOptics, lenses_by_kind, of_kinds, relative_areas
-from ..optics.window import psf_of_depth
+from ..optics.field_varying import full_optics, halo_nodes
+from ..optics.lens_types import KindOptics, lenses_by_kind, of_kinds, relative_areas
+from ..optics.psf import psf_of_depth
 from .forward_model import Optics
 
 LEVELS = ("full", "near", "pinhole")

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.cores import Cores, core_tables, drawn, ring_edges
-from ..optics.full import CORE_REACH, halo_nodes, halo_of, kernel_size
-from ..optics.refraction import on_host
+from ..optics.field_varying import CORE_REACH, halo_nodes, halo_of, kernel_size
+from ..optics.psf_core import Cores, core_tables, drawn, ring_edges
+from ..optics.raytrace import on_host
 from .field_varying_model import halo_image
 from .rays import Envelope, RingLight
 
@@ -35,7 +35,7 @@ _RINGS = tuple(np.arange(1, 29) / 8)
 class Ring(NamedTuple):
     """The ring of the field whose cores stamps are of.
 
-    `ends`: inner and outer, mm. `stretch`, `light`: of `gs_jax.optics.cores.Cores`, at each depth of the stamps.
+    `ends`: inner and outer, mm. `stretch`, `light`: of `gs_jax.optics.psf_core.Cores`, at each depth of the stamps.
     """
 
     ends: tuple[float, float]

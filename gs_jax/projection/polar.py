@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..optics.halo import HaloGrid, polar_shares
+from ..optics.field_varying import HaloGrid, polar_shares
 from .linear_map import linear_call
 
 # Rings of polar nodes, from the axis on, that are closer to each other than pixels are.

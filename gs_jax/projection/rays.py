@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ..geometry import Imager, chief_ray, envelope, field_limit
 from ..grid import Grid
-from ..optics.cores import ring_light
+from ..optics.psf_core import ring_light
 
 # Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
 # where the envelope and all its derivatives vanish.
@@ -56,7 +56,7 @@ class Envelope(NamedTuple):
 
 
 class RingLight(NamedTuple):
-    """What the core of a spot holds of a point's light, in a ring of the field; see `gs_jax.optics.cores`."""
+    """What the core of a spot holds of a point's light, in a ring of the field; see `gs_jax.optics.psf_core`."""
 
     inner: float
     outer: float

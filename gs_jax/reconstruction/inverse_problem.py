@@ -14,9 +14,9 @@ from ..detection.background import between, square_levels
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
-from ..optics.cores import apparent_depths
-from ..optics.full import FullOptics
-from ..optics.kinds import KindOptics, kind_weights, lenses_by_kind, of_kinds
+from ..optics.field_varying import FullOptics
+from ..optics.lens_types import KindOptics, kind_weights, lenses_by_kind, of_kinds
+from ..optics.psf_core import apparent_depths
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import BackprojectionOperator, ImagingOperator

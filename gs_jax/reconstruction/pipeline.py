@@ -17,7 +17,7 @@ from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.focus import warn_if_blurred
+from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS

@@ -109,7 +109,7 @@ def method_of(name: str, steps: int, weights: Path | None, **options) -> Any:
 
 
 def _sharpness(imager, grid):
-    from ..optics.focus import sharpness
+    from ..optics.lens_types import sharpness
 
     return sharpness(imager, grid)
 
@@ -121,7 +121,7 @@ def _points(image, imager, grid, sharp, progress):
     from ..detection.consistency import signal
     from ..detection.evidence import point_evidence
     from ..detection.locate import NOT_TRUSTED, find_points
-    from ..optics.focus import blur_of
+    from ..optics.lens_types import blur_of
 
     light = signal(image)
     points = find_points(light, imager, grid, progress=progress)

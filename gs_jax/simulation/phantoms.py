@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
-from ..layouts.cells import Number, check_positive, half_size
+from ..layouts import Number, check_positive, half_size
 
 Emitters = Float[np.ndarray, "emitter 4"]
 

@@ -30,7 +30,7 @@ from ...io.toml import one_line
 from ...lenses import MicrolensArray
 from ...optics import aberrations
 from ...optics.psf import GOLDEN_ANGLE, diffraction_psf, window_fraction
-from ...optics.unit import unit_rays
+from ...optics.raytrace import unit_rays
 
 # Depths of the datasheet, pixels of a spot's window, and samples in a pixel at most.
 _DEPTHS, SIZE, _MOST_SAMPLES = 7, 49, 4

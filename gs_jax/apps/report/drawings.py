@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...design.design import Design
 from ...geometry import Imager
-from ...layouts.cells import cell_edges
+from ...layouts import cell_edges
 from ...mold.lenslets import cap_sag, caps_of, surface
 from ...optics.psf import diffraction_psf, window_fraction
 from ...pictures.style import round_length

@@ -30,7 +30,7 @@ from ...calibration.unknowns import (
     residuals,
 )
 from ...geometry import Imager
-from ...optics.refraction import on_host
+from ...optics.raytrace import on_host
 from .device_model import Errors, built, no_errors
 
 # Lenses that must see a point: one says no depth.

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ...design.microscope import Microscope
 from ...design.spots import psf_width
 from ...geometry import Imager
-from ...optics.axial import axial_strehl
+from ...optics.psf import axial_strehl
 from ...optics.theory import FWHM
 from .device_model import Errors, built
 from .surface import lens_squares, log_strehl_of_height

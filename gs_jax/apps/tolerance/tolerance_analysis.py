@@ -15,7 +15,7 @@ from ...base.progress import Progress
 from ...design.design import Design
 from ...design.microscope import Microscope
 from ...design.sheet import microscopes_of
-from ...layouts.cells import check_positive
+from ...layouts import check_positive
 from .depth_recovery import Bench, bench_of, depth_errors
 from .device_model import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
 from .images import log_sharpness

@@ -14,12 +14,11 @@ from jaxtyping import Float32
 from ...base.arrays import in_float32
 from ...geometry import Imager, Sensor
 from ...grid import Grid
-from ...layouts.patterns import hexagonal_layout, poisson_disc_layout, random_layout
+from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ...lenses import MicrolensArray
-from ...optics.full import FullOptics, full_optics, halo_nodes
-from ...optics.halo import HaloGrid
+from ...optics.field_varying import FullOptics, HaloGrid, full_optics, halo_nodes
 from ...projection.forward_model import forward
-from ...simulation.camera import Camera, electrons, expose
+from ...simulation.synthetic import Camera, electrons, expose
 from .random_scenes import PLANES as SCENE_PLANES, random_scene, shared_out
 
 # Scenes that one microscope images: its tables take longer than an image.

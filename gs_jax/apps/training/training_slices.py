@@ -18,7 +18,7 @@ from ...base.progress import Progress
 from ...base.workers import Workers
 from ...detection.unet import standardized
 from ...io.files import atomic_write, decoding, make_folder
-from ...optics.cores import apparent_depths
+from ...optics.psf_core import apparent_depths
 from ...projection.backprojection import backproject
 from .random_scenes import drawn
 from .simulated_captures import SCENES, Kind, example

@@ -2,7 +2,7 @@
 
 The array's surface is the upper envelope of the lenses' caps, so a lens ends where it meets its neighbours' caps: the
 clear aperture of lenses that are alike is their Voronoi cell, within the disc of `aperture_diameter` and within the
-plate. Seen from the vertex it is star-shaped, so its edge is one distance in each direction. `gs_jax.layouts.cells` has
+plate. Seen from the vertex it is star-shaped, so its edge is one distance in each direction. `gs_jax.layouts` has
 areas and distances too, on the host and without derivatives.
 
 Where lenses differ, edges are curved: of two spheres the projection of the circle in which they meet. A flat lens may
@@ -28,7 +28,7 @@ _LENSES = 16
 # Neighbours that may bound a lens's area. A cell of a random layout has six on average.
 _NEIGHBOURS = 64
 # Of lenses that differ: neighbours, radii in each direction at which the edge is looked for, and halvings.
-_NEAREST, _RADII, _HALVINGS = 32, 24, 20
+_NEAREST, _EDGE_RADII, _HALVINGS = 32, 24, 20
 
 
 @partial(jax.jit, static_argnames="directions")
@@ -150,9 +150,9 @@ def _first_root(function, end):
 
     By bisection.
     """
-    step = end / _RADII
-    positive = jax.vmap(function)(step * jnp.arange(1, _RADII + 1, dtype=step.dtype)) > 0
-    first = jnp.where(jnp.any(positive), jnp.argmax(positive), _RADII - 1).astype(step.dtype)
+    step = end / _EDGE_RADII
+    positive = jax.vmap(function)(step * jnp.arange(1, _EDGE_RADII + 1, dtype=step.dtype)) > 0
+    first = jnp.where(jnp.any(positive), jnp.argmax(positive), _EDGE_RADII - 1).astype(step.dtype)
 
     def halve(_, ends):
         low, high = ends
@@ -168,7 +168,7 @@ def _first_root(function, end):
 class Cells(eqx.Module):
     """What bounds the Voronoi cells of lenses: with it the mean clear aperture of lenses that are alike is a short sum.
 
-    Of each edge of each cell its `lens`, what is `beyond` it (as of `gs_jax.layouts.cells.Edges`), and the edges
+    Of each edge of each cell its `lens`, what is `beyond` it (as of `gs_jax.layouts.Edges`), and the edges
     `before` and `after` it, counterclockwise. It holds while cells keep their neighbours: lenses may move a little.
     """
 
@@ -181,7 +181,7 @@ class Cells(eqx.Module):
 def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cells:
     """The cells of lenses on a plate. Host code."""
     # A reconstruction needs no cells, and SciPy's import takes as long as a back-projection.
-    from ..layouts.cells import cell_edges
+    from ..layouts import cell_edges
 
     edges = cell_edges(centers, size)
     x, y = (edges.start + edges.end).T

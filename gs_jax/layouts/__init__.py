@@ -1,1 +1,0 @@
-"""Where the lenses go, and how they cover the plate."""
