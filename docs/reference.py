@@ -1,4 +1,4 @@
-"""Pages of the site that the package itself says: its public names in their groups, its modules, its pictures."""
+"""Generated pages of the site: public names by group, modules, and figures."""
 
 import inspect
 import re
@@ -14,31 +14,31 @@ _GROUP = re.compile(r"^(\w[^\n]+):\n\n((?:    .+\n)+)", re.MULTILINE)
 
 
 class Group(NamedTuple):
-    """A group of `help(gs_jax)`."""
+    """A group of public names, as listed by `help(gs_jax)`."""
 
     title: str
     names: list[str]
 
     @property
     def page(self) -> str:
-        """The page's path."""
+        """Path of the page."""
         return f"docs/api/{re.sub(r'[^a-z]+', '-', self.title.lower())}.md"
 
     @property
     def text(self) -> str:
-        """The page, for mkdocstrings."""
+        """Markdown of the page, for mkdocstrings."""
         names = "\n\n".join(f"::: gs_jax.{name}" for name in self.names)
         return f"# {self.title}\n\n{names}\n"
 
 
 def groups() -> list[Group]:
-    """All public names, in the order and the groups of the package's docstring."""
+    """Groups of public names, in the order of the package's docstring."""
     found = _GROUP.findall(gs_jax.__doc__ or "")
     return [Group(title, [line.split()[0] for line in lines.splitlines()]) for title, lines in found]
 
 
 def public() -> Iterator[tuple[str, object]]:
-    """Public names and the public members of classes among them; what `Solver` says of solvers is said once."""
+    """Public names and public members of classes; members that solvers share with `Solver` are left out."""
     for group in groups():
         for name in group.names:
             value = getattr(gs_jax, name)
@@ -51,7 +51,7 @@ def public() -> Iterator[tuple[str, object]]:
 
 
 def missing() -> Iterator[str]:
-    """What a public name, or one of its parameters, has no words for; and names without an example."""
+    """Complaints about public names without a docstring, an example, or a description of a parameter."""
     for name, value in public():
         text = inspect.getdoc(value) or ""
         if not text:
@@ -69,7 +69,7 @@ def missing() -> Iterator[str]:
 
 
 def modules() -> str:
-    """A table of the package's folders and modules with their first lines."""
+    """Table of the package's folders and modules with the first line of each docstring."""
     rows = []
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
@@ -82,14 +82,17 @@ def modules() -> str:
     return "\n\n| module | |\n|---|---|\n" + "\n".join(rows) + "\n"
 
 
-def gallery(page: Path) -> str:
-    """Every picture of a page of results, with its words and a link to its section."""
-    found, heading = [], ""
-    for line in page.read_text(encoding="utf-8").splitlines():
-        if line.startswith("## "):
-            heading = line[3:]
-        if match := re.match(r"!\[(.+)\]\((.+)\)", line):
-            anchor = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-            where = f"../{page.parent.name}"
-            found.append(f"![{match[1]}]({where}/{match[2]})\n\n{match[1]}: [{heading}]({where}/{page.name}#{anchor}).")
-    return "\n\n" + "\n\n".join(found) + "\n"
+def gallery(folder: Path) -> str:
+    """Every figure of the pages of results, in the order of the index, with a link to its section."""
+    figures = []
+    index = (folder / "README.md").read_text(encoding="utf-8")
+    for name in dict.fromkeys(re.findall(r"results/(\w+)\.md", index)):
+        heading = ""
+        for line in (folder / "results" / f"{name}.md").read_text(encoding="utf-8").splitlines():
+            if match := re.match(r"##? (.+)", line):
+                heading = match[1]
+            if match := re.match(r"!\[(.+)\]\(\.\./(.+)\)", line):
+                anchor = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+                link = f"[{heading}](../{folder.name}/results/{name}.md#{anchor})"
+                figures.append(f"![{match[1]}](../{folder.name}/{match[2]})\n\n{match[1]}: {link}.")
+    return "\n\n".join(figures)

@@ -49,8 +49,8 @@ def test_links_lead_somewhere(path):
         assert (path.parent / link).exists(), link
 
 
-def test_the_readme_leads_to_all():
-    text = (ROOT / "README.md").read_text()
+def test_the_start_page_leads_to_all():
+    text = (ROOT / "docs" / "index.md").read_text()
     assert all(f"design/{name}.md" in text for name in ("KEYS", "LAB", "CLUSTER"))
 
 

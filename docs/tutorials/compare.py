@@ -84,5 +84,5 @@ plt.show()
 # %% [markdown]
 # Points are easy: both find them, and the paper's lenses locate them better, as they have more light and magnify more.
 # A sharp spot pays where a scene is extended: volumes at several exposures, by these two and by conics, are in the
-# [experiments](../../experiments/README.md#co-design-the-lens). To search for a design of your own, see
+# [experiments](../../experiments/results/codesign.md#co-design-the-lens). To search for a design of your own, see
 # [the next tutorial](objective.md).
