@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .base.arrays import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, as_shape, check_fields, library_of
-from .lenses import MicrolensArray, Scalar, Scalars
+from .lenses import MicrolensArray
+from .typing import Scalar, Scalars
 
 # A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
 SHORTEST, LONGEST = 1e-5, 0.1

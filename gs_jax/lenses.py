@@ -22,15 +22,13 @@ from .base.arrays import (
     library_of,
 )
 from .base.errors import InputError
+from .typing import Scalar, Scalars
 
 # Side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]
 # Numbers that lenses may have of their own.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
 _INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
-# Of JAX or of NumPy, as the array's own numbers are; `Scalars` are several.
-Scalar = Any
-Scalars = Any
 
 
 class MicrolensArray(eqx.Module):

@@ -11,6 +11,7 @@ MODULES = sorted((ROOT / "gs_jax").rglob("*.py"))
 # Whatever stands here imports from what stands before it.
 ORDER = [
     "_version",
+    "typing",
     "base",
     "lenses",
     "geometry",

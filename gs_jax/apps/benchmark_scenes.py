@@ -20,6 +20,7 @@ from ..optics.apertures import clear_diameter
 from ..optics.psf import geometric_psf
 from ..optics.theory import FWHM
 from ..simulation.synthetic import Camera, electrons, expose, simulate_points
+from ..typing import Volume
 
 WIDTH, DEPTH, PARTICLES, PEAK_ELECTRONS = 5.76, 20.0, 10, 10_000.0
 # Emitters across a particle.
@@ -85,7 +86,7 @@ def case(bench: Bench, seed: int, progress: Progress | None = None) -> Case:
     return Case(np.asarray(electrons(counts, camera)), particles, spots(particles, grid, width))
 
 
-def spots(points: Float[np.ndarray, "point 4"], grid: Grid, width: float) -> Float32[np.ndarray, "depth y x"]:
+def spots(points: Float[np.ndarray, "point 4"], grid: Grid, width: float) -> Volume:
     """Points as Gaussians of standard deviation `width` in the nearest plane; their maximum is the intensity."""
     z = np.asarray(grid.depths)
     volume = np.zeros(grid.volume_shape, np.float32)

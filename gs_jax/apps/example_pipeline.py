@@ -1,6 +1,5 @@
 """The demonstration: a microscope is judged, improved and used, and its mold is made."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
@@ -36,6 +35,7 @@ from ..reconstruction.pipeline import reconstruct
 from ..simulation.phantoms import letters, random_points, rasterize
 from ..simulation.synthetic import Camera, expose, simulate
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..typing import PathLike
 from .report.page import write_report
 
 _SCENE_MM = 0.016  # finer than the voxels and no multiple of them
@@ -55,7 +55,7 @@ class Views(NamedTuple):
     volumes: dict[str, np.ndarray]
 
 
-def run(folder: str | os.PathLike[str], progress: Progress | None = None) -> Path:
+def run(folder: PathLike, progress: Progress | None = None) -> Path:
     """Run the pipeline and write a folder: designs, captures, volume, points, mold, pictures, reports.
 
     Returns

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Shaped
 
+from ..typing import Real
 from .errors import InputError
 
 
@@ -35,9 +36,6 @@ Tree = TypeVar("Tree")
 def in_float32(tree: Tree) -> Tree:
     """The same modules, tuples and dictionaries with every array as float32."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
-
-
-Real = Float[Array | np.ndarray, "*#shape"] | float | int
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Float64, Int, Num
+from jaxtyping import Float, Float64, Int
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
+from ..typing import Image
 from .matching import near_of
 from .sources import Sources, Spots, assigned
 from .spots import find_spots
@@ -85,7 +86,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(
-    images: Sequence[Num[Array | np.ndarray, "row column"]],
+    images: Sequence[Image],
     points: Float[np.ndarray, "source 3"],
     imager: Imager,
     *,
@@ -247,7 +248,7 @@ def spots_in(image, imager: Imager, sources: int = 1) -> Float64[np.ndarray, "sp
 
 
 def residuals_of(
-    found: Calibration, images: Sequence[Num[Array | np.ndarray, "row column"]], points: Float[np.ndarray, "image 3"]
+    found: Calibration, images: Sequence[Image], points: Float[np.ndarray, "image 3"]
 ) -> Float64[np.ndarray, "spot 2"]:
     """How far the spots of captures of other points are from where a calibration puts them, `(x, y)`, pixels."""
     imager, sources = found.imager, Sources(points, np.arange(len(points)))

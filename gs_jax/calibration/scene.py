@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float64, Num
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
@@ -13,6 +13,7 @@ from ..base.progress import Progress
 from ..detection.locate import find_points
 from ..geometry import Imager
 from ..grid import Grid
+from ..typing import Image
 from .fit import Calibration, refine, spots_in
 from .matching import near_of
 from .sources import Sources
@@ -28,7 +29,7 @@ _NEAR = 0.5
 
 
 def calibrate_by_scene(
-    image: Num[Array | np.ndarray, "row column"],
+    image: Image,
     imager: Imager,
     grid: Grid,
     *,

@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import equinox as eqx
 from ..base.errors import InputError
 from ..design.design import Design
 from ..io.files import atomic_write, check_input, decoding
+from ..typing import PathLike
 from .solve import State
 from .study import Study
 
@@ -31,7 +31,7 @@ class Log:
     ends: list[dict[str, Any]] = field(default_factory=list)
 
 
-def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, design: Design, state: State | None) -> None:
+def write_checkpoint(path: PathLike, log: Log, study: Study, design: Design, state: State | None) -> None:
     """Write the file, whole or not at all; the state is None between two starts."""
     head = {"format": _FORMAT, "of": _digest(study, design), "log": asdict(log)}
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
@@ -39,7 +39,7 @@ def write_checkpoint(path: str | os.PathLike[str], log: Log, study: Study, desig
         eqx.tree_serialise_leaves(file, state)
 
 
-def read_checkpoint(path: str | os.PathLike[str], study: Study, design: Design) -> tuple[Log, bytes]:
+def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, bytes]:
     """The log, and the state for `restored`, empty between two starts.
 
     Raises

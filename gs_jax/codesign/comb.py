@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
-from ..optics.theory import Real
+from ..typing import Real
 
 # Least power that a frequency counts with, as a fraction of one lens's: keeps logarithms finite.
 _FLOOR = 1e-3

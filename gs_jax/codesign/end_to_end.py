@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.theory import Real
 from ..projection.backprojection import backproject
 from ..projection.forward_model import forward
 from ..projection.subfields import subfield
+from ..typing import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
 # Side of the PSF of a voxel where none is given, pixels: three standard deviations of voxels up to 5 pixels wide.

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
-from ..optics.theory import Real
+from ..typing import Real
 
 # What is known before the image, standard deviations of x, y, z (mm) and of the logarithm of the brightness.
 PRIOR = (10.0, 10.0, 10.0, 10.0)

@@ -22,6 +22,7 @@ from ..base.errors import short_repr
 from ..design.microscope import Microscope
 from ..design.spots import encircled_radius, field_heights, psf_width
 from ..optics import aberrations, theory
+from ..typing import Result
 from .exposure_terms import crowded, volume_error
 from .layout_terms import (
     conditioning,
@@ -33,7 +34,6 @@ from .layout_terms import (
     shortage,
 )
 
-Result = Float[Array, "..."]
 Built = TypeVar("Built")
 
 UM = 1000.0

@@ -7,7 +7,6 @@ a log, and the log and the solver's state make a checkpoint.
 
 import contextlib
 import math
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from ..base.errors import errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design, read_design
+from ..typing import PathLike
 from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values
 from .solve import State
@@ -28,7 +28,7 @@ from .targets import Row
 # Seconds between two checkpoints.
 _EVERY = 10.0
 
-PathLike = str | os.PathLike[str]
+PathLike = PathLike
 
 
 class Outcome(NamedTuple):

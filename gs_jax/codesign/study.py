@@ -18,7 +18,6 @@ solver = "levenberg-marquardt"
 """
 
 import math
-import os
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from ..base.errors import InputError, short_repr
 from ..io.files import read_text
 from ..io.toml import Table, one_line
 from ..lenses import Orientation
+from ..typing import PathLike
 from .objectives import check_term
 from .parameters import NAMES
 
@@ -164,7 +164,7 @@ def labels(terms: Sequence[TermTable], study: Study) -> list[str]:
     return [term.name if names.count(term.name) == 1 else f"{term.name} {term.kind}" for term in terms]
 
 
-def read_study(path: str | os.PathLike[str]) -> Study:
+def read_study(path: PathLike) -> Study:
     """The study in a TOML file.
 
     *File.*
@@ -203,7 +203,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
 
 
-def parent_path(path: str | os.PathLike[str], study: Study) -> Path:
+def parent_path(path: PathLike, study: Study) -> Path:
     """The file of the design that a study starts from.
 
     Raises

@@ -1,6 +1,5 @@
 """Lens centres on disk: the file that a design names, in whatever unit, order and frame it is."""
 
-import os
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +13,7 @@ from ..io.files import write_text
 from ..io.point_tables import read_columns
 from ..io.provenance import Provenance, write_sidecar
 from ..io.toml import Table, one_line
+from ..typing import PathLike
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000
@@ -117,14 +117,14 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
     lens |= columns
 
 
-def lens_columns(path: str | os.PathLike[str], columns: tuple[str, str] | None = None) -> dict[str, list[float]]:
+def lens_columns(path: PathLike, columns: tuple[str, str] | None = None) -> dict[str, list[float]]:
     """What a file of lens centres says of each lens besides, by `LENS_KEYS`. `InputError` as `read_columns`."""
     more = read_columns(Path(path), columns, most=MAX_LENSES, also=LENS_KEYS).more
     return {name: numbers.tolist() for name, numbers in more.items()}
 
 
 def read_centers(
-    path: str | os.PathLike[str],
+    path: PathLike,
     *,
     columns: tuple[str, str] | None = None,
     unit: str | None = None,
@@ -164,7 +164,7 @@ def read_centers(
     return (centers * [-1.0, 1.0] if mirror else centers) + 0.0  # not -0.0
 
 
-def unit_of_file(path: str | os.PathLike[str], columns: tuple[str, str] | None = None) -> str | None:
+def unit_of_file(path: PathLike, columns: tuple[str, str] | None = None) -> str | None:
     """The unit that a file's header says of x and y; None if it says none. `InputError` as `read_columns`."""
     return _unit_in(read_columns(Path(path), columns, most=MAX_LENSES).names)
 
@@ -188,9 +188,7 @@ def other_reading(centers: np.ndarray, half: np.ndarray) -> str:
     return ""
 
 
-def write_centers(
-    path: str | os.PathLike[str], centers: Float[np.ndarray, "lens 2"], provenance: Provenance | None = None
-) -> None:
+def write_centers(path: PathLike, centers: Float[np.ndarray, "lens 2"], provenance: Provenance | None = None) -> None:
     """Writes lens centres, mm, as the CSV file that the key `array.centers_file` names.
 
     Raises

@@ -5,7 +5,6 @@ A key carries its unit, and this module is where units end: `Design.imager` give
 
 import difflib
 import math
-import os
 import re
 import tomllib
 import warnings
@@ -21,6 +20,7 @@ from ..geometry import Imager, Sensor
 from ..io.files import read_text, write_text
 from ..io.toml import Table, one_line
 from ..lenses import MicrolensArray
+from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .checks import check_whole, of_each
 from .imagers import sharp_depths, tables_of
@@ -210,7 +210,7 @@ def _shape(lens: LensTable) -> str:
     return conic + terms + (", curved side to the object" if lens.orientation == "curved" else "")
 
 
-def read_design(path: str | os.PathLike[str]) -> Design:
+def read_design(path: PathLike) -> Design:
     """The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`.
 
     *File.*
@@ -241,7 +241,7 @@ def read_design(path: str | os.PathLike[str]) -> Design:
     return checked_design(path, data)
 
 
-def checked_design(path: str | os.PathLike[str], data: dict[str, Any]) -> Design:
+def checked_design(path: PathLike, data: dict[str, Any]) -> Design:
     """The design of the tables that the file `path` has, or will have; it raises and warns as `read_design`."""
     try:
         design = Design.model_validate(data)
@@ -255,7 +255,7 @@ def checked_design(path: str | os.PathLike[str], data: dict[str, Any]) -> Design
     return design
 
 
-def write_design(path: str | os.PathLike[str], design: Design) -> None:
+def write_design(path: PathLike, design: Design) -> None:
     """Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal.
 
     *File.*

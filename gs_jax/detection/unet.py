@@ -5,19 +5,19 @@ looks at one slice (the paper's) or at several around it (ours) gives back what 
 and a volume comes out, of the same voxels: nothing is downsampled.
 """
 
-import os
 from itertools import product
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..io import weights
 from ..io.provenance import Provenance
+from ..typing import PathLike, Volume
 from .background import mirrored
 
 # The networks that come with the package, and what a file of weights may hold at most.
@@ -134,9 +134,7 @@ def multislice_network(key: PRNGKeyArray) -> UNet:
     return UNet((-3, -2, -1, 0, 1, 2, 3), (16, 32, 64, 128), standardized=True, key=key)
 
 
-def suppress(
-    volume: Float[Array | np.ndarray, "depth y x"], network: UNet | None = None
-) -> Float32[np.ndarray, "depth y x"]:
+def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet | None = None) -> Volume:
     """What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero.
 
     *Host.*
@@ -215,13 +213,13 @@ def _tiles(size: int, network: UNet) -> list[tuple[int, np.ndarray]]:
     return [(start, mirrored(start + offsets, size)) for start in range(0, size, core)]
 
 
-def write_weights(path: str | os.PathLike[str], network: UNet, provenance: Provenance | None = None) -> None:
+def write_weights(path: PathLike, network: UNet, provenance: Provenance | None = None) -> None:
     """Writes a network as `.npz`; see `gs_jax.io.weights`."""
     about = {"offsets": network.offsets, "widths": network.widths, "standardized": network.standardized}
     weights.write_weights(path, network, about, provenance)
 
 
-def read_weights(path: str | os.PathLike[str]) -> UNet:
+def read_weights(path: PathLike) -> UNet:
     """The network in a file of `write_weights`, in float32. Nothing in the file is ever executed.
 
     Raises

@@ -1,7 +1,6 @@
 """Captures corrected for their camera: the one way from a file to light, of every command that reads captures."""
 
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from ..base.errors import InputError, errors_name_file
 from ..geometry import Sensor
+from ..typing import PathLike
 from .captures import DTYPES, averaged, channel_of, frames, sites
 
 # A pixel with less than this share of the flat field's median has no light to speak of.
@@ -144,7 +144,7 @@ class Corrected(NamedTuple):
 
 
 def read_corrected(
-    path: str | os.PathLike[str],
+    path: PathLike,
     sensor: Sensor | None = None,
     *,
     page: int | str | None = None,

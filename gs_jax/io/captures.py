@@ -6,7 +6,6 @@ suffix to `_FORMATS` with a function that reads it and one that writes it.
 
 import contextlib
 import json
-import os
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from ..base.errors import InputError, short_repr
+from ..typing import PathLike
 from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance, write_sidecar
 from .tiff import declared_mosaic, decode_plane, decode_png, page_count
@@ -45,7 +45,7 @@ class Wanted(NamedTuple):
 
 
 def read_capture(
-    path: str | os.PathLike[str],
+    path: PathLike,
     shape: tuple[int, int] | None = None,
     *,
     page: int | str | None = None,
@@ -96,7 +96,7 @@ def averaged(images: Iterator[Shaped[np.ndarray, "row column"]]) -> Shaped[np.nd
 
 
 def frames(
-    path: str | os.PathLike[str],
+    path: PathLike,
     shape: tuple[int, int] | None = None,
     *,
     page: int | str | None = None,
@@ -119,7 +119,7 @@ def frames(
 
 
 def checked(
-    path: str | os.PathLike[str], images: Iterator[Shaped[np.ndarray, "row column"]]
+    path: PathLike, images: Iterator[Shaped[np.ndarray, "row column"]]
 ) -> Iterator[Shaped[np.ndarray, "row column"]]:
     """Images of a file in the machine's byte order; `InputError` if they are of several sizes or not finite."""
     size = None
@@ -138,7 +138,7 @@ def checked(
 
 
 def write_capture(
-    path: str | os.PathLike[str], image: Shaped[Array | np.ndarray, "row column"], provenance: Provenance | None = None
+    path: PathLike, image: Shaped[Array | np.ndarray, "row column"], provenance: Provenance | None = None
 ) -> None:
     """Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all.
 

@@ -17,6 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from ..base.errors import InputError, short_repr
+from ..typing import PathLike
 
 AnyPath = TypeVar("AnyPath", bound=PurePath)
 
@@ -37,7 +38,7 @@ def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 
-def check_input(path: str | os.PathLike[str]) -> Path:
+def check_input(path: PathLike) -> Path:
     """The path of a regular file that can be opened for reading.
 
     Raises
@@ -56,7 +57,7 @@ def check_input(path: str | os.PathLike[str]) -> Path:
     raise InputError(f"{path}: found {found}, allowed: a file.")
 
 
-def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
+def read_text(path: PathLike, most: int = MAX_TEXT_BYTES) -> str:
     """The text of a UTF-8 file of at most `most` bytes, by default 64 MiB, without a byte order mark.
 
     Raises
@@ -73,7 +74,7 @@ def read_text(path: str | os.PathLike[str], most: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"{path}: found a byte that is not UTF-8 at offset {error.start}, allowed: UTF-8.") from error
 
 
-def check_output(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
+def check_output(path: PathLike, suffixes: Sequence[str]) -> Path:
     """A path that can be written, with one of the `suffixes`; to be asked before a long computation.
 
     Raises
@@ -89,7 +90,7 @@ def check_output(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
     return path
 
 
-def make_folder(path: str | os.PathLike[str]) -> Path:
+def make_folder(path: PathLike) -> Path:
     """A folder to write several files to, made with its parents where it is missing.
 
     Raises
@@ -130,7 +131,7 @@ def _holds_only_an_image(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: PathLike) -> Iterator[Path]:
     """A path beside `path` to write a file or a Zarr folder to, which takes its place at the end.
 
     Whatever goes wrong inside, an interrupt too, the new file is removed and the old one is as it was.
@@ -222,7 +223,7 @@ def decoding(path: Path, kind: str) -> Iterator[None]:
         logger.disabled = was_disabled
 
 
-def write_json(path: str | os.PathLike[str], data: Any) -> None:
+def write_json(path: PathLike, data: Any) -> None:
     """Writes `data` as JSON, whole or not at all.
 
     NumPy and JAX values become numbers and lists. JSON has no NaN and no infinity: both become null.
@@ -236,7 +237,7 @@ def write_json(path: str | os.PathLike[str], data: Any) -> None:
     write_text(path, text + "\n", [".json"])
 
 
-def write_text(path: str | os.PathLike[str], text: str, suffixes: Sequence[str]) -> None:
+def write_text(path: PathLike, text: str, suffixes: Sequence[str]) -> None:
     """Writes UTF-8 text, whole or not at all; `InputError` as `check_output`."""
     with atomic_write(check_output(path, suffixes)) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -252,7 +253,7 @@ def _plain(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def write_figure(path: str | os.PathLike[str], figure: Any) -> None:
+def write_figure(path: PathLike, figure: Any) -> None:
     """Writes a figure as PNG at its own resolution, whole or not at all; `InputError` as `check_output`."""
     with atomic_write(check_output(path, [".png"])) as temporary:
         figure.savefig(temporary, format="png")

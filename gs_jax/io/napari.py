@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Num
 
 from ..base.errors import InputError
 from ..grid import Grid
+from ..typing import Points
 from .point_tables import POINTS_HEADER, read_points
 from .volume_series import Series, read_series
 from .volumes import VOLUME_SUFFIXES, display_range, read_volume
@@ -65,7 +66,7 @@ def step_of(grid: Grid) -> float:
     return float(np.diff(np.asarray(grid.depths, np.float64)).mean()) if grid.depths.size > 1 else grid.pitch
 
 
-def points_layer(points: Float[Array | np.ndarray, "point 4"], name: str, thickness: float = 0.25) -> Layer:
+def points_layer(points: Points, name: str, thickness: float = 0.25) -> Layer:
     """Points, each shown in the planes that are less than half of `thickness` from it, mm."""
     points = np.asarray(points, np.float64)
     # A plane shows what is within half a unit of the data's.

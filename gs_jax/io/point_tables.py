@@ -4,16 +4,16 @@ import contextlib
 import csv
 import io
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Shaped
+from jaxtyping import Float64, Int, Shaped
 
 from ..base.errors import InputError, short_repr
+from ..typing import PathLike, Points
 from .files import MAX_TEXT_BYTES, atomic_write, check_input, check_output, read_text, write_text
 from .provenance import Provenance, write_sidecar
 
@@ -25,7 +25,7 @@ _LONGEST = 1000
 POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 
 
-def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
+def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
     """Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`.
 
     *File.*
@@ -58,8 +58,8 @@ def read_points(path: str | os.PathLike[str]) -> Float64[np.ndarray, "point 4"]:
 
 
 def write_points(
-    path: str | os.PathLike[str],
-    points: Float[Array | np.ndarray, "point 4"],
+    path: PathLike,
+    points: Points,
     more: Mapping[str, Shaped[np.ndarray, " point"]] | None = None,
     *,
     provenance: Provenance | None = None,
@@ -101,7 +101,7 @@ def write_points(
 
 
 def write_points_in_time(
-    path: str | os.PathLike[str],
+    path: PathLike,
     frames: Iterable[tuple[int, Mapping[str, list]]],
     *,
     provenance: Provenance | None = None,
@@ -142,7 +142,7 @@ MAX_SOURCES = 10_000
 
 
 def read_positions(
-    path: str | os.PathLike[str], captures: Sequence[str | os.PathLike[str]]
+    path: PathLike, captures: Sequence[PathLike]
 ) -> tuple[Float64[np.ndarray, "source 3"], Int[np.ndarray, " source"]]:
     """Places `(x, y, z)` of sources, mm, NaN where they are not known, and the capture of each, from 0.
 
@@ -186,7 +186,7 @@ def _number(place: str, cell: str) -> float:
     return value
 
 
-def _capture(place: str, cell: str, captures: Sequence[str | os.PathLike[str]]) -> int:
+def _capture(place: str, cell: str, captures: Sequence[PathLike]) -> int:
     names = [PurePath(path).name for path in captures]
     if cell in names:
         return names.index(cell)
@@ -341,7 +341,7 @@ def _is_called(name: str, what: re.Pattern) -> bool:
     return any(what.fullmatch(word) for word in words)
 
 
-def read_table(path: str | os.PathLike[str], header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
+def read_table(path: PathLike, header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
     """The numbers of a CSV file whose first line is `header`; without rows it is `(0, column)`.
 
     Raises

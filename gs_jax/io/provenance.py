@@ -8,7 +8,6 @@ it; STL has the mold's report.
 
 import hashlib
 import json
-import os
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -21,6 +20,7 @@ from PIL import Image
 
 from .._version import __version__
 from ..base.errors import InputError, short_repr
+from ..typing import PathLike
 from .files import check_input, decoding, read_text, write_json
 
 Provenance = Mapping[str, str]
@@ -29,7 +29,7 @@ Provenance = Mapping[str, str]
 NAMESPACE, KEY = "gs_jax/provenance", "provenance"
 
 
-def made_by(command: str, inputs: Iterable[str | os.PathLike[str]] = (), design: str = "") -> dict[str, str]:
+def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> dict[str, str]:
     """Of what `command` makes of files, with their SHA-256; `design` is the text of the microscope's."""
     found = {"software": f"gs_jax {__version__}", "command": command}
     for path in map(Path, inputs):
@@ -41,12 +41,12 @@ def made_by(command: str, inputs: Iterable[str | os.PathLike[str]] = (), design:
     return found | ({"design": design} if design else {})
 
 
-def sidecar(path: str | os.PathLike[str]) -> Path:
+def sidecar(path: PathLike) -> Path:
     """The file beside one that has no place for its provenance."""
     return Path(f"{path}.json")
 
 
-def write_sidecar(path: str | os.PathLike[str], provenance: Provenance | None) -> None:
+def write_sidecar(path: PathLike, provenance: Provenance | None) -> None:
     """Writes it, or removes an old one that would now be wrong."""
     if provenance is not None:
         write_json(sidecar(path), {KEY: dict(provenance)})
@@ -54,7 +54,7 @@ def write_sidecar(path: str | os.PathLike[str], provenance: Provenance | None) -
         sidecar(path).unlink()
 
 
-def read_provenance(path: str | os.PathLike[str]) -> dict[str, str]:
+def read_provenance(path: PathLike) -> dict[str, str]:
     """What a file says of where it comes from; empty if it says nothing.
 
     Raises

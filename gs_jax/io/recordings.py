@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ..base.errors import InputError
+from ..typing import PathLike
 from .captures import CAPTURE_SUFFIXES, Wanted, check_colour, check_declared, checked, frames, opened_tiff, tiff_page
 from .files import check_input, decoding
 
@@ -45,7 +46,7 @@ class Recording(NamedTuple):
 
 
 @contextlib.contextmanager
-def opened_recording(path: str | os.PathLike[str], *, page: int | str | None = None) -> Iterator[Recording | None]:
+def opened_recording(path: PathLike, *, page: int | str | None = None) -> Iterator[Recording | None]:
     """The frames of a recording, or None if the path is a single capture.
 
     Parameters

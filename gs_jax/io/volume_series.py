@@ -20,6 +20,7 @@ from jaxtyping import Float32
 
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
+from ..typing import PathLike, Volume
 from .files import atomic_write, decoding
 from .provenance import Provenance
 from .volumes import CHUNK, image_attributes, plain_depths, sharded
@@ -84,9 +85,7 @@ class VolumeSeries:
         """Whether the store is there, for others to write volumes to by `write_frame`."""
         return bool(self._levels)
 
-    def write(
-        self, frame: int, volume: Float32[np.ndarray, "depth row column"] | None, note: Note | None = None
-    ) -> None:
+    def write(self, frame: int, volume: Volume | None, note: Note | None = None) -> None:
         """Writes the volume of a frame, counted from 0, and then that it is there, with what is said of it.
 
         None is a volume that somebody else has written.
@@ -171,7 +170,7 @@ def opened_levels(path: Path, grid: Grid) -> list[Any]:
     return [group[str(level)] for level in range(len(pyramid(grid.shape)))]
 
 
-def write_frame(path: Path, levels: list[Any], frame: int, volume: Float32[np.ndarray, "depth row column"]) -> None:
+def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume) -> None:
     """Writes the volume of a frame to arrays as `opened_levels` opens: of each a file, whole or not at all."""
     for level, array in enumerate(levels):
         volume = halved(volume) if level else volume
@@ -181,7 +180,7 @@ def write_frame(path: Path, levels: list[Any], frame: int, volume: Float32[np.nd
         array[frame] = volume
 
 
-def read_head(path: str | os.PathLike[str]) -> tuple[dict[str, str], int] | None:
+def read_head(path: PathLike) -> tuple[dict[str, str], int] | None:
     """The request of the volumes in a store, and how many frames there are to be; None if there is no journal."""
     try:
         with open(Path(path) / JOURNAL, encoding="utf-8") as file:
@@ -213,7 +212,7 @@ class Series(NamedTuple):
     shown: tuple[float, float]
 
 
-def read_series(path: str | os.PathLike[str]) -> Series | None:
+def read_series(path: PathLike) -> Series | None:
     """What `VolumeSeries` wrote, or None if it is anything else."""
     if read_head(path) is None:
         return None
@@ -259,7 +258,7 @@ def pyramid(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     return shapes
 
 
-def halved(volume: Float32[np.ndarray, "depth row column"]) -> Float32[np.ndarray, "depth _ _"]:
+def halved(volume: Volume) -> Float32[np.ndarray, "depth _ _"]:
     """The mean of 2 x 2 voxels of each plane; at an odd end, of those that are there."""
     odd = [(0, 0), *((0, n % 2) for n in volume.shape[1:])]
     even = np.pad(volume, odd, mode="edge") if volume.shape[1] % 2 or volume.shape[2] % 2 else volume

@@ -25,10 +25,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
-from jaxtyping import Array, Float32, Shaped
+from jaxtyping import Array, Shaped
 
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
+from ..typing import PathLike, Volume
 from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, NAMESPACE, Provenance
 from .tiff import decode_page, place_for_description, take_place
@@ -40,7 +41,7 @@ _MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centi
 
 
 def write_volume(
-    path: str | os.PathLike[str],
+    path: PathLike,
     volume: Shaped[Array | np.ndarray, "depth row column"],
     grid: Grid,
     provenance: Provenance | None = None,
@@ -84,7 +85,7 @@ def write_volume(
     _FORMATS[path.suffix.lower()].write(path, voxels, depths, grid, provenance or {})
 
 
-def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "depth row column"], Grid]:
+def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     """A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths.
 
     *File.*
@@ -113,7 +114,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float32[np.ndarray, "dept
     return voxels, grid
 
 
-def _as_float32(path: Path, voxels: np.ndarray) -> Float32[np.ndarray, "depth row column"]:
+def _as_float32(path: Path, voxels: np.ndarray) -> Volume:
     if voxels.dtype == np.float32:
         return voxels
     if voxels.dtype.kind in "buif":
@@ -346,7 +347,7 @@ def image_attributes(
     depths: list[float],
     grid: Grid,
     shapes: Sequence[tuple[int, ...]],
-    voxels: Float32[np.ndarray, "depth row column"],
+    voxels: Volume,
     provenance: Provenance,
     *,
     in_time: bool = False,

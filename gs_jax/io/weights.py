@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import os
 import zipfile
 from collections.abc import Callable
 from importlib import resources
@@ -14,15 +13,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..base.errors import short_repr
+from ..typing import PathLike
 from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance
 
 _MOST_BYTES = 2**27
 
 
-def write_weights(
-    path: str | os.PathLike[str], network: PyTree, about: dict[str, Any], provenance: Provenance | None = None
-) -> None:
+def write_weights(path: PathLike, network: PyTree, about: dict[str, Any], provenance: Provenance | None = None) -> None:
     """Writes the arrays of a network as `.npz`, in float16, with what makes another of its kind; whole or not at all.
 
     Raises
@@ -37,7 +35,7 @@ def write_weights(
         np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
 
 
-def read_weights(path: str | os.PathLike[str], skeleton: Callable[..., PyTree]) -> PyTree:
+def read_weights(path: PathLike, skeleton: Callable[..., PyTree]) -> PyTree:
     """The network in a file of `write_weights`, in float32.
 
     Parameters

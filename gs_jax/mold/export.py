@@ -7,7 +7,6 @@ rounded to float32 and merged before anything is written, and what is left is ch
 import io
 import json
 import math
-import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from ..base.errors import InputError
 from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import KEY, Provenance, write_sidecar
 from ..lenses import MicrolensArray
+from ..typing import PathLike
 from .lenslets import caps_of
 from .solids import MoldShape, mark_plans, mold_block
 
@@ -65,7 +65,7 @@ def _merged(vertices: np.ndarray, facets: np.ndarray) -> Mesh:
     return Mesh(ordered[is_new], facets[whole])
 
 
-def write_mesh(path: str | os.PathLike[str], mesh: Mesh, name: str, provenance: Provenance | None = None) -> None:
+def write_mesh(path: PathLike, mesh: Mesh, name: str, provenance: Provenance | None = None) -> None:
     """Writes a mesh as binary STL or 3MF, by the suffix, whole or not at all. The same mesh gives the same bytes.
 
     STL's header says what it is and that its unit is the millimetre; 3MF has fields for it, and for where it comes
@@ -132,7 +132,7 @@ _WRITERS = {".stl": _stl, ".3mf": _3mf}
 MESH_SUFFIXES = tuple(_WRITERS)
 
 
-def read_mesh(path: str | os.PathLike[str]) -> Mesh:
+def read_mesh(path: PathLike) -> Mesh:
     """The mesh in an STL or 3MF file, in mm, with equal corners merged.
 
     Raises
@@ -224,7 +224,7 @@ def _disc(radius: float) -> m3.CrossSection:
     return m3.CrossSection.circle(radius, 4 * math.ceil(math.pi / 4 / math.acos(1 - min(_CHORD / radius, 1))))
 
 
-def write_mask(path: str | os.PathLike[str], mask: Mask, provenance: Provenance | None = None) -> None:
+def write_mask(path: PathLike, mask: Mask, provenance: Provenance | None = None) -> None:
     """Writes a mask as DXF, SVG or, where `gdstk` is installed, GDSII, by the suffix; whole or not at all.
 
     Layers are OUTLINE, OPENINGS and MARKS (GDSII: 0, 1 and 2). DXF and SVG are in mm, GDSII in um.

@@ -17,6 +17,7 @@ from ..design.design import Design, read_design
 from ..io.files import atomic_write, check_output, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
 from ..lenses import MicrolensArray
+from ..typing import PathLike
 from .export import MESH_SUFFIXES, printable, read_mesh, write_mesh
 from .lenslets import caps_of, part_centers, surface
 from .manufacturability import Finding, check_design, check_solid, refuse_errors
@@ -38,8 +39,8 @@ _FRAMES = {
 
 
 def make_mold(
-    design: Design | str | os.PathLike[str],
-    path: str | os.PathLike[str],
+    design: Design | PathLike,
+    path: PathLike,
     *,
     positive: bool = False,
     shape: MoldShape = MoldShape(),

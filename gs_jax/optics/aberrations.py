@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import safe_quotient, safe_sqrt
 from ..lenses import MicrolensArray
-from .theory import Real, Result
+from ..typing import Real, Result
 
 
 class Wavefront(eqx.Module):

@@ -41,6 +41,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
+from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .raytrace import Point, chief_length, direction_cosines, pupil_disc, pupil_radius, unit_rays
 from .theory import airy_deviation
@@ -154,18 +155,16 @@ _RAYS = 2**15
 # Turn of Vogel's spiral, which spreads any number of points evenly over a disc.
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
-Scalar = Float[ArrayLike, ""]
-
 
 @partial(jax.jit, static_argnames=("size", "samples"))
 def diffraction_psf(
     imager: Imager,
-    depth: Scalar,
+    depth: ScalarLike,
     *,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
-    radius: Scalar | None = None,
+    radius: ScalarLike | None = None,
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
     samples: int = 4,
 ) -> Float[Array, "row column"]:
@@ -209,12 +208,12 @@ def diffraction_psf(
 @partial(jax.jit, static_argnames=("size", "samples"))
 def window_fraction(
     imager: Imager,
-    depth: Scalar,
+    depth: ScalarLike,
     *,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
-    radius: Scalar | None = None,
+    radius: ScalarLike | None = None,
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
     samples: int = 4,
 ) -> Float[Array, ""]:
@@ -225,12 +224,12 @@ def window_fraction(
 @partial(jax.jit, static_argnames=("size",))
 def geometric_psf(
     imager: Imager,
-    depth: Scalar,
+    depth: ScalarLike,
     *,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
-    radius: Scalar | None = None,
+    radius: ScalarLike | None = None,
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
 ) -> Float[Array, "row column"]:
     """Density of rays, each shared by the four pixels around it, with the sum 1 unless no ray is in the window.
@@ -270,12 +269,12 @@ def geometric_psf(
 @partial(jax.jit, static_argnames=("size",))
 def gaussian_psf(
     imager: Imager,
-    depth: Scalar,
+    depth: ScalarLike,
     *,
     size: int,
     field: Point = (0.0, 0.0),
     offset: Point = (0.0, 0.0),
-    radius: Scalar | None = None,
+    radius: ScalarLike | None = None,
 ) -> Float[Array, "row column"]:
     """Round Gaussian about the rays' centroid, integrated over the pixels, with the sum 1.
 
@@ -309,10 +308,10 @@ def gaussian_psf(
 @partial(jax.jit, static_argnames=("samples",))
 def strehl(
     imager: Imager,
-    depth: Scalar,
+    depth: ScalarLike,
     *,
     field: Point = (0.0, 0.0),
-    radius: Scalar | None = None,
+    radius: ScalarLike | None = None,
     edges: Float[Array | np.ndarray, "edge 2"] | None = None,
     samples: int = 256,
 ) -> Float[Array, ""]:

@@ -24,7 +24,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.arrays import library_of, safe_sqrt
 from ..geometry import Imager, chief_ray
-from ..lenses import MicrolensArray, Scalars
+from ..lenses import MicrolensArray
+from ..typing import Scalars
 
 # `(2, ...)`, of either library, as all of a call are.
 Coordinates = Any

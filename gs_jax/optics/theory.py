@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..base.arrays import Real, safe_quotient
-
-Result = Float[Array, "..."]
+from ..base.arrays import safe_quotient
+from ..typing import Real, Result
 
 # Full width at half maximum of a Gaussian, in standard deviations.
 FWHM = math.sqrt(8 * math.log(2))

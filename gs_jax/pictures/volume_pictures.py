@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ..grid import Grid
+from ..typing import Points
 
 # Darkest and brightest shown, percentiles: back-projection has a pedestal, which is no object, and a few bright voxels.
 _DARKEST, _BRIGHTEST = 50, 99.95
@@ -40,7 +41,7 @@ def show(
     volume: Num[Array | np.ndarray, "depth y x"],
     grid: Grid,
     *,
-    points: Float[Array | np.ndarray, "point 4"] | None = None,
+    points: Points | None = None,
 ) -> Figure:
     """Maximum projections of a volume along z, y and x, to scale in mm, with points as circles.
 

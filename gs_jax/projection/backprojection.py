@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
 from ..grid import Grid
+from ..typing import Image
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .rays import Envelope, Rays, trace
 
@@ -19,7 +20,7 @@ _DEPTHS = 16
 
 @partial(jax.jit, static_argnames=("method", "normalize"))
 def backproject(
-    image: Num[Array | np.ndarray, "row column"],
+    image: Image,
     imager: Imager,
     grid: Grid,
     *,

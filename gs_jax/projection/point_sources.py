@@ -17,6 +17,7 @@ from ..geometry import Imager
 from ..optics.field_varying import CORE_REACH, halo_nodes, halo_of, kernel_size
 from ..optics.psf_core import Cores, core_tables, drawn, ring_edges
 from ..optics.raytrace import on_host
+from ..typing import Points
 from .field_varying_model import halo_image
 from .rays import Envelope, RingLight
 
@@ -80,7 +81,7 @@ def stamps(
 
 
 def forward_points(
-    points: Float[Array | np.ndarray, "point 4"], imager: Imager, stamps: Stamps, progress: Progress | None = None
+    points: Points, imager: Imager, stamps: Stamps, progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
     """The image of points, Eq. (2): what `forward` does for voxels, without a grid.
 

@@ -10,6 +10,7 @@ from ..base.progress import Progress
 from ..solvers.convolution import Convolution, ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..typing import Image
 from .inverse_problem import above_offset
 from .pipeline import iterated
 
@@ -20,7 +21,7 @@ Deconvolver = ConvolutionADMM | FISTA | RichardsonLucy
 
 
 def deconvolve(
-    image: Num[Array | np.ndarray, "row column"],
+    image: Image,
     psf: Num[Array | np.ndarray, "high wide"],
     solver: Deconvolver = ConvolutionADMM(steps=100, tv=TV),
     *,

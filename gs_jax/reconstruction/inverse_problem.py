@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float
 
 from ..base.arrays import check_finite
 from ..base.progress import Progress
@@ -21,6 +21,7 @@ from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.base import Unmatched
+from ..typing import Image
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARKEST = 1
@@ -56,9 +57,7 @@ def model_of(imager: Imager, grid: Grid, optics: Optics | str, progress: Progres
     return Model(imager, optics_of(imager, grid.depths, optics, progress=progress), side, optics != "full")
 
 
-def explainable(
-    image: Num[Array | np.ndarray, "row column"], model: Model
-) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
+def explainable(image: Image, model: Model) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
     """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it.
 
     It raises `InputError` if a pixel is not finite.

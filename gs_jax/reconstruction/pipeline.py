@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Float32, Num
+from jaxtyping import Array, Float
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
@@ -24,12 +24,10 @@ from ..projection.levels import LEVELS
 from ..solvers.base import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
+from ..typing import Image, Volume
 from .inverse_problem import Sight, System, explainable, model_of, sights_of, slow_waves
 from .methods import BackProjection, ListRichardsonLucy, Method
 from .residual import misfit_of_noise
-
-Image = Num[Array | np.ndarray, "row column"]
-Volume = Float32[np.ndarray, "depth y x"]
 
 # Planes of a device between two steps of the progress bar; a plane more or less changes neither speed nor memory.
 _PLANES = 16
@@ -288,9 +286,7 @@ def _step(state, solver, light, system):
     return solver.step(system.operator, light, state)
 
 
-def backproject_by_all(
-    image: Num[Array | np.ndarray, "row column"], imager: Imager, grid: Grid, **options
-) -> Float[Array, "depth y x"]:
+def backproject_by_all(image: Image, imager: Imager, grid: Grid, **options) -> Float[Array, "depth y x"]:
     """As `backproject`, whose arguments it takes; no device does more than one depth more than another."""
     count = grid.depths.size
     last = jnp.full(-count % jax.local_device_count(), grid.depths[-1])

@@ -10,16 +10,15 @@ from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float32
 
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..grid import Grid
 from ..io.volume_series import Note, VolumeSeries, opened_levels, write_frame
+from ..typing import Volume
 
 Frame = TypeVar("Frame")
-Volume = Float32[np.ndarray, "depth row column"]
 
 # Frames that are read before they are asked for. One volume is written while the next is computed.
 AHEAD = 2

@@ -4,13 +4,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Num, Shaped
+from jaxtyping import Array, Float, Float64, Shaped
 
 from ..base.arrays import check_finite
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics, forward
+from ..typing import Image
 from .inverse_problem import explainable, model_of
 
 # Squares along a side of the sensor, unless it has fewer pixels.
@@ -38,7 +39,7 @@ class Reprojection(NamedTuple):
 
 def reproject(
     volume: Float[Array | np.ndarray, "depth y x"],
-    image: Num[Array | np.ndarray, "row column"],
+    image: Image,
     imager: Imager,
     grid: Grid,
     *,

@@ -3,7 +3,6 @@
 From a scene to the image on the sensor."""
 
 import math
-import os
 from pathlib import Path
 
 import equinox as eqx
@@ -29,6 +28,7 @@ from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
+from ..typing import PathLike
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
 EXPANDED = 16.0
@@ -217,7 +217,7 @@ _STEP = 0.1
 _SLAB = 48
 
 
-def read_scene(path: str | os.PathLike[str]) -> tuple[np.ndarray, Grid | None]:
+def read_scene(path: PathLike) -> tuple[np.ndarray, Grid | None]:
     """A scene from a file: points `(point, 4)` if it is a CSV, else a volume with its grid.
 
     Raises

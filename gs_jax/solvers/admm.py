@@ -20,7 +20,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num, PyTree
 
-from ..base.arrays import Real, divide
+from ..base.arrays import divide
+from ..typing import Real
 from .base import (
     as_image,
     check_options,

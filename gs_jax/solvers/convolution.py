@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Complex, Float, Num
+from jaxtyping import Array, Complex, Float
 
-from ..base.arrays import Real, divide, safe_sqrt
+from ..base.arrays import divide, safe_sqrt
+from ..typing import Image, Real
 from .admm import Prior, Splitting, advance, or_one
 from .base import as_image, check_options
 
@@ -115,7 +116,7 @@ class ConvolutionADMM(eqx.Module):
     def __check_init__(self):
         check_options(self)
 
-    def init(self, system: Convolution, image: Num[Array | np.ndarray, "row column"]) -> State:
+    def init(self, system: Convolution, image: Image) -> State:
         A = system.operator
         prior = Prior.of(self, A.T.mv(as_image(A, image)), wrap=True)
         shape, axes = system.scene_shape, _axes(system)
@@ -131,9 +132,7 @@ class ConvolutionADMM(eqx.Module):
         split = (x, *prior.split(x))
         return State(Splitting.start(x, split, or_one(_START * gain**2)), prior, gain, spectrum, solvent)
 
-    def step(
-        self, system: Convolution, image: Num[Array | np.ndarray, "row column"], state: State
-    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+    def step(self, system: Convolution, image: Image, state: State) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = as_image(system.operator, image)
         splitting, prior, gain, spectrum, solvent = state
         shape, axes = system.scene_shape, _axes(system)

@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import Real, divide
+from ..base.arrays import divide
+from ..typing import Real
 from .base import as_image, check_options, least_weight_of_darkness, norm
 
 # Steps of the power method, and what it may fall short by: for operators without negative entries the largest

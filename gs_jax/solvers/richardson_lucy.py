@@ -13,8 +13,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import Real, divide
+from ..base.arrays import divide
 from ..base.errors import InputError
+from ..typing import Real
 from .base import Unmatched, as_image, check_options, differences, differences_adjoint, magnitude, norm
 
 # Tents that make a background slow, by default: wider than the halo of a spot.

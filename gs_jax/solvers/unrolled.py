@@ -6,7 +6,6 @@ step is taken to a power that was learned, and a network then weighs each voxel 
 The last have no networks again: where light may be is known then, and least squares say how much of it there is.
 """
 
-import os
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,6 +20,7 @@ from ..base.arrays import divide
 from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
+from ..typing import PathLike
 from .base import Unmatched, as_image, check_options, norm
 from .richardson_lucy import TENTS, RichardsonLucy, State as LucyState, divergence, tent_background, tent_step
 
@@ -202,14 +202,14 @@ class Unrolled(eqx.Module):
         return weights.shipped("unrolled", _skeleton)
 
 
-def write_unrolled(path: str | os.PathLike[str], networks: Unrolled, provenance: Provenance | None = None) -> None:
+def write_unrolled(path: PathLike, networks: Unrolled, provenance: Provenance | None = None) -> None:
     """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
     width = networks.layers[0].bias.shape[-1]
     about = {"first": networks.first, "networks": networks.power.size, "squares": networks.last, "width": width}
     weights.write_weights(path, networks, about, provenance)
 
 
-def read_unrolled(path: str | os.PathLike[str]) -> Unrolled:
+def read_unrolled(path: PathLike) -> Unrolled:
     """The networks in a file of `write_unrolled`, in float32. Nothing in the file is ever executed.
 
     Raises

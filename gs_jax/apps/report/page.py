@@ -1,13 +1,12 @@
 """The page: what a microscope is, what it promises and what it showed, in one file."""
 
-import os
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Num
 
 from ...base.errors import InputError
 from ...base.progress import Progress
@@ -19,6 +18,7 @@ from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
 from ...pictures.volume_pictures import in_range, palette, png, slices, slider
+from ...typing import Image, PathLike, Points
 from . import drawings, report_tables, views
 from .drawings import line_chart
 
@@ -30,13 +30,13 @@ PAPER = {
 
 
 def write_report(
-    path: str | os.PathLike[str],
+    path: PathLike,
     design: Design,
     *,
     volume: Num[Array | np.ndarray, "z y x"] | None = None,
     grid: Grid | None = None,
-    points: Float[Array | np.ndarray, "point 4"] | None = None,
-    image: Num[Array | np.ndarray, "row column"] | None = None,
+    points: Points | None = None,
+    image: Image | None = None,
     tolerance: Mapping[str, Any] | None = None,
     notes: Mapping[str, str] | None = None,
     origins: Mapping[str, Mapping[str, Any]] | None = None,

@@ -1,7 +1,6 @@
 """What a page says in tables: the datasheet with what violates what, calibration, tolerances, origins of files."""
 
 import json
-import os
 import re
 import shlex
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ from ...base.errors import InputError
 from ...design.design import Design, span_of
 from ...design.sheet import confusion_of
 from ...io.files import read_text
+from ...typing import PathLike
 
 # A spot so many times wider than promised is marked, as `gs_jax.design.problems` has it in words.
 _FAR = 2.0
@@ -121,7 +121,7 @@ def calibration_summary(design: Design) -> str:
     return f"{found}, {said.get('calibrated_rms_pixels', '?')} pixels RMS{mirrored}."
 
 
-def read_tolerance(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_tolerance(path: PathLike) -> dict[str, Any]:
     """What `gs-jax tolerance -o` wrote; `InputError` if it is anything else."""
     try:
         found = json.loads(read_text(path))
@@ -199,6 +199,6 @@ def versions() -> list[tuple[str, str]]:
     return [(name, found[name]) for name in ("gs-jax", "python", "jax", "system")]
 
 
-def name_of(path: str | os.PathLike[str]) -> str:
+def name_of(path: PathLike) -> str:
     """Without its folder."""
     return Path(path).name

@@ -1,6 +1,5 @@
 """Tolerances in files."""
 
-import os
 import tomllib
 
 from pydantic import ValidationError
@@ -8,10 +7,11 @@ from pydantic import ValidationError
 from ...base.errors import InputError
 from ...io.files import read_text
 from ...io.toml import one_line
+from ...typing import PathLike
 from .tolerance_spec import Tolerances
 
 
-def read_tolerances(path: str | os.PathLike[str]) -> Tolerances:
+def read_tolerances(path: PathLike) -> Tolerances:
     """The tolerances in a TOML file, whose keys are the fields of `Tolerances`; what it leaves out has its default.
 
     Raises

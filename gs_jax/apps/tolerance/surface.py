@@ -11,15 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...lenses import MicrolensArray
+from ...typing import ScalarLike
 
 # Of equal area, in a lens: terraces are wide in its middle alone.
 _RINGS = 256
 
-Real = Float[Array | np.ndarray, ""] | float
-
 
 def step_squares(
-    slope: Float[Array | np.ndarray, " place"], layer: Real, pixel: Real
+    slope: Float[Array | np.ndarray, " place"], layer: ScalarLike, pixel: ScalarLike
 ) -> tuple[Float[Array, " place"], Float[Array, " place"]]:
     """Mean squares of a printed surface's height error, mm^2, and of its slope's, at places of the wanted slope."""
     slope = jnp.asarray(slope)
@@ -28,7 +27,7 @@ def step_squares(
 
 
 def lens_squares(
-    array: MicrolensArray, radius: Real, layer: Real, pixel: Real, wavelength: Real
+    array: MicrolensArray, radius: ScalarLike, layer: ScalarLike, pixel: ScalarLike, wavelength: ScalarLike
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean squares of a lens's height error, mm^2, and of the slope that bends rays, within a radius, mm.
 
@@ -42,7 +41,7 @@ def lens_squares(
 
 
 def log_strehl_of_height(
-    square: Real | Float[Array, " place"], refractive_index: Real, wavelength: Real
+    square: ScalarLike | Float[Array, " place"], refractive_index: ScalarLike, wavelength: ScalarLike
 ) -> Float[Array, "..."]:
     """Logarithm of `exp(-(2 pi (n - 1) sigma / lambda)^2)`, the light that stays in the spot's core.
 

@@ -7,6 +7,8 @@ from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
+from ...typing import Volume
+
 # Planes of a scene.
 PLANES = 6
 _TEXT = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
@@ -44,9 +46,7 @@ def on_sheet(page: Float32[np.ndarray, "y x"], rng: np.random.Generator) -> Floa
     return np.stack([page * np.maximum(1 - abs(plane - i), 0) for i in range(PLANES)]).astype(np.float32)
 
 
-def shared_out(
-    scene: Float32[np.ndarray, "plane y2 x2"], at: np.ndarray, depths: np.ndarray
-) -> Float32[np.ndarray, "depth y x"]:
+def shared_out(scene: Float32[np.ndarray, "plane y2 x2"], at: np.ndarray, depths: np.ndarray) -> Volume:
     """A scene on voxels half as large, on the volume's: means of 2 x 2, and linear weights along z."""
     planes, rows, columns = scene.shape
     coarse = scene.reshape(planes, rows // 2, 2, columns // 2, 2).mean((2, 4))

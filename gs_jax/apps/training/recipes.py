@@ -17,6 +17,7 @@ from ...base.workers import Workers
 from ...detection.unet import UNet, multislice_network, paper_network
 from ...reconstruction.inverse_problem import System, above_offset, sights_of
 from ...solvers.unrolled import State, Unrolled, untrained
+from ...typing import Volume
 from .simulated_captures import SCENES, Kind, example, tables
 from .training_loop import Recipe
 from .training_slices import Batch, Stack, paper_batch, patches
@@ -34,7 +35,7 @@ class Case(NamedTuple):
 
     light: Float32[np.ndarray, "row column"]
     system: System
-    truth: Float32[np.ndarray, "depth y x"]
+    truth: Volume
     start: State
 
 

@@ -19,6 +19,7 @@ from ...lenses import MicrolensArray
 from ...optics.field_varying import FullOptics, HaloGrid, full_optics, halo_nodes
 from ...projection.forward_model import forward
 from ...simulation.synthetic import Camera, electrons, expose
+from ...typing import Volume
 from .random_scenes import PLANES as SCENE_PLANES, random_scene, shared_out
 
 # Scenes that one microscope images: its tables take longer than an image.
@@ -70,7 +71,7 @@ class Example(NamedTuple):
     image: Float32[np.ndarray, "row column"]
     imager: Imager
     grid: Grid
-    truth: Float32[np.ndarray, "depth y x"]
+    truth: Volume
 
 
 def example(seed: int, number: int, kind: Kind) -> Example:

@@ -1,6 +1,5 @@
 """Training of a network by a recipe, with checkpoints from which it goes on exactly."""
 
-import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ...base.errors import InputError
 from ...io.files import atomic_write, check_input, decoding
+from ...typing import PathLike
 
 
 class Recipe(NamedTuple):
@@ -87,13 +87,13 @@ def _step(recipe: Recipe, steps: int, network: Any, memory: optax.OptState, batc
     return optax.apply_updates(network, updates), memory, value
 
 
-def write_checkpoint(path: str | os.PathLike[str], state: State) -> None:
+def write_checkpoint(path: PathLike, state: State) -> None:
     """Writes a state, exactly, whole or not at all."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         eqx.tree_serialise_leaves(file, state)
 
 
-def read_checkpoint(path: str | os.PathLike[str], recipe: Recipe, *, steps: int, seed: int) -> State:
+def read_checkpoint(path: PathLike, recipe: Recipe, *, steps: int, seed: int) -> State:
     """The state in a file of `write_checkpoint`, of the same recipe, number of steps and seed.
 
     Raises

@@ -3,7 +3,6 @@
 Everything is a function of a seed and a number: the same arguments give the same data.
 """
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -20,6 +19,7 @@ from ...detection.unet import standardized
 from ...io.files import atomic_write, decoding, make_folder
 from ...optics.psf_core import apparent_depths
 from ...projection.backprojection import backproject
+from ...typing import PathLike
 from .random_scenes import drawn
 from .simulated_captures import SCENES, Kind, example
 
@@ -96,7 +96,7 @@ def simulated_stack(seed: int, number: int, kinds: Sequence[Kind] = KINDS) -> St
 
 
 def stacks(
-    folder: str | os.PathLike[str],
+    folder: PathLike,
     count: int,
     seed: int,
     progress: Progress | None = None,
