@@ -98,8 +98,7 @@ def explore_command(design: Path, study: Path | None, output: Path | None, port:
     """
     import webbrowser
 
-    from ..apps.explore.server import Server
-    from ..apps.explore.session import Session
+    from ..apps.explore.server import Server, Session
     from ..codesign.study import read_study
     from ..design.design import read_design
 

@@ -1,7 +1,7 @@
-// Sliders ask what becomes of the design: one question at a time, and when its answer is there, only the latest after it.
+// Sliders request an evaluation of the design: one request at a time, and after its answer only the latest one.
 "use strict";
 (() => {
-const at = id => document.getElementById(id), inputs = [...document.querySelectorAll("#knobs input")];
+const at = id => document.getElementById(id), inputs = [...document.querySelectorAll("#sliders input")];
 const steps = input => Number(input.max);
 const exact = {};
 const value = input => exact[input.name] ?? Number(input.dataset.low) + input.value / steps(input) * (input.dataset.high - input.dataset.low);

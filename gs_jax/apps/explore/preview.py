@@ -1,28 +1,32 @@
-"""Ghosts of a point, and a small reconstruction, of a microscope whose numbers move."""
+"""Previews of a microscope whose numbers move: the ghosts of a point, and a small simulated reconstruction."""
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.signal import fftconvolve
 
-from ...geometry import Imager, Sensor, chief_ray, envelope
+from ...codesign.parameters import Parent
+from ...geometry import Imager, Sensor, envelope
 from ...grid import Grid
+from ...optics.raytrace import on_host
 from ...simulation.phantoms import random_points
-from .evaluation import SIZE, Bench, Values, imager_of, spot_of, unit_of
+from .evaluation import SIZE, Values, lens_unit, moved_imager, pupil_samples, spot
 
-# Cells of a map of ghosts, across; pixels of a small sensor, across; planes and points of the scene, and voxels across.
-# Depths of such a map.
-_CELLS, _PIXELS, _PLANES, _POINTS, _VOXELS, _DEPTHS = 141, 640, 5, 20, 181, 9
+# Cells across the map of ghosts, and its depths.
+_CELLS, _GHOST_DEPTHS = 141, 9
+# Pixels across the small sensor; planes, points and voxels across of the reconstruction.
+_PIXELS, _PLANES, _POINTS, _VOXELS = 640, 5, 20, 181
 
 
-class Ghosts(NamedTuple):
-    """How many rays of back-projection cross each cell, `[row, column]`, over `(left, top, right, bottom)`, mm.
+class GhostMap(NamedTuple):
+    """How many rays of back-projection cross each cell of `box`, `(left, top, right, bottom)`, mm.
 
-    `lenses` see the point, which all of their own rays meet.
+    `lenses` see the point.
     """
 
     crossings: Int[np.ndarray, "row column"]
@@ -30,35 +34,35 @@ class Ghosts(NamedTuple):
     lenses: int
 
 
-def ghosts_of(imager: Imager, near: float, far: float) -> Ghosts:
-    """Where back-projection puts the light of a point on the axis, in the middle of the depths, mm, over all of them.
+def map_ghosts(imager: Imager, near: float, far: float) -> GhostMap:
+    """Count where back-projection puts the light of a point on the axis, in the middle of the depths, over all depths.
 
-    Each lens throws each image back along its own chief ray: the point is where those of its own images meet at its
-    depth; all else is its blur at other depths, and ghosts, which are other lenses' images. Lenses count within the
-    field radius.
+    Each lens throws each image back along its own chief ray. Rays meet at the point at its depth; all else is its blur
+    at other depths, and ghosts, which are other lenses' images. Lenses count within the field radius.
     """
-    centers = np.asarray(imager.centers, float)
-    x0, x1, y1, y0 = imager.sensor.extent
-    half = np.array(imager.array.size) / 2
-    box = (min(x0, -half[0]), min(y0, -half[1]), max(x1, half[0]), max(y1, half[1]))
-    images = np.asarray(imager.project(np.array([[0.0, 0.0, (near + far) / 2]])), float)[:, 0]
-    on = (images >= (x0, y0)).all(1) & (images <= (x1, y1)).all(1)
-    images = images[on & (np.hypot(*centers.T) <= imager.field_radius)]
-    edges = [np.linspace(box[1], box[3], _CELLS + 1), np.linspace(box[0], box[2], _CELLS + 1)]
-    crossings = np.zeros((_CELLS, _CELLS), int)
-    for magnification in np.asarray(imager.magnification(np.linspace(near, far, _DEPTHS)), float):
-        # `p = c + m (c - q)` for q.
-        offset = (centers[:, None] - images[None]) / magnification
-        kept = np.hypot(*np.moveaxis(offset, -1, 0)) <= imager.field_radius
-        places = (centers[:, None] + offset)[kept]
-        crossings += np.histogram2d(places[:, 1], places[:, 0], edges)[0].astype(int)
-    return Ghosts(crossings, box, len(images))
+    depths = np.linspace(near, far, _GHOST_DEPTHS)
+    left, right, bottom, top = imager.sensor.extent
+    half_x, half_y = (side / 2 for side in imager.array.size)
+    box = (min(left, -half_x), min(top, -half_y), max(right, half_x), max(bottom, half_y))
+    host = on_host(imager)
+    # On the axis, at each depth and in the middle of them.
+    axis = host.views_of_all(np.column_stack([np.zeros((_GHOST_DEPTHS + 1, 2)), [*depths, (near + far) / 2]]))
+    images, offsets = axis.spot[:, -1], axis.offset
+    on = (images >= (left, top)).all(1) & (images <= (right, bottom)).all(1)
+    images = images[on & (np.hypot(*offsets[:, -1].T) <= imager.field_radius)]
+    magnifications = np.broadcast_to(imager.magnifications(depths), (len(axis.spot), _GHOST_DEPTHS))
+    # A spot moves by -M for a point that moves by 1.
+    points = (axis.spot[:, None, :-1] - images[None, :, None]) / magnifications[:, None, :, None]
+    kept = np.hypot(*np.moveaxis(points + offsets[:, None, :-1], -1, 0)) <= imager.field_radius
+    edges = [np.linspace(low, high, _CELLS + 1) for low, high in ((box[1], box[3]), (box[0], box[2]))]
+    crossings = np.histogram2d(points[kept][:, 1], points[kept][:, 0], edges)[0].astype(int)
+    return GhostMap(crossings, box, len(images))
 
 
-class Small(NamedTuple):
-    """A small reconstruction: maxima along z, `[row, column]` over `(left, top, right, bottom)`, and the true points.
+class Reconstruction(NamedTuple):
+    """Maxima along z over `(left, top, right, bottom)`, mm, and the true points.
 
-    `contrast` is the mean of the points' brightness over the background's standard deviation, above its median.
+    `contrast` is the mean brightness of the points above the volume's median, over its standard deviation.
     """
 
     maxima: Float[np.ndarray, "row column"]
@@ -67,13 +71,12 @@ class Small(NamedTuple):
     contrast: float
 
 
-def small_reconstruction(bench: Bench, values: Values, diameter: float) -> Small:
-    """Points in five planes, imaged with spots by diffraction onto a coarse sensor, and back-projected.
+def reconstruct_points(start: Parent, values: Values, clear_diameters: Float[np.ndarray, " type"]) -> Reconstruction:
+    """Image points in five planes with the spots of each lens type onto a coarse sensor, and back-project them.
 
-    `diameter` is that of the clear aperture, mm. Light beside a spot's window is left out.
+    Light outside a spot's window is left out. `clear_diameters` are those of the types, mm.
     """
-    near, far, unit = values["near_mm"], values["far_mm"], unit_of(bench, values)
-    imager = imager_of(bench, values)
+    near, far, imager = values["near_mm"], values["far_mm"], moved_imager(start, values)
     coarse = max(-(-max(imager.sensor.shape) // _PIXELS), 1)
     rows, columns = (max(n // coarse, 2) for n in imager.sensor.shape)
     sensor = Sensor((rows, columns), imager.sensor.pixel_pitch * coarse, imager.sensor.origin)
@@ -83,79 +86,72 @@ def small_reconstruction(bench: Bench, values: Values, diameter: float) -> Small
     points = random_points(_POINTS, (side, side), (near, far), seed=2)[:, :3]
     plane = np.arange(_POINTS) % _PLANES
     points[:, 2] = depths[plane]
-    image = np.zeros(sensor.shape)
-    for number, depth in enumerate(depths):
-        spot = _binned(spot_of(bench, unit, float(depth), 0.0, diameter / 2), coarse)
-        image += fftconvolve(_dots(small, points[plane == number]), spot, mode="same")
-    pitch = max(sensor.shape) * sensor.pixel_pitch / _VOXELS
-    grid = Grid.over(sensor, depths=depths, pitch=pitch)
-    volume = _backprojected(np.maximum(image, 0), small, grid)
+    image, samples = np.zeros(sensor.shape), pupil_samples(start)
+    for number, (lenses, diameter) in enumerate(zip(start.lenses, clear_diameters, strict=True)):
+        unit = lens_unit(start, values, number)
+        for k, depth in enumerate(depths):
+            binned = _bin(spot(unit, float(depth), 0.0, diameter / 2, samples=samples), coarse)
+            image += fftconvolve(_dots(small, points[plane == k], lenses), binned, mode="same")
+    grid = Grid.over(sensor, depths=depths, pitch=max(sensor.shape) * sensor.pixel_pitch / _VOXELS)
+    volume = _backproject(np.maximum(image, 0), small, grid)
     left, right, bottom, top = grid.extent
-    return Small(volume.max(0), points, (left, top, right, bottom), _contrast(volume, points, grid))
+    return Reconstruction(volume.max(0), points, (left, top, right, bottom), _contrast(volume, points, grid))
 
 
-def _backprojected(image: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
-    """`backproject`, slower, but compiled once whatever the field radius, the plate and the planes are."""
-    magnifications = np.broadcast_to(imager.magnifications(grid.depths), (len(imager.centers), grid.depths.size))
-    sensor, kind = imager.sensor, imager.sensor_distance.dtype
-    first = np.asarray(sensor.to_mm(np.zeros(2)))
-    numbers = (image, imager.centers, magnifications, imager.reduced_depth(grid.depths), imager.field_radius)
-    numbers = (*numbers, grid.x, grid.y, first, sensor.pixel_pitch)
-    return np.asarray(_summed(*(jnp.asarray(x, kind) for x in numbers)))
+def _backproject(image: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
+    """`gs_jax.backproject` more slowly, but compiled once for all plates and field radii, its static fields."""
+    array, dtype = dataclasses.replace(imager.array, size=(math.inf, math.inf)), imager.sensor_distance.dtype
+    fixed = dataclasses.replace(imager, array=array, field_radius=1.0)
+    return np.asarray(_sum_lenses(jnp.asarray(image, dtype), fixed, grid, jnp.asarray(imager.field_radius, dtype)))
 
 
 @jax.jit
-def _summed(image, centers, magnifications, reduced, field, x, y, first, pixel):
-    """Over the lenses, of each plane; `first` is the place `(x, y)` of the first pixel."""
+def _sum_lenses(image: Array, imager: Imager, grid: Grid, field_radius: Array) -> Array:
+    def plane(depth):
+        # Views are separable in x and y: one line of points along each is enough.
+        across, along = jnp.broadcast_to(depth, grid.x.shape), jnp.broadcast_to(depth, grid.y.shape)
+        across = jnp.stack([grid.x, jnp.zeros_like(across), across], -1)
+        along = jnp.stack([jnp.zeros_like(along), grid.y, along], -1)
 
-    def along(positions, count):
-        low = jnp.clip(jnp.floor(positions), 0, count - 2)
-        within = (positions >= 0) & (positions <= count - 1)
-        share = positions - low
-        return low.astype(int), jnp.where(within, 1 - share, 0), jnp.where(within, share, 0)
+        def add_lens(lens, plane):
+            by_x, by_y = imager.views(across, lens[None]), imager.views(along, lens[None])
+            rows = _interpolate(image, imager.sensor.to_pixels(by_y.spot)[:, 0])
+            seen = _interpolate(rows.T, imager.sensor.to_pixels(by_x.spot)[:, 1]).T
+            squared = by_y.offset[:, 1:] ** 2 + by_x.offset[None, :, 0] ** 2
+            return plane + envelope(squared, by_x.reduced_depth[None], field_radius) * seen
 
-    def of_lens(plane, lens, magnification, depth):
-        rows, top, bottom = along((chief_ray(centers[lens, 1], y, magnification) - first[1]) / pixel, image.shape[0])
-        columns, left, right = along((chief_ray(centers[lens, 0], x, magnification) - first[0]) / pixel, image.shape[1])
-        strip = top[:, None] * image[rows] + bottom[:, None] * image[rows + 1]
-        seen = left[None] * strip[:, columns] + right[None] * strip[:, columns + 1]
-        squared = ((y - centers[lens, 1]) ** 2)[:, None] + ((x - centers[lens, 0]) ** 2)[None]
-        return plane + envelope(squared, depth, field) * seen
+        return jax.lax.fori_loop(0, len(imager.array.centers), add_lens, jnp.zeros(grid.shape, image.dtype))
 
-    def plane(each):
-        magnification, depth = each
-        nothing = jnp.zeros((y.size, x.size), image.dtype)
-        add = lambda lens, sum_: of_lens(sum_, lens, magnification[lens], depth)
-        return jax.lax.fori_loop(0, centers.shape[0], add, nothing)
-
-    return jax.lax.map(plane, (magnifications.T, reduced))
+    return jax.lax.map(plane, grid.depths)
 
 
-def _binned(spot: np.ndarray, coarse: int) -> np.ndarray:
-    """A spot on pixels that are so many of the sensor's across, an odd number of them, the middle in their middle."""
-    reach = -(-(SIZE - coarse) // (2 * coarse)) if coarse < SIZE else 0
-    wide = (2 * reach + 1) * coarse
-    if wide < SIZE:
-        reach, wide = reach + 1, wide + 2 * coarse
-    before = (wide - SIZE) // 2
-    padded = np.pad(spot, (before, wide - SIZE - before))
+def _interpolate(image: Array, position: Array | np.ndarray) -> Array:
+    """Rows of an image at fractional positions, zero outside."""
+    low = jnp.clip(jnp.floor(position), 0, len(image) - 2).astype(int)
+    share, inside = position - low.astype(position.dtype), (position >= 0) & (position <= len(image) - 1)
+    part = lambda weight: jnp.where(inside, weight, 0)[:, None]
+    return part(1 - share) * image[low] + part(share) * image[low + 1]
+
+
+def _bin(spot: np.ndarray, coarse: int) -> np.ndarray:
+    """A spot on pixels `coarse` times as large, an odd number of them, its middle in the middle pixel."""
+    reach = max(-(-(SIZE - coarse) // (2 * coarse)), 0)
+    side = (2 * reach + 1) * coarse
+    before = (side - SIZE) // 2
+    padded = np.pad(spot, (before, side - SIZE - before))
     return padded.reshape(2 * reach + 1, coarse, 2 * reach + 1, coarse).sum((1, 3))
 
 
-def _dots(imager: Imager, points: np.ndarray) -> np.ndarray:
-    """Images of points by chief rays, each shared by four pixels."""
-    image = np.zeros(imager.sensor.shape)
-    if not len(points):
-        return image
-    views = imager.views_of_all(points)
-    places, light = np.asarray(imager.sensor.to_pixels(views.spot), float), np.asarray(imager.brightness(views), float)
-    corner = np.floor(places)
-    share = places - corner
-    for down, right in np.ndindex(2, 2):
-        row, column = (corner + (down, right)).astype(int).reshape(-1, 2).T
-        part = light * np.abs(1 - down - share[..., 0]) * np.abs(1 - right - share[..., 1])
-        on = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
-        np.add.at(image, (row[on], column[on]), part.ravel()[on])
+def _dots(imager: Imager, points: np.ndarray, lenses: tuple[int, ...]) -> np.ndarray:
+    """Chief-ray images of points by some lenses, each shared by the four nearest pixels."""
+    host = on_host(imager)
+    views = host.views(points[None], np.array(lenses)[:, None])
+    spots, light = host.sensor.to_pixels(views.spot), np.asarray(host.brightness(views))
+    corner, image = np.floor(spots).astype(int), np.zeros(imager.sensor.shape)
+    for step in np.ndindex(2, 2):
+        pixel, part = corner + step, light * np.prod(1 - np.abs(corner + step - spots), -1)
+        on = ((pixel >= 0) & (pixel < image.shape)).all(-1)
+        np.add.at(image, tuple(pixel[on].T), part[on])
     return image
 
 
@@ -163,7 +159,7 @@ def _contrast(volume: np.ndarray, points: np.ndarray, grid: Grid) -> float:
     rows = np.clip(np.rint((points[:, 1] - float(grid.y[0])) / grid.pitch).astype(int), 1, grid.shape[0] - 2)
     columns = np.clip(np.rint((points[:, 0] - float(grid.x[0])) / grid.pitch).astype(int), 1, grid.shape[1] - 2)
     planes = np.abs(np.asarray(grid.depths, float)[:, None] - points[None, :, 2]).argmin(0)
-    near = lambda k, r, c: volume[k, r - 1 : r + 2, c - 1 : c + 2].max()
-    bright = np.mean([near(k, r, c) for k, r, c in zip(planes, rows, columns, strict=True)])
-    middle, spread = np.median(volume), volume.std()
-    return float((bright - middle) / spread) if spread > 0 else 0.0
+    around = lambda k, r, c: volume[k, r - 1 : r + 2, c - 1 : c + 2].max()
+    bright = np.mean([around(k, r, c) for k, r, c in zip(planes, rows, columns, strict=True)])
+    deviation = volume.std()
+    return float((bright - np.median(volume)) / deviation) if deviation > 0 else 0.0

@@ -1,41 +1,190 @@
-"""The page's server: the standard library's, on this machine alone.
+"""The page of `gs-jax explore`: a session of one person, and the HTTP server that answers its page.
 
-It listens on 127.0.0.1, answers to no other name (a page elsewhere that resolves to this machine gets nothing), and
-all of its addresses begin with a secret that changes each time: other pages and users of the machine do not know it.
+The server listens on 127.0.0.1 and answers to no other host name, so a foreign page that resolves to this machine gets
+nothing. All addresses begin with a secret token that changes each time: other pages and users do not know it.
 """
 
 import json
 import secrets
+import time
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import jinja2
+import numpy as np
+
 from ...base.errors import InputError
-from .session import Session
+from ...codesign.study import Study
+from ...design.design import Design, write_design
+from ...pictures.volume_pictures import in_range, png
+from ..report.drawings import layout, line_chart
+from ..report.page import render
+from .evaluation import (
+    SPOT_DEPTHS,
+    SPOT_FIELDS,
+    Evaluation,
+    Values,
+    complete_values,
+    evaluate_design,
+    find_violations,
+    live_terms,
+    make_sliders,
+    moved_design,
+    moved_imager,
+    start_of,
+)
+from .preview import map_ghosts, reconstruct_points
 
 HOST = "127.0.0.1"
-# Of a question, bytes: seven numbers with their names.
-_LONGEST = 4096
+# Of a request's body, bytes: seven numbers with their names.
+_MAX_BYTES = 4096
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
+# Kept designs, and numbers after a file's name.
+_MAX_KEPT, _MAX_NUMBER = 50, 10_000
+# Columns of the history: numbers of which the largest of all depths is shown.
+_COLUMNS = {
+    "spot_width_um": "spot, um",
+    "lateral_resolution_um": "promised, um",
+    "axial_resolution_um": "axial, um",
+    "blur_um": "blur, um",
+    "occupancy": "occupancy",
+}
+
+
+class Session:
+    """One design that one person explores.
+
+    Parameters
+    ----------
+    design
+        The starting design.
+    study
+        The study whose targets are evaluated.
+    path
+        The file to save designs to; a number is added to its name if it exists.
+    provenance
+        The provenance of saved designs.
+    """
+
+    def __init__(self, design: Design, study: Study | None, path: Path, provenance: dict[str, str]):
+        self.design, self.study, self.path, self.provenance = design, study, path, provenance
+        self.start, self.sliders = start_of(design, study), make_sliders(design)
+        self.terms = live_terms(self.start, study)
+        self.kept: list[tuple[str, Values, Evaluation]] = []
+        environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+        environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
+        text = (resources.files("gs_jax") / "apps" / "explore" / "parts.html").read_text("utf-8")
+        self.html: Any = environment.from_string(text).module
+        self.keep({}, "start")
+
+    def page(self, token: str) -> str:
+        """The page, as HTML."""
+        late = [table.name for table in (self.study.terms if self.study else ()) if table.name not in self.terms]
+        context = {"design": self.design, "sliders": self.sliders, "token": token, "late": late}
+        return render("explore.html", context, folder="explore")
+
+    def move(self, values: Values) -> dict[str, Any]:
+        """Evaluate the design of these values: parts of the page by name, and the time that it took."""
+        began = time.perf_counter()
+        values, evaluation = self._evaluate(values)
+        imager = moved_imager(self.start, values)
+        ghosts = map_ghosts(imager, values["near_mm"], values["far_mm"])
+        picture = _picture(np.sqrt(ghosts.crossings), 0.0, max(float(np.sqrt(ghosts.crossings.max())), 1.0))
+        violations = find_violations(self.design, self.study, self.start, values, evaluation)
+        parts = {
+            "violations": self.html.violations(violations),
+            "numbers": self.html.numbers(evaluation, self.kept[0][2]),
+            "spots": self._spots(evaluation, values),
+            "layout": layout(imager, picture, ghosts.box, "where back-projection puts a point"),
+            "chart": self._chart(evaluation),
+        }
+        return {"parts": parts, "ms": round(1000 * (time.perf_counter() - began))}
+
+    def reconstruct(self, values: Values) -> dict[str, Any]:
+        """Reconstruct a few points: a part of the page."""
+        began = time.perf_counter()
+        values, evaluation = self._evaluate(values)
+        maxima, points, box, contrast = reconstruct_points(self.start, values, evaluation.clear_diameters)
+        low, high = (float(value) for value in np.percentile(maxima, (50, 99.9)))
+        picture = _picture(maxima, low, max(high, low + 1e-12))
+        parts = {"small": self.html.reconstruction(picture, box, points.tolist(), contrast)}
+        return {"parts": parts, "ms": round(1000 * (time.perf_counter() - began))}
+
+    def keep(self, values: Values, name: str = "") -> dict[str, Any]:
+        """Add the design of these values to the history."""
+        if len(self.kept) >= _MAX_KEPT:
+            raise InputError(f"at most {_MAX_KEPT} designs are kept.")
+        self.kept.append((name or f"{len(self.kept)}", *self._evaluate(values)))
+        return self.history()
+
+    def save(self, values: Values) -> dict[str, Any]:
+        """Write the design of these values to a new file."""
+        values = complete_values(self.sliders, values)
+        path = _free_path(self.path)
+        write_design(path, moved_design(self.design, self.start, values, dict(self.provenance)))
+        return {"said": f"Saved as {path.name}."}
+
+    def history(self) -> dict[str, Any]:
+        """The kept designs: a part of the page, and their values."""
+        part = self.html.history(_COLUMNS, self.sliders, self.kept)
+        return {"parts": {"history": part}, "kept": [values for _, values, _ in self.kept]}
+
+    def _evaluate(self, values: Values) -> tuple[Values, Evaluation]:
+        values = complete_values(self.sliders, values)
+        return values, evaluate_design(self.start, values, self.terms)
+
+    def _chart(self, now: Evaluation) -> str:
+        line = lambda evaluation, name: (evaluation.depths, evaluation.numbers[name])
+        lines = {"now": line(now, "spot_width_um"), "now, promised": line(now, "lateral_resolution_um")}
+        lines["start"] = line(self.kept[0][2], "spot_width_um")
+        if len(self.kept) > 1:
+            lines[f"kept {self.kept[-1][0]}"] = line(self.kept[-1][2], "spot_width_um")
+        return line_chart(lines, x="depth z, mm", y="width of a spot, um", title="Spots by depth", log=True, marks=True)
+
+    def _spots(self, evaluation: Evaluation, values: Values) -> str:
+        def cell(spot):
+            spot = np.nan_to_num(spot)
+            return _picture(np.sqrt(np.maximum(spot, 0) / max(spot.max(), 1e-30)), 0.0, 1.0), 100 * spot.sum()
+
+        by_field = evaluation.spots.swapaxes(0, 1)
+        heights = [share * values["field_radius_mm"] for share in SPOT_FIELDS]
+        rows = [(height, [cell(spot) for spot in spots]) for height, spots in zip(heights, by_field, strict=True)]
+        return self.html.spots(evaluation.depths[list(SPOT_DEPTHS)], rows)
+
+
+def _picture(values: np.ndarray, low: float, high: float) -> str:
+    return png(in_range(values, low, high), "magma")
+
+
+def _free_path(path: Path) -> Path:
+    """The path, or with the first number after its name that is free."""
+    for number in range(1, _MAX_NUMBER):
+        free = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+        if not free.exists():
+            return free
+    raise InputError(f"{path}: {_MAX_NUMBER} files of this name exist, choose another.")
 
 
 class Server(ThreadingHTTPServer):
-    """Answers the page of a session; `url` is where it is."""
+    """Serves the page of a session at `url`."""
 
     daemon_threads = True
 
     def __init__(self, session: Session, port: int = 0):
         super().__init__((HOST, port), _Handler)
         self.session, self.token = session, secrets.token_urlsafe(16)
-        # One of a kind at a time; a move does not wait for a reconstruction.
-        self.turn, self.slow = Lock(), Lock()
-        self.names = {f"{name}:{self.server_port}" for name in (HOST, "localhost")}
-        self.answers: dict[str, Callable[[dict[str, float]], dict[str, Any]]] = {
+        # One request at a time; but a move does not wait for a reconstruction.
+        self.lock, self.reconstruction_lock = Lock(), Lock()
+        self.hosts = {f"{name}:{self.server_port}" for name in (HOST, "localhost")}
+        self.actions: dict[str, Callable[[dict[str, float]], dict[str, Any]]] = {
             "move": session.move,
             "reconstruct": session.reconstruct,
             "keep": session.keep,
@@ -45,7 +194,7 @@ class Server(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Of the page, with its secret."""
+        """Address of the page, with its token."""
         return f"http://{HOST}:{self.server_port}/{self.token}/"
 
 
@@ -54,47 +203,44 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        if not self._is_ours():
-            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"gs-jax explore: not the address that it printed.\n")
+        if not self._is_local():
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain", "gs-jax explore: not the address that it printed.\n")
         elif self.path == f"/{self.server.token}/":
-            self._answer(HTTPStatus.OK, "text/html", self.server.session.page(self.server.token).encode())
+            self._answer(HTTPStatus.OK, "text/html", self.server.session.page(self.server.token))
         else:
-            self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"gs-jax explore: nothing here.\n")
+            self._answer(HTTPStatus.NOT_FOUND, "text/plain", "gs-jax explore: no such page.\n")
 
     def do_POST(self) -> None:
         _, token, name = (*self.path.split("/"), "", "")[:3]
-        if not self._is_ours() or not secrets.compare_digest(token.encode(), self.server.token.encode()):
-            return self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"gs-jax explore: not from its own page.\n")
-        if name not in self.server.answers:
-            return self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"gs-jax explore: nothing here.\n")
+        if not self._is_local() or not secrets.compare_digest(token.encode(), self.server.token.encode()):
+            return self._answer(HTTPStatus.FORBIDDEN, "text/plain", "gs-jax explore: not from its own page.\n")
+        if name not in self.server.actions:
+            return self._answer(HTTPStatus.NOT_FOUND, "text/plain", "gs-jax explore: no such page.\n")
         try:
             values = self._values()
-            with self.server.slow if name == "reconstruct" else self.server.turn:
-                found = self.server.answers[name](values)
+            with self.server.reconstruction_lock if name == "reconstruct" else self.server.lock:
+                answer = self.server.actions[name](values)
         except InputError as error:
-            found = {"error": str(error)}
-        self._json(found)
+            answer = {"error": str(error)}
+        self._answer(HTTPStatus.OK, "application/json", json.dumps(answer))
 
-    def _is_ours(self) -> bool:
-        """Whether it is asked by this machine's name, and by no other page."""
-        origin = self.headers.get("Origin")
-        own = {f"http://{name}" for name in self.server.names}
-        return self.headers.get("Host") in self.server.names and (origin is None or origin in own)
+    def _is_local(self) -> bool:
+        """Whether the request names this machine, and comes from no other page."""
+        origin, hosts = self.headers.get("Origin"), self.server.hosts
+        return self.headers.get("Host") in hosts and origin in {None, *(f"http://{name}" for name in hosts)}
 
     def _values(self) -> dict[str, float]:
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > _LONGEST:
-            raise InputError(f"found a question of {length or 'no'} bytes, allowed: up to {_LONGEST}.")
+        if not length.isdecimal() or int(length) > _MAX_BYTES:
+            raise InputError(f"a request must have up to {_MAX_BYTES} bytes, got {length or 'no length'}.")
         try:
-            found = json.loads(self.rfile.read(int(length)))
-            return {str(name): float(value) for name, value in found.items()}
+            data = json.loads(self.rfile.read(int(length)))
+            return {str(name): float(value) for name, value in data.items()}
         except (ValueError, TypeError, AttributeError) as error:
-            raise InputError("found no numbers, allowed: a number for each name.") from error
+            raise InputError("a request must be a JSON object of numbers.") from error
 
-    def _json(self, data: dict[str, Any]) -> None:
-        self._answer(HTTPStatus.OK, "application/json", json.dumps(data).encode())
-
-    def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+    def _answer(self, status: HTTPStatus, kind: str, text: str) -> None:
+        body = text.encode()
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Content-Length", str(len(body)))
@@ -106,4 +252,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: a terminal has better to say."""
+        """Suppress per-request logging."""
