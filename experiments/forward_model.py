@@ -2,9 +2,10 @@
 
 Cost: `gs_jax.forward` at full scale (5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at
 each depth) and with more or fewer depths, lenses and pixels; in focus also with all of the light, the cores of six
-rings or of two, the adjoints, a step of Richardson-Lucy, and Eq. (2) by FFTs of whole images, in turns. Zones: Eq. (2)
-takes the envelope C from the centre of the zone that a voxel lies in, `gs_jax.forward` from the voxel; nothing else
-differs. The zone of a lens is its Voronoi cell, so the departure follows from the envelope alone.
+rings or of two, the adjoints, a step of Richardson-Lucy, and Eq. (2) by FFTs of whole images, in turns.
+ApertureProfile: Eq. (2) takes the envelope C from the centre of the zone that a voxel lies in, `gs_jax.forward` from
+the voxel; nothing else differs. The zone of a lens is its Voronoi cell, so the departure follows from the envelope
+alone.
 
     python -m experiments.forward_model [--out DIR]
 
@@ -28,7 +29,7 @@ from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import envelope
-from gs_jax.optics.field_varying import full_optics
+from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.projection.convolution import with_margin
 
 STUDY = {
@@ -51,7 +52,7 @@ def cost(job: Job, rounds: int = 3) -> dict[str, float]:
 def levels(job: Job, rounds: int = 3) -> dict[str, dict[str, float]]:
     """`cost` with one PSF ("near") and all of the light ("full"; "two rings"), and of what is made of them."""
     s: Inputs = inputs(job)
-    full = lambda **options: full_optics(s.imager, s.grid.depths, **options)
+    full = lambda **options: field_varying_psf(s.imager, s.grid.depths, **options)
     geometry = s.imager, s.grid
     models = {
         WHOLE: (by_whole_images, _psf(job)),
@@ -142,7 +143,7 @@ def zone_departure(imager: Imager, depth: float, size: tuple[float, float], poin
     centers = np.asarray(imager.centers)
     place = rng.uniform(-0.5, 0.5, (points, 2)) * size
     zone = KDTree(centers).query(place)[1]
-    # Zones' centroids, by the points themselves.
+    # ApertureProfile' centroids, by the points themselves.
     middle = np.stack([np.bincount(zone, q, len(centers)) for q in place.T], -1) / np.bincount(zone)[:, None]
     reduced = imager.reduced_depth(depth)
     light = lambda q: np.asarray(envelope(_squared(q, centers), reduced, imager.field_radius))

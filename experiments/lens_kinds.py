@@ -29,7 +29,7 @@ from gs_jax.design.design import Design, design_text, read_design
 from gs_jax.geometry import envelope
 from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
-from gs_jax.optics.raytrace import pupil_disc
+from gs_jax.optics.raytrace import pupil_quadrature
 
 FOLDER = Path(__file__).parents[1] / "design"
 # Orientation, and whether the conic constant is free.
@@ -57,7 +57,7 @@ def started(kind: str, study: Study, design: Design) -> tuple[Design, Study]:
 def width_by_optiland(design: Design, depth: float) -> float:
     """Full width at half height of a Gaussian of the variance of Optiland's rays over the field, in the object, um."""
     imager = design.imager()
-    points, weights = map(np.asarray, pupil_disc(clear_diameter(imager.array) / 2, 12))
+    points, weights = map(np.asarray, pupil_quadrature(clear_diameter(imager.array) / 2, 12))
     square, total = 0.0, 0.0
     for height in HEIGHTS * imager.field_radius:
         landing, _, _ = optiland_rays(imager, depth, points, float(height))

@@ -2,12 +2,13 @@
 
 What is minimised is the error of the best linear estimate of a volume (`gs_jax.codesign.linear_error`): transfer
 functions of exact rays, light, shot and read noise at equal exposure, and parallax. Free are the sensor distance, the
-radius of curvature and the aperture of each kind, up to what a mask leaves of the nearest neighbours. Kinds are dealt
-so that neighbours differ (`kinds` of a study), and start from what one kind came to, their radii spread. Over 18 to 23
-mm, and over a longer span, where one focus has to be a compromise. Each is done for several layouts of the same
-statistics, the same for all numbers of kinds; gains are of pairs, with intervals by Student's t over the layouts. What
-was found for the first layout is then judged by what it was not found by: letters at three depths of the span, imaged
-by `experiments/ray_tracer.py` with the camera's noise, and reconstructed by Richardson-Lucy with the full model.
+radius of curvature and the aperture of each kind, up to what a mask leaves of the nearest neighbours. Kinds are
+interleave so that neighbours differ (`kinds` of a study), and start from what one kind came to, their radii spread.
+Over 18 to 23 mm, and over a longer span, where one focus has to be a compromise. Each is done for several layouts of
+the same statistics, the same for all numbers of kinds; gains are of pairs, with intervals by Student's t over the
+layouts. What was found for the first layout is then judged by what it was not found by: letters at three depths of the
+span, imaged by `experiments/ray_tracer.py` with the camera's noise, and reconstructed by Richardson-Lucy with the full
+model.
 
     python -m experiments.many_foci [--out DIR] [--layouts N]
 

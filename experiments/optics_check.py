@@ -30,10 +30,10 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
-from gs_jax.optics.aberrations import independent_rms, of_array
+from gs_jax.optics.aberrations import independent_rms, seidel_of_array
 from gs_jax.optics.apertures import aperture_area
 from gs_jax.optics.psf import diffraction_psf, geometric_psf, strehl
-from gs_jax.optics.raytrace import best_focus, pupil_disc, unit_rays, wavefront_rms
+from gs_jax.optics.raytrace import best_focus, pupil_quadrature, trace_lenslet, wavefront_rms
 
 WAVELENGTH = 520e-6
 # Of the pupil, mm: near half the paper's pitch (1.23 mm), and as far as its lens can be traced to a field of 3 mm.
@@ -103,9 +103,9 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
 
 def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) -> dict:
     """Ours and Optiland's rays of one object point: largest differences, and what both say of the spot."""
-    points, weights = map(np.asarray, pupil_disc(radius, 16))
+    points, weights = map(np.asarray, pupil_quadrature(radius, 16))
     theirs, slopes, path = optiland_rays(imager, depth, np.vstack([[0, 0], points]), field)
-    ours = unit_rays(imager, depth, points, (field, 0.0))
+    ours = trace_lenslet(imager, depth, points, (field, 0.0))
     error = _on_sphere(theirs, slopes, path, imager)
     mean, mine, off = weights @ theirs[1:], np.asarray(ours.landing), (field, 0.0)
     return {
@@ -167,7 +167,7 @@ def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray)
 
 
 def _third_order(imager: Imager, depth: float, field: float, radius: float) -> float:
-    error = of_array(imager.array, radius, imager.reduced_depth(depth), field, imager.reduced_sensor_distance)
+    error = seidel_of_array(imager.array, radius, imager.reduced_depth(depth), field, imager.reduced_sensor_distance)
     return float(independent_rms(error))
 
 

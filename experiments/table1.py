@@ -95,16 +95,16 @@ def _depth_of_field(design: Design) -> list[tuple[str, ...]]:
     rows = []
     for what, diameter in _diameters(design).items():
         lens = _lens(design, diameter)
-        found = ", ".join(_depths_of_field(lens, confusion) for confusion in (0.009, 0.018, 0.036))
+        found = ", ".join(_depths_of_field(lens, circle_of_confusion) for circle_of_confusion in (0.009, 0.018, 0.036))
         rows.append((f"depth of field at 20 mm, {what}", "~5 mm", found, found, "by confusion: Eq. 8 (Eq. 7)"))
     return rows
 
 
-def _depths_of_field(lens: tuple[float, float, float], confusion: float) -> str:
+def _depths_of_field(lens: tuple[float, float, float], circle_of_confusion: float) -> str:
     f, z, f_number = lens
-    exact = theory.depth_of_field(f, f_number, z, confusion)
-    printed = theory.approximate_depth_of_field(f, f_number, z, confusion)
-    return f"{1000 * confusion:g} um: {exact:.2f} ({printed:.2f}) mm"
+    exact = theory.depth_of_field(f, f_number, z, circle_of_confusion)
+    printed = theory.approximate_depth_of_field(f, f_number, z, circle_of_confusion)
+    return f"{1000 * circle_of_confusion:g} um: {exact:.2f} ({printed:.2f}) mm"
 
 
 def _diameters(design: Design) -> dict[str, float]:

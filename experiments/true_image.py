@@ -1,9 +1,10 @@
 """How much of an image that no model of ours rendered the forward model explains.
 
 The near model has one PSF, that on the axis, within the field radius; the full one has all of the light that lenses
-pass on (`full_optics`, `full_image_of_points`). Nothing is fitted but one gain for a whole image, by least squares on
-its pixels. Error is the RMS of the difference over that of the image, correlation Pearson's, both of the images and of
-both binned by 4 and 16; light is the model's sum over the image's. Two rings are the full model with fewer cores.
+pass on (`field_varying_psf`, `full_image_of_points`). Nothing is fitted but one gain for a whole image, by least
+squares on its pixels. Error is the RMS of the difference over that of the image, correlation Pearson's, both of the
+images and of both binned by 4 and 16; light is the model's sum over the image's. Two rings are the full model with
+fewer cores.
 
 - Captures by an independent ray tracer with the authors' array, noise included: letters, a USAF target, 120 points.
 - Devices of another kind, which nothing was tuned to, by `experiments/ray_tracer.py`. It shares no code with `gs_jax`
@@ -32,7 +33,7 @@ from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import random_layout
 from gs_jax.lenses import Orientation
-from gs_jax.optics.field_varying import RINGS, full_optics
+from gs_jax.optics.field_varying import RINGS, field_varying_psf
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.optics.raytrace import best_focus
 from gs_jax.projection.point_sources import full_image_of_points
@@ -111,7 +112,7 @@ def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndar
     near = forward(volume, imager, grid, jnp.stack([kernel(depth) for depth in depths]))
     found = {"near": scores(np.asarray(near), image)}
     for name, rings in (("full", RINGS), ("two rings", TWO_RINGS)):
-        optics = full_optics(imager, depths, rings=rings, progress=progress)
+        optics = field_varying_psf(imager, depths, rings=rings, progress=progress)
         found[name] = scores(np.asarray(forward(volume, imager, grid, optics)), image)
     return found
 

@@ -241,7 +241,7 @@ class Imager(eqx.Module):
         """`z'`: from the object to the lens vertices as the optics sees it, mm.
 
         `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front. An imager of NumPy's
-        numbers (`gs_jax.optics.raytrace.on_host`) gives NumPy's.
+        numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
         """
         return library_of(self.sensor_distance).asarray(depth) + self.array.air_in_front
 
@@ -265,7 +265,7 @@ class Imager(eqx.Module):
         v = self.reduced_sensor_distance
         return magnification * (v + height) / (v - height * magnification)
 
-    def lean(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
+    def axis_offset(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """How far beside its vertex a lens's axis is at a depth, mm, `(*batch, 2)`: it is normal to the array."""
         xp, reduced = library_of(self.sensor_distance), self.reduced_depth(depth)
         tilt = xp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
@@ -303,7 +303,7 @@ class Imager(eqx.Module):
         center, point = self.centers[lenses], points[..., :2]
         if self.tilt is None:
             return Views(chief_ray(center, point, magnification[..., None]), point - center, reduced)
-        lean = self.lean(depth)
+        lean = self.axis_offset(depth)
         magnification = self.magnification_of(magnification, self.heights[lenses])
         # Distances are from the lens's axis, which leans.
         drawn = point + xp.broadcast_to(1 / distortion - 1, reduced.shape)[..., None] * lean

@@ -36,8 +36,8 @@ def as_scipy(A: lx.AbstractLinearOperator) -> Any:
     from scipy.sparse.linalg import LinearOperator
 
     there, back, into, out = _both_ways(A)
-    on_host = lambda function, shape: lambda flat: np.asarray(function(flat.reshape(shape).astype(into.dtype))).ravel()
-    matvec, rmatvec = on_host(there, into.shape), on_host(back, out.shape)
+    to_numpy = lambda function, shape: lambda flat: np.asarray(function(flat.reshape(shape).astype(into.dtype))).ravel()
+    matvec, rmatvec = to_numpy(there, into.shape), to_numpy(back, out.shape)
     # SciPy's stubs know the class that is subclassed, not the call that makes one of functions.
     of_functions: Any = LinearOperator
     return of_functions((_size(out), _size(into)), matvec=matvec, rmatvec=rmatvec, dtype=np.dtype(into.dtype))

@@ -4,7 +4,7 @@ Reflect the centres at the four edges, and the Voronoi cells of the originals be
 plate, with the plate's corners and the crossings of cells and edges among the vertices. All that is exact here
 rests on this.
 
-Which lens of a plate is of which kind, so that neighbours are of different kinds. Host code; lengths in mm.
+Which lens of a plate is of which type, so that neighbours are of different types. Host code; lengths in mm.
 
 Where the lenses go: random and regular layouts of their centres.
 
@@ -59,7 +59,7 @@ def coverage(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number], *, di
     return min(1.0, float(area.sum() / math.prod(size)))
 
 
-def largest_hole(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number]) -> float:
+def max_gap(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number]) -> float:
     """The largest distance of a point of the plate from the nearest centre, mm; exact.
 
     Discs of this radius about the centres just cover the plate. The farthest point is a vertex of a Voronoi
@@ -71,11 +71,11 @@ def largest_hole(centers: Float[np.ndarray, "lens 2"], size: Sequence[Number]) -
         If a centre lies outside the plate.
     """
     _check_inside(centers, half := half_size(size))
-    vertices, _, _ = gaps(centers, half)
+    vertices, _, _ = voronoi_vertices(centers, half)
     return float(KDTree(centers).query(vertices)[0].max())
 
 
-def gaps(centers, half, reach=math.inf):
+def voronoi_vertices(centers, half, reach=math.inf):
     """Vertices of the Voronoi cells within the plate, the lenses around each, and its distance from them."""
     points, owners = _reflected(centers, half, reach)
     triangles = Delaunay(points)
@@ -162,25 +162,25 @@ def in_mm(half) -> str:
     return f"{2 * half[0]:.4g} x {2 * half[1]:.4g} mm"
 
 
-# Neighbours whose kinds a lens looks at.
+# Neighbours whose types a lens looks at.
 _NEIGHBOURS = 6
 
 
-def dealt(centers: Float[np.ndarray, "lens 2"], kinds: int) -> Int[np.ndarray, " lens"]:
-    """The kind of each lens, 0 to `kinds - 1`, as many of each to a few lenses.
+def interleave(centers: Float[np.ndarray, "lens 2"], types: int) -> Int[np.ndarray, " lens"]:
+    """The type of each lens, 0 to `types - 1`, as many of each to a few lenses.
 
-    Column after column, each lens gets the kind that its six nearest neighbours so far have least of, and of those the
+    Column after column, each lens gets the type that its six nearest neighbours so far have least of, and of those the
     rarest on the plate.
     """
     found = np.full(len(centers), -1)
-    if kinds == 1 or len(centers) == 1:
+    if types == 1 or len(centers) == 1:
         return found + 1
     tree: Any = KDTree(centers)
     near = tree.query(centers, k=min(_NEIGHBOURS + 1, len(centers)))[1][:, 1:]
     columns = np.round(centers[:, 0] / nearest_neighbour_distances(centers).mean())
     for lens in np.lexsort((centers[:, 1], columns)):
-        others = np.bincount(found[near[lens]][found[near[lens]] >= 0], minlength=kinds)
-        rare = np.bincount(found[found >= 0], minlength=kinds)
+        others = np.bincount(found[near[lens]][found[near[lens]] >= 0], minlength=types)
+        rare = np.bincount(found[found >= 0], minlength=types)
         found[lens] = np.lexsort((rare, others))[0]
     return found
 
@@ -267,7 +267,7 @@ def random_layout(
     if not 0 <= pitch_sd < pitch:
         raise InputError(f"`pitch_sd` must be at least 0 and less than the pitch, {pitch:.4g} mm, got {pitch_sd:.4g}.")
     rng = np.random.default_rng(seed)
-    start = lloyd_relaxed(rng.uniform(-half, half, (count, 2)), size, iterations=RELAXATIONS)
+    start = lloyd_relax(rng.uniform(-half, half, (count, 2)), size, iterations=RELAXATIONS)
     return _matched(start, size, pitch, pitch_sd, diameter, rng)
 
 
@@ -298,7 +298,7 @@ def poisson_disc_layout(size: Sequence[Number], *, min_distance: Number, seed: i
     candidates = rng.uniform(-half, half, (1 + round(4 * half.prod() / min_distance**2), 2))
     while len(candidates):
         centers = _thinned(np.concatenate([centers, candidates]), min_distance)
-        vertices, _, radii = gaps(centers, half)
+        vertices, _, radii = voronoi_vertices(centers, half)
         room = rng.permutation(np.flatnonzero(radii > min_distance * (1 + 1e-9)))
         angle, reach = rng.uniform(0, 2 * np.pi, len(room)), np.sqrt(rng.uniform(size=len(room)))
         offset = (reach * (radii[room] - min_distance))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -328,7 +328,7 @@ def square_layout(size: Sequence[Number], *, pitch: Number) -> Float[np.ndarray,
     return _lattice(size, pitch, [[1, 0], [0, 1]])
 
 
-def lloyd_relaxed(
+def lloyd_relax(
     centers: Float[np.ndarray, "lens 2"], size: Sequence[Number], *, iterations: int
 ) -> Float[np.ndarray, "lens 2"]:
     """Centres moved to the centroids of their Voronoi cells within the plate, several times (Lloyd, 1982).
@@ -356,13 +356,13 @@ def _matched(centers, size, pitch, pitch_sd, diameter, rng):
         to_pitch, mean, sd = _pitch_step(centers, pitch, pitch_sd)
         to_holes, hole = _hole_step(centers, half, diameter)
         pitch_met = max(abs(mean - pitch), abs(sd - pitch_sd)) <= TOLERANCE * pitch
-        if pitch_met and (diameter is None or max(hole, largest_hole(centers, size)) <= diameter / 2):
+        if pitch_met and (diameter is None or max(hole, max_gap(centers, size)) <= diameter / 2):
             return centers
         kicks = 0.0 if step < STEPS else max(0.0, 1 - step % STEPS / (NOISY_PART * STEPS))
         velocity = MOMENTUM * velocity + GAIN_PITCH * to_pitch + GAIN_HOLE * to_holes
         velocity += NOISE * pitch * kicks * rng.normal(size=centers.shape)
         centers = np.clip(centers + velocity, -half, half)
-    distances, hole = nearest_neighbour_distances(centers), largest_hole(centers, size)
+    distances, hole = nearest_neighbour_distances(centers), max_gap(centers, size)
     raise InputError(
         f"found no such layout of {len(centers)} lenses on {in_mm(half)}; the search came to pitch "
         f"{distances.mean():.4f} mm of {pitch:.4g}, SD {distances.std():.4f} mm of {pitch_sd:.4g}, largest hole "
@@ -390,7 +390,7 @@ def _hole_step(centers, half, diameter):
     if diameter is None:
         return step, 0.0
     # Lenses farther than a diameter from an edge leave a hole if their cells reach it: no need to reflect them.
-    vertices, lenses, radii = gaps(centers, half, reach=diameter)
+    vertices, lenses, radii = voronoi_vertices(centers, half, reach=diameter)
     # Half a percent more than wanted, so that the end is reached and not only approached.
     wide = radii > (radius := 0.995 * diameter / 2)
     excess = (1 - radius / radii[wide])[:, None]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -59,7 +59,7 @@ class MicrolensArray(eqx.Module):
     aspheric_terms
         `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
     others
-        Lenses on the same plate that are not looked at, but end these where their surfaces meet; see `some`.
+        Lenses on the same plate that are not looked at, but end these where their surfaces meet; see `subset`.
 
     Raises
     ------
@@ -115,11 +115,12 @@ class MicrolensArray(eqx.Module):
         """One of the lenses alone, on the same plate."""
         return dataclasses.replace(self, centers=self.centers[index][None], others=None, **self._numbers(index))
 
-    def some(self, which: Int[np.ndarray, " kept"]) -> "MicrolensArray":
-        """Lenses that are alike, such as one of `kinds`, as an array whose `others` are the rest.
+    def subset(self, which: Sequence[int] | Int[np.ndarray, " kept"]) -> "MicrolensArray":
+        """Lenses that are alike, such as one of `lenses_by_type`, as an array whose `others` are the rest.
 
         The numbers are those of the first of them.
         """
+        which = np.array(which)
         rest = np.setdiff1d(np.arange(len(self.centers)), which)
         others = dataclasses.replace(self, centers=self.centers[rest], **self._numbers(rest)) if rest.size else None
         return dataclasses.replace(self, centers=self.centers[which], others=others, **self._numbers(which[0]))
@@ -172,28 +173,28 @@ class MicrolensArray(eqx.Module):
         """How far the surface is below its vertex, mm, where it `reaches`."""
         return sag(squared_radius, *self._shape)
 
-    def steepness(self, squared_radius: Scalars) -> Scalars:
+    def sag_slope_over_r(self, squared_radius: Scalars) -> Scalars:
         """Slope of the surface over the radius, `s'(r) / r`, 1/mm: that has no division by zero on the axis."""
-        return steepness(squared_radius, *self._shape)
+        return sag_slope_over_r(squared_radius, *self._shape)
 
     @property
     def _shape(self):
         return self.radius_of_curvature, self.conic_constant, self.aspheric_terms
 
 
-def kinds(array: MicrolensArray) -> list[Int[np.ndarray, " lens"]]:
-    """Which lenses have the same numbers, kind by kind, in the order of their first lenses. Host code."""
+def lenses_by_type(array: MicrolensArray) -> tuple[tuple[int, ...], ...]:
+    """Indices of the lenses of each type: lenses with the same numbers, in the order of their first lens. Host code."""
     count = len(array.centers)
     numbers = [np.broadcast_to(np.asarray(getattr(array, name)), count) for name in EACH]
-    _, first, kind = np.unique(np.stack(numbers, -1), axis=0, return_index=True, return_inverse=True)
-    return [np.flatnonzero(kind.ravel() == number) for number in np.argsort(first)]
+    _, first, number = np.unique(np.stack(numbers, -1), axis=0, return_index=True, return_inverse=True)
+    return tuple(tuple(np.flatnonzero(number.ravel() == n).tolist()) for n in np.argsort(first))
 
 
 def type_of_lens(array: MicrolensArray) -> Int[np.ndarray, " lens"]:
-    """The number of each lens's type, in the order of `kinds`. Host code."""
+    """The number of each lens's type, in the order of `lenses_by_type`. Host code."""
     types = np.zeros(len(array.centers), int)
-    for number, which in enumerate(kinds(array)):
-        types[which] = number
+    for number, which in enumerate(lenses_by_type(array)):
+        types[list(which)] = number
     return types
 
 
@@ -207,7 +208,7 @@ def sag(
     return total
 
 
-def steepness(
+def sag_slope_over_r(
     squared_radius: Scalars, radius_of_curvature: Scalar, conic_constant: Scalar, terms: Iterable[Scalar]
 ) -> Scalars:
     """Of `MicrolensArray`'s surface, 1/mm."""

@@ -51,9 +51,11 @@ def axial_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     return _of_alike(imager, depths).axial_resolution
 
 
-def depth_of_field(imager: Imager, depths: Depths, *, confusion: ArrayLike | None = None) -> Float[Array, " depth"]:
-    """Of a sensor that is focused on each depth (Eq. 8); `confusion` is a diameter, by default two pixels."""
-    return _of_alike(imager, depths, confusion).depth_of_field
+def depth_of_field(
+    imager: Imager, depths: Depths, *, circle_of_confusion: ArrayLike | None = None
+) -> Float[Array, " depth"]:
+    """Of a sensor that is focused on each depth (Eq. 8); `circle_of_confusion` is a diameter, by default two pixels."""
+    return _of_alike(imager, depths, circle_of_confusion).depth_of_field
 
 
 def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
@@ -86,12 +88,14 @@ def spacing(imager: Imager) -> Float[Array, " lens"]:
     return terms.spacing(_judged(imager, jnp.ones(1)))
 
 
-def _of_alike(imager, depths, confusion=None) -> Microscope:
+def _of_alike(imager, depths, circle_of_confusion=None) -> Microscope:
     imager.array.check_alike()
-    return _judged(imager, depths, confusion)
+    return _judged(imager, depths, circle_of_confusion)
 
 
-def _judged(imager, depths, confusion=None) -> Microscope:
+def _judged(imager, depths, circle_of_confusion=None) -> Microscope:
     kind = imager.sensor_distance.dtype
-    confusion = 2 * imager.sensor.pixel_pitch if confusion is None else confusion
-    return Microscope(imager, jnp.asarray(depths, kind), jnp.asarray(imager.field_radius, kind), as_float(confusion))
+    circle_of_confusion = 2 * imager.sensor.pixel_pitch if circle_of_confusion is None else circle_of_confusion
+    return Microscope(
+        imager, jnp.asarray(depths, kind), jnp.asarray(imager.field_radius, kind), as_float(circle_of_confusion)
+    )

@@ -9,14 +9,14 @@ from jax.test_util import check_grads
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.optics.aberrations import (
-    Wavefront,
+    WavefrontCoefficients,
     balanced_rms,
     independent_rms,
     linear_field_radius,
     linear_rms,
     log_strehl,
-    of_array,
     seidel,
+    seidel_of_array,
     strehl,
 )
 from gs_jax.optics.raytrace import wavefront
@@ -139,7 +139,7 @@ def test_shape_and_conjugate_factors(plano):
 
 def wave(rng):
     """A wavefront of all terms, waves or mm."""
-    return Wavefront(*(jnp.asarray(x) for x in rng.normal(size=5)))
+    return WavefrontCoefficients(*(jnp.asarray(x) for x in rng.normal(size=5)))
 
 
 def test_rms_over_the_pupil():
@@ -151,7 +151,9 @@ def test_rms_over_the_pupil():
     removed = np.stack([np.ones_like(x), x, square], axis=1)
     left_of = lambda w: w - removed @ np.linalg.lstsq(removed, w, rcond=None)[0]
     for name, shape in shapes.items():
-        one = Wavefront(*(jnp.array(float(term == name)) for term in Wavefront.__dataclass_fields__))
+        one = WavefrontCoefficients(
+            *(jnp.array(float(term == name)) for term in WavefrontCoefficients.__dataclass_fields__)
+        )
         # A pupil of squares of 1/400 of its radius.
         left = shape if name == "defocus" else left_of(shape)
         np.testing.assert_allclose(getattr(balanced_rms(one), name), left.std(), rtol=2e-3)
@@ -165,7 +167,7 @@ def test_rms_over_the_pupil():
 def test_defocus_that_balances_spherical_aberration():
     """`W020 = -W040` leaves the balanced part alone, in both sums."""
     zero = jnp.array(0.0)
-    error = Wavefront(jnp.array(2.0), zero, zero, zero, jnp.array(-2.0))
+    error = WavefrontCoefficients(jnp.array(2.0), zero, zero, zero, jnp.array(-2.0))
     np.testing.assert_allclose([linear_rms(error), independent_rms(error)], 2 / (6 * math.sqrt(5)), rtol=1e-14)
 
 
@@ -190,7 +192,7 @@ def test_strehl_ratio_against_a_diffraction_integral():
     for peak in (0.5, 1.3):  # waves of balanced spherical aberration: 0.04 and 0.1 waves RMS
         phase = 2 * np.pi * peak * ((x**2 + y**2) ** 2 - x**2 - y**2)
         zero = jnp.array(0.0)
-        error = Wavefront(jnp.array(peak), zero, zero, zero, jnp.array(-peak))
+        error = WavefrontCoefficients(jnp.array(peak), zero, zero, zero, jnp.array(-peak))
         np.testing.assert_allclose(strehl(independent_rms(error), 1.0), abs(np.exp(1j * phase).mean()) ** 2, rtol=0.01)
 
 
@@ -251,7 +253,7 @@ def test_a_surface_that_is_no_sphere_changes_spherical_aberration_alone(plano, s
     for name, array in parts.items():
         imager = Imager(array, Sensor((8, 8), 0.005), 5.0, 3.0)
         errors[name] = -wavefront(imager, DEPTH, radii, (0.2, 0.0))
-        thirds[name] = of_array(array, 1.0, DEPTH, 0.2, 5.0)
+        thirds[name] = seidel_of_array(array, 1.0, DEPTH, 0.2, 5.0)
     fourth = (errors["shaped"] - errors["thin"]) / radii[:, 1] ** 4
     change = jax.tree.map(lambda a, b: a - b, thirds["shaped"], thirds["thin"])
     # The next order is the sixth, (r / R)^2 = 1e-3 of the fourth with factors of a few.
@@ -265,7 +267,7 @@ def test_gradients_where_an_error_is_zero():
     total = lambda *x: independent_rms(error(*x)) + linear_rms(error(*x))
     arguments = tuple(jnp.array(x) for x in (F, N, 0.7, DEPTH, 0.0))
     assert all(jnp.isfinite(g) for g in jax.grad(total, argnums=range(5))(*arguments))
-    none = Wavefront(*(jnp.zeros(()) for _ in range(5)))
+    none = WavefrontCoefficients(*(jnp.zeros(()) for _ in range(5)))
     assert all(jnp.isfinite(g) for g in jax.tree.leaves(jax.grad(independent_rms)(none)))
 
 

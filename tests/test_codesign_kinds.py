@@ -19,10 +19,10 @@ from gs_jax.codesign.study import Study
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
 from gs_jax.design.sheet import datasheet
-from gs_jax.layouts import dealt
+from gs_jax.layouts import interleave
 from gs_jax.optics.apertures import clear_diameter
 
-KINDS = [name for name, term in TERMS.items() if term.kinds]
+KINDS = [name for name, term in TERMS.items() if term.types]
 
 
 def conics(count=12, side=4.2, *, diameter=0.8, radii=1.34):
@@ -57,7 +57,7 @@ def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     """From 15 to 30 mm: paraxial foci are a third of the vergences apart, that of the middle kind in their middle."""
     design = started(conics(), study(kinds=3))
     radii = np.array(design.lens.radius_of_curvature_mm)
-    which = dealt(np.array(design.array.centers_mm), 3)
+    which = interleave(np.array(design.array.centers_mm), 3)
     np.testing.assert_array_equal(radii, np.unique(radii)[which])
     assert np.ptp(np.bincount(which)) <= 2
     middle = np.unique(radii)[1]
@@ -71,14 +71,14 @@ def test_lenses_are_dealt_with_radii_spread_over_the_depths():
 
 def test_kinds_that_cannot_be():
     three = started(conics(), study(kinds=3))
-    with pytest.raises(InputError, match="`kinds`: found 2 for a design of 3 kinds, allowed: 3, or none"):
+    with pytest.raises(InputError, match="`kinds`: found 2 for a design of 3 types, allowed: 3, or none"):
         started(three, study(kinds=2))
     with pytest.raises(InputError, match="`kinds`: found 5 for a design of 4 lenses"):
         started(conics(4, 2.4), study(kinds=5))
     thin = conics().model_copy(update={"lens": conics().lens.model_copy(update={"focal_length_mm": 4.65})})
     with pytest.raises(InputError, match="`kinds`.*without it"):
         started(thin, study(kinds=2))
-    with pytest.raises(InputError, match="`lens`: found lenses of 12 kinds, allowed: lenses of up to 8"):
+    with pytest.raises(InputError, match="`lens`: found lenses of 12 types, allowed: lenses of up to 8"):
         problem_of(conics(radii=np.linspace(1.3, 1.4, 12).tolist()), study())
     for name in ("scene_error", "localization_um"):
         with pytest.raises(InputError, match=f"`terms`: found {name} for lenses that differ, allowed"):
@@ -101,8 +101,8 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     np.testing.assert_allclose(found.imager.array.radius_of_curvature, array.radius_of_curvature, atol=1e-4)
     # Rounded to 1e-4 mm; 64 directions against 512.
     np.testing.assert_allclose(found.clear_diameter, clear_diameter(array), rtol=1e-3)
-    for kind, which in zip(found.kinds, parent.lenses, strict=True):
-        np.testing.assert_allclose(kind.clear_diameter, clear_diameter(array.some(np.array(which))), rtol=1e-3)
+    for kind, which in zip(found.types, parent.lenses, strict=True):
+        np.testing.assert_allclose(kind.clear_diameter, clear_diameter(array.subset(which)), rtol=1e-3)
     # Kinds that come to the same are one number again.
     same = new_design(design, parent, {"radius_of_curvature_mm": jnp.array([1.34001, 1.34003])})
     assert same.lens.radius_of_curvature_mm == 1.34
@@ -198,7 +198,7 @@ def test_two_foci_are_better_over_a_long_span(searches):
     assert 20 * np.log10(one.after[0].high / two.after[0].high) > 2
     radii = two.design.lens.radius_of_curvature_mm
     assert len(set(radii)) == 2 and len(radii) == 12
-    assert "12 lenses of 2 kinds" in repr(two.design)
+    assert "12 lenses of 2 types" in repr(two.design)
 
 
 @pytest.mark.integration
@@ -214,7 +214,7 @@ def test_what_is_found_goes_on_as_a_design_of_two_kinds(searches):
 def test_dealt_lenses_are_balanced():
     centers = np.array(list(itertools.product(np.arange(6.0), np.arange(6.0))))
     for kinds in (1, 2, 3):
-        assert np.bincount(dealt(centers, kinds)).tolist() == [36 // kinds] * kinds
-    np.testing.assert_array_equal(dealt(np.zeros((1, 2)), 1), [0])
-    which = dealt(centers, 2).reshape(6, 6)
+        assert np.bincount(interleave(centers, kinds)).tolist() == [36 // kinds] * kinds
+    np.testing.assert_array_equal(interleave(np.zeros((1, 2)), 1), [0])
+    which = interleave(centers, 2).reshape(6, 6)
     assert (which[1:] != which[:-1]).mean() + (which[:, 1:] != which[:, :-1]).mean() > 1.2  # at random: 1

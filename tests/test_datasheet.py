@@ -16,10 +16,10 @@ from gs_jax.design.design import read_design
 from gs_jax.design.microscope import Microscope
 from gs_jax.design.problems import findings
 from gs_jax.design.sheet import datasheet, summary, tables
+from gs_jax.lenses import lenses_by_type
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
-from gs_jax.optics.apertures import cells_of, clear_diameter, pitch
-from gs_jax.optics.lens_types import lenses_by_kind
+from gs_jax.optics.apertures import clear_diameter, pitch, voronoi_cells
 
 from .helpers import scene
 from .test_cli import run
@@ -64,7 +64,7 @@ def test_the_papers_design(table1):
 
 
 def test_limits_are_depths_from_the_plate(table1):
-    sheet, f, plate = datasheet(table1, [20.0], confusion=0.018), 2 / 0.43, 1 / 1.43
+    sheet, f, plate = datasheet(table1, [20.0], circle_of_confusion=0.018), 2 / 0.43, 1 / 1.43
     arguments = (f, sheet["f_number"], 20 + plate, 0.018)
     np.testing.assert_allclose(sheet["near_limit_mm"], theory.near_limit(*arguments) - plate, rtol=1e-5)
     np.testing.assert_allclose(sheet["far_limit_mm"], theory.far_limit(*arguments) - plate, rtol=1e-5)
@@ -82,7 +82,7 @@ def test_the_clear_diameter_is_that_of_the_array(table1):
 
 @pytest.mark.integration
 def test_infinity_is_none(table1):
-    sheet = datasheet(table1, [3.0, 200.0], confusion=0.1)
+    sheet = datasheet(table1, [3.0, 200.0], circle_of_confusion=0.1)
     assert sheet["focus_distance_mm"][0] is None
     assert sheet["far_limit_mm"][1] is None and sheet["depth_of_field_mm"][1] is None
     assert any(sentence.startswith("At 3 mm no real image forms") for sentence in findings(table1, sheet))
@@ -155,7 +155,7 @@ def test_nothing_is_wrong_with_a_small_lens_in_focus(table1):
     [
         (dict(depths=[]), r"`depths` must be one or more positive lengths, mm, got \[\]"),
         (dict(depths=[20.0, -1.0]), "`depths` must be"),
-        (dict(confusion=0.0), "`confusion` must be positive and finite"),
+        (dict(circle_of_confusion=0.0), "`circle_of_confusion` must be positive and finite"),
     ],
 )
 def test_wrong_arguments_are_named(table1, arguments, words):
@@ -167,7 +167,7 @@ def test_an_infinite_plate_has_no_density():
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
         one = jnp.array(1.0)
-        Microscope(imager, grid.depths, one, confusion=one)
+        Microscope(imager, grid.depths, one, circle_of_confusion=one)
 
 
 @pytest.mark.integration
@@ -189,7 +189,7 @@ def test_gradients_by_everything_that_is_continuous():
             Imager(moved, imager.sensor, v, 1.0, wavelength=um * 1e-3),
             depths,
             field_radius=field_radius,
-            confusion=um * 1e-2,
+            circle_of_confusion=um * 1e-2,
             plate_scale=um,
         )
         sharp = m.depth_of_field, m.approximate_depth_of_field, m.near_limit, m.far_limit, m.middle.depth_of_field
@@ -221,8 +221,8 @@ def test_the_clear_aperture_follows_the_imager(how):
     diameter = jnp.array([1.0, 1.0, 0.9, 0.9]) if how == "kinds" else jnp.array(1.0)
     array = MicrolensArray(centers, aperture_diameter=diameter, size=(2.0, 2.0))
     imager = Imager(array, Sensor((40, 40), 1e-3), 5.8, 0.4)
-    cells = cells_of(np.asarray(centers), array.size) if how == "by cells" else None
-    lenses = lenses_by_kind(imager) if how == "kinds" else ()
+    cells = voronoi_cells(np.asarray(centers), array.size) if how == "by cells" else None
+    lenses = lenses_by_type(imager.array) if how == "kinds" else ()
     m = Microscope(
         imager, jnp.array([20.0]), jnp.array(0.4), jnp.array(0.01), cells=cells, directions=16, lenses=lenses
     )
@@ -257,7 +257,7 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
     status, out, err = run(monkeypatch, capsys, "metrics", design, *options)
     assert (status, err) == (0, "")
-    assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], confusion=0.018)
+    assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], circle_of_confusion=0.018)
     assert "- At 20 mm the image forms 2 mm behind the sensor" in out and "the circle of confusion, 18 um" in out
 
 

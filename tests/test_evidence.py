@@ -10,7 +10,7 @@ from gs_jax.detection import evidence
 from gs_jax.detection.consistency import signal
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.locate import searched_voxels
-from gs_jax.optics.lens_types import LEAST_SHARP, sharpness
+from gs_jax.optics.lens_types import MIN_SHARPNESS, sharpness
 from gs_jax.optics.psf_core import apparent_depths
 
 from .test_locate import capture_of, find, many, small
@@ -21,7 +21,7 @@ DEPTHS = Grid([18.0, 22.0], (3, 3), 1.0)
 def test_sharpness_tells_the_design_in_focus_from_the_printed_one():
     """By our tracer's cores: a fifth to a half of the light, and a hundredth."""
     assert 0.15 < sharpness(geomscope(sensor_distance_mm=5.8).imager(), DEPTHS) < 0.5
-    assert sharpness(geomscope(sensor_distance_mm=4.0).imager(), DEPTHS) < 0.02 < LEAST_SHARP
+    assert sharpness(geomscope(sensor_distance_mm=4.0).imager(), DEPTHS) < 0.02 < MIN_SHARPNESS
 
 
 def test_places_are_counted_where_cores_are_looked_for(monkeypatch):

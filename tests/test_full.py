@@ -16,21 +16,21 @@ from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Se
 from gs_jax.design.design import read_design
 from gs_jax.detection.locate import find_points
 from gs_jax.geometry import falloff
-from gs_jax.optics.field_varying import full_optics
+from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.optics.psf_core import (
+    aperture_profile,
     apparent_depths,
     clear_area,
     core_magnification,
-    drawn,
-    mean_zones,
+    mean_aperture_profile,
+    render_kernel,
     ring_edges,
-    ring_share,
-    spot_rays,
-    spread,
-    transmitted,
-    zones,
+    ring_window,
+    sample_profile,
+    sample_pupil,
+    transmission,
 )
-from gs_jax.optics.raytrace import unit_rays
+from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
@@ -60,7 +60,7 @@ def volume(shape, dtype=float) -> jax.Array:
 @pytest.mark.parametrize("pixels", [(96, 81), (80, 80)])
 def test_the_adjoint_is_exact(dtype, rtol, pixels):
     scope, voxels = imager(dtype, pixels=pixels), grid(dtype)
-    A = ImagingOperator(scope, voxels, full_optics(scope, voxels.depths))
+    A = ImagingOperator(scope, voxels, field_varying_psf(scope, voxels.depths))
     x = volume(voxels.volume_shape, dtype)
     y = jax.random.uniform(jax.random.key(1), pixels, dtype)
     one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
@@ -72,7 +72,7 @@ def test_the_adjoint_is_exact(dtype, rtol, pixels):
 def test_nothing_is_scattered():
     """Some versions of JAX compile a scatter-add for GPUs to loops that wait for each other."""
     scope, voxels = imager(), grid(shape=(6, 5))
-    A = ImagingOperator(scope, voxels, full_optics(scope, voxels.depths))
+    A = ImagingOperator(scope, voxels, field_varying_psf(scope, voxels.depths))
     for operator in (A, A.T):
         lowered = jax.jit(lambda x, operator=operator: operator.mv(x)).lower(operator.in_structure())
         assert "stablehlo.scatter" not in lowered.as_text()
@@ -82,7 +82,7 @@ def test_nothing_is_scattered():
 def brightness():
     """A weighted sum of an image's pixels, by the volume and the microscope, and where it is taken."""
     scope, voxels = imager(), grid(shape=(6, 5))
-    optics = full_optics(scope, voxels.depths)
+    optics = field_varying_psf(scope, voxels.depths)
     weights = jax.random.normal(jax.random.key(2), scope.sensor.shape)
     return jax.jit(lambda x, scope: jnp.vdot(weights, forward(x, scope, voxels, optics))), voxels.volume_shape, scope
 
@@ -111,8 +111,8 @@ def traced_light(scope: Imager, point) -> float:
         offsets = np.delete(centers, (centers == center).all(1), 0) - center
         beyond = (pupil @ offsets.T > (offsets**2).sum(1) / 2).any(1) | (np.hypot(*pupil.T) > radius)
         field = point[:2] - center
-        rays = unit_rays(scope, point[2], pupil, field)
-        light = np.where(rays.valid & ~beyond, transmitted(scope, point[2], pupil, field), 0)
+        rays = trace_lenslet(scope, point[2], pupil, field)
+        light = np.where(rays.valid & ~beyond, transmission(scope, point[2], pupil, field), 0)
         pixels = np.asarray(scope.sensor.to_pixels(np.asarray(rays.landing) + center))
         seen = ((pixels > -0.5) & (pixels < np.array(scope.sensor.shape) - 0.5)).all(1)
         total += light[seen].sum() * (side[1] - side[0]) ** 2
@@ -127,7 +127,7 @@ def test_it_holds_the_light_that_rays_bring(point):
     found = full_image_of_points(np.array([[*point, 2.0]]), scope)
     np.testing.assert_allclose(found.sum(), 2 * traced_light(scope, point), rtol=0.05)
     one = Grid([point[2]], (1, 1), 0.1, point[:2])
-    image = forward(jnp.full((1, 1, 1), 2.0), scope, one, full_optics(scope, one.depths))
+    image = forward(jnp.full((1, 1, 1), 2.0), scope, one, field_varying_psf(scope, one.depths))
     np.testing.assert_allclose(image.sum(), found.sum(), rtol=0.05)
 
 
@@ -141,7 +141,7 @@ def test_a_lens_that_is_sharp_has_no_halo(pitch):
     array = dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0))
     scope = dataclasses.replace(lens, array=array, sensor=Sensor((41, 41), pitch, (-0.148, 0.0)))
     one = Grid([20.0], (1, 1), 0.1, (1.0, 0.0))
-    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, full_optics(scope, one.depths)))
+    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, field_varying_psf(scope, one.depths)))
     # All in a few pixels, and nothing that is negative.
     row, column = np.unravel_index(image.argmax(), image.shape)
     reach = max(round(0.02 / pitch), 1)
@@ -154,7 +154,7 @@ def test_fewer_rings_hold_the_same_light():
     scope, voxels = imager(), grid()
     x = volume(voxels.volume_shape)
     wanted: tuple[dict[str, Any], ...] = ({}, {"rings": (1.0, 2.5)})
-    six, two = (forward(x, scope, voxels, full_optics(scope, voxels.depths, **o)) for o in wanted)
+    six, two = (forward(x, scope, voxels, field_varying_psf(scope, voxels.depths, **o)) for o in wanted)
     np.testing.assert_allclose(two.sum(), six.sum(), rtol=0.02)
     assert np.corrcoef(six.ravel(), two.ravel())[0, 1] > 0.95
     assert not np.array_equal(six, two)
@@ -164,7 +164,7 @@ def test_points_are_voxels_that_lie_anywhere():
     scope = imager(pixels=(200, 200), pitch=0.03)
     point = np.array([[0.2, -0.1, 20.0, 1.0]])
     one = Grid([20.0], (1, 1), 0.1, point[0, :2])
-    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, full_optics(scope, one.depths)))
+    image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, field_varying_psf(scope, one.depths)))
     found = full_image_of_points(point, scope)
     binned = lambda image: image.reshape(50, 4, 50, 4).sum((1, 3))
     assert np.corrcoef(binned(found).ravel(), binned(image).ravel())[0, 1] > 0.98
@@ -176,36 +176,40 @@ def test_what_leaves_a_lens_is_what_its_solid_angle_holds():
     thin = eqx.tree_at(lambda i: i.array.thin_lens_focal_length, ideal, jnp.asarray(4.65), is_leaf=lambda x: x is None)
     lone = [dataclasses.replace(i, array=dataclasses.replace(i.array, centers=np.zeros((1, 2)))) for i in (thin, ideal)]
     for scope, least in zip(lone, (0.999, 0.9), strict=True):
-        rays = spot_rays(scope, 200.0, np.zeros(1), zones(scope.array), 4096)
+        rays = sample_pupil(scope, 200.0, np.zeros(1), aperture_profile(scope.array), 4096)
         part = rays.light.sum() / (np.pi / (4 * np.pi * float(scope.reduced_depth(200.0)) ** 2))
         assert least < part < 1.001
     # Normal incidence: each face passes 4 n / (n + 1)^2.
     (light,) = (
-        transmitted(lone[1], 200.0, np.zeros((1, 2)), np.zeros(2)) * 4 * np.pi * lone[1].reduced_depth(200.0) ** 2
+        transmission(lone[1], 200.0, np.zeros((1, 2)), np.zeros(2)) * 4 * np.pi * lone[1].reduced_depth(200.0) ** 2
     )
     np.testing.assert_allclose(light, (4 * 1.43 / 2.43**2) ** 2, rtol=1e-6)
 
 
 def test_zones_are_the_lenses_apertures():
     array = imager(lenses=25).array
-    found = zones(array)
+    found = aperture_profile(array)
     areas = np.asarray(clear_area(array))
     step = found.radius[1] - found.radius[0]
     np.testing.assert_allclose((2 * np.pi * found.radius * found.open).sum() * step, areas.mean(), rtol=2e-3)
     # By regression, what a larger area adds is that area.
     np.testing.assert_allclose((2 * np.pi * found.radius * found.by_area).sum() * step, 1, rtol=0.02)
-    np.testing.assert_array_equal(mean_zones(array).open, found.open)
-    alone = zones(MicrolensArray([[0.0, 0.0]]))
+    np.testing.assert_array_equal(mean_aperture_profile(array).open, found.open)
+    alone = aperture_profile(MicrolensArray([[0.0, 0.0]]))
     assert (alone.open == 1).all() and (alone.by_area == 0).all()
 
 
 @pytest.mark.integration
 def test_tables_are_kept_for_the_same_microscope():
     scope = imager(pixels=(24, 24), pitch=0.2)
-    first = full_optics(scope, [20.0])
-    assert full_optics(imager(pixels=(24, 24), pitch=0.2), [20.0]) is first
+    first = field_varying_psf(scope, [20.0])
+    assert field_varying_psf(imager(pixels=(24, 24), pitch=0.2), [20.0]) is first
     farther = eqx.tree_at(lambda i: i.sensor_distance, scope, scope.sensor_distance + 1e-6)
-    for other in (full_optics(scope, [20.1]), full_optics(farther, [20.0]), full_optics(scope, [20.0], extent=2.0)):
+    for other in (
+        field_varying_psf(scope, [20.1]),
+        field_varying_psf(farther, [20.0]),
+        field_varying_psf(scope, [20.0], extent=2.0),
+    ):
         assert other is not first
 
 
@@ -213,7 +217,7 @@ def test_rings_add_up_to_the_falloff():
     scope = imager()
     rings = ring_edges(scope)
     distance2 = jnp.linspace(0, 20, 200)
-    total = sum(ring_share(distance2, *ring) for ring in rings)
+    total = sum(ring_window(distance2, *ring) for ring in rings)
     np.testing.assert_allclose(total, falloff(distance2, rings[-1][1]), atol=1e-12)
 
 
@@ -222,11 +226,11 @@ def test_a_kernel_keeps_its_light_and_is_symmetric():
     profile = np.exp(-np.arange(160) / 32)
     profile /= profile.sum()
     for size, parts in ((23, 1), (111, 5), (13, 0.5)):
-        kernel = drawn(profile, size, parts)
+        kernel = render_kernel(profile, size, parts)
         np.testing.assert_allclose(kernel.sum(), 1, rtol=1e-3)
         for same in (kernel[::-1], kernel[:, ::-1], kernel.T):
             np.testing.assert_allclose(kernel, same, atol=1e-15)
-    radius = np.hypot(*spread(profile, 20_000).T)
+    radius = np.hypot(*sample_profile(profile, 20_000).T)
     assert abs(np.mean(radius < 2) - profile[:32].sum()) < 0.01
 
 

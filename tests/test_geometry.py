@@ -7,7 +7,7 @@ from scipy import integrate
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray, envelope
-from gs_jax.optics.raytrace import unit_rays
+from gs_jax.optics.raytrace import trace_lenslet
 
 from .helpers import scene
 
@@ -159,9 +159,9 @@ def test_lenses_may_differ():
     second = array.lens(1)
     np.testing.assert_allclose([second.radius_of_curvature, second.conic_constant], [2.2, -0.7])
     np.testing.assert_array_equal(second.centers, [[1.0, 0.0]])
-    unit_rays(imager_of(second), 20.0, np.zeros(2))
+    trace_lenslet(imager_of(second), 20.0, np.zeros(2))
     with pytest.raises(ValueError, match=r"Found lenses that differ \(radius_of_curvature\), allowed: "):
-        unit_rays(imager_of(array), 20.0, np.zeros(2))
+        trace_lenslet(imager_of(array), 20.0, np.zeros(2))
 
 
 def imager_of(array):

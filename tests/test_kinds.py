@@ -1,4 +1,4 @@
-"""Images by lenses that differ, kind by kind."""
+"""Images by lenses that differ, type by type."""
 
 import dataclasses
 
@@ -22,8 +22,9 @@ from gs_jax import (
 )
 from gs_jax.detection.consistency import Signal, readings
 from gs_jax.detection.evidence import point_evidence
-from gs_jax.detection.kinds import Kind, readings_of
-from gs_jax.optics.lens_types import kind_weights, lenses_by_kind, of_kinds
+from gs_jax.detection.type_views import LensType, readings_of
+from gs_jax.lenses import lenses_by_type
+from gs_jax.optics.lens_types import split_by_type, type_weights
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.methods import BackProjection, ListRichardsonLucy
 from gs_jax.simulation.phantoms import random_points
@@ -33,7 +34,7 @@ from gs_jax.solvers.richardson_lucy import RichardsonLucy
 from .test_full import grid, imager, volume
 from .test_locate import small
 
-# Radii of two kinds: f of 4.65 and 5.1 mm.
+# Radii of two types: f of 4.65 and 5.1 mm.
 RADII = np.array([2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0])
 
 
@@ -55,15 +56,15 @@ def test_the_adjoint_is_exact(level):
 
 @pytest.mark.integration
 def test_the_image_is_the_sum_of_the_kinds():
-    """And of kinds with the same numbers nothing but what one kind is, up to the cores of a mean lens."""
+    """And of types with the same numbers nothing but what one type is, up to the cores of a mean lens."""
     scope, voxels = imager(), grid(shape=(7, 6))
     x = volume(voxels.volume_shape)
     whole = forward(x, scope, voxels, optics_of(scope, voxels.depths, "near"))
     # A number that changes nothing, but is another.
     almost = differing(scope, np.where(RADII > 2, 2.0 + 1e-9, 2.0))
-    assert len(lenses_by_kind(almost)) == 2
+    assert len(lenses_by_type(almost.array)) == 2
     parts = forward(x, almost, voxels, optics_of(almost, voxels.depths, "near"))
-    # One PSF is of the mean clear area of all lenses, the other of each kind's own.
+    # One PSF is of the mean clear area of all lenses, the other of each type's own.
     np.testing.assert_allclose(parts.sum(), whole.sum(), rtol=0.02)
     np.testing.assert_allclose(parts, whole, atol=0.05 * float(whole.max()))
 
@@ -86,8 +87,8 @@ def test_gradients():
 def test_a_sharp_lens_counts_more():
     """At 18 mm lenses of f = 4.65 mm are sharp at 5.75 mm, at 60 mm those of 5.1 mm; of equal lenses all count."""
     scope = imager(pixels=(960, 810), pitch=0.006)
-    lenses = lenses_by_kind(differing(scope))
-    weights = kind_weights(of_kinds(differing(scope), lenses), np.array([18.0, 45.0]), 0.03)
+    lenses = lenses_by_type(differing(scope).array)
+    weights = type_weights(split_by_type(differing(scope), lenses), np.array([18.0, 45.0]), 0.03)
     assert weights[0, 0] > 1.2 > 0.8 > weights[1, 0] and weights[1, 1] > weights[0, 1]
     np.testing.assert_allclose(np.array([5, 4]) @ weights / 9, 1)
 
@@ -103,7 +104,7 @@ def test_back_projection_adds_kinds_by_weight():
     np.testing.assert_array_equal(by_rays, np.asarray(backproject(image, imager(), voxels), np.float32))
     found = reconstruct(image, scope, voxels, RichardsonLucy(steps=2), optics="near")
     assert np.isfinite(found).all() and found.max() > 0
-    # On the pixels of each kind's own cores, as back-projection.
+    # On the pixels of each type's own cores, as back-projection.
     for method in (ListRichardsonLucy(steps=2), Unrolled.pretrained()):
         found = reconstruct(image, scope, voxels, method)
         assert np.isfinite(found).all() and found.max() > 0
@@ -130,14 +131,16 @@ def test_only_kinds_that_are_sharp_read_points():
     scope, _ = small()
     light = Signal(*np.ones((2, *scope.sensor.shape), np.float32))
     ends, flat = np.array([19.0, 21.0]), np.ones(2)
-    one, other = of_kinds(scope, (tuple(range(20)), tuple(range(20, 49))))
-    kinds = [Kind(one, ends, ends, flat), Kind(other, ends, ends + 0.1, np.array([1.0, 0.0]))]
+    one, other = split_by_type(scope, (tuple(range(20)), tuple(range(20, 49))))
+    types = [LensType(one, ends, ends, flat), LensType(other, ends, ends + 0.1, np.array([1.0, 0.0]))]
     points = np.array([[0.1, 0.2, 19.2], [0.1, 0.2, 20.8]])
-    seen, all_, late = readings_of(points, light, kinds), readings(points, light, scope), points + [0, 0, 0.1]
+    seen, all_, late = readings_of(points, light, types), readings(points, light, scope), points + [0, 0, 0.1]
     assert seen.seen.sum(1).tolist()[0] == all_.seen.sum(1)[0] > seen.seen.sum(1)[1] > 0
-    assert seen.kind is not None and set(seen.kind[1][seen.seen[1]]) == {0}
+    assert seen.lens_type is not None and set(seen.lens_type[1][seen.seen[1]]) == {0}
     second = readings(late, light, other)
-    np.testing.assert_allclose(seen.pixels[0][(seen.kind[0] == 1) & seen.seen[0]], second.pixels[0][second.seen[0]])
+    np.testing.assert_allclose(
+        seen.pixels[0][(seen.lens_type[0] == 1) & seen.seen[0]], second.pixels[0][second.seen[0]]
+    )
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ from scipy.spatial.distance import cdist
 from gs_jax.layouts import (
     coverage,
     hexagonal_layout,
-    largest_hole,
-    lloyd_relaxed,
+    lloyd_relax,
+    max_gap,
     nearest_neighbour_distances,
     poisson_disc_layout,
     random_layout,
@@ -64,7 +64,7 @@ def test_random_layout_is_the_papers(count, seed):
     distances = neighbours(centers)
     assert abs(distances.mean() - 1.23) < 0.02 and abs(distances.std() - 0.09) < 0.02
     assert farthest(centers, PLATE, 0.1) <= 1
-    assert largest_hole(centers, PLATE) <= 1
+    assert max_gap(centers, PLATE) <= 1
     np.testing.assert_allclose(coverage(centers, PLATE, diameter=2.0), 1, rtol=1e-12)
 
 
@@ -181,8 +181,8 @@ def test_lattices_have_every_point_that_fits(size, pitch):
 def test_regular_layouts_have_the_holes_and_the_coverage_of_closed_forms():
     """On plates whose edges are lattice lines, so that there is no effect of the border."""
     square, hexagonal = square_layout((12, 8), pitch=2), hexagonal_layout((12, 8 * np.sqrt(3)), pitch=2)
-    np.testing.assert_allclose(largest_hole(square, (12, 8)), np.sqrt(2), rtol=1e-7)
-    np.testing.assert_allclose(largest_hole(hexagonal, (12, 8 * np.sqrt(3))), 2 / np.sqrt(3), rtol=1e-7)
+    np.testing.assert_allclose(max_gap(square, (12, 8)), np.sqrt(2), rtol=1e-7)
+    np.testing.assert_allclose(max_gap(hexagonal, (12, 8 * np.sqrt(3))), 2 / np.sqrt(3), rtol=1e-7)
     np.testing.assert_allclose(coverage(square, (12, 8), diameter=2), np.pi / 4, rtol=1e-7)
     np.testing.assert_allclose(coverage(hexagonal, (12, 8 * np.sqrt(3)), diameter=2), np.pi / np.sqrt(12), rtol=1e-7)
     angle = np.arccos(1 / 1.2)  # discs of radius 1.2 overlap in four lenses of two segments each
@@ -206,7 +206,7 @@ def test_hole_and_coverage_agree_with_a_dense_grid(centers):
     size, step = (4, 3), 0.01
     found = farthest(centers, size, step)
     # A grid misses the farthest point by half a diagonal of its meshes.
-    assert found - 1e-7 <= largest_hole(centers, size) <= found + step / np.sqrt(2)
+    assert found - 1e-7 <= max_gap(centers, size) <= found + step / np.sqrt(2)
     points = grid((4 - step, 3 - step), step)  # the middles of meshes
     nearest = cdist(points, centers).min(axis=1)
     for diameter in (0.3, 1.0, 2.5):
@@ -221,20 +221,20 @@ def test_lloyd_moves_to_the_centroids_of_a_dense_grid(centers):
     points = grid((4 - 0.01, 3 - 0.01), 0.01)
     owner = cdist(points, centers).argmin(axis=1)
     centroids = np.array([points[owner == lens].mean(axis=0) for lens in range(len(centers))])
-    np.testing.assert_allclose(lloyd_relaxed(centers, (4, 3), iterations=1), centroids, atol=5e-3)
+    np.testing.assert_allclose(lloyd_relax(centers, (4, 3), iterations=1), centroids, atol=5e-3)
 
 
 def test_lloyd_evens_out():
     start = scattered(50, (6, 4), 0)
-    relaxed = lloyd_relaxed(start, (6, 4), iterations=30)
-    assert largest_hole(relaxed, (6, 4)) < 0.6 * largest_hole(start, (6, 4))
+    relaxed = lloyd_relax(start, (6, 4), iterations=30)
+    assert max_gap(relaxed, (6, 4)) < 0.6 * max_gap(start, (6, 4))
     assert neighbours(relaxed).min() > 3 * neighbours(start).min()
     with pytest.raises(ValueError, match="`centers` must differ"):
-        lloyd_relaxed(ODD[-1], (4, 3), iterations=1)
+        lloyd_relax(ODD[-1], (4, 3), iterations=1)
 
 
 def test_measures_refuse_lenses_beside_the_plate():
-    for measure in (largest_hole, lambda *a: coverage(*a, diameter=1), lambda *a: lloyd_relaxed(*a, iterations=1)):
+    for measure in (max_gap, lambda *a: coverage(*a, diameter=1), lambda *a: lloyd_relax(*a, iterations=1)):
         with pytest.raises(ValueError, match="on a plate of 4 x 3 mm, got 1 outside"):
             measure(np.array([[0.0, 0.0], [0.0, 1.6]]), (4, 3))
 
@@ -257,4 +257,4 @@ def test_authors_layout():
     np.testing.assert_allclose(coverage(centers, PLATE, diameter=2), 0.983, atol=1e-3)
     near = cdist(grid((19.95, 19.95), 0.05), centers).min(axis=1) < 1
     np.testing.assert_allclose(coverage(centers, PLATE, diameter=2), near.mean(), atol=2e-4)
-    assert largest_hole(centers, PLATE) > 1
+    assert max_gap(centers, PLATE) > 1

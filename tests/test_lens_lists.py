@@ -12,7 +12,7 @@ from gs_jax.design.design import read_design, write_design
 from gs_jax.design.keys import commented, schema
 from gs_jax.design.problems import findings
 from gs_jax.design.sheet import datasheet, summary, tables
-from gs_jax.lenses import kinds
+from gs_jax.lenses import lenses_by_type
 
 from .test_centers import with_file
 from .test_designs import MISSING, message_of, written
@@ -28,8 +28,8 @@ def test_lists_are_numbers_of_each_lens(tmp_path):
     np.testing.assert_array_equal(array.radius_of_curvature, RADII)
     np.testing.assert_array_equal(array.conic_constant, [0, -0.5, 0])
     assert array.aperture_diameter.shape == () and not array.alike
-    assert [which.tolist() for which in kinds(array)] == [[0, 2], [1]]
-    assert "3 lenses of 2 kinds, R = 1.9 to 2 mm, k = -0.5 to 0, n = 1.43, D = 2 mm" in repr(design)
+    assert lenses_by_type(array) == ((0, 2), (1,))
+    assert "3 lenses of 2 types, R = 1.9 to 2 mm, k = -0.5 to 0, n = 1.43, D = 2 mm" in repr(design)
 
 
 def test_lists_are_read_back(tmp_path):
@@ -42,7 +42,7 @@ def test_lists_are_read_back(tmp_path):
 def test_a_list_of_one_number_is_that_number(tmp_path):
     """What is alike stays as fast as it is."""
     design = read_design(written(tmp_path, {"lens.radius_of_curvature_mm": [1.9, 1.9, 1.9]}))
-    assert design.imager().array.alike and len(kinds(design.imager().array)) == 1
+    assert design.imager().array.alike and len(lenses_by_type(design.imager().array)) == 1
     assert "3 lenses, R = 1.9 mm" in repr(design)
 
 
@@ -114,7 +114,7 @@ def test_a_datasheet_of_kinds(tmp_path):
     assert "kinds" not in alone and sheet["lenses_per_point"] == alone["lenses_per_point"]
     np.testing.assert_allclose(first["spot_width_um"], alone["spot_width_um"], rtol=0.1)
     assert sheet["coverage"] == pytest.approx(alone["coverage"], rel=0.01)
-    assert "2 kinds of lenses, f = 4.419 to 4.651 mm" in summary(design, sheet)
+    assert "2 types of lenses, f = 4.419 to 4.651 mm" in summary(design, sheet)
     assert len(tables(sheet)) == len(tables(alone)) + 1
     said = findings(design, sheet)
     assert any(sentence.startswith("Lenses of f = 4.419 mm: in focus by Eqs. 7 and 8") for sentence in said)

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from experiments.many_foci import gain, numbers_of, picture, run
 from gs_jax import random_layout
 from gs_jax.base.progress import Progress
-from gs_jax.layouts import dealt
+from gs_jax.layouts import interleave
 
 pytestmark = pytest.mark.integration
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.integration
 def test_neighbours_are_of_other_kinds():
     centers = np.asarray(random_layout(200, (17.1, 17.1), pitch=1.05, pitch_sd=0.08, seed=1))
     for kinds in (2, 3):
-        which = dealt(centers, kinds)
+        which = interleave(centers, kinds)
         assert np.ptp(np.bincount(which)) <= 0.1 * len(centers)
         tree: Any = KDTree(centers)
         nearest = tree.query(centers, k=3)[1][:, 1:]

@@ -21,7 +21,7 @@ from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
 from gs_jax.design.sheet import datasheet
-from gs_jax.optics.raytrace import on_host
+from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
 
@@ -176,7 +176,7 @@ def one_map(case: Case, _) -> None:
     voxels = Grid(case.grid.depths, (2, 3), 0.31 * case.imager.field_radius, case.grid.origin)
     places = np.stack(np.meshgrid(case.depths, voxels.y, voxels.x, indexing="ij"), -1).reshape(-1, 3)[:, ::-1]
     light = np.random.default_rng(0).random(voxels.volume_shape)
-    host = on_host(case.imager)
+    host = to_numpy(case.imager)
     views = host.views_of_all(places)
     spots, weight = host.sensor.to_pixels(views.spot), np.asarray(host.brightness(views)) * light.ravel()
     low, image = np.floor(spots).astype(int), np.zeros(case.imager.sensor.shape)

@@ -117,7 +117,9 @@ def outside(array, points):
         # The edge's corners are a little outside its circle.
         here = squared <= (cap.reach + CHORD) ** 2
         squared = np.where(here, squared, 0)
-        off = (points[:, 2] - cap_sag(array) + cap.sag(squared)) / np.sqrt(1 + squared * cap.steepness(squared) ** 2)
+        off = (points[:, 2] - cap_sag(array) + cap.sag(squared)) / np.sqrt(
+            1 + squared * cap.sag_slope_over_r(squared) ** 2
+        )
         offs.append(np.where(here, off, np.inf))
     nearest = np.abs(offs).argmin(axis=0)
     return np.array(offs)[nearest, np.arange(len(points))], nearest

@@ -97,7 +97,7 @@ def test_facets_of_any_profile_are_within_the_chord_error(cap):
     weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
     points = np.einsum("qk,fkx->fqx", weights, corners).reshape(-1, 3)
     squared = (points[:, :2] ** 2).sum(axis=1)
-    off = (points[:, 2] + cap.sag(squared)) / np.sqrt(1 + squared * cap.steepness(squared) ** 2)
+    off = (points[:, 2] + cap.sag(squared)) / np.sqrt(1 + squared * cap.sag_slope_over_r(squared) ** 2)
     assert -CHORD < off.min() and off.max() < CHORD
     assert abs(off.mean()) < CHORD / 10
 

@@ -11,7 +11,7 @@ from gs_jax.codesign.objectives import TERMS
 from gs_jax.codesign.parameters import candidate, parent_of, start_values
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.sheet import datasheet
-from gs_jax.layouts import largest_hole, nearest_neighbour_distances
+from gs_jax.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.optics.psf import diffraction_psf
 
 # Off the raster of places, where a hole has a kink.
@@ -38,7 +38,7 @@ def design():
 
 @pytest.fixture(scope="module")
 def focused(design):
-    return candidate(parent_of(design, depths_mm=(18.0, 23.0), confusion=0.018), {})
+    return candidate(parent_of(design, depths_mm=(18.0, 23.0), circle_of_confusion=0.018), {})
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def terms(focused):
 @pytest.mark.integration
 def test_the_papers_metrics_are_those_of_the_datasheet(design, focused, terms):
     """The same formulas by two ways: six digits are what a datasheet has."""
-    sheet = datasheet(design, focused.depths.tolist(), confusion=0.018)
+    sheet = datasheet(design, focused.depths.tolist(), circle_of_confusion=0.018)
     shown = {"lateral_resolution_um": "lateral_resolution_um", "axial_resolution_um": "axial_resolution_um"}
     shown |= {"occupancy": "occupancy", "coverage": "coverage"}
     for name, key in shown.items():
@@ -57,7 +57,7 @@ def test_the_papers_metrics_are_those_of_the_datasheet(design, focused, terms):
     np.testing.assert_allclose(terms["lenses_per_point"], sheet["lenses_per_point"][0], rtol=1e-5)
     object_blur = np.array(sheet["blur_um"]) / sheet["magnification"]
     np.testing.assert_allclose(terms["blur_um"], object_blur, rtol=1e-4)
-    middle = datasheet(design, [20.5], confusion=0.018)
+    middle = datasheet(design, [20.5], circle_of_confusion=0.018)
     np.testing.assert_allclose(terms["depth_of_field_mm"], middle["depth_of_field_mm"][0], rtol=1e-5)
 
 
@@ -125,7 +125,7 @@ def test_manufacture(design, focused, terms):
     centers = np.array(design.array.centers_mm)
     np.testing.assert_allclose(terms["spacing_mm"], nearest_neighbour_distances(centers), rtol=1e-9)
     # Places are half a millimetre apart: a hole is missed by a quarter of it at most, and never overstated.
-    hole, exact = float(terms["hole_mm"].max()), largest_hole(centers, (20.0, 20.0))
+    hole, exact = float(terms["hole_mm"].max()), max_gap(centers, (20.0, 20.0))
     assert exact - 0.3 < hole <= exact * (1 + 1e-9)
     np.testing.assert_allclose(terms["sag_mm"], 2 - np.sqrt(3), rtol=1e-12)
     slope = np.degrees(np.arcsin(np.asarray(focused.clear_diameter) / 4))

@@ -23,7 +23,7 @@ def design():
 
 @pytest.fixture(scope="module")
 def parent(design):
-    return parent_of(design, depths_mm=(18.0, 23.0), confusion=0.036)
+    return parent_of(design, depths_mm=(18.0, 23.0), circle_of_confusion=0.036)
 
 
 def test_bounds_are_invertible_from_the_number():

@@ -8,7 +8,7 @@ from scipy.special import j0, j1
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray
 from gs_jax.optics.psf import diffraction_psf, gaussian_psf, geometric_psf, strehl, window_fraction
-from gs_jax.optics.raytrace import best_focus, unit_rays, wavefront_rms
+from gs_jax.optics.raytrace import best_focus, trace_lenslet, wavefront_rms
 
 WAVELENGTH, RADIUS = 520e-6, 0.65
 KINDS = [diffraction_psf, geometric_psf, gaussian_psf]
@@ -78,7 +78,7 @@ def test_huygens_principle_summed_directly(v, field):
     side = RADIUS * (2 * (np.arange(count) + 0.5) / count - 1)
     points = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     points = points[(points**2).sum(1) < RADIUS**2]
-    rays = unit_rays(imager, z, points, field)
+    rays = trace_lenslet(imager, z, points, field)
     behind = v + 2 - np.sqrt(4 - (points**2).sum(1))
     to_lens = np.asarray(rays.path) - behind * np.sqrt(1 + (np.asarray(rays.tangent) ** 2).sum(1))
     chief = np.asarray(chief_ray(np.zeros(2), np.array(field), float(imager.magnification(z))))

@@ -7,7 +7,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import PSFS, psf_of_depth
-from gs_jax.optics.raytrace import pupil_disc, unit_rays
+from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
 from gs_jax.simulation.synthetic import simulate, simulate_points, simulate_volume
 
 
@@ -42,8 +42,8 @@ def test_the_window_holds_the_light(sensor_distance, pixel):
     array = MicrolensArray([[0.0, 0.0]], aperture_diameter=1.6, size=(4.0, 4.0))
     wide = Imager(array, Sensor((64, 64), pixel), sensor_distance, 0.6)
     window = psf_of_depth(wide, [20.0], "geometric")(20.0).shape[0]
-    points, weights = pupil_disc(0.8, rings=40)
-    rays = unit_rays(wide, 20.0, points)
+    points, weights = pupil_quadrature(0.8, rings=40)
+    rays = trace_lenslet(wide, 20.0, points)
     inside = (np.abs(rays.landing) < window / 2 * pixel).all(1)
     assert np.sum(weights, where=rays.valid & inside) > 0.999 * np.sum(weights, where=rays.valid)
 

@@ -33,21 +33,21 @@ def test_a_thin_lens_out_of_focus():
 
 
 @pytest.mark.parametrize(
-    ("confusion", "exact", "approximate"), [(0.009, 0.97, 1.26), (0.018, 1.94, 2.53), (0.036, 3.9, 5.1)]
+    ("circle_of_confusion", "exact", "approximate"), [(0.009, 0.97, 1.26), (0.018, 1.94, 2.53), (0.036, 3.9, 5.1)]
 )
-def test_what_circle_of_confusion_the_papers_5_mm_need(confusion, exact, approximate):
-    arguments = (F, theory.f_number(F, PITCH), DEPTH, confusion)
+def test_what_circle_of_confusion_the_papers_5_mm_need(circle_of_confusion, exact, approximate):
+    arguments = (F, theory.f_number(F, PITCH), DEPTH, circle_of_confusion)
     np.testing.assert_allclose(theory.depth_of_field(*arguments), exact, rtol=0.01)
     np.testing.assert_allclose(theory.approximate_depth_of_field(*arguments), approximate, rtol=0.01)
 
 
-@pytest.mark.parametrize("confusion", [0.009, 0.05])
-def test_limits_are_where_the_blur_is_the_circle_of_confusion(confusion):
+@pytest.mark.parametrize("circle_of_confusion", [0.009, 0.05])
+def test_limits_are_where_the_blur_is_the_circle_of_confusion(circle_of_confusion):
     """Eq. 8 against a root of the blur, with the sensor where the depth is in focus."""
     v = float(theory.focus_distance(F, DEPTH))
     root = lambda low, high: float(brentq(excess, low, high, xtol=1e-13))  # pyright: ignore[reportArgumentType]
-    excess = lambda z: float(theory.blur(F, PITCH, z, v)) - confusion
-    arguments = (F, theory.f_number(F, PITCH), DEPTH, confusion)
+    excess = lambda z: float(theory.blur(F, PITCH, z, v)) - circle_of_confusion
+    arguments = (F, theory.f_number(F, PITCH), DEPTH, circle_of_confusion)
     np.testing.assert_allclose(theory.near_limit(*arguments), root(5.0, DEPTH), rtol=1e-12)
     np.testing.assert_allclose(theory.far_limit(*arguments), root(DEPTH, 200.0), rtol=1e-12)
 
@@ -68,13 +68,13 @@ def test_blur_by_two_marginal_rays():
 
 
 def test_beyond_the_hyperfocal_distance():
-    number, confusion = theory.f_number(F, PITCH), 0.036
-    hyperfocal = F**2 / (confusion * number) + F
-    far = lambda z: theory.far_limit(F, number, z, confusion)
+    number, circle_of_confusion = theory.f_number(F, PITCH), 0.036
+    hyperfocal = F**2 / (circle_of_confusion * number) + F
+    far = lambda z: theory.far_limit(F, number, z, circle_of_confusion)
     assert jnp.isfinite(far(hyperfocal * 0.999)) and far(hyperfocal * 1.001) == jnp.inf
-    assert theory.depth_of_field(F, number, hyperfocal * 1.001, confusion) == jnp.inf
+    assert theory.depth_of_field(F, number, hyperfocal * 1.001, circle_of_confusion) == jnp.inf
     # Focused there, everything from half of it on is sharp.
-    near = theory.near_limit(F, number, hyperfocal, confusion)
+    near = theory.near_limit(F, number, hyperfocal, circle_of_confusion)
     np.testing.assert_allclose(near, hyperfocal / 2, rtol=1e-12)
 
 
@@ -101,7 +101,7 @@ def test_the_airy_disc_is_as_wide_as_its_gaussian():
     """Half the peak of (2 J1(x) / x)^2, by SciPy's Bessel function."""
     half = root_scalar(lambda x: (2 * j1(x) / x) ** 2 - 0.5, bracket=(1.0, 2.0)).root
     width = 2 * half * 0.52e-3 * 5.0 / (np.pi * 1.2)
-    np.testing.assert_allclose(theory.FWHM * theory.airy_deviation(0.52e-3, 5.0, 1.2), width, rtol=1e-3)
+    np.testing.assert_allclose(theory.FWHM * theory.airy_sigma(0.52e-3, 5.0, 1.2), width, rtol=1e-3)
 
 
 def test_lenses_are_counted():
@@ -153,6 +153,6 @@ def test_gradients():
 
 
 def test_everything_broadcasts():
-    depths, confusion = jnp.array([[18.0], [20.0]]), jnp.array([[0.009, 0.018, 0.036]])
-    assert theory.depth_of_field(F, 3.8, depths, confusion).shape == (2, 3)
+    depths, circle_of_confusion = jnp.array([[18.0], [20.0]]), jnp.array([[0.009, 0.018, 0.036]])
+    assert theory.depth_of_field(F, 3.8, depths, circle_of_confusion).shape == (2, 3)
     assert theory.blur(F, PITCH, depths, jnp.array([[4.0, 5.8]])).shape == (2, 2)

@@ -51,7 +51,7 @@ def test_light_is_brightest_on_the_axis_that_leans():
     imager = tilted()
     normal = np.array([-TILT[0], -TILT[1], 1.0]) / np.sqrt(1 + TILT @ TILT)
     reduced = float(imager.reduced_depth(20.0))
-    lean = np.asarray(imager.lean(jnp.array([20.0])))[0]
+    lean = np.asarray(imager.axis_offset(jnp.array([20.0])))[0]
     np.testing.assert_allclose(np.cross([*lean, reduced], normal), 0, atol=1e-12)
     alone = eqx.tree_at(lambda i: i.array.centers, dataclasses.replace(imager, field_radius=1.0), jnp.zeros((1, 2)))
     image = np.asarray(backproject(np.ones((700, 720)), alone, Grid([20.0], (161, 161), 0.02)))[0]

@@ -30,7 +30,7 @@ from gs_jax.design.spots import field_heights
 from gs_jax.geometry import envelope
 from gs_jax.optics import theory
 from gs_jax.optics.psf import axial_strehl, strehl
-from gs_jax.optics.raytrace import pupil_disc
+from gs_jax.optics.raytrace import pupil_quadrature
 
 from .test_cli import run
 
@@ -145,8 +145,8 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
     errors = jax.tree.map(lambda x: 3 * x, in_units(drawn(jax.random.key(seed), 1), spreads))
     width, ratio = map(np.exp, log_sharpness(nominal, errors, jnp.array(0.005)))
     imager = built(nominal.imager, errors)
-    points, weights = map(np.asarray, pupil_disc(0.2))
-    airy = float(theory.airy_deviation(imager.wavelength, imager.sensor_distance, 0.4))
+    points, weights = map(np.asarray, pupil_quadrature(0.2))
+    airy = float(theory.airy_sigma(imager.wavelength, imager.sensor_distance, 0.4))
     sag, v = np.asarray(imager.array.sag((points**2).sum(1))), float(imager.sensor_distance)
     for row, depth in enumerate(DEPTHS[:2]):
         squares, shares = [], []

@@ -1,4 +1,4 @@
-"""Lenses that differ on one plate: where they end, and kinds of them."""
+"""Lenses that differ on one plate: where they end, and types of them."""
 
 import dataclasses
 from typing import Any
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gs_jax import MicrolensArray
-from gs_jax.lenses import kinds
+from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.apertures import _edges, aperture_area
-from gs_jax.optics.psf_core import zones
+from gs_jax.optics.psf_core import aperture_profile
 
 from .test_aperture import layout
 
@@ -79,9 +79,9 @@ def test_areas_are_those_of_a_raster():
 
 def test_a_kind_keeps_its_neighbours():
     array = unequal()
-    which = kinds(array)
-    assert [kind.tolist() for kind in which] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
-    parts = [array.some(kind) for kind in which]
+    which = lenses_by_type(array)
+    assert which == ((0, 3, 6), (1, 4, 7), (2, 5, 8))
+    parts = [array.subset(type_) for type_ in which]
     assert all(part.alike and len(part.centers) == 3 and len(part.whole.centers) == 9 for part in parts)
     areas = np.concatenate([aperture_area(part) for part in parts])
     np.testing.assert_allclose(areas, aperture_area(array)[np.concatenate(which)], rtol=1e-12)
@@ -89,15 +89,18 @@ def test_a_kind_keeps_its_neighbours():
 
 @pytest.mark.integration
 def test_how_open_lenses_are_by_radius():
-    """The integral over the radii is the area; of the same lenses as two kinds the shares are those of one."""
+    """The integral over the radii is the area; of the same lenses as two types the shares are those of one."""
     disc = dataclasses.replace(unequal(), size=(np.inf, np.inf))
-    for kind in map(disc.some, kinds(disc)):
-        open_, step = zones(kind).open, zones(kind).radius[1] - zones(kind).radius[0]
-        area = (2 * np.pi * zones(kind).radius * step * open_).sum()
-        np.testing.assert_allclose(area, aperture_area(kind).mean(), rtol=2e-2)  # 64 radii and angles
+    for type_ in map(disc.subset, lenses_by_type(disc)):
+        open_, step = (
+            aperture_profile(type_).open,
+            aperture_profile(type_).radius[1] - aperture_profile(type_).radius[0],
+        )
+        area = (2 * np.pi * aperture_profile(type_).radius * step * open_).sum()
+        np.testing.assert_allclose(area, aperture_area(type_).mean(), rtol=2e-2)  # 64 radii and angles
     alike = MicrolensArray(layout(12, (4.0, 4.0)))
-    halves = [zones(alike.some(np.arange(half, 12, 2))).open for half in (0, 1)]
-    np.testing.assert_allclose(np.mean(halves, 0), zones(alike).open, atol=1e-12)
+    halves = [aperture_profile(alike.subset(np.arange(half, 12, 2))).open for half in (0, 1)]
+    np.testing.assert_allclose(np.mean(halves, 0), aperture_profile(alike).open, atol=1e-12)
 
 
 @pytest.mark.integration

@@ -10,7 +10,7 @@ from skimage.feature import peak_local_max
 
 from ..detection.consistency import signal
 from ..geometry import Imager
-from ..optics.psf_core import SpotRays, spot_rays, zones
+from ..optics.psf_core import PupilSamples, aperture_profile, sample_pupil
 
 # Of the window, pixels: standard deviation, half its side; how often it is moved at most, and when it rests.
 _WINDOW, _HALF, _MOVES, _RESTS = 1.5, 4, 300, 1e-4
@@ -50,15 +50,15 @@ def core_offsets(
 
     A point `field` beside a lens's axis is imaged at `-M_z field` from the axis, plus this.
     """
-    aperture, found = zones(imager.array), []
+    aperture, found = aperture_profile(imager.array), []
     for depth in depths:
-        rays = spot_rays(imager, float(depth), fields, aperture, _RAYS)
+        rays = sample_pupil(imager, float(depth), fields, aperture, _RAYS)
         chief = float(imager.magnification(depth)) * fields
         found.append([_middle_of_rays(rays, k, chief[k], imager.sensor.pixel_pitch) for k in range(len(fields))])
     return np.array(found)
 
 
-def _middle_of_rays(rays: SpotRays, field: int, chief: float, pixel: float) -> float:
+def _middle_of_rays(rays: PupilSamples, field: int, chief: float, pixel: float) -> float:
     along, across, light = rays.landing[field, :, 0] + chief, rays.landing[field, :, 1], rays.light[field]
     near = np.hypot(along, across) < _REACH * pixel
     if not light[near].sum() > 0:

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ..base.errors import InputError
 from ..geometry import Imager
 from ..lenses import MicrolensArray
-from ..optics.raytrace import on_host
+from ..optics.raytrace import to_numpy
 from .matching import Similarity, match, match_shift, meeting_lenses, near_of
 from .sources import Sources, assigned
 from .unknowns import moved_lenses, offsets_of
@@ -139,7 +139,7 @@ def _place(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
 
 def _without(spots, point, imager: Imager):
     """The spots that are not of a source."""
-    views = on_host(imager).views_of_all(np.asarray(point, np.float64)[None])
+    views = to_numpy(imager).views_of_all(np.asarray(point, np.float64)[None])
     seen = np.linalg.norm(views.offset[:, 0], axis=1) < imager.field_radius
     if not len(spots) or not seen.any():
         return spots

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import Imager
-from ..lenses import MicrolensArray, type_of_lens
-from ..optics.lens_types import lenses_by_kind, of_kinds
+from ..lenses import MicrolensArray, lenses_by_type, type_of_lens
+from ..optics.lens_types import split_by_type
 from .spots import core_offsets
 
 # Fields at which exact rays are traced, the degree of what is laid through them, and depths at most.
@@ -171,7 +171,7 @@ def core_powers(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
     powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
     fitted = lambda one: np.linalg.lstsq(powers, core_offsets(one, depths, fields).T)[0].T
-    return np.stack([fitted(one) for one in of_kinds(level, lenses_by_kind(level))])
+    return np.stack([fitted(one) for one in split_by_type(level, lenses_by_type(level.array))])
 
 
 @jax.jit

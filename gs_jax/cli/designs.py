@@ -53,9 +53,9 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
     if output:
         check_output(output, [".json"])
         check_may_write(output, inputs=(design,))
-    confusion = confusion_um and confusion_um / 1000
+    circle_of_confusion = confusion_um and confusion_um / 1000
     microscope = read_design(design)
-    sheet = datasheet(microscope, depths, confusion=confusion)
+    sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if output:
         write_json(output, sheet)
     click.echo(summary(microscope, sheet))
@@ -65,7 +65,7 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
         console.print()
         console.print(table)
     click.echo()
-    for sentence in findings(microscope, sheet, confusion=confusion):
+    for sentence in findings(microscope, sheet, circle_of_confusion=circle_of_confusion):
         click.echo(f"- {sentence}")
 
 

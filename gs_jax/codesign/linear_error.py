@@ -40,30 +40,30 @@ READ_NOISE = 2.0
 _NODES = 16
 
 
-def lost_power(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
+def lost_power(types: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
     """Mean squared error of the best linear estimate over the scene's variance, at each depth: 0 to 1.
 
     Parameters
     ----------
-    kinds
-        The lenses of each kind, with depths, sensor and sensor distance in common; one if all lenses are alike. The
+    types
+        The lenses of each type, with depths, sensor and sensor distance in common; one if all lenses are alike. The
         depths are the scene's planes.
     places
         `(x, y)` of objects, mm: the lenses around each, where they are, give the parallax. They are averaged over.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    c = kinds[0]
+    c = types[0]
     dtype, finest = c.depths.dtype, 1 / (2 * PLACE)
     # In the object, 1/mm; over a plane's area. On the sensor they are those of a mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
     frequency = object_frequency / jnp.mean(c.magnification)
     spectrum = _spectrum(c.magnification[:, None] * frequency[None])
-    amplitudes = [_amplitude(one, kinds, frequency, spectrum) for one in kinds]
+    amplitudes = [_amplitude(one, types, frequency, spectrum) for one in types]
     ways, planes = directions(dtype), jnp.eye(c.depths.size, dtype=dtype)
 
     def at_place(place):
-        views = [_view(one, place, ways) for one in kinds]
+        views = [_view(one, place, ways) for one in types]
 
         def at_frequency(frequency, amplitudes):
             real, imaginary = planes[None], 0.0
@@ -86,9 +86,9 @@ def lost_power(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> 
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
 
-def _amplitude(c: Microscope, kinds, frequency, spectrum) -> Float[Array, "depth frequency"]:
+def _amplitude(c: Microscope, types, frequency, spectrum) -> Float[Array, "depth frequency"]:
     """What a lens passes on of each plane, over the noise."""
-    amplitude = lit_density(c) * c.magnification / jnp.sqrt(noise_density(c, kinds))
+    amplitude = lit_density(c) * c.magnification / jnp.sqrt(noise_density(c, types))
     return amplitude[:, None] * safe_sqrt(transfer_power(c, frequency) * spectrum)
 
 
@@ -100,12 +100,12 @@ def _view(c: Microscope, place, ways):
     return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * c.magnification[None, None]
 
 
-def noise_density(c: Microscope, kinds: Sequence[Microscope]) -> Float[Array, ""]:
+def noise_density(c: Microscope, types: Sequence[Microscope]) -> Float[Array, ""]:
     """Electrons^2 per mm^2 of a sub-image: shot noise of all planes and of the sub-images over it, and read noise.
 
-    `c` is the kind of lens whose sub-image it is, `kinds` are all: each as bright as its aperture is large.
+    `c` is the type of lens whose sub-image it is, `types` are all: each as bright as its aperture is large.
     """
-    over = sum(one.occupancy * lit_density(one) for one in kinds)
+    over = sum(one.occupancy * lit_density(one) for one in types)
     shot = FILL * jnp.sum(lit_density(c) + over)
     return shot + (READ_NOISE / c.imager.sensor.pixel_pitch) ** 2
 

@@ -1,7 +1,7 @@
 """What a design is wanted to do: named terms, each a pure function of a `Microscope`.
 
 A term has a name with its unit, and gives a number or an array of them (over depths, lenses, places) in that unit. If
-lenses differ it is of the whole plate, of each kind (`of_each`), or of the best kind (`of_best`).
+lenses differ it is of the whole plate, of each type (`of_each`), or of the best type (`of_best`).
 Lengths are mm everywhere else in the package; here they are what a study file says. All are differentiable in
 everything that may be free, and finite where lenses coincide or rays do not get through.
 Bare equation numbers mean the GEOMScope paper.
@@ -48,7 +48,7 @@ _FLAT = 1e-6
 class Term(NamedTuple):
     """A term: what it says in words, and its function.
 
-    With `log` the function gives the value's logarithm; with `random` it takes a key after the candidate; with `kinds`
+    With `log` the function gives the value's logarithm; with `random` it takes a key after the candidate; with `types`
     it also takes microscopes whose lenses differ.
     """
 
@@ -56,23 +56,23 @@ class Term(NamedTuple):
     function: Callable[..., Result]
     log: bool = False
     random: bool = False
-    kinds: bool = False
+    types: bool = False
 
 
 def of_each(function: Callable[[Microscope], Result]) -> Callable[[Microscope], Result]:
-    """A function of lenses that are alike, of each kind: all of its entries count."""
-    return lambda c: jnp.stack([function(kind) for kind in c.kinds]) if c.kinds else function(c)
+    """A function of lenses that are alike, of each type: all of its entries count."""
+    return lambda c: jnp.stack([function(one) for one in c.types]) if c.types else function(c)
 
 
 def of_best(
     function: Callable[[Microscope], Result], best: Callable[..., Result] = jnp.argmin
 ) -> Callable[[Microscope], Result]:
-    """A function of lenses that are alike, of the kind that is best at each depth: the one in focus there."""
+    """A function of lenses that are alike, of the type that is best at each depth: the one in focus there."""
 
     def at_best(c: Microscope) -> Result:
-        if not c.kinds:
+        if not c.types:
             return function(c)
-        found = jnp.stack([function(kind) for kind in c.kinds])
+        found = jnp.stack([function(one) for one in c.types])
         return jnp.take_along_axis(found, best(found, axis=0, keepdims=True), 0)[0]
 
     return at_best
@@ -151,17 +151,17 @@ def sag(c: Microscope) -> Float[Array, ""]:
 def edge_slope(c: Microscope) -> Float[Array, ""]:
     """Slope of the surface at the rim of the clear disc, of a sphere `asin(a / R)`, degrees; at most 90."""
     square = _within(c, (c.clear_diameter / 2) ** 2)
-    return jnp.rad2deg(jnp.arctan(safe_sqrt(square) * c.imager.array.steepness(square)))
+    return jnp.rad2deg(jnp.arctan(safe_sqrt(square) * c.imager.array.sag_slope_over_r(square)))
 
 
 def least_radius(c: Microscope) -> Float[Array, " place"]:
     """Least radius of curvature of the surface at places from the vertex to the rim: of a tool that would cut it."""
     radii = jnp.linspace(0, 1, _PLACES, dtype=c.clear_diameter.dtype) * c.clear_diameter / 2
     array, square = c.imager.array, _within(c, radii**2)
-    steepness, change = jax.jvp(array.steepness, (square,), (jnp.ones_like(square),))
-    length2 = 1 + square * steepness**2
+    ratio, change = jax.jvp(array.sag_slope_over_r, (square,), (jnp.ones_like(square),))
+    length2 = 1 + square * ratio**2
     # Along the radius s'' / (1 + s'^2)^(3/2), across it s' / r / (1 + s'^2)^(1/2).
-    along, across = (steepness + 2 * square * change) / length2**1.5, steepness / length2**0.5
+    along, across = (ratio + 2 * square * change) / length2**1.5, ratio / length2**0.5
     return 1 / jnp.maximum(jnp.maximum(along, across), _FLAT)
 
 
@@ -175,53 +175,53 @@ def _within(c: Microscope, squared_radius: Float[Array, "*shape"]) -> Float[Arra
 
 TERMS: dict[str, Term] = {
     "lateral_resolution_um": Term(
-        "lateral resolution in focus (Eq. 5)", of_each(lambda c: UM * c.lateral_resolution), kinds=True
+        "lateral resolution in focus (Eq. 5)", of_each(lambda c: UM * c.lateral_resolution), types=True
     ),
     "axial_resolution_um": Term(
-        "axial resolution in focus (Eq. 6)", of_each(lambda c: UM * c.axial_resolution), kinds=True
+        "axial resolution in focus (Eq. 6)", of_each(lambda c: UM * c.axial_resolution), types=True
     ),
-    "depth_of_field_mm": Term("depth of field (Eq. 8)", of_each(lambda c: c.middle.depth_of_field[0]), kinds=True),
+    "depth_of_field_mm": Term("depth of field (Eq. 8)", of_each(lambda c: c.middle.depth_of_field[0]), types=True),
     "depth_of_field_eq7_mm": Term(
-        "depth of field (Eq. 7)", of_each(lambda c: c.middle.approximate_depth_of_field[0]), kinds=True
+        "depth of field (Eq. 7)", of_each(lambda c: c.middle.approximate_depth_of_field[0]), types=True
     ),
-    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", of_each(focus_offset), kinds=True),
+    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", of_each(focus_offset), types=True),
     "blur_um": Term(
-        "diameter of the thin lens's blur, in the object", of_best(lambda c: UM * c.object_blur), kinds=True
+        "diameter of the thin lens's blur, in the object", of_best(lambda c: UM * c.object_blur), types=True
     ),
-    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", of_best(log_strehl, jnp.argmax), log=True, kinds=True),
-    "wavefront_waves": Term("RMS wavefront error over the field", of_best(wavefront), kinds=True),
-    "lenses_per_point": Term("lenses that see a point, N_e", lambda c: c.lenses_per_point, kinds=True),
-    "occupancy": Term("occupancy V (Eq. 11)", lambda c: c.occupancy, kinds=True),
-    "light_percent": Term("share of a point's light that is used", light, kinds=True),
-    "field_of_view_mm": Term("width of the field of view", field_of_view, kinds=True),
-    "thickness_mm": Term("thickness, plate and sensor distance", thickness, kinds=True),
+    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", of_best(log_strehl, jnp.argmax), log=True, types=True),
+    "wavefront_waves": Term("RMS wavefront error over the field", of_best(wavefront), types=True),
+    "lenses_per_point": Term("lenses that see a point, N_e", lambda c: c.lenses_per_point, types=True),
+    "occupancy": Term("occupancy V (Eq. 11)", lambda c: c.occupancy, types=True),
+    "light_percent": Term("share of a point's light that is used", light, types=True),
+    "field_of_view_mm": Term("width of the field of view", field_of_view, types=True),
+    "thickness_mm": Term("thickness, plate and sensor distance", thickness, types=True),
     "psf_width_um": Term(
-        "width of the spot (FWHM of its variance), in the object", of_best(lambda c: UM * psf_width(c)), kinds=True
+        "width of the spot (FWHM of its variance), in the object", of_best(lambda c: UM * psf_width(c)), types=True
     ),
     "encircled_radius_um": Term(
-        "radius of 80 % of the rays, in the object", of_best(lambda c: UM * encircled_radius(c)), kinds=True
+        "radius of 80 % of the rays, in the object", of_best(lambda c: UM * encircled_radius(c)), types=True
     ),
-    "depth_span_mm": Term("span of the depths", lambda c: c.depths[-1] - c.depths[0], kinds=True),
-    "spacing_mm": Term("distance of nearest lenses", spacing, kinds=True),
-    "web_mm": Term("mask left between neighbouring apertures", web, kinds=True),
-    "hole_mm": Term("distance of a place on the plate from a lens", hole, kinds=True),
-    "coverage": Term("share of the plate that is clear aperture", lambda c: c.coverage, kinds=True),
-    "sag_mm": Term("height of a whole lens", of_each(sag), kinds=True),
-    "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True, kinds=True),
-    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage, kinds=True),
-    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True, kinds=True),
-    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True, kinds=True),
+    "depth_span_mm": Term("span of the depths", lambda c: c.depths[-1] - c.depths[0], types=True),
+    "spacing_mm": Term("distance of nearest lenses", spacing, types=True),
+    "web_mm": Term("mask left between neighbouring apertures", web, types=True),
+    "hole_mm": Term("distance of a place on the plate from a lens", hole, types=True),
+    "coverage": Term("share of the plate that is clear aperture", lambda c: c.coverage, types=True),
+    "sag_mm": Term("height of a whole lens", of_each(sag), types=True),
+    "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True, types=True),
+    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage, types=True),
+    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True, types=True),
+    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True, types=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
     "scene_error": Term(
         "relative error of reconstructed scenes, for an exposure", log_error_for_exposure, log=True, random=True
     ),
-    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error, kinds=True),
+    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error, types=True),
     "crowded_precision_um": Term(
-        "least error of locating a point in a scene, x, y, z, for an exposure", crowded, kinds=True
+        "least error of locating a point in a scene, x, y, z, for an exposure", crowded, types=True
     ),
-    "edge_slope_deg": Term("slope at the clear aperture's rim", of_each(edge_slope), kinds=True),
-    "least_radius_mm": Term("least radius of curvature of a lens's surface", of_each(least_radius), kinds=True),
+    "edge_slope_deg": Term("slope at the clear aperture's rim", of_each(edge_slope), types=True),
+    "least_radius_mm": Term("least radius of curvature of a lens's surface", of_each(least_radius), types=True),
 }
 
 # As they are in every process, whatever a caller puts into the table.

@@ -38,21 +38,21 @@ class Free(NamedTuple):
     names: tuple[str, ...]
 
     def values(self, imager: Imager) -> Values:
-        """The free numbers by name. What lenses have of their own is one number for each kind of lens."""
+        """The free numbers by name. What lenses have of their own is one number for each type of lens."""
         if missing := [name for name in self.names if _leaf(imager, name) is None]:
             found = f"found {missing[0]} of an imager without one"
             raise InputError(f"free: {found}, allowed: with one, which may be zero.")
         values = {name: _leaf(imager, name) for name in self.names}
         for name in self.names:
-            if (kind := _kind(imager, name)) is not None:
-                values[name] = values[name][np.unique(kind, return_index=True)[1]]
+            if (lens_type := _type(imager, name)) is not None:
+                values[name] = values[name][np.unique(lens_type, return_index=True)[1]]
         return values
 
     def replaced(self, imager: Imager, values: Values) -> Imager:
-        """The imager with other numbers; `imager` says which lens is of which kind, so its own are not traced."""
-        kinds = [_kind(imager, name) for name in self.names]
-        each = zip((values[name] for name in self.names), kinds, strict=True)
-        numbers = [value if kind is None else value[kind] for value, kind in each]
+        """The imager with other numbers; `imager` says which lens is of which type, so its own are not traced."""
+        types = [_type(imager, name) for name in self.names]
+        each = zip((values[name] for name in self.names), types, strict=True)
+        numbers = [value if one is None else value[one] for value, one in each]
         return eqx.tree_at(lambda i: [_leaf(i, name) for name in self.names], imager, numbers)
 
 
@@ -67,7 +67,7 @@ def free(*names: str) -> Free:
         Fields of `Imager` and of `MicrolensArray`: `"sensor_distance"`, `"rotation"`, `"shift"`, `"tilt"`,
         `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
         `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`. Of lenses that differ, radius, aperture and
-        conic constant are free for each kind, and which lens is of which kind stays.
+        conic constant are free for each type, and which lens is of which type stays.
 
     Raises
     ------
@@ -208,8 +208,8 @@ def _leaf(imager, name):
     return getattr(imager.array if name in _OF_ARRAY else imager, name)
 
 
-def _kind(imager, name) -> np.ndarray | None:
-    """The number of each lens's kind, where lenses have a number of their own."""
+def _type(imager, name) -> np.ndarray | None:
+    """The number of each lens's type, where lenses have a number of their own."""
     if name not in EACH or _leaf(imager, name).ndim == 0:
         return None
     return type_of_lens(imager.array)

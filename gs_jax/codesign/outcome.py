@@ -16,7 +16,7 @@ from ..design.checks import of_each
 from ..design.design import Design, write_design
 from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
-from ..lenses import kinds
+from ..lenses import lenses_by_type
 from ..pictures.style import PALETTE
 from .objectives import TERMS, unit_of
 from .search import Outcome, PathLike
@@ -136,10 +136,10 @@ def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
 
 
 def _draw_layout(axes: Axes, design: Design) -> None:
-    """Lenses on the plate, each with its disc in the colour of its kind, and the sensor."""
+    """Lenses on the plate, each with its disc in the colour of its type, and the sensor."""
     diameters = of_each(design, "aperture_diameter_mm")
     discs = [Circle(center, d / 2) for center, d in zip(design.array.centers_mm, diameters, strict=True)]
-    for colour, which in zip(PALETTE, kinds(design.imager().array), strict=False):
+    for colour, which in zip(PALETTE, lenses_by_type(design.imager().array), strict=False):
         some = [discs[lens] for lens in which]
         axes.add_collection(PatchCollection(some, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.5))
     sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]

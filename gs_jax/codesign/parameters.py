@@ -4,7 +4,7 @@ A `Parent` is the design that an optimisation starts from, `start_values` are it
 is the microscope of other values: everything that an objective needs, differentiable in all of them. `new_design`
 goes back to a file. Names carry the unit of the study file, and so do the values here: all are mm but the index, the
 conic constant and the aspheric terms A_4, A_6, ..., in mm^-3, mm^-5, .... Of lenses that differ, radius, aperture and
-conic constant are a value for each kind, in the order of their first lenses; which lens is of which kind stays.
+conic constant are a value for each type, in the order of their first lenses; which lens is of which type stays.
 """
 
 import dataclasses
@@ -25,9 +25,8 @@ from ..design.design import Design
 from ..design.microscope import Microscope
 from ..geometry import Imager
 from ..io.toml import one_line
-from ..lenses import EACH, type_of_lens
-from ..optics.apertures import Cells, cells_of, pitch
-from ..optics.lens_types import lenses_by_kind
+from ..lenses import EACH, lenses_by_type, type_of_lens
+from ..optics.apertures import VoronoiCells, pitch, voronoi_cells
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -49,24 +48,24 @@ _TERMS = 2
 _DIGITS = 4
 # Significant digits of numbers that are no length, as many as float32 has: of a term of the surface picometres of sag.
 _SIGNIFICANT = 7
-# Of lenses that differ: enough for the mean clear aperture of a kind to 1e-3, an eighth of the work of all.
+# Of lenses that differ: enough for the mean clear aperture of a type to 1e-3, an eighth of the work of all.
 _EDGES = 64
 
 
 class Parent(eqx.Module):
     """A design with what its file does not say: where it is judged.
 
-    `cells`: of its lenses, None if they may move or differ. `lenses`: which are of each kind. `pitch`: mean distance
+    `cells`: of its lenses, None if they may move or differ. `lenses`: which are of each type. `pitch`: mean distance
     of nearest neighbours, mm; 1 for one lens. `middle`, `span`: of the depths that count, from the plate, mm.
-    `depth_count`: how many they are. `confusion`: mm. `exposure`: as of a `Microscope`.
+    `depth_count`: how many they are. `circle_of_confusion`: mm. `exposure`: as of a `Microscope`.
     """
 
     imager: Imager
-    cells: Cells | None
+    cells: VoronoiCells | None
     pitch: Float[Array, ""] = eqx.field(converter=as_float)
     middle: Float[Array, ""] = eqx.field(converter=as_float)
     span: Float[Array, ""] = eqx.field(converter=as_float)
-    confusion: Float[Array, ""] = eqx.field(converter=as_float)
+    circle_of_confusion: Float[Array, ""] = eqx.field(converter=as_float)
     depth_count: int = eqx.field(static=True)
     largest_magnification: float = eqx.field(static=True)
     exposure: float = eqx.field(static=True)
@@ -77,7 +76,7 @@ def parent_of(
     design: Design,
     *,
     depths_mm: tuple[float, float] | None = None,
-    confusion: float | None = None,
+    circle_of_confusion: float | None = None,
     depth_count: int = 6,
     exposure: float = 1e4,
     free: Mapping[str, tuple[float, float]] = MappingProxyType({}),
@@ -88,7 +87,7 @@ def parent_of(
     ----------
     depths_mm
         Nearest and farthest depth that count; by default the design's working distance.
-    confusion
+    circle_of_confusion
         Diameter of the circle of confusion, mm; by default two pixels.
     depth_count
         Depths between them, both included.
@@ -105,15 +104,15 @@ def parent_of(
         imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, none)
     return Parent(
         imager,
-        cells_of(np.array(design.array.centers_mm), design.array.size_mm) if stays else None,
+        voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if stays else None,
         pitch(imager.array.centers)[0] if len(design.array.centers_mm) > 1 else 1.0,
         (near + far) / 2,
         far - near,
-        2 * imager.sensor.pixel_pitch if confusion is None else confusion,
+        2 * imager.sensor.pixel_pitch if circle_of_confusion is None else circle_of_confusion,
         depth_count,
         _largest_magnification(design, near, far, free),
         exposure,
-        lenses_by_kind(imager),
+        lenses_by_type(imager.array),
     )
 
 
@@ -179,7 +178,7 @@ def candidate(parent: Parent, values: Values) -> Microscope:
         imager,
         parent.middle + values["depth_span_mm"] * offsets,
         field_radius=jnp.array(imager.field_radius, scale.dtype),
-        confusion=parent.confusion,
+        circle_of_confusion=parent.circle_of_confusion,
         plate_scale=scale,
         largest_magnification=parent.largest_magnification,
         exposure=parent.exposure,
@@ -190,7 +189,7 @@ def candidate(parent: Parent, values: Values) -> Microscope:
 
 
 def of_lenses(parent: Parent, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A value for each lens, of one for each kind; one of all lenses stays."""
+    """A value for each lens, of one for each type; one of all lenses stays."""
     if value.ndim == 0:
         return value
     return value[type_of_lens(parent.imager.array)]
@@ -236,7 +235,7 @@ def significant(value: Float[Array, "..."]) -> Float64[np.ndarray, "..."]:
 
 
 def _of_lenses_rounded(parent: Parent, name: str, value: Float[Array, "..."]) -> float | list[float]:
-    """One number if all kinds come to the same."""
+    """One number if all types come to the same."""
     numbers = of_lenses(parent, value)
     numbers = np.round(np.asarray(numbers, float), _DIGITS) if name.endswith("_mm") else significant(numbers)
     return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

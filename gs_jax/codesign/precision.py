@@ -29,28 +29,28 @@ from .transfer import lens_electrons, transfer_power
 _NODES = 24
 
 
-def crowded_bound(kinds: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, "depth 3"]:
+def crowded_bound(types: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, "depth 3"]:
     """The least standard deviations of x, y, z of points as bright as a lit place of 40 um x 40 um, mm.
 
     Parameters
     ----------
-    kinds
-        The lenses of each kind, with depths, sensor and sensor distance in common; one if all lenses are alike. The
+    types
+        The lenses of each type, with depths, sensor and sensor distance in common; one if all lenses are alike. The
         depths are those of the points.
     places
         `(x, y)` of points, mm. Root mean squares over them are given.
     """
-    spots = [_spot(one, kinds) for one in kinds]
-    prior = jnp.asarray(PRIOR[:3], kinds[0].depths.dtype)
+    spots = [_spot(one, types) for one in types]
+    prior = jnp.asarray(PRIOR[:3], types[0].depths.dtype)
 
     def at(place):
-        told = sum(_told(one, spot, place) for one, spot in zip(kinds, spots, strict=True))
+        told = sum(_told(one, spot, place) for one, spot in zip(types, spots, strict=True))
         return jnp.diagonal(jnp.linalg.inv(told + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
 
     return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
 
 
-def _spot(c: Microscope, kinds: Sequence[Microscope]):
+def _spot(c: Microscope, types: Sequence[Microscope]):
     """At each depth of the spot of a lens its squared light, 1/mm^2, and of its derivative by x or y; and its noise."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     dtype, highest = c.depths.dtype, 1 / (2 * c.imager.sensor.pixel_pitch)
@@ -59,7 +59,7 @@ def _spot(c: Microscope, kinds: Sequence[Microscope]):
     power = transfer_power(c, frequency)
     energy = jnp.sum(ring[None] * power, 1)
     slope = jnp.sum(ring[None] * power * (2 * jnp.pi * frequency[None]) ** 2, 1) / 2
-    return energy, slope, noise_density(c, kinds)
+    return energy, slope, noise_density(c, types)
 
 
 def _told(c: Microscope, spot, place) -> Float[Array, "depth 3 3"]:

@@ -18,13 +18,13 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design
-from ..lenses import kinds
+from ..lenses import lenses_by_type
 from .bounds import Bounds, Box
 from .checkpoint import Log, restored
 from .objectives import TERMS, with_terms
 from .parameters import Parent, Values, candidate, parent_of, start_values
 from .solve import NOT_FINITE, State, Stepper, run, solver_of, stepper
-from .study import MOST_KINDS, StageTable, Study, TermTable, labels
+from .study import MOST_TYPES, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
 
 
@@ -62,14 +62,14 @@ def problem_of(design: Design, study: Study) -> Problem:
         If what is free does not exist in the design, or depths may come to lie behind the plate.
     """
     _check_free(design, study)
-    confusion = None if study.confusion_um is None else study.confusion_um / 1000
-    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "confusion": confusion}
+    circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
+    where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
     parent = parent_of(design, **where, exposure=study.exposure, free=study.free)
     return Problem(parent, study)
 
 
 def _check_free(design: Design, study: Study) -> None:
-    _check_kinds(len(kinds(design.imager().array)), study)
+    _check_types(len(lenses_by_type(design.imager().array)), study)
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
     twice = sum(study.depths_mm or design.imaging.working_distance_mm)
@@ -83,11 +83,11 @@ def _check_free(design: Design, study: Study) -> None:
         )
 
 
-def _check_kinds(count: int, study: Study) -> None:
-    if count > MOST_KINDS:
-        raise InputError(f"`lens`: found lenses of {count} kinds, allowed: lenses of up to {MOST_KINDS}.")
+def _check_types(count: int, study: Study) -> None:
+    if count > MOST_TYPES:
+        raise InputError(f"`lens`: found lenses of {count} types, allowed: lenses of up to {MOST_TYPES}.")
     named = [*(term.name for term in study.terms), *(limit.name for limit in study.pareto)]
-    if alike := [name for name in named if count > 1 and not TERMS[name].kinds]:
+    if alike := [name for name in named if count > 1 and not TERMS[name].types]:
         raise InputError(f"`terms`: found {alike[0]} for lenses that differ, allowed: for lenses that are alike.")
 
 

@@ -35,7 +35,7 @@ from .parameters import NAMES
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
 # Of lenses: each is traced for itself.
-MOST_KINDS = 8
+MOST_TYPES = 8
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
 # Of what may be free, but lengths.
@@ -138,7 +138,7 @@ class Study(Table):
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
     name: str = Field(default="optimized", description="a string")
     orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
-    kinds: int | None = Field(default=None, ge=1, le=MOST_KINDS, description=f"a whole number from 1 to {MOST_KINDS}")
+    kinds: int | None = Field(default=None, ge=1, le=MOST_TYPES, description=f"a whole number from 1 to {MOST_TYPES}")
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")

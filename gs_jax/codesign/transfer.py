@@ -13,7 +13,7 @@ from ..base.arrays import safe_sqrt
 from ..design.microscope import Microscope
 from ..design.spots import field_heights
 from ..geometry import envelope
-from ..optics.raytrace import pupil_disc, unit_rays
+from ..optics.raytrace import pupil_quadrature, trace_lenslet
 
 # What an exposure is counted for, mm.
 AWAY, PLACE = 20.0, 0.04
@@ -45,11 +45,11 @@ def transfer_power(c: Microscope, frequencies: Float[Array, " frequency"]) -> Fl
     frequencies
         On the sensor, 1/mm.
     """
-    points, weights = pupil_disc(c.clear_diameter / 2, _RINGS)
+    points, weights = pupil_quadrature(c.clear_diameter / 2, _RINGS)
     heights, ways = field_heights(c), directions(c.depths.dtype)
 
     def power(depth, height):
-        rays = unit_rays(c.imager, depth, points, (height, jnp.zeros_like(height)))
+        rays = trace_lenslet(c.imager, depth, points, (height, jnp.zeros_like(height)))
         lit = jnp.where(rays.valid, weights, 0)
         # What is reflected totally at the rim is missing. From the middle of the spot, for small phases.
         middle = jnp.sum(lit[:, None] * rays.landing, 0) / jnp.maximum(jnp.sum(lit), 1e-6)

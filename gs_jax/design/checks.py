@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from ..lenses import steepness
+from ..lenses import sag_slope_over_r
 from .centers import LENS_KEYS, other_reading
 
 MIN_SPACING_MM = 1e-3
@@ -49,7 +49,7 @@ def _check_lenses(design) -> None:
             found = f"`lens.aperture_diameter_mm`: found {aperture}{of_lens}"
             raise ValueError(f"{found}, allowed: at most {round(end, 6)} mm, {where}")
         radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
-        rising = steepness(radii**2, radius, conic, lens.aspheric_terms) <= 0
+        rising = sag_slope_over_r(radii**2, radius, conic, lens.aspheric_terms) <= 0
         if rising.any():
             which = f"lens {number} rises" if of_lens else "lenses rise"
             found = f"found {list(lens.aspheric_terms)}, with which {which} at {radii[np.argmax(rising)]:.3g} mm"

@@ -69,11 +69,11 @@ class Design(Table):
             else f"R = {span_of(lens.radius_of_curvature_mm)} mm"
         )
         count = len(set(zip(*(of_each(self, key) for key in LENS_KEYS), strict=True)))
-        of_kinds = f" of {count} kinds" if count > 1 else ""
+        of_types = f" of {count} types" if count > 1 else ""
         return "\n".join(
             [
                 f"Design {self.name!r}",
-                f"  {len(array.centers_mm)} lenses{of_kinds}, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
+                f"  {len(array.centers_mm)} lenses{of_types}, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
                 f"D = {span_of(lens.aperture_diameter_mm)} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
                 f"{array.substrate_thickness_mm:g} mm thick",
                 f"  sensor of {sensor.shape[0]} x {sensor.shape[1]} pixels of {sensor.pixel_pitch_um:g} um "

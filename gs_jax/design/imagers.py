@@ -6,7 +6,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..geometry import Imager
-from ..lenses import kinds
+from ..lenses import lenses_by_type
 from ..optics import theory
 from ..optics.apertures import clear_diameter
 
@@ -59,13 +59,13 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
     InputError
         If no depth is in focus, or what is sharp has no end.
     """
-    v, confusion, ends = float(imager.reduced_sensor_distance), 2 * imager.sensor.pixel_pitch, []
-    for which in kinds(imager.array):
-        array = imager.array.some(which)
+    v, circle_of_confusion, ends = float(imager.reduced_sensor_distance), 2 * imager.sensor.pixel_pitch, []
+    for which in lenses_by_type(imager.array):
+        array = imager.array.subset(which)
         focal_length = float(array.focal_length)
         in_focus = 1 / focal_length - 1 / v
         if in_focus > 0:
-            sharp = focal_length, focal_length / float(clear_diameter(array)), 1 / in_focus, confusion
+            sharp = focal_length, focal_length / float(clear_diameter(array)), 1 / in_focus, circle_of_confusion
             ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
     front = float(imager.reduced_depth(0.0))
     if not ends or not np.isfinite(ends).all() or min(ends) <= front:

@@ -17,9 +17,9 @@ from ..base.arrays import POSITIVE, as_float, check_fields
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..optics import aberrations, theory
-from ..optics.aberrations import Wavefront
-from ..optics.apertures import Cells, clear_diameter, clear_diameters
-from ..optics.lens_types import of_kinds
+from ..optics.aberrations import WavefrontCoefficients
+from ..optics.apertures import VoronoiCells, clear_diameter, clear_diameters
+from ..optics.lens_types import split_by_type
 
 
 class Microscope(eqx.Module):
@@ -33,7 +33,7 @@ class Microscope(eqx.Module):
         From the plate, mm.
     field_radius
         `sqrt(A_e / pi)`, mm: the imager's, which decides shapes and cannot be traced.
-    confusion
+    circle_of_confusion
         Diameter of the circle of confusion, mm.
     plate_scale
         The plate's size over that of the imager's array, which cannot be traced.
@@ -44,7 +44,7 @@ class Microscope(eqx.Module):
     cells, directions
         How clear apertures are found, as of `gs_jax.optics.apertures`: of lenses that are alike, and of others.
     lenses
-        Which are of each kind, where they differ; none if all are alike. What follows from a lens's shape is of the
+        Which are of each type, where they differ; none if all are alike. What follows from a lens's shape is of the
         `kinds` then, the rest also of the whole, whose clear diameter is the mean lens's.
     found_diameter
         Of one of `kinds`, which are made anew whenever they are asked for: those of all are found at once.
@@ -58,11 +58,11 @@ class Microscope(eqx.Module):
     imager: Imager
     depths: Float[Array, " depth"]
     field_radius: Float[Array, ""]
-    confusion: Float[Array, ""]
+    circle_of_confusion: Float[Array, ""]
     plate_scale: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     largest_magnification: float = eqx.field(static=True, default=math.inf)
     exposure: float = eqx.field(static=True, default=1e4)
-    cells: Cells | None = None
+    cells: VoronoiCells | None = None
     directions: int = eqx.field(static=True, default=512)
     lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
     found_diameter: Float[Array, ""] | None = None
@@ -78,17 +78,17 @@ class Microscope(eqx.Module):
         return self.plate_scale * jnp.array(self.imager.array.size, self.plate_scale.dtype)
 
     @property
-    def kinds(self) -> tuple["Microscope", ...]:
-        """The lenses of each kind alone, where they differ."""
+    def types(self) -> tuple["Microscope", ...]:
+        """The lenses of each type alone, where they differ."""
         if not self.lenses:
             return ()
-        pairs = zip(of_kinds(self.imager, self.lenses), self._clear_diameters, strict=True)
+        pairs = zip(split_by_type(self.imager, self.lenses), self._clear_diameters, strict=True)
         return tuple(dataclasses.replace(self, imager=one, lenses=(), found_diameter=own) for one, own in pairs)
 
     @property
     def each(self) -> tuple["Microscope", ...]:
-        """Of each kind of lens; of lenses that are alike this itself."""
-        return self.kinds or (self,)
+        """Of each type of lens; of lenses that are alike this itself."""
+        return self.types or (self,)
 
     @property
     def middle(self) -> "Microscope":
@@ -153,7 +153,7 @@ class Microscope(eqx.Module):
 
     @property
     def _sharp(self):
-        return self.focal_length, self.f_number, self.reduced, self.confusion
+        return self.focal_length, self.f_number, self.reduced, self.circle_of_confusion
 
     @property
     def depth_of_field(self) -> Float[Array, " depth"]:
@@ -192,10 +192,10 @@ class Microscope(eqx.Module):
         count = self.imager.array.centers.shape[0]
         return count * math.pi / 4 * self.clear_diameter**2 / jnp.prod(self.plate)
 
-    def wavefront(self, heights: Float[Array, " field"]) -> Wavefront:
+    def wavefront(self, heights: Float[Array, " field"]) -> WavefrontCoefficients:
         """Third-order errors at heights beside a lens's axis, sensor where it is: `(depth, field)`, or broadcast."""
         array, v = self.imager.array, self.imager.reduced_sensor_distance
-        return aberrations.of_array(array, self.clear_diameter / 2, self.reduced[:, None], heights[None], v)
+        return aberrations.seidel_of_array(array, self.clear_diameter / 2, self.reduced[:, None], heights[None], v)
 
     @property
     def focus_distance(self) -> Float[Array, " depth"]:
@@ -215,8 +215,8 @@ class Microscope(eqx.Module):
 
 
 @partial(jax.jit, static_argnames=("directions", "lenses"))
-def _clear_diameters(array: MicrolensArray, plate_scale, cells: Cells | None, directions: int, lenses):
-    """Of each kind, or of all lenses."""
+def _clear_diameters(array: MicrolensArray, plate_scale, cells: VoronoiCells | None, directions: int, lenses):
+    """Of each type, or of all lenses."""
     # As large as the plate's size says.
     array = _shrunk(array, plate_scale)
     if lenses:

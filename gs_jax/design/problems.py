@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..optics import aberrations, theory
-from ..optics.raytrace import unit_rays
+from ..optics.raytrace import trace_lenslet
 from .design import Design
 from .microscope import Microscope
 from .sheet import microscopes_of
@@ -24,14 +24,14 @@ _LEAST_BETWEEN = 0.005
 _STREHL_DOMAIN = 0.1
 
 
-def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None = None) -> list[str]:
+def findings(design: Design, sheet: dict[str, Any], *, circle_of_confusion: float | None = None) -> list[str]:
     """What violates what, in short sentences; empty if nothing does.
 
     Parameters
     ----------
     design, sheet
         A microscope and its datasheet.
-    confusion
+    circle_of_confusion
         As for `datasheet`.
 
     Raises
@@ -39,10 +39,10 @@ def findings(design: Design, sheet: dict[str, Any], *, confusion: float | None =
     InputError
         As `datasheet`.
     """
-    kinds = microscopes_of(design, sheet["depth_mm"], confusion=confusion)
-    focus = _focus(design, sheet, kinds)
-    # What a wavefront error does is said of lenses that are alike: each kind has its own.
-    strehl = _strehl(design, sheet, kinds[0]) if len(kinds) == 1 else []
+    types = microscopes_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
+    focus = _focus(design, sheet, types)
+    # What a wavefront error does is said of lenses that are alike: each type has its own.
+    strehl = _strehl(design, sheet, types[0]) if len(types) == 1 else []
     checks = (_rays(sheet), focus, strehl, _pixels(design, sheet))
     return [sentence for check in (*checks, _pitch(sheet), _occupancy(sheet), _mask(sheet)) for sentence in check]
 
@@ -74,26 +74,30 @@ def _light_within(m: Microscope, depths, radius):
     """Of a point on a lens's axis, by exact rays, relative."""
     radii = jnp.asarray((np.arange(_RAYS) + 0.5) / _RAYS, depths.dtype) * m.clear_diameter / 2
     pupil = jnp.stack([radii, jnp.zeros_like(radii)], -1)
-    rays = jax.vmap(lambda depth: unit_rays(m.imager, depth, pupil))(depths)
+    rays = jax.vmap(lambda depth: trace_lenslet(m.imager, depth, pupil))(depths)
     return jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
 
 
-def _focus(design: Design, sheet: dict[str, Any], kinds: list[Microscope]) -> list[str]:
-    v, blurs, confusion = design.imaging.sensor_distance_mm, sheet["blur_um"], float(kinds[0].confusion)
-    outside = [i for i, blur in enumerate(blurs) if blur > confusion * 1000]
+def _focus(design: Design, sheet: dict[str, Any], types: list[Microscope]) -> list[str]:
+    v, blurs, circle_of_confusion = (
+        design.imaging.sensor_distance_mm,
+        sheet["blur_um"],
+        float(types[0].circle_of_confusion),
+    )
+    outside = [i for i, blur in enumerate(blurs) if blur > circle_of_confusion * 1000]
     if not outside:
         return []
-    limit = f"the circle of confusion, {_length(confusion)}"
+    limit = f"the circle of confusion, {_length(circle_of_confusion)}"
     return [
         *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
         f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
-        *(_of(m, kinds, said) for m in kinds for said in (_sharp_range(design, m), *_sharp_cores(m))),
+        *(_of(m, types, said) for m in types for said in (_sharp_range(design, m), *_sharp_cores(m))),
     ]
 
 
-def _of(m: Microscope, kinds: list[Microscope], said: str) -> str:
-    """Of which lenses something is said, where there are several kinds."""
-    return said if len(kinds) == 1 else f"Lenses of f = {float(m.focal_length):.4g} mm: {said[:1].lower()}{said[1:]}"
+def _of(m: Microscope, types: list[Microscope], said: str) -> str:
+    """Of which lenses something is said, where there are several types."""
+    return said if len(types) == 1 else f"Lenses of f = {float(m.focal_length):.4g} mm: {said[:1].lower()}{said[1:]}"
 
 
 def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:

@@ -13,9 +13,9 @@ from rich.table import Table
 from ..base.arrays import as_float
 from ..base.errors import InputError, short_repr
 from ..layouts import check_positive, nearest_neighbour_distances
+from ..lenses import lenses_by_type
 from ..optics import aberrations
-from ..optics.apertures import cells_of
-from ..optics.lens_types import lenses_by_kind
+from ..optics.apertures import voronoi_cells
 from .design import Design
 from .microscope import Microscope
 from .spots import encircled_radius, psf_width
@@ -25,35 +25,35 @@ _DEPTHS = 7
 
 
 def microscope_of(
-    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float | None = None
+    design: Design, depths: Sequence[float] | np.ndarray, *, circle_of_confusion: float | None = None
 ) -> Microscope:
     """A design as it is judged at these depths, mm, with `datasheet`'s circle of confusion."""
     imager = design.imager()
     if not imager.array.alike:
         raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
-    return microscopes_of(design, depths, confusion=confusion)[0]
+    return microscopes_of(design, depths, circle_of_confusion=circle_of_confusion)[0]
 
 
 def microscopes_of(
-    design: Design, depths: Sequence[float] | np.ndarray, *, confusion: float | None = None
+    design: Design, depths: Sequence[float] | np.ndarray, *, circle_of_confusion: float | None = None
 ) -> list[Microscope]:
-    """`microscope_of` with the lenses of each kind alone, in the order of their first lenses."""
+    """`microscope_of` with the lenses of each type alone, in the order of their first lenses."""
     imager = design.imager()
     alike = imager.array.alike
     whole = Microscope(
         imager,
         as_float(depths),
         field_radius=as_float(design.imaging.field_radius_mm),
-        confusion=as_float(confusion_of(design, confusion)),
-        cells=cells_of(np.array(design.array.centers_mm), design.array.size_mm) if alike else None,
-        lenses=() if alike else lenses_by_kind(imager),
+        circle_of_confusion=as_float(circle_of_confusion_of(design, circle_of_confusion)),
+        cells=voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if alike else None,
+        lenses=() if alike else lenses_by_type(imager.array),
     )
     # Each finds its own diameter, whatever of its imager is replaced.
-    return [dataclasses.replace(kind, found_diameter=None) for kind in whole.each]
+    return [dataclasses.replace(one, found_diameter=None) for one in whole.each]
 
 
 def datasheet(
-    design: Design, depths: Sequence[float] | None = None, *, confusion: float | None = None
+    design: Design, depths: Sequence[float] | None = None, *, circle_of_confusion: float | None = None
 ) -> dict[str, Any]:
     """The metrics of a design as numbers for a JSON file, with units in the names.
 
@@ -61,12 +61,12 @@ def datasheet(
     ----------
     design
         The microscope. Its clear diameter is that of a disc as large as a lens's mean clear aperture: what the lenses'
-        discs cover of the plate, by their number. If lenses differ, `kinds` holds spots of each kind, and the lists
-        are of the kind with the narrowest spot at each depth (`sharpest_kind`, from 1); scalars are means of the
+        discs cover of the plate, by their number. If lenses differ, `kinds` holds spots of each type, and the lists
+        are of the type with the narrowest spot at each depth (`sharpest_kind`, from 1); scalars are means of the
         lenses.
     depths
         From the plate, mm; by default seven over the working distance.
-    confusion
+    circle_of_confusion
         Diameter of the circle of confusion on the sensor, mm; by default two pixels (paper, "Depth of field").
 
     Returns
@@ -80,32 +80,35 @@ def datasheet(
         If a depth or the confusion is not positive and finite, or there is no depth.
     """
     depths = _checked(design, depths)
-    centers, kinds = np.array(design.array.centers_mm), microscopes_of(design, depths, confusion=confusion)
+    centers, types = (
+        np.array(design.array.centers_mm),
+        microscopes_of(design, depths, circle_of_confusion=circle_of_confusion),
+    )
     distances = nearest_neighbour_distances(centers)
-    columns = [_columns(m) for m in kinds]
+    columns = [_columns(m) for m in types]
     best = np.argmin([column["spot_width_um"] for column in columns], 0)
     shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
     for name in ("lenses_per_point", "occupancy"):
         shown[name] = np.sum([column[name] for column in columns], 0).tolist()
-    lenses = [len(m.imager.array.centers) for m in kinds]
+    lenses = [len(m.imager.array.centers) for m in types]
     mean = lambda values: _round(float(np.average(values, weights=lenses)))
     return {
         "depth_mm": depths,
         **{name: [_round(value) for value in values] for name, values in shown.items()},
-        "f_number": mean([float(m.f_number) for m in kinds]),
-        "numerical_aperture": mean([float(m.numerical_aperture) for m in kinds]),
-        "focal_length_mm": mean([float(m.focal_length) for m in kinds]),
+        "f_number": mean([float(m.f_number) for m in types]),
+        "numerical_aperture": mean([float(m.numerical_aperture) for m in types]),
+        "focal_length_mm": mean([float(m.focal_length) for m in types]),
         "pitch_mm": _round(float(distances.mean())),
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
-        "coverage": _round(sum(float(m.coverage) for m in kinds)),
-        **({"sharpest_kind": (best + 1).tolist(), "kinds": _kinds(kinds, columns)} if len(kinds) > 1 else {}),
+        "coverage": _round(sum(float(m.coverage) for m in types)),
+        **({"sharpest_kind": (best + 1).tolist(), "kinds": _type_rows(types, columns)} if len(types) > 1 else {}),
     }
 
 
-def _kinds(kinds: Sequence[Microscope], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _type_rows(types: Sequence[Microscope], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
-    for m, column in zip(kinds, columns, strict=True):
+    for m, column in zip(types, columns, strict=True):
         array = m.imager.array
         numbers = {
             "radius_of_curvature_mm": array.radius_of_curvature,
@@ -143,7 +146,7 @@ def _columns(m: Microscope) -> dict[str, Any]:
 def tables(sheet: dict[str, Any]) -> list[Table]:
     """A datasheet to read: an image in focus, how far out of focus it is, and what to expect. All fit 80 columns."""
     made = [_table(title, columns, sheet) for title, columns in _TABLES.items()]
-    return made + ([_table_of_kinds(sheet)] if len(sheet.get("kinds", ())) in range(2, _COLUMNS + 1) else [])
+    return made + ([_table_of_types(sheet)] if len(sheet.get("kinds", ())) in range(2, _COLUMNS + 1) else [])
 
 
 def summary(design: Design, sheet: dict[str, Any]) -> str:
@@ -152,16 +155,16 @@ def summary(design: Design, sheet: dict[str, Any]) -> str:
         f"{design.name}: f = {_plain(sheet['focal_length_mm'])} mm, F/{_plain(sheet['f_number'])}, "
         f"NA {_plain(sheet['numerical_aperture'])}, pitch {_plain(sheet['pitch_mm'])} mm "
         f"(SD {_plain(sheet['pitch_sd_mm'])} mm), field radius {_plain(sheet['field_radius_mm'])} mm, "
-        f"{100 * sheet['coverage']:.1f} % of the plate covered{_kinds_in_words(sheet)}"
+        f"{100 * sheet['coverage']:.1f} % of the plate covered{_types_in_words(sheet)}"
     )
 
 
-def _kinds_in_words(sheet: dict[str, Any]) -> str:
-    if not (kinds := sheet.get("kinds")):
+def _types_in_words(sheet: dict[str, Any]) -> str:
+    if not (types := sheet.get("kinds")):
         return ""
-    focal = [kind["focal_length_mm"] for kind in kinds]
+    focal = [one["focal_length_mm"] for one in types]
     ends = f"f = {_plain(min(focal))} to {_plain(max(focal))} mm"
-    return f"; {len(kinds)} kinds of lenses, {ends}: means above, the sharpest kind at each depth below"
+    return f"; {len(types)} types of lenses, {ends}: means above, the sharpest type at each depth below"
 
 
 _TABLES = {
@@ -189,7 +192,7 @@ _TABLES = {
         "spot_radius_um": "radius of\n80 % of the light",
     },
 }
-# Kinds that a table has room for.
+# Types that a table has room for.
 _COLUMNS = 6
 # Below it a Strehl ratio only says that diffraction does not limit the image.
 _LEAST_STREHL = 0.01
@@ -204,14 +207,14 @@ def _table(title: str, columns: dict[str, str], sheet: dict[str, Any]) -> Table:
     return table
 
 
-def _table_of_kinds(sheet: dict[str, Any]) -> Table:
-    title = "Width at half height by each kind of lens: in the object, um"
+def _table_of_types(sheet: dict[str, Any]) -> Table:
+    title = "Width at half height by each type of lens: in the object, um"
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     table.add_column("depth\nmm", justify="right")
-    for kind in sheet["kinds"]:
-        table.add_column(f"{kind['lenses']} of f =\n{_plain(kind['focal_length_mm'])} mm", justify="right")
+    for one in sheet["kinds"]:
+        table.add_column(f"{one['lenses']} of f =\n{_plain(one['focal_length_mm'])} mm", justify="right")
     for i, depth in enumerate(sheet["depth_mm"]):
-        table.add_row(_plain(depth), *(_plain(kind["spot_width_um"][i]) for kind in sheet["kinds"]))
+        table.add_row(_plain(depth), *(_plain(one["spot_width_um"][i]) for one in sheet["kinds"]))
     return table
 
 
@@ -238,9 +241,9 @@ def _checked(design: Design, depths: Sequence[float] | None) -> list[float]:
     return found
 
 
-def confusion_of(design: Design, confusion: float | None) -> float:
+def circle_of_confusion_of(design: Design, circle_of_confusion: float | None) -> float:
     """The circle of confusion asked for, by default two pixels, mm; `InputError` unless positive and finite."""
-    if confusion is None:
+    if circle_of_confusion is None:
         return 2 * design.sensor.pixel_pitch_um / 1000
-    check_positive("confusion", confusion)
-    return confusion
+    check_positive("circle_of_confusion", circle_of_confusion)
+    return circle_of_confusion

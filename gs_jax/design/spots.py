@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from ..base.arrays import safe_sqrt
 from ..geometry import envelope
 from ..optics import theory
-from ..optics.raytrace import pupil_disc, unit_rays
+from ..optics.raytrace import pupil_quadrature, trace_lenslet
 from .microscope import Microscope
 
 _FIELDS = 4
@@ -25,7 +25,7 @@ def psf_width(c: Microscope) -> Float[Array, " depth"]:
     landing, weight, lit = _spots(c)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
-    airy = theory.airy_deviation(c.imager.wavelength, c.imager.reduced_sensor_distance, c.clear_diameter)
+    airy = theory.airy_sigma(c.imager.wavelength, c.imager.reduced_sensor_distance, c.clear_diameter)
     total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
     return theory.FWHM * jnp.sqrt(total) / c.magnification
 
@@ -66,9 +66,9 @@ def _quantile(x: Float[Array, " entry"], share: Float[Array, " entry"], width: f
 
 def _spots(c: Microscope):
     """Where rays land, `(depth, field, ray, 2)`; the share of each height, and of each ray of it."""
-    points, weights = pupil_disc(c.clear_diameter / 2)
+    points, weights = pupil_quadrature(c.clear_diameter / 2)
     heights = field_heights(c)
-    trace = lambda z, h: unit_rays(c.imager, z, points, (h, jnp.zeros_like(h)))
+    trace = lambda z, h: trace_lenslet(c.imager, z, points, (h, jnp.zeros_like(h)))
     rays = jax.vmap(jax.vmap(trace, (None, 0)), (0, None))(c.depths, heights)
     lit = jnp.where(rays.valid, weights[None, None], 0)
     total = jnp.sum(lit, -1, keepdims=True)

@@ -16,7 +16,7 @@ from scipy.special import bdtrc
 
 from ..base.arrays import check_finite
 from ..geometry import Imager
-from ..optics.raytrace import on_host
+from ..optics.raytrace import to_numpy
 from .background import between, smoothed, square_levels
 
 # Of the Gaussian that evens out where in a pixel a spot is, pixels: most that keeps spots 2.5 pixels apart apart.
@@ -49,7 +49,7 @@ def signal(image: Shaped[Array | np.ndarray, "row column"]) -> Signal:
 class Readings(NamedTuple):
     """What lenses read of points, one row a point; where `seen` is false no lens sees it, and zeros fill the row.
 
-    `kind` says of which kind a lens is, if lenses differ.
+    `lens_type` says of which type a lens is, if lenses differ.
     """
 
     pixels: Float64[np.ndarray, "point lens 2"]
@@ -57,7 +57,7 @@ class Readings(NamedTuple):
     noise: Float64[np.ndarray, "point lens"]
     field: Float64[np.ndarray, "point lens"]
     seen: Bool[np.ndarray, "point lens"]
-    kind: Int[np.ndarray, "point lens"] | None = None
+    lens_type: Int[np.ndarray, "point lens"] | None = None
 
 
 def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Imager) -> Readings:
@@ -70,8 +70,8 @@ def readings(points: Float[np.ndarray, "point 3"], signal: Signal, imager: Image
         image a point beyond the sensor do not see it.
     """
     # In NumPy: other numbers of points need no other program.
-    host = on_host(imager)
-    beside = points[:, :2] - host.lean(points[:, 2])
+    host = to_numpy(imager)
+    beside = points[:, :2] - host.axis_offset(points[:, 2])
     tree = KDTree(host.centers)
     most = max(tree.query_ball_point(beside, imager.field_radius, return_length=True), default=0)
     # With two or more there is an axis of lenses.

@@ -8,13 +8,13 @@ from jaxtyping import Array, Float, Float64, Int, Shaped
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.lens_types import core_side
+from ..optics.lens_types import core_width
 from ..optics.psf_core import apparent_depths
 from .consistency import Signal, agreed_level, log_false_alarms, signal, survival
-from .kinds import kinds_of, readings_of
 from .locate import LIT, SHARE, count_of, searched_voxels
+from .type_views import lens_types_of, readings_of
 
-# Depths at which it is asked which kinds of lenses can see points.
+# Depths at which it is asked which types of lenses can see points.
 _DEPTHS = 9
 # What a file holds in the place of the logarithm of 0.
 _LEAST_LOG = -999.0
@@ -50,10 +50,10 @@ def point_evidence(
     # Cores lie, and are looked for, where chief rays of other depths land.
     ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
     depths = np.concatenate([ends, points[:, 2]])
-    kinds = kinds_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS), core_side(imager))
-    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
+    lens_types = lens_types_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS), core_width(imager))
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
     places[:, 2] = apparent[2:]
-    seen = readings_of(places, light, kinds)
+    seen = readings_of(places, light, lens_types)
     lenses, noise = seen.seen.sum(1), seen.noise.max(1, initial=0)
     level = agreed_level(seen.light, seen.seen, SHARE)
     tests = count_of(searched_voxels(imager, grid.at(apparent[:2])))

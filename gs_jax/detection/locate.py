@@ -19,8 +19,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.lens_types import FIELDS, HALF_SIDE, core_side, warn_if_blurred
-from ..optics.psf_core import apparent_depths, core_shares
+from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
+from ..optics.psf_core import apparent_depths, ensquared_light
 from ..projection.backprojection import backproject
 from .background import in_bands
 from .consistency import (
@@ -35,7 +35,7 @@ from .consistency import (
     survival,
     without_spots,
 )
-from .kinds import Kind, kinds_of, readings_of
+from .type_views import LensType, lens_types_of, readings_of
 
 Points = Float64[np.ndarray, "_ 4"]
 Places = Float64[np.ndarray, "_ 3"]
@@ -141,27 +141,27 @@ def find_points(
     if not isinstance(image, Signal):
         warn_if_blurred(imager, grid, "points", NOT_TRUSTED)
     depths = _around(grid)
-    kinds = kinds_of(imager, depths, core_side(imager))
-    # Of lenses that differ, each kind is read where its own cores land: points are at their depths all along.
-    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(kinds) == 1 else depths
+    lens_types = lens_types_of(imager, depths, core_width(imager))
+    # Of lenses that differ, each type is read where its own cores land: points are at their depths all along.
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
     searched = grid.at(np.interp(np.asarray(grid.depths), depths, apparent))
     voxels = searched_voxels(imager, searched)
     # What is less is not lit.
     least = LIT * float(seen.noise.min())
     as_bright = survival(seen.light, least)
-    points, spots, own = _consistent(np.zeros((0, 3)), seen, as_bright, kinds, voxels)
+    points, spots, own = _consistent(np.zeros((0, 3)), seen, as_bright, lens_types, voxels)
     for _ in range(_SEARCHES):
         rest = seen._replace(light=without_spots(seen.light, spots, own))
         # A spot between two voxels must not be missed.
         wide = rest._replace(light=_brightest_neighbour(rest.light))
-        new = _candidates(wide, kinds, voxels, progress)
+        new = _candidates(wide, lens_types, voxels, progress)
         with progress.step("Comparing lenses"):
-            lit = _lit(readings_of(new, wide, kinds), survival(wide.light, least), count_of(voxels))
-            new = _refined(new[lit], voxels, rest, kinds)
-            points, spots, own = _consistent(np.concatenate([points, new]), seen, as_bright, kinds, voxels)
+            lit = _lit(readings_of(new, wide, lens_types), survival(wide.light, least), count_of(voxels))
+            new = _refined(new[lit], voxels, rest, lens_types)
+            points, spots, own = _consistent(np.concatenate([points, new]), seen, as_bright, lens_types, voxels)
     # Until here, depths were those of chief rays.
     points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
-    found = np.column_stack([points, _intensity(points, spots, own, seen, kinds)])
+    found = np.column_stack([points, _intensity(points, spots, own, seen, lens_types)])
     found = found[_inside(found, grid, float(voxels.depths[1] - voxels.depths[0]) / _COARSE)]
     return found[np.argsort(-found[:, 3], kind="stable")]
 
@@ -220,7 +220,7 @@ def _brightest_neighbour(light: Float32[np.ndarray, "row column"]) -> Float32[np
     return result
 
 
-def _candidates(rest: Signal, kinds: Sequence[Kind], voxels: Grid, progress: Progress) -> Places:
+def _candidates(rest: Signal, lens_types: Sequence[LensType], voxels: Grid, progress: Progress) -> Places:
     """Local maxima of the summed logarithms, at voxels."""
     bright = np.empty_like(rest.light)
 
@@ -235,7 +235,7 @@ def _candidates(rest: Signal, kinds: Sequence[Kind], voxels: Grid, progress: Pro
     found = [np.zeros((0, 3))]
     for first in progress.track(range(0, last - 1, inner), "Searching for points"):
         some = np.minimum(first + np.arange(inner + 2), last)
-        volume = _summed(image, kinds, voxels.at(voxels.depths[some]))
+        volume = _summed(image, lens_types, voxels.at(voxels.depths[some]))
         is_maximum = np.asarray(_is_maximum(volume))
         # NumPy takes long to find them in three dimensions at once.
         maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
@@ -243,12 +243,15 @@ def _candidates(rest: Signal, kinds: Sequence[Kind], voxels: Grid, progress: Pro
     return np.concatenate(found)
 
 
-def _summed(image, kinds: Sequence[Kind], voxels: Grid) -> Float[Array, "depth y x"]:
+def _summed(image, lens_types: Sequence[LensType], voxels: Grid) -> Float[Array, "depth y x"]:
     """`backproject` by all lenses that can see each plane."""
-    if len(kinds) == 1:
-        return backproject(image, kinds[0].imager, voxels)
+    if len(lens_types) == 1:
+        return backproject(image, lens_types[0].imager, voxels)
     depths = np.asarray(voxels.depths, np.float64)
-    light = [(kind.sees(depths), backproject(image, kind.imager, voxels.at(kind.place(depths)))) for kind in kinds]
+    light = [
+        (lens_type.sees(depths), backproject(image, lens_type.imager, voxels.at(lens_type.place(depths))))
+        for lens_type in lens_types
+    ]
     parts = [jnp.where(seen[:, None, None], volume, 0) for seen, volume in light]
     return sum(parts[1:], parts[0])
 
@@ -264,14 +267,14 @@ def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
     return highest
 
 
-def _refined(points: Places, voxels: Grid, rest: Signal, kinds: Sequence[Kind]) -> Places:
+def _refined(points: Places, voxels: Grid, rest: Signal, lens_types: Sequence[LensType]) -> Places:
     """Points moved uphill between the voxels: to the best of 27 places, twice as close each time."""
     step = float(voxels.depths[1] - voxels.depths[0])
     around = (np.array(list(np.ndindex(3, 3, 3))) - 1) * (voxels.pitch, voxels.pitch, step)
     each = np.arange(len(points))
     for part in 0.5 ** np.arange(1, _REFINEMENTS + 1):
         places = points[:, None] + part * around
-        seen = readings_of(places.reshape(-1, 3), rest, kinds)
+        seen = readings_of(places.reshape(-1, 3), rest, lens_types)
         brightness = _brightness(seen.light, seen.noise).sum(1).reshape(places.shape[:2])
         points = places[each, brightness.argmax(1)]
     return points
@@ -286,14 +289,14 @@ def _lit(seen: Readings, as_bright, tests: int) -> np.ndarray:
 
 
 def _consistent(
-    candidates: Places, signal: Signal, as_bright, kinds: Sequence[Kind], voxels: Grid
+    candidates: Places, signal: Signal, as_bright, lens_types: Sequence[LensType], voxels: Grid
 ) -> tuple[Places, Readings, Float64[np.ndarray, "point lens"]]:
     """The points among the candidates, their readings, and their own part of what was read.
 
     Brightest first; from the readings of each, the light of the points before it is taken away. Nearer than a coarse
     voxel to one of them there is no other point, only the rim of its spot.
     """
-    seen = readings_of(candidates, signal, kinds)
+    seen = readings_of(candidates, signal, lens_types)
     order = np.argsort(-agreed_level(seen.light, seen.seen, SHARE), kind="stable")
     candidates, seen = candidates[order], select_readings(seen, order)
     tests = count_of(voxels)
@@ -319,7 +322,7 @@ def _consistent(
 
 
 def _intensity(
-    points: Places, seen: Readings, own: np.ndarray, signal: Signal, kinds: Sequence[Kind]
+    points: Places, seen: Readings, own: np.ndarray, signal: Signal, lens_types: Sequence[LensType]
 ) -> Float64[np.ndarray, " point"]:
     """What the points send out, the median of the lenses.
 
@@ -330,9 +333,9 @@ def _intensity(
     middle = np.floor(seen.pixels + 0.5).astype(int)
     row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(signal.light.shape))
     total = signal.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
-    expected = _expected(points, seen, kinds[0].imager)
-    for number, kind in enumerate(kinds[1:], 1):
-        expected = np.where(seen.kind == number, _expected(points, seen, kind.imager), expected)
+    expected = _expected(points, seen, lens_types[0].imager)
+    for number, lens_type in enumerate(lens_types[1:], 1):
+        expected = np.where(seen.lens_type == number, _expected(points, seen, lens_type.imager), expected)
     use = seen.seen & (seen.light > 0) & (expected > 0)
     ratio = np.where(use, total * own / np.where(use, seen.light * expected, 1), 0)
     return np.array([np.median(some[which]) if which.any() else 0.0 for some, which in zip(ratio, use, strict=True)])
@@ -344,7 +347,7 @@ def _expected(points: Places, seen: Readings, imager: Imager) -> Float64[np.ndar
         return np.zeros_like(seen.light)
     depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
     fields = np.linspace(0, imager.field_radius, FIELDS)
-    shares = core_shares(imager, depths, fields, core_side(imager))
+    shares = ensquared_light(imager, depths, fields, core_width(imager))
     place = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
     at = np.stack(np.broadcast_arrays(place, seen.field / fields[1]))
     return map_coordinates(shares, at.reshape(2, -1), order=1, mode="nearest").reshape(seen.field.shape)

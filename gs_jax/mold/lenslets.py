@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.integrate import cumulative_simpson
 from scipy.spatial import Delaunay, KDTree
 
-from ..lenses import MicrolensArray, sag, steepness
+from ..lenses import MicrolensArray, sag, sag_slope_over_r
 
 # Of walls, from the axis: usual for what is to come off a mold.
 DRAFT = math.radians(5)
@@ -47,9 +47,9 @@ class Cap:
         """How far the surface is below its vertex at a squared distance from the axis, mm."""
         return sag(np.asarray(squared, float), self.radius, self.conic, self.terms)
 
-    def steepness(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    def sag_slope_over_r(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """Slope over the distance from the axis, 1/mm."""
-        return steepness(np.asarray(squared, float), self.radius, self.conic, self.terms)
+        return sag_slope_over_r(np.asarray(squared, float), self.radius, self.conic, self.terms)
 
     @property
     def rim(self) -> float:
@@ -75,7 +75,7 @@ class Cap:
         squared = np.linspace(0, reach, 257) ** 2
         if not ((1 + self.conic) * squared < self.radius**2).all():
             return False
-        steep = self.steepness(squared)
+        steep = self.sag_slope_over_r(squared)
         return bool((steep > 0).all() and (steep * np.sqrt(squared) <= math.tan(STEEPEST)).all())
 
 
@@ -271,7 +271,7 @@ def estimated_facets(caps: list[Cap], reaches: list[float], chord: float) -> flo
 
 def _maps(cap, reach) -> _Maps:
     r = np.linspace(0, reach, _RADII)
-    steep = cap.steepness(r**2)
+    steep = cap.sag_slope_over_r(r**2)
     stretch = np.sqrt(1 + (r * steep) ** 2)
     integral = lambda values: cumulative_simpson(values, x=r, initial=0)
     # (stretch - 1) / r, without a division by zero on the axis.
@@ -281,7 +281,7 @@ def _maps(cap, reach) -> _Maps:
 
 def _curvatures(cap, r):
     """The mean curvature at radii from 0 on, and the largest principal one, 1/mm."""
-    steep = cap.steepness(r**2)
+    steep = cap.sag_slope_over_r(r**2)
     stretch = np.sqrt(1 + (r * steep) ** 2)
     meridian, parallel = np.gradient(r * steep, r, edge_order=2) / stretch**3, steep / stretch
     return (meridian + parallel) / 2, float(max(np.abs(meridian).max(), parallel.max()))

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..design.design import Design
-from ..layouts import cell_edges, coverage, largest_hole
+from ..layouts import cell_edges, coverage, max_gap
 from ..lenses import MicrolensArray
 from .export import Mesh
 from .lenslets import STEEPEST, cap_sag, caps_of, estimated_facets, surface, visible_reaches
@@ -120,7 +120,7 @@ def _slope(array: MicrolensArray) -> Finding:
         text = f"`lens.aperture_diameter_mm`: found {fault.found}, allowed: {allowed}."
         return Finding("edge slope", "error", text)
     radii = [np.linspace(0, cap.reach, 257) for cap in caps]
-    slope = max(float((r * cap.steepness(r**2)).max()) for cap, r in zip(caps, radii, strict=True))
+    slope = max(float((r * cap.sag_slope_over_r(r**2)).max()) for cap, r in zip(caps, radii, strict=True))
     degrees, critical = math.degrees(math.atan(slope)), math.degrees(math.asin(1 / float(array.refractive_index)))
     is_sphere = array.alike and caps[0].conic == 0 and not caps[0].terms
     text = f"the lenses slope by {'asin(D / 2R) =' if is_sphere else 'up to'} {degrees:.3g} degrees"
@@ -188,7 +188,7 @@ def _holes(array: MicrolensArray) -> Finding:
         share = 1 - coverage(centers, array.size, diameter=float(array.aperture_diameter))
     else:
         share = float((_owners(array) < 0).mean())
-    hole = largest_hole(centers, array.size)
+    hole = max_gap(centers, array.size)
     if share < 1e-6:
         return Finding("coverage", "ok", "lenses cover the whole plate.")
     area = share * math.prod(array.size)

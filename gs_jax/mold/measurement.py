@@ -162,7 +162,7 @@ def _outside(points, its: _Found):
     """
     spoke = points[..., :2] - its.cap.center
     squared = np.minimum((spoke**2).sum(axis=-1), its.cap.reach**2)
-    steep = its.cap.steepness(squared)[..., None]
+    steep = its.cap.sag_slope_over_r(squared)[..., None]
     normal = np.concatenate([steep * spoke, -np.ones_like(steep)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return (points[..., 2] - its.vertex - its.cap.sag(squared)) * normal[..., 2], normal

@@ -33,7 +33,7 @@ from ..lenses import MicrolensArray
 from ..typing import Real, Result
 
 
-class Wavefront(eqx.Module):
+class WavefrontCoefficients(eqx.Module):
     """Coefficients of a wavefront error at the edge of the pupil, mm.
 
     `spherical` (W040), `coma` (W131), `astigmatism` (W222), `field_curvature` (W220) and `defocus` (W020) multiply
@@ -47,7 +47,7 @@ class Wavefront(eqx.Module):
     defocus: Float[Array, "..."]
 
 
-class Terms(eqx.Module):
+class RmsTerms(eqx.Module):
     """Root-mean-square wavefront errors of independent terms, mm; all are positive."""
 
     spherical: Float[Array, "..."]
@@ -66,7 +66,7 @@ def seidel(
     *,
     plano_to_object: bool = True,
     departure: Real = 0.0,
-) -> Wavefront:
+) -> WavefrontCoefficients:
     """Wavefront error of a plano-convex lens for a point beside its axis.
 
     Parameters
@@ -95,12 +95,12 @@ def seidel(
     s3 = a**2 * angle**2 * power
     s4 = s3 / n
     defocus = a**2 / 2 * (power - toward - 1 / jnp.asarray(sensor_distance))
-    return Wavefront(s1 / 8, s2 / 2 if plano_to_object else -s2 / 2, s3 / 2, (s3 + s4) / 4, defocus)
+    return WavefrontCoefficients(s1 / 8, s2 / 2 if plano_to_object else -s2 / 2, s3 / 2, (s3 + s4) / 4, defocus)
 
 
-def of_array(
+def seidel_of_array(
     array: MicrolensArray, pupil_radius: Real, reduced_depth: Real, field_height: Real, sensor_distance: Real
-) -> Wavefront:
+) -> WavefrontCoefficients:
     """`seidel` of an array's lens; of an ideal thin lens nothing but the defocus.
 
     The sensor's distance is the reduced one, `v'`.
@@ -111,10 +111,10 @@ def of_array(
     if array.thin_lens_focal_length is None:
         return error
     nothing = jnp.zeros_like(error.coma)
-    return Wavefront(nothing, nothing, nothing, nothing, nothing + error.defocus)
+    return WavefrontCoefficients(nothing, nothing, nothing, nothing, nothing + error.defocus)
 
 
-def balanced_rms(error: Wavefront) -> Terms:
+def balanced_rms(error: WavefrontCoefficients) -> RmsTerms:
     """RMS of each term with the tilt and defocus that balance it, and of the defocus that is left.
 
     `W040 / (6 sqrt 5)`, `W131 / (6 sqrt 2)`, `W222 / (2 sqrt 6)`, `(W020 + W220 + W040 + W222/2) / (2 sqrt 3)`: the
@@ -122,7 +122,7 @@ def balanced_rms(error: Wavefront) -> Terms:
     The tilt moves the image and blurs nothing.
     """
     left = error.defocus + error.field_curvature + error.spherical + error.astigmatism / 2
-    return Terms(
+    return RmsTerms(
         jnp.abs(error.spherical) / (6 * math.sqrt(5)),
         jnp.abs(error.coma) / (6 * math.sqrt(2)),
         jnp.abs(error.astigmatism) / (2 * math.sqrt(6)),
@@ -130,18 +130,18 @@ def balanced_rms(error: Wavefront) -> Terms:
     )
 
 
-def linear_rms(error: Wavefront) -> Result:
+def linear_rms(error: WavefrontCoefficients) -> Result:
     """`dw = dw_c + dw_s + dw_d` as printed (Eq. 10), mm: balanced coma and spherical aberration, and defocus.
 
     Errors that are independent do not add up like this: it is an upper bound. Astigmatism and field curvature are not
     in it.
     """
     nothing = jnp.zeros_like(error.spherical)
-    terms = balanced_rms(Wavefront(error.spherical, error.coma, nothing, nothing, error.defocus))
+    terms = balanced_rms(WavefrontCoefficients(error.spherical, error.coma, nothing, nothing, error.defocus))
     return terms.coma + terms.spherical + terms.defocus
 
 
-def independent_rms(error: Wavefront) -> Result:
+def independent_rms(error: WavefrontCoefficients) -> Result:
     """Standard deviation of the wavefront less its tilt, the root of the sum of the balanced squares, mm."""
     terms = balanced_rms(error)
     return safe_sqrt(terms.spherical**2 + terms.coma**2 + terms.astigmatism**2 + terms.defocus**2)
@@ -167,10 +167,10 @@ def linear_field_radius(
     """Field height where the Strehl ratio is half of that on the axis (paper, "Field of view"), by Eqs. 9 and 10, mm.
 
     Coma alone grows with the field there, `dw(h) = dw(0) + k h`. With `L = ln 2 (lambda / 2 pi)^2` the height solves
-    `dw(h)^2 = dw(0)^2 + L`. Parameters as in `of_array`; see `strehl` for where this means something. Without coma, as
-    of an ideal lens, it is infinite.
+    `dw(h)^2 = dw(0)^2 + L`. Parameters as in `seidel_of_array`; see `strehl` for where this means something. Without
+    coma, as of an ideal lens, it is infinite.
     """
-    error = of_array(array, pupil_radius, reduced_depth, 1.0, sensor_distance)
+    error = seidel_of_array(array, pupil_radius, reduced_depth, 1.0, sensor_distance)
     slope = balanced_rms(error).coma
     axis = linear_rms(error) - slope
     drop = math.log(2) * (jnp.asarray(wavelength) / (2 * math.pi)) ** 2

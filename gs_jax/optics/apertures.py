@@ -165,7 +165,7 @@ def _first_root(function, end):
     return at, jax.grad(function)(at)
 
 
-class Cells(eqx.Module):
+class VoronoiCells(eqx.Module):
     """What bounds the Voronoi cells of lenses: with it the mean clear aperture of lenses that are alike is a short sum.
 
     Of each edge of each cell its `lens`, what is `beyond` it (as of `gs_jax.layouts.Edges`), and the edges
@@ -178,7 +178,7 @@ class Cells(eqx.Module):
     after: Int[Array, " edge"]
 
 
-def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cells:
+def voronoi_cells(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> VoronoiCells:
     """The cells of lenses on a plate. Host code."""
     # A reconstruction needs no cells, and SciPy's import takes as long as a back-projection.
     from ..layouts import cell_edges
@@ -190,10 +190,10 @@ def cells_of(centers: Float[np.ndarray, "lens 2"], size: Sequence[float]) -> Cel
     first, last = (np.searchsorted(lens, lens, side) for side in ("left", "right"))
     here = np.arange(count)
     before, after = np.where(here == first, last, here) - 1, np.where(here + 1 == last, first, here + 1)
-    return Cells(*(jnp.asarray(part) for part in (lens, edges.beyond[order], before, after)))
+    return VoronoiCells(*(jnp.asarray(part) for part in (lens, edges.beyond[order], before, after)))
 
 
-def clear_diameter(array: MicrolensArray, *, cells: Cells | None = None) -> Float[Array, ""]:
+def clear_diameter(array: MicrolensArray, *, cells: VoronoiCells | None = None) -> Float[Array, ""]:
     """Diameter of the disc whose area is the mean clear aperture of the lenses, mm.
 
     Parameters
@@ -207,15 +207,15 @@ def clear_diameter(array: MicrolensArray, *, cells: Cells | None = None) -> Floa
 def clear_diameters(
     array: MicrolensArray, lenses: tuple[tuple[int, ...], ...], *, directions: int = 512
 ) -> Float[Array, " kind"]:
-    """`clear_diameter` of the lenses of each kind, all found at once; `lenses` are which, `directions` as above."""
+    """`clear_diameter` of the lenses of each type, all found at once; `lenses` are which, `directions` as above."""
     return jnp.sqrt(4 / math.pi * _mean_areas(directions, lenses, array, None))
 
 
 # A few numbers of many: by reverse passes all derivatives cost as much as a few, and whatever asks for them again
 # computes the same, which XLA sees.
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _mean_areas(directions: int, lenses, array: MicrolensArray, cells: Cells | None) -> Float[Array, " kind"]:
-    """Of each kind, or of all lenses."""
+def _mean_areas(directions: int, lenses, array: MicrolensArray, cells: VoronoiCells | None) -> Float[Array, " kind"]:
+    """Of each type, or of all lenses."""
     if cells is not None:
         return _area_of_cells(array, cells)[None] / len(array.centers)
     areas = aperture_area(array, directions=directions)
@@ -231,7 +231,7 @@ def _(directions, lenses, primals, tangents):
     return areas, sum(jnp.tensordot(slope, change, change.ndim) for slope, change in pairs)
 
 
-def _area_of_cells(array: MicrolensArray, cells: Cells):
+def _area_of_cells(array: MicrolensArray, cells: VoronoiCells):
     """Of all lenses."""
     centers = array.centers
     sides = jnp.array([[-1, 0], [1, 0], [0, -1], [0, 1]], centers.dtype)
@@ -249,7 +249,7 @@ def _area_of_cells(array: MicrolensArray, cells: Cells):
         return (height[edge] - height * cos) / sin
 
     radius = array.aperture_diameter / 2
-    ends = wedge(crossing(cells.after), height, radius) - wedge(crossing(cells.before), height, radius)
+    ends = wedge_area(crossing(cells.after), height, radius) - wedge_area(crossing(cells.before), height, radius)
     return jnp.sum(ends)
 
 
@@ -298,11 +298,11 @@ def _disc_within(normal, height, radius):
     tie = (height[None] == height[:, None]) & (order[None] < order[:, None])
     hidden = jnp.any(~crossing & (cos > 0) & ((height[None] < height[:, None]) | tie), axis=1)
     edge = ~hidden & (low < high)
-    wedges = wedge(jnp.where(edge, high, 0), height, radius) - wedge(jnp.where(edge, low, 0), height, radius)
+    wedges = wedge_area(jnp.where(edge, high, 0), height, radius) - wedge_area(jnp.where(edge, low, 0), height, radius)
     return jnp.sum(wedges)
 
 
-def wedge(end, height, radius):
+def wedge_area(end, height, radius):
     """Area that a disc shares with the triangle from its centre to a line at `height`, from the foot to `end`."""
     half_chord = safe_sqrt(radius**2 - height**2)
     inside = jnp.clip(end, -half_chord, half_chord)

@@ -24,17 +24,17 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from .psf_core import (
     RINGS,
-    Cores,
-    Zones,
+    ApertureProfile,
+    PsfCores,
+    add_diffraction,
+    aperture_profile,
     clear_area,
-    core_tables,
-    diffracted,
-    drawn,
+    render_kernel,
     ring_edges,
     ring_light,
-    spot_rays,
-    spread,
-    zones,
+    sample_profile,
+    sample_pupil,
+    trace_cores,
 )
 
 # Widest field, in reduced depths of the nearest plane: beyond, a lens passes on a third of its light and less.
@@ -51,11 +51,12 @@ _STEEP = 8
 _HALO_RAYS, _CORE_SAMPLES = 16384, 2048
 
 
-class HaloGrid(NamedTuple):
+class PolarGrid(NamedTuple):
     """Polar nodes about a lens's axis, on the object's side and on the sensor's.
 
     `step`: distance of the inner nodes in the object, mm; `pixel`: of those on the sensor. `bend`: radius at which
-    they begin to spread, in steps. `angles`, `fields`, `radii`: numbers of nodes, around and outward on either side.
+    they begin to sample_profile, in steps. `angles`, `fields`, `radii`: numbers of nodes, around and outward on either
+    side.
     """
 
     step: float
@@ -76,7 +77,7 @@ class HaloGrid(NamedTuple):
         return np.pi * np.diff(edges**2) / self.angles
 
 
-def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float) -> HaloGrid:
+def _polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float) -> PolarGrid:
     """Nodes for a range of depths.
 
     Parameters
@@ -100,11 +101,16 @@ def halo_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], most: float
     count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
     largest = float(imager.magnification(float(depths.min()))) / middle
     radii = count((1 + _BEYOND) * largest * widest / step)
-    return HaloGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
+    return PolarGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
 
 
-def halo_table(
-    imager: Imager, depth: float, aperture: Zones, grid: HaloGrid, cores: Cores, ends: Sequence[float] = RINGS
+def stray_light_table(
+    imager: Imager,
+    depth: float,
+    aperture: ApertureProfile,
+    grid: PolarGrid,
+    cores: PsfCores,
+    ends: Sequence[float] = RINGS,
 ) -> Float32[np.ndarray, "kind harmonic radius field"]:
     """From each object harmonic over the fields to the image's over the radii, at one depth.
 
@@ -112,19 +118,19 @@ def halo_table(
     An object in the direction `phi` is imaged in the opposite one, from which the image's angle counts.
     """
     fields = grid.step * grid.nodes(grid.fields)
-    rays = diffracted(imager, spot_rays(imager, depth, fields, aperture, _HALO_RAYS))
+    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _HALO_RAYS))
     chief = float(imager.magnification(float(depth)))
     table = np.zeros((2, grid.fields, grid.radii * grid.angles))
     share = lambda landing, light: np.stack([_shared(grid, *one) for one in zip(landing, light, strict=True)])
     table[0] = share(rays.landing, rays.light)
     if aperture.by_area.any():
-        table[1] = share(rays.landing, rays.light_by_area)
-    for (inner, outer), stretch, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
+        table[1] = share(rays.landing, rays.light_per_area)
+    for (inner, outer), distortion, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
         # The share of a core's light that a lens has at each field.
         amount = np.asarray(ring_light(fields**2, light, inner, outer), np.float64)
-        core = imager.sensor.pixel_pitch * spread(profile, _CORE_SAMPLES)
+        core = imager.sensor.pixel_pitch * sample_profile(profile, _CORE_SAMPLES)
         for field in np.flatnonzero(amount):
-            landing = core - [chief * stretch * fields[field], 0]
+            landing = core - [chief * distortion * fields[field], 0]
             table[0, field] -= _shared(grid, landing, np.full(len(core), amount[field] / len(core)))
     around = table.reshape(2, grid.fields, grid.radii, grid.angles)
     # Spots are symmetric about the field's direction: their spectra are real.
@@ -132,14 +138,14 @@ def halo_table(
     return spectra.transpose(0, 3, 2, 1).astype(np.float32)
 
 
-def _resolved(grid: HaloGrid) -> Float64[np.ndarray, "radius harmonic"]:
+def _resolved(grid: PolarGrid) -> Float64[np.ndarray, "radius harmonic"]:
     """Near the axis nodes are closer together than pixels, which would sample what they cannot resolve."""
     finest = np.pi * np.maximum(grid.nodes(grid.radii), 0.5)
     return 1 / (1 + (np.arange(grid.angles // 2 + 1) / finest[:, None]) ** _STEEP)
 
 
-def polar_shares(
-    grid: HaloGrid, count: int, x: Num[np.ndarray, " place"], y: Num[np.ndarray, " place"]
+def polar_weights(
+    grid: PolarGrid, count: int, x: Num[np.ndarray, " place"], y: Num[np.ndarray, " place"]
 ) -> tuple[Int[np.ndarray, " entry"], Int[np.ndarray, " entry"], Float64[np.ndarray, " entry"]]:
     """How the four nodes around each place share it, bilinearly in the nodes' numbers: (place, node, share).
 
@@ -162,7 +168,7 @@ def polar_shares(
 def _shared(grid, landing, light):
     """Light of rays on the polar nodes, `(radius angle)`."""
     x, y = -landing.T / grid.pixel
-    ray, node, share = polar_shares(grid, grid.radii, x, y)
+    ray, node, share = polar_weights(grid, grid.radii, x, y)
     return np.bincount(node, light[ray] * share, grid.radii * grid.angles)
 
 
@@ -170,13 +176,13 @@ def _shared(grid, landing, light):
 CORE_REACH = 5
 
 
-class Halo(eqx.Module):
-    """All light but the cores', at some depths; made by `halo_of`.
+class StrayLight(eqx.Module):
+    """All light but the cores', at some depths; made by `trace_stray_light`.
 
     Parameters
     ----------
     table
-        Of `gs_jax.optics.field_varying.halo_table`, one a depth.
+        Of `gs_jax.optics.field_varying.stray_light_table`, one a depth.
     area
         Mean clear area of the lenses, mm^2.
     sensor_distance
@@ -188,7 +194,7 @@ class Halo(eqx.Module):
     table: Float[Array, "depth kind harmonic radius field"]
     area: Float[Array, ""]
     sensor_distance: Float[Array, ""]
-    grid: HaloGrid = eqx.field(static=True)
+    grid: PolarGrid = eqx.field(static=True)
 
     @property
     def reach(self) -> float:
@@ -196,15 +202,15 @@ class Halo(eqx.Module):
         return CORE_REACH * self.grid.pixel
 
 
-class FullOptics(eqx.Module):
-    """Where all of a point's light goes, at some depths; made by `full_optics`.
+class FieldVaryingPsf(eqx.Module):
+    """Where all of a point's light goes, at some depths; made by `field_varying_psf`.
 
     A lens's spot has a core, sharp, where the field is not too wide, and a halo, which is everything else. Cores
     are splatted ring by ring, and each ring has one kernel. The halo is computed on coarse pixels.
 
     Parameters
     ----------
-    stretch
+    distortion
         Magnification of the cores, over the chief ray's.
     light
         Coefficients of `gs_jax.optics.psf_core.ring_light`.
@@ -218,23 +224,23 @@ class FullOptics(eqx.Module):
         Where the rings end, in field radii.
     """
 
-    stretch: Float[Array, "depth ring"]
+    distortion: Float[Array, "depth ring"]
     light: Float[Array, "depth ring coefficient"]
     kernel: Float[Array, "depth size size"]
     wide_kernels: Float[Array, "depth outer small small"]
-    halo: Halo
+    halo: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
 
 
-def full_optics(
+def field_varying_psf(
     imager: Imager,
     depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
     *,
     extent: float | None = None,
-    nodes: HaloGrid | None = None,
+    nodes: PolarGrid | None = None,
     rings: Sequence[float] = RINGS,
     progress: Progress | None = None,
-) -> FullOptics:
+) -> FieldVaryingPsf:
     """The tables of a microscope at some depths, by exact rays; a second each, and the last ones are kept.
 
     They are constants to JAX: derivatives of an image by the lens centres and the sensor's distance move the spots and
@@ -249,8 +255,8 @@ def full_optics(
     extent
         Size of the object, mm: no light is followed that comes from farther off. By default the sensor's.
     nodes
-        Of the halo, by `halo_nodes`: what is compiled for tables of some nodes serves others of the same. By default
-        those that suit the depths.
+        Of the halo, by `make_polar_grid`: what is compiled for tables of some nodes serves others of the same. By
+        default those that suit the depths.
     rings
         Where the rings of the field end that have a core each, in field radii. Fewer are faster and less true,
         such as `(1.0, 2.5)`.
@@ -259,12 +265,12 @@ def full_optics(
 
     Examples
     --------
-    >>> image = forward(volume, imager, grid, full_optics(imager, grid.depths))
+    >>> image = forward(volume, imager, grid, field_varying_psf(imager, grid.depths))
     """
     depths = np.asarray(depths, np.float64)
     leaves, structure = jax.tree.flatten(imager)
     same = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
-    nodes = nodes or halo_nodes(imager, depths, extent=extent)
+    nodes = nodes or make_polar_grid(imager, depths, extent=extent)
     return _tables(_Wanted(same, nodes, tuple(rings), imager, depths, progress))
 
 
@@ -273,51 +279,51 @@ class _Wanted:
     """What tables are asked for; equal if the tables are."""
 
     same: tuple
-    grid: HaloGrid
+    grid: PolarGrid
     rings: tuple[float, ...]
     imager: Imager = dataclasses.field(compare=False)
     depths: Float64[np.ndarray, " depth"] = dataclasses.field(compare=False)
     progress: Progress | None = dataclasses.field(compare=False)
 
 
-# Capture after capture of a microscope has the same tables, one for each kind of lens; these are kept, some 80 MiB each
+# Capture after capture of a microscope has the same tables, one for each type of lens; these are kept, some 80 MiB each
 # at full scale.
 @lru_cache(maxsize=4)
 def _tables(wanted):
     imager, depths, grid, progress = wanted.imager, wanted.depths, wanted.grid, wanted.progress
-    cores = core_tables(imager, depths, CORE_REACH * grid.pixel, wanted.rings, progress)
-    halo = halo_of(imager, depths, grid, cores, wanted.rings, progress)
+    cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, wanted.rings, progress)
+    halo = trace_stray_light(imager, depths, grid, cores, wanted.rings, progress)
     size = kernel_size(imager, halo)
-    kernel = np.stack([drawn(profile, size) for profile in cores.profile[:, 0]])
+    kernel = np.stack([render_kernel(profile, size) for profile in cores.profile[:, 0]])
     outer = cores.profile[:, 1:]
-    wide = np.stack([[drawn(profile, size // 4 * 2 + 1, 0.5) for profile in profiles] for profiles in outer])
-    tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.stretch, cores.light, kernel, wide))
-    stretch, light, kernel, wide = tables
-    return FullOptics(stretch, light, kernel, wide, halo, wanted.rings)
+    wide = np.stack([[render_kernel(profile, size // 4 * 2 + 1, 0.5) for profile in profiles] for profiles in outer])
+    tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.distortion, cores.light, kernel, wide))
+    distortion, light, kernel, wide = tables
+    return FieldVaryingPsf(distortion, light, kernel, wide, halo, wanted.rings)
 
 
-def halo_nodes(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> HaloGrid:
+def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> PolarGrid:
     """The halo's nodes for a range of depths and an object's extent, mm; by default the sensor's."""
     extent = extent or 2 * max(map(abs, imager.sensor.extent))
     farthest = float(jnp.abs(imager.array.centers).max()) + extent / 2
-    return halo_grid(imager, depths, math.sqrt(2) * farthest)
+    return _polar_grid(imager, depths, math.sqrt(2) * farthest)
 
 
-def halo_of(
+def trace_stray_light(
     imager: Imager,
     depths: Float64[np.ndarray, " depth"],
-    grid: HaloGrid,
-    cores: Cores,
+    grid: PolarGrid,
+    cores: PsfCores,
     ends: Sequence[float] = RINGS,
     progress: Progress | None = None,
-) -> Halo:
+) -> StrayLight:
     """What the cores leave of the light at each depth, theirs being those of rings with these ends, in field radii."""
-    aperture = zones(imager.array)
-    each = zip(depths, map(Cores, *cores), strict=True)
-    tables = in_threads(lambda one: halo_table(imager, one[0], aperture, grid, one[1], ends), each)
+    aperture = aperture_profile(imager.array)
+    each = zip(depths, map(PsfCores, *cores), strict=True)
+    tables = in_threads(lambda one: stray_light_table(imager, one[0], aperture, grid, one[1], ends), each)
     tracked = zip((progress or Progress()).track(depths, "Tracing halos"), tables, strict=True)
     table = np.stack([table for _, table in tracked])
-    return Halo(
+    return StrayLight(
         jnp.asarray(table, imager.sensor_distance.dtype),
         jnp.mean(clear_area(imager.array)),
         imager.reduced_sensor_distance,
@@ -325,6 +331,6 @@ def halo_of(
     )
 
 
-def kernel_size(imager: Imager, halo: Halo) -> int:
+def kernel_size(imager: Imager, halo: StrayLight) -> int:
     """Pixels along a side of a core's kernel, odd."""
     return 2 * round(halo.reach / imager.sensor.pixel_pitch) + 1

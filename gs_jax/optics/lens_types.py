@@ -1,6 +1,6 @@
-"""Optics of lenses that differ: what is computed for one lens unit, for each kind of lens, and how much a kind counts.
+"""Optics of lenses that differ: what is computed for one lens unit, for each type of lens, and how much a kind counts.
 
-Images are linear in the lenses: the image by all is the sum of the images by each kind, whose lenses are alike.
+Images are linear in the lenses: the image by all is the sum of the images by each type, whose lenses are alike.
 
 Whether a microscope is in focus: the part of a spot's light that falls into its core. Host code."""
 
@@ -15,42 +15,37 @@ from jaxtyping import Array, Float, Float64
 from ..base.errors import InputWarning
 from ..geometry import Imager
 from ..grid import Grid
-from ..lenses import kinds
-from .field_varying import FullOptics
-from .psf_core import clear_area, core_shares
+from ..lenses import lenses_by_type
+from .field_varying import FieldVaryingPsf
+from .psf_core import clear_area, ensquared_light
 
 # Points of the field at which a lens's light is computed.
 _LIGHT_FIELDS = 17
 
 
-class KindOptics(eqx.Module):
-    """Optics of each kind of lens; `gs_jax.optics_of` makes it.
+class PerTypePsf(eqx.Module):
+    """Optics of each type of lens; `gs_jax.optics_of` makes it.
 
-    `lenses`: which are of the kind. `optics`: its PSF at each depth, with the sum of the light that it has over that of
+    `lenses`: which are of the type. `optics`: its PSF at each depth, with the sum of the light that it has over that of
     the mean lens; or all of its light.
     """
 
     lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    optics: tuple[Float[Array, "_ _ _"] | FullOptics, ...]  # each of its own size
+    optics: tuple[Float[Array, "_ _ _"] | FieldVaryingPsf, ...]  # each of its own size
 
 
-def lenses_by_kind(imager: Imager) -> tuple[tuple[int, ...], ...]:
-    """Which lenses of an imager are of each kind. Host code."""
-    return tuple(tuple(which.tolist()) for which in kinds(imager.array))
-
-
-def of_kinds(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
-    """The imager with the lenses of each kind alone; the others still end these where their surfaces meet."""
-    return [eqx.tree_at(lambda i: i.array, imager, imager.array.some(np.array(which))) for which in lenses]
+def split_by_type(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
+    """The imager with the lenses of each type alone; the others still end these where their surfaces meet."""
+    return [eqx.tree_at(lambda i: i.array, imager, imager.array.subset(which)) for which in lenses]
 
 
 def relative_areas(imagers: Sequence[Imager]) -> Float64[np.ndarray, " kind"]:
-    """Mean clear area of each kind's lenses over that of all lenses: the light that a kind has near its axis."""
+    """Mean clear area of each type's lenses over that of all lenses: the light that a kind has near its axis."""
     areas = [np.asarray(clear_area(one.array), np.float64) for one in imagers]
     return np.array([area.mean() for area in areas]) / np.concatenate(areas).mean()
 
 
-def kind_weights(
+def type_weights(
     imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float
 ) -> Float64[np.ndarray, "kind depth"]:
     """How much each kind counts in a sum over the lenses, at each depth; 1 on average over the lenses.
@@ -64,7 +59,7 @@ def kind_weights(
     Parameters
     ----------
     imagers
-        `of_kinds`.
+        `split_by_type`.
     depths
         From the array's front, mm.
     side
@@ -72,7 +67,7 @@ def kind_weights(
     """
     fields = np.linspace(0, imagers[0].field_radius, _LIGHT_FIELDS)
     # Lenses are spread evenly: there are as many more at a field as its circle is longer.
-    signal = np.stack([core_shares(one, depths, fields, side) @ fields for one in imagers])
+    signal = np.stack([ensquared_light(one, depths, fields, side) @ fields for one in imagers])
     count = np.array([len(one.array.centers) for one in imagers], np.float64)
     mean = count @ signal / count.sum()
     return np.divide(signal, mean, out=np.ones_like(signal), where=mean > 0)
@@ -81,12 +76,12 @@ def kind_weights(
 # Least part of a spot's light, of lenses within the field radius, that must fall into its core. The paper's microscope
 # has 21 to 51 % in focus, over 18 to 22 mm, and 1 % with its sensor at 4 mm; its first lenses on pixels three times as
 # wide have 6 % there, and show one of three points.
-LEAST_SHARP = 0.08
+MIN_SHARPNESS = 0.08
 # Half the side, in pixels, of the square in which the light of a core is summed, and fields at which it is.
 HALF_SIDE, FIELDS = 3, 17
 
 
-def core_side(imager: Imager) -> float:
+def core_width(imager: Imager) -> float:
     """Side of the square in which the light of a core is summed, mm."""
     return (2 * HALF_SIDE + 1) * imager.sensor.pixel_pitch
 
@@ -94,27 +89,27 @@ def core_side(imager: Imager) -> float:
 def sharpness(imager: Imager, grid: Grid) -> float:
     """The part of a spot's light that falls into its core, of lenses within the field radius.
 
-    The least over the depths of a grid, by exact rays. Points are found by their cores: below `LEAST_SHARP` what is
+    The least over the depths of a grid, by exact rays. Points are found by their cores: below `MIN_SHARPNESS` what is
     found are caustics, and no points.
     """
     depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
     fields = np.linspace(0, imager.field_radius, FIELDS)
-    each = [imager] if imager.array.alike else of_kinds(imager, lenses_by_kind(imager))
-    in_square = lambda one, side: core_shares(one, depths, fields, side) @ fields
-    # At each depth the kind of lenses that is the sharpest.
-    core = core_side(imager)
+    each = [imager] if imager.array.alike else split_by_type(imager, lenses_by_type(imager.array))
+    in_square = lambda one, side: ensquared_light(one, depths, fields, side) @ fields
+    # At each depth the type of lenses that is the sharpest.
+    core = core_width(imager)
     return float(np.max([in_square(one, core) / in_square(one, math.inf) for one in each], 0).min())
 
 
-def blur_of(share: float, what: str, then: str) -> str | None:
+def blur_warning(share: float, what: str, then: str) -> str | None:
     """A warning that something needs sharper spots than this `sharpness`, and what that means; None if not."""
-    if share >= LEAST_SHARP:
+    if share >= MIN_SHARPNESS:
         return None
     found = f"{share:.1%} of a spot's light falls into its core"
-    return f"out of focus at these depths: {found}, where {what} need {LEAST_SHARP:.0%}; {then}"
+    return f"out of focus at these depths: {found}, where {what} need {MIN_SHARPNESS:.0%}; {then}"
 
 
 def warn_if_blurred(imager: Imager, grid: Grid, what: str, then: str) -> None:
     """`InputWarning` where spots are not sharp enough for something."""
-    if blurred := blur_of(sharpness(imager, grid), what, then):
+    if blurred := blur_warning(sharpness(imager, grid), what, then):
         warnings.warn(blurred, InputWarning, stacklevel=3)

@@ -43,8 +43,8 @@ from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
 from ..typing import ScalarLike
 from .apertures import clear_diameter
-from .raytrace import Point, chief_length, direction_cosines, pupil_disc, pupil_radius, unit_rays
-from .theory import airy_deviation
+from .raytrace import Point, chief_ray_length, direction_cosines, pupil_quadrature, pupil_radius, trace_lenslet
+from .theory import airy_sigma
 
 # The grid in the exit pupil reaches this much beyond the lens's own radius, for the pupil's distortion.
 _PUPIL_MARGIN = 1.08
@@ -79,15 +79,15 @@ def trace_exit_pupil(imager: Imager, depth, field, radius, edges, count: int) ->
     """
     radius = pupil_radius(imager, radius)
     reach = _PUPIL_MARGIN * radius
-    chief = unit_rays(imager, depth, np.zeros(2), field)
-    distance = chief_length(imager, chief)
+    chief = trace_lenslet(imager, depth, np.zeros(2), field)
+    distance = chief_ray_length(imager, chief)
 
     def trace(points):
-        rays = unit_rays(imager, depth, points, field)
+        rays = trace_lenslet(imager, depth, points, field)
         end, cosines = rays.landing - chief.landing[None], direction_cosines(rays.tangent)
         return rays, end, cosines, end - distance * (cosines - direction_cosines(chief.tangent)[None])
 
-    known, weights = pupil_disc(radius)
+    known, weights = pupil_quadrature(radius)
     rays, _, _, found = trace(known)
     coordinate = reach * jnp.asarray(np.linspace(-1, 1, count), radius.dtype)
     wanted = jnp.stack(jnp.meshgrid(coordinate, coordinate), -1).reshape(-1, 2)
@@ -101,7 +101,7 @@ def trace_exit_pupil(imager: Imager, depth, field, radius, edges, count: int) ->
     path = rays.path - jnp.sum(end * cosines, -1) + jnp.sum(end * (end / 2 - wanted + found), -1) / distance
     # Around the lens the search may end at another ray: nothing comes from there.
     lit = rays.valid & (jnp.sum((wanted - found) ** 2, -1) < (_CLOSE * radius) ** 2)
-    share = inside(points, radius, edges, coordinate[1] - coordinate[0])
+    share = soft_aperture(points, radius, edges, coordinate[1] - coordinate[0])
     # Light that is even over the lens is denser where the exit pupil is narrower.
     density = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
     lit = lit & (density > 0)
@@ -135,7 +135,7 @@ def _chebyshev(x: Float[Array, " point"]) -> Float[Array, "point degree"]:
     return jnp.stack(terms, -1)
 
 
-def inside(points: Float[Array, "point 2"], radius: Array, edges, step: Array) -> Float[Array, " point"]:
+def soft_aperture(points: Float[Array, "point 2"], radius: Array, edges, step: Array) -> Float[Array, " point"]:
     """How far points of the lens are within the aperture: from 0 to 1 over one step, for the sake of gradients."""
     inward = radius - jnp.sqrt(jnp.maximum(jnp.sum(points**2, -1), step**2))
     if edges is not None:
@@ -246,8 +246,8 @@ def geometric_psf(
     spiral = np.sqrt(order / _RAYS) * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)])
     radius = pupil_radius(imager, radius)
     points = radius * jnp.asarray(spiral.T, radius.dtype)
-    rays = unit_rays(imager, depth, points, field)
-    weights = jnp.where(rays.valid, inside(points, radius, edges, radius * (np.pi / _RAYS) ** 0.5), 0)
+    rays = trace_lenslet(imager, depth, points, field)
+    weights = jnp.where(rays.valid, soft_aperture(points, radius, edges, radius * (np.pi / _RAYS) ** 0.5), 0)
     dtype = rays.landing.dtype
     from_chief = rays.landing - _map(imager, depth, field, dtype)[None]
     position = from_chief[:, ::-1] / imager.sensor.pixel_pitch + jnp.asarray(offset, dtype)[None] + size // 2
@@ -289,13 +289,13 @@ def gaussian_psf(
     """
     _check(size)
     radius = pupil_radius(imager, radius)
-    points, weights = pupil_disc(radius)
-    rays = unit_rays(imager, depth, points, field)
+    points, weights = pupil_quadrature(radius)
+    rays = trace_lenslet(imager, depth, points, field)
     weights = jnp.where(rays.valid, weights, 0)
     weights = (weights / jnp.sum(weights))[:, None]
     centroid = jnp.sum(weights * rays.landing, 0)
     spread = jnp.sum(weights * (rays.landing - centroid[None]) ** 2) / 2
-    airy = airy_deviation(imager.wavelength, imager.reduced_sensor_distance, 2 * radius)
+    airy = airy_sigma(imager.wavelength, imager.reduced_sensor_distance, 2 * radius)
     sigma = jnp.sqrt(spread + airy**2)
     pitch = imager.sensor.pixel_pitch
     shift = centroid - _map(imager, depth, field, radius.dtype) + pitch * jnp.asarray(offset, radius.dtype)[::-1]
@@ -424,7 +424,7 @@ def psf_of_depth(
     radius = clear_diameter(imager.array) / 2
     # All zones: near the focus of the rim's rays those of other zones land farther out.
     fan = radius * jnp.linspace(0, 1, _ZONES)[:, None] * jnp.array([[1.0, 0.0]])
-    ends = [unit_rays(imager, depth, fan) for depth in (min(depths), max(depths))]
+    ends = [trace_lenslet(imager, depth, fan) for depth in (min(depths), max(depths))]
     reaches = [float(jnp.where(rays.valid, jnp.abs(rays.landing[:, 0]), 0).max()) for rays in ends]
     pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
     if not pixels <= _FARTHEST:
@@ -464,10 +464,10 @@ def axial_strehl(
     radius = pupil_radius(imager, radius)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     at = radius * jnp.asarray(np.sqrt((nodes + 1) / 2), radius.dtype)
-    distance = chief_length(imager, unit_rays(imager, depth, np.zeros(2)))
+    distance = chief_ray_length(imager, trace_lenslet(imager, depth, np.zeros(2)))
 
     def trace(at):
-        rays = unit_rays(imager, depth, jnp.stack([at, jnp.zeros_like(at)], -1))
+        rays = trace_lenslet(imager, depth, jnp.stack([at, jnp.zeros_like(at)], -1))
         tangent, end = rays.tangent[:, 0], rays.landing[:, 0]
         sine = tangent / jnp.sqrt(1 + tangent**2)
         return end - distance * sine, (rays.path - end * sine + end**2 / (2 * distance), rays.valid)

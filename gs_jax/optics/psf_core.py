@@ -22,14 +22,14 @@ from ..geometry import Imager, falloff
 from ..lenses import EACH, MicrolensArray, sag
 from .apertures import aperture_area
 from .psf import GOLDEN_ANGLE
-from .raytrace import on_host, passed, refracted, solid_angle
-from .theory import airy_deviation
+from .raytrace import refract, solid_angle, to_numpy, transmittance
+from .theory import airy_sigma
 
 # Radii and angles at which an aperture is asked whether it is open.
 _RADII, _ANGLES = 64, 64
 
 
-class Zones(NamedTuple):
+class ApertureProfile(NamedTuple):
     """The clear apertures of all lenses, averaged over lenses and angles: how open they are at each radius.
 
     `radius`, mm. `open`: share of the lenses, 0 to 1. `by_area`: how that grows with a lens's clear area, 1/mm^2, by
@@ -41,16 +41,16 @@ class Zones(NamedTuple):
     by_area: Float64[np.ndarray, " zone"]
 
 
-class SpotRays(NamedTuple):
+class PupilSamples(NamedTuple):
     """Rays of one depth to the sensor, for points at `(field, 0)` from a lens's axis.
 
     `landing`: from the axis, mm. `light`: share of what the point sends out in all directions, of a mean lens;
-    `light_by_area`: what that changes with a lens's clear area, 1/mm^2.
+    `light_per_area`: what that changes with a lens's clear area, 1/mm^2.
     """
 
     landing: Float64[np.ndarray, "field ray 2"]
     light: Float64[np.ndarray, "field ray"]
-    light_by_area: Float64[np.ndarray, "field ray"]
+    light_per_area: Float64[np.ndarray, "field ray"]
 
 
 def clear_area(array: MicrolensArray) -> Float[Array, " lens"]:
@@ -62,20 +62,20 @@ def clear_area(array: MicrolensArray) -> Float[Array, " lens"]:
     return aperture_area(dataclasses.replace(array, size=(math.inf, math.inf)))
 
 
-def mean_zones(array: MicrolensArray) -> Zones:
+def mean_aperture_profile(array: MicrolensArray) -> ApertureProfile:
     """How open the lenses of an array are, by radius, as if they were alike: enough for the light of a mean lens."""
     radius, shares = _open_shares(array)
-    return Zones(radius, shares.mean(0), np.zeros(_RADII))
+    return ApertureProfile(radius, shares.mean(0), np.zeros(_RADII))
 
 
-def zones(array: MicrolensArray) -> Zones:
+def aperture_profile(array: MicrolensArray) -> ApertureProfile:
     """How open the lenses of an array are, by radius, each with its own area."""
     radius, shares = _open_shares(array)
     areas = np.asarray(clear_area(array), np.float64)
     excess = areas - areas.mean()
     spread = (excess**2).sum()
     slope = excess @ shares / spread if spread > 1e-6 * (areas**2).sum() else np.zeros(_RADII)
-    return Zones(radius, shares.mean(0), slope)
+    return ApertureProfile(radius, shares.mean(0), slope)
 
 
 def _open_shares(array):
@@ -106,7 +106,7 @@ def _covered_by_alike(centers, diameter):
 
 def _covered_by_any(array):
     """Within the disc of a neighbour that is less below the plane of the vertices."""
-    whole, mine = on_host(array.whole), on_host(array)
+    whole, mine = to_numpy(array.whole), to_numpy(array)
     radius, diameter, conic = (getattr(whole, name) for name in EACH)
     rim, own = diameter / 2, float(mine.aperture_diameter) / 2
 
@@ -122,24 +122,24 @@ def _covered_by_any(array):
     return covered
 
 
-def spot_rays(
-    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: Zones, count: int
-) -> SpotRays:
+def sample_pupil(
+    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: ApertureProfile, count: int
+) -> PupilSamples:
     """Rays of a point at each field, `count` of them evenly over the lens's disc."""
     order, rim = np.arange(count) + 0.5, float(imager.array.aperture_diameter) / 2
     radius = rim * np.sqrt(order / count)
     points = radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)
-    host, landing, light = on_host(imager), np.empty((len(fields), count, 2)), np.empty((len(fields), count))
+    host, landing, light = to_numpy(imager), np.empty((len(fields), count, 2)), np.empty((len(fields), count))
     # Field by field: what each makes stays in the processor's cache.
     for k, field in enumerate(fields):
         at, light[k] = _light(host, float(depth), points.T, np.array([[field], [0.0]]))
         landing[k] = at.T
     light *= np.pi * rim**2 / count
     share, slope = (np.interp(radius, aperture.radius, part) for part in (aperture.open, aperture.by_area))
-    return SpotRays(landing, light * share, light * slope)
+    return PupilSamples(landing, light * share, light * slope)
 
 
-def transmitted(
+def transmission(
     imager: Imager,
     depth: float,
     pupil_points: Float[np.ndarray, "point 2"],
@@ -154,15 +154,15 @@ def transmitted(
     Parameters
     ----------
     imager, depth, pupil_points, field
-        As for `gs_jax.optics.raytrace.unit_rays`; where its rays are not valid, there is no light.
+        As for `gs_jax.optics.raytrace.trace_lenslet`; where its rays are not valid, there is no light.
     """
-    return _light(on_host(imager), depth, pupil_points.T.astype(np.float64), field[:, None].astype(np.float64))[1]
+    return _light(to_numpy(imager), depth, pupil_points.T.astype(np.float64), field[:, None].astype(np.float64))[1]
 
 
 def _light(imager, depth, points, field):
     """Of rays to a field, all with their coordinates first: where they land, and their light per area."""
-    ray = refracted(imager, depth, points, field)
-    light = solid_angle(imager, depth, ray) * passed(imager, ray) / (4 * np.pi)
+    ray = refract(imager, depth, points, field)
+    light = solid_angle(imager, depth, ray) * transmittance(imager, ray) / (4 * np.pi)
     return ray.landing, np.where(ray.valid, light, 0)
 
 
@@ -186,19 +186,19 @@ _SPARSE = 8
 _BINS, _SAMPLES = 16, 2**17
 
 
-class Cores(NamedTuple):
+class PsfCores(NamedTuple):
     """The cores of all rings at one depth.
 
-    `stretch`: magnification over the chief ray's, one a ring. `light`: coefficients of `ring_light`. `profile`: light
-    in radial bins of a sixteenth of a pixel, with the sum 1.
+    `distortion`: magnification over the chief ray's, one a ring. `light`: coefficients of `ring_light`. `profile`:
+    light in radial bins of a sixteenth of a pixel, with the sum 1.
     """
 
-    stretch: Float64[np.ndarray, " ring"]
+    distortion: Float64[np.ndarray, " ring"]
     light: Float64[np.ndarray, "ring coefficient"]
     profile: Float64[np.ndarray, "ring bin"]
 
 
-def ring_share(distance_squared, inner, outer):
+def ring_window(distance_squared, inner, outer):
     """1 within a ring of the field, 0 beyond it, with the envelope's smooth falloff at both ends; all rings add up."""
     # The ends may be traced; a disc has no falloff inside.
     hole = falloff(distance_squared, jnp.where(inner > 0, inner, 1.0))
@@ -215,7 +215,7 @@ def ring_light(distance_squared, coefficients, inner, outer):
     value = coefficients[..., -1]
     for power in range(coefficients.shape[-1] - 2, -1, -1):
         value = value * t + coefficients[..., power]
-    return value * ring_share(distance_squared, inner, outer)
+    return value * ring_window(distance_squared, inner, outer)
 
 
 def ring_edges(imager: Imager, ends: Sequence[float] = RINGS) -> list[tuple[float, float]]:
@@ -224,7 +224,9 @@ def ring_edges(imager: Imager, ends: Sequence[float] = RINGS) -> list[tuple[floa
     return [(radius * float(a), radius * float(b)) for a, b in zip((0.0, *ends), ends, strict=False)]
 
 
-def core_table(imager: Imager, depth: float, aperture: Zones, reach: float, ends: Sequence[float] = RINGS) -> Cores:
+def _cores_at_depth(
+    imager: Imager, depth: float, aperture: ApertureProfile, reach: float, ends: Sequence[float] = RINGS
+) -> PsfCores:
     """The cores at one depth, by exact rays of a mean lens.
 
     A ring has one kernel: the mean of its spots up to `reach` (mm) about the magnification at which that mean is the
@@ -233,25 +235,25 @@ def core_table(imager: Imager, depth: float, aperture: Zones, reach: float, ends
     pitch = imager.sensor.pixel_pitch
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
-    rays = diffracted(imager, spot_rays(imager, depth, fields, aperture, _RAYS))
+    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
     parts = [_ring_cores(rays, fields, chief, pitch, edges, *ring) for ring in rings]
-    return Cores(*map(np.stack, zip(*parts, strict=True)))
+    return PsfCores(*map(np.stack, zip(*parts, strict=True)))
 
 
-def core_tables(
+def trace_cores(
     imager: Imager,
     depths: Float64[np.ndarray, " depth"],
     reach: float,
     ends: Sequence[float] = RINGS,
     progress: Progress | None = None,
-) -> Cores:
-    """The cores at some depths: `core_table` of each, with the depths first."""
-    aperture = mean_zones(imager.array)
-    tables = in_threads(lambda depth: core_table(imager, depth, aperture, reach, ends), depths)
+) -> PsfCores:
+    """The cores at some depths: `_cores_at_depth` of each, with the depths first."""
+    aperture = mean_aperture_profile(imager.array)
+    tables = in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends), depths)
     tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
-    return Cores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
+    return PsfCores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
 
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
@@ -267,7 +269,7 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
         some = np.linspace(depths.min(), depths.max(), _MOST)
         beyond = float(imager.reduced_depth(0.0))
         return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
-    aperture, fields = mean_zones(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
+    aperture, fields = mean_aperture_profile(imager.array), np.linspace(0, imager.field_radius, _FIELDS + 1)
     return np.array(list(in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
 
 
@@ -283,11 +285,11 @@ def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float
     return jnp.asarray(found, imager.sensor_distance.dtype)
 
 
-def core_shares(
+def ensquared_light(
     imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"], side: float
 ) -> Float64[np.ndarray, "depth field"]:
     """Share of a point's light that a mean lens brings into a square of this side (mm) about its spot's core."""
-    aperture = mean_zones(imager.array)
+    aperture = mean_aperture_profile(imager.array)
 
     def share(depth):
         magnification, rays = _core(imager, float(depth), fields, aperture)
@@ -297,28 +299,28 @@ def core_shares(
     return np.array(list(in_threads(share, depths)))
 
 
-def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: Zones):
+def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: ApertureProfile):
     """Magnification of the bright core at one depth, and the rays of the fields that say so."""
-    rays = spot_rays(imager, depth, fields, aperture, _RAYS)
+    rays = sample_pupil(imager, depth, fields, aperture, _RAYS)
     chief = float(imager.magnification(depth))
     return chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch), rays
 
 
-def diffracted(imager: Imager, rays: SpotRays) -> SpotRays:
+def add_diffraction(imager: Imager, rays: PupilSamples) -> PupilSamples:
     """Rays moved at random, but always the same, by as much as the aperture diffracts: a Gaussian as wide as Airy's."""
-    width = float(airy_deviation(imager.wavelength, imager.reduced_sensor_distance, imager.array.aperture_diameter))
+    width = float(airy_sigma(imager.wavelength, imager.reduced_sensor_distance, imager.array.aperture_diameter))
     moves = np.random.default_rng(0).normal(0, width, rays.landing.shape[1:])
     return rays._replace(landing=rays.landing + moves)
 
 
 def _ring_cores(rays, fields, chief, pitch, edges, inner, outer):
-    share = np.asarray(ring_share(jnp.asarray(fields**2), inner, outer), np.float64)
+    share = np.asarray(ring_window(jnp.asarray(fields**2), inner, outer), np.float64)
     used = share > 1e-6
-    mine = SpotRays(*(part[used] for part in rays))
+    mine = PupilSamples(*(part[used] for part in rays))
     # Lenses are spread evenly: there are as many more at a field as its circle is longer.
     weight = share[used] * np.maximum(fields[used], fields[1] / 8)
-    stretch = _sharpest(mine, fields[used], weight, chief, pitch)
-    radius = _from_map(mine, fields[used], chief * stretch)
+    distortion = _sharpest(mine, fields[used], weight, chief, pitch)
+    radius = _from_map(mine, fields[used], chief * distortion)
     profile = np.histogram(radius, edges, weights=mine.light * weight[:, None])[0]
     profile = profile / profile.sum()
     # As pixels see it: parts of one are not told apart.
@@ -330,24 +332,24 @@ def _ring_cores(rays, fields, chief, pitch, edges, inner, outer):
     # Ridge: a ring that begins far out leaves the low powers undetermined.
     system = np.concatenate([powers * root[:, None], 1e-4 * root.max() * np.eye(_DEGREE + 1)])
     light = np.linalg.lstsq(system, np.append(amount * root, np.zeros(_DEGREE + 1)))[0]
-    return stretch, light, profile
+    return distortion, light, profile
 
 
-def _from_map(rays: SpotRays, fields, magnification) -> np.ndarray:
+def _from_map(rays: PupilSamples, fields, magnification) -> np.ndarray:
     """Distances of the rays from where a magnification puts the spot."""
     # NumPy's `hypot` takes three times as long.
     return np.sqrt((rays.landing[..., 0] + magnification * fields[:, None]) ** 2 + rays.landing[..., 1] ** 2)
 
 
-def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> float:
+def _sharpest(rays: PupilSamples, fields, weight, chief: float, pitch: float) -> float:
     """The magnification, over the chief ray's, that gives the weighted mean of the spots the largest sum of squares."""
     rays = rays._replace(light=rays.light * weight[:, None])
     # Where pixels are large, it is found as well as if they were not.
     pitch = min(pitch, _SHARP * chief * float(np.max(fields)))
 
-    def squares(stretch, rays=rays):
+    def squares(distortion, rays=rays):
         # Shared by two rings: what is counted in one alone jumps, and rounding would decide where the largest sum is.
-        place = (2 / pitch * _from_map(rays, fields, chief * stretch)).ravel()
+        place = (2 / pitch * _from_map(rays, fields, chief * distortion)).ravel()
         ring, light = place.astype(int), rays.light.ravel()
         outer = light * (place - ring)
         count = ring.max() + 2
@@ -358,8 +360,8 @@ def _sharpest(rays: SpotRays, fields, weight, chief: float, pitch: float) -> flo
         return -(total**2 / area).sum()
 
     tried = np.linspace(1 - _FARTHEST, 1 + _FARTHEST, _STEPS)
-    some = SpotRays(*(part[:, ::_SPARSE] for part in rays))
-    best = int(np.argmin([squares(stretch, some) for stretch in tried]))
+    some = PupilSamples(*(part[:, ::_SPARSE] for part in rays))
+    best = int(np.argmin([squares(distortion, some) for distortion in tried]))
     return _least(squares, tried[max(best - 1, 0)], tried[min(best + 1, _STEPS - 1)])
 
 
@@ -380,19 +382,21 @@ def _least(cost: Callable[[float], float], low: float, high: float) -> float:
     return inner[int(np.argmin(costs))]
 
 
-def drawn(profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1) -> Float64[np.ndarray, "row column"]:
+def render_kernel(
+    profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1
+) -> Float64[np.ndarray, "row column"]:
     """A kernel from its radial light, on pixels (or their `parts` each way), odd `size` in all; its sum is 1.
 
     Light is put down point by point, so that none is lost between the pixels; turned and mirrored, it is symmetric.
     """
-    column, row = np.floor(parts * spread(profile, _SAMPLES) + size / 2).astype(int).T
+    column, row = np.floor(parts * sample_profile(profile, _SAMPLES) + size / 2).astype(int).T
     inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
     light = np.bincount((row * size + column)[inside], minlength=size * size).reshape(size, size) / _SAMPLES
     light = light + light[::-1] + light[:, ::-1] + light[::-1, ::-1]
     return (light + light.T) / 8
 
 
-def spread(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
+def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
     """Points `(x, y)` in pixels that are as dense as a core is bright, along Vogel's spiral."""
     order = np.arange(count) + 0.5
     edges = np.arange(profile.size + 1) / _BINS

@@ -38,16 +38,16 @@ _NEWTON_STEPS = 3
 class Refraction(NamedTuple):
     """A ray through the lens.
 
-    `point`: where it meets the curved side, mm. `sag`, `steepness`: of the surface there, mm and 1/mm. `air`: by how
-    much the point is farther than the array's front, mm, glass counted as so much air. `slope`: in front; `glass`: in
-    the plate; `tangent`: behind. `front`, `back`: at each face the cosines before and behind it, with the normal.
+    `point`: where it meets the curved side, mm. `sag`, `sag_slope_over_r`: of the surface there, mm and 1/mm. `air`: by
+    how much the point is farther than the array's front, mm, glass counted as so much air. `slope`: in front; `glass`:
+    in the plate; `tangent`: behind. `front`, `back`: at each face the cosines before and behind it, with the normal.
     `landing`: on the sensor, mm. `valid`: False if the surface does not reach the point or the light is reflected
     totally; the other numbers are then finite and meaningless.
     """
 
     point: Coordinates
     sag: Scalars
-    steepness: Scalars
+    sag_slope_over_r: Scalars
     air: Scalars
     slope: Coordinates
     glass: Coordinates
@@ -58,7 +58,7 @@ class Refraction(NamedTuple):
     valid: Any
 
 
-def on_host(module: Module) -> Module:
+def to_numpy(module: Module) -> Module:
     """The same imager, or array, with NumPy's arrays, in float64."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), module)
 
@@ -73,7 +73,7 @@ def secant(slope: Coordinates) -> Scalars:
     return library_of(slope).sqrt(1 + dot(slope, slope))
 
 
-def refracted(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> Refraction:
+def refract(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> Refraction:
     """The ray from a field through a point of the curved side, or of an ideal lens, and on to the sensor.
 
     Raises
@@ -91,30 +91,30 @@ def refracted(imager: Imager, depth: Scalars, point: Coordinates, field: Coordin
 def _plane_first(imager, depth, point, field) -> Refraction:
     array, xp = imager.array, library_of(point)
     n, t = array.refractive_index, array.substrate_thickness
-    point, sag, steepness, reached = _surface(array, point)
-    air = as_air(n, t - sag, depth, point - field)
+    point, sag, sag_slope_over_r, reached = _surface(array, point)
+    air = equivalent_air(n, t - sag, depth, point - field)
     slope = (point - field) / (depth + air)
     glass = slope_in_glass(n, slope)
-    lateral, axial, inside, behind2 = _bent(n, glass, point, steepness)
+    lateral, axial, inside, behind2 = _bent(n, glass, point, sag_slope_over_r)
     valid = reached & (behind2 > 0)
     behind = xp.sqrt(xp.where(behind2 > 0, behind2, 1))
-    tangent = _behind(lateral, axial, n, behind - n * inside, point, steepness, valid)
+    tangent = _behind(lateral, axial, n, behind - n * inside, point, sag_slope_over_r, valid)
     landing = point + (imager.sensor_distance + sag) * tangent
     front = 1 / secant(slope), 1 / secant(glass)
-    return Refraction(point, sag, steepness, air, slope, glass, tangent, front, (inside, behind), landing, valid)
+    return Refraction(point, sag, sag_slope_over_r, air, slope, glass, tangent, front, (inside, behind), landing, valid)
 
 
 def _curve_first(imager, depth, point, field) -> Refraction:
     array, xp = imager.array, library_of(point)
     n, t = array.refractive_index, array.substrate_thickness
-    point, sag, steepness, reached = _surface(array, point)
+    point, sag, sag_slope_over_r, reached = _surface(array, point)
     slope = (point - field) / (depth + sag)
     # The surface falls toward the sensor: its normal leans toward the axis.
-    lateral, axial, outside, inside2 = _bent(1 / n, slope, point, -steepness)
+    lateral, axial, outside, inside2 = _bent(1 / n, slope, point, -sag_slope_over_r)
     inside = xp.sqrt(inside2)
     # Light that comes from behind the surface does not meet it.
     met = reached & (outside > 0)
-    glass = _behind(lateral, axial, 1 / n, inside - outside / n, point, -steepness, met)
+    glass = _behind(lateral, axial, 1 / n, inside - outside / n, point, -sag_slope_over_r, met)
     in_glass2 = dot(glass, glass) / (1 + dot(glass, glass))
     cosine2 = 1 - n**2 * in_glass2
     valid = met & (cosine2 > 0)
@@ -122,7 +122,7 @@ def _curve_first(imager, depth, point, field) -> Refraction:
     tangent = xp.where(valid, n * glass / secant(glass), 0) / cosine
     landing = point + (t - sag) * glass + imager.sensor_distance * tangent
     back = 1 / secant(glass), cosine
-    return Refraction(point, sag, steepness, sag, slope, glass, tangent, (outside, inside), back, landing, valid)
+    return Refraction(point, sag, sag_slope_over_r, sag, slope, glass, tangent, (outside, inside), back, landing, valid)
 
 
 def _ideally(imager, depth, point, field) -> Refraction:
@@ -141,42 +141,44 @@ def _ideally(imager, depth, point, field) -> Refraction:
 
 
 def _surface(array, point):
-    """A point of the curved side, its sag and steepness, and whether there is one: on the axis where there is none."""
+    """A point of the curved side, its sag and `sag_slope_over_r`, and whether it exists: the axis where it does not."""
     xp, r2 = library_of(point), dot(point, point)
     reached = array.reaches(r2)
     point, r2 = xp.where(reached, point, 0), xp.where(reached, r2, 0)
-    return point, array.sag(r2), array.steepness(r2), reached
+    return point, array.sag(r2), array.sag_slope_over_r(r2), reached
 
 
-def _bent(ratio, slope, point, steepness):
+def _bent(ratio, slope, point, sag_slope_over_r):
     """A ray's lateral and axial parts, its cosine with a surface's normal, and the squared cosine of what is refracted.
 
     `ratio` is the index before the surface over that behind it. The normal goes along the light; it is
-    `(steepness point, 1)`, normalised.
+    `(sag_slope_over_r point, 1)`, normalised.
     """
     length = secant(slope)
     lateral, axial = slope / length, 1 / length
-    cosine = (steepness * dot(lateral, point) + axial) / _normal(point, steepness)
+    cosine = (sag_slope_over_r * dot(lateral, point) + axial) / _normal(point, sag_slope_over_r)
     return lateral, axial, cosine, 1 - ratio**2 * (1 - cosine**2)
 
 
-def _behind(lateral, axial, ratio, bend, point, steepness, valid):
+def _behind(lateral, axial, ratio, bend, point, sag_slope_over_r, valid):
     """Slopes behind a surface: of `ratio` times the ray plus `bend` times the normal (Snell)."""
-    xp, bend = library_of(point), bend / _normal(point, steepness)
-    return xp.where(valid, ratio * lateral + bend * steepness * point, 0) / xp.where(valid, ratio * axial + bend, 1)
+    xp, bend = library_of(point), bend / _normal(point, sag_slope_over_r)
+    return xp.where(valid, ratio * lateral + bend * sag_slope_over_r * point, 0) / xp.where(
+        valid, ratio * axial + bend, 1
+    )
 
 
-def _normal(point, steepness):
-    """Length of `(steepness point, 1)`."""
-    return library_of(point).sqrt(1 + steepness**2 * dot(point, point))
+def _normal(point, sag_slope_over_r):
+    """Length of `(sag_slope_over_r point, 1)`."""
+    return library_of(point).sqrt(1 + sag_slope_over_r**2 * dot(point, point))
 
 
 def solid_angle(imager: Imager, depth: Scalars, ray: Refraction) -> Scalars:
     """Of an object point's light, per area of the lens where it meets the curved side, 1/mm^2.
 
     The Jacobian of the slope `q = a / h` by the point, times `(1 + q^2)^(-3/2)`. With `a` the way sideways and `h` the
-    depth in air, it is `|1 - a . grad h / h| / h^2`. With the plane in front `grad h` follows from `as_air`'s equation,
-    with the curve in front `h` grows by the sag. An ideal lens has a constant `h`.
+    depth in air, it is `|1 - a . grad h / h| / h^2`. With the plane in front `grad h` follows from `equivalent_air`'s
+    equation, with the curve in front `h` grows by the sag. An ideal lens has a constant `h`.
     """
     h = depth + ray.air
     tilt = secant(ray.slope) ** -3 / h**2
@@ -184,7 +186,7 @@ def solid_angle(imager: Imager, depth: Scalars, ray: Refraction) -> Scalars:
     if array.thin_lens_focal_length is not None:
         return tilt
     n, xp = array.refractive_index, library_of(ray.slope)
-    steeper = dot(ray.slope, ray.point) * ray.steepness
+    steeper = dot(ray.slope, ray.point) * ray.sag_slope_over_r
     if array.orientation == "curved":
         return abs(1 - steeper) * tilt
     square = dot(ray.slope, ray.slope)
@@ -196,7 +198,7 @@ def solid_angle(imager: Imager, depth: Scalars, ray: Refraction) -> Scalars:
     return abs(1 - along / h) * tilt
 
 
-def passed(imager: Imager, ray: Refraction) -> Scalars:
+def transmittance(imager: Imager, ray: Refraction) -> Scalars:
     """Share of the light that both faces let through: Fresnel's equations, unpolarised. An ideal lens passes all."""
     if imager.array.thin_lens_focal_length is not None:
         return ray.front[0]
@@ -211,7 +213,7 @@ def _through(n_in, cos_in, n_out, cos_out):
     return 1 - (across**2 + along**2) / 2
 
 
-def as_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coordinates) -> Scalars:
+def equivalent_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coordinates) -> Scalars:
     """The layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
     square, xp = dot(across, across), library_of(across)
     g = thickness / n
@@ -234,7 +236,7 @@ Point = Float[ArrayLike, "2"] | tuple[Float[ArrayLike, ""], Float[ArrayLike, ""]
 _FOCUS_STEPS = 3
 
 
-class UnitRay(NamedTuple):
+class LensletRay(NamedTuple):
     """A ray behind the lens.
 
     `landing`: where it meets the sensor, `(x, y)` from the lens's axis, mm. `tangent`: its slopes `dx/dz, dy/dz`.
@@ -249,12 +251,12 @@ class UnitRay(NamedTuple):
 
 
 @jax.jit
-def unit_rays(
+def trace_lenslet(
     imager: Imager,
     depth: Float[ArrayLike, ""],
     pupil_points: Float[Array | np.ndarray, "*batch 2"],
     field: Point = (0.0, 0.0),
-) -> UnitRay:
+) -> LensletRay:
     """Rays from one object point through points of the lens, to the sensor.
 
     With `thin_lens_focal_length` the unit is an ideal lens in the vertex plane: the object's image at
@@ -278,7 +280,7 @@ def unit_rays(
     over_points = jax.vmap(lambda point: tuple(_ray(imager, depth, point, field)), 1, (1, 1, 0, 0))
     landing, tangent, path, valid = over_points(points.reshape(-1, 2).T)
     landing, tangent = landing.T.reshape(points.shape), tangent.T.reshape(points.shape)
-    return UnitRay(landing, tangent, path.reshape(points.shape[:-1]), valid.reshape(points.shape[:-1]))
+    return LensletRay(landing, tangent, path.reshape(points.shape[:-1]), valid.reshape(points.shape[:-1]))
 
 
 @jax.jit
@@ -297,16 +299,16 @@ def wavefront(
     Parameters
     ----------
     imager, depth, pupil_points, field
-        As for `unit_rays`.
+        As for `trace_lenslet`.
 
     Returns
     -------
     Array
         `(*batch,)`; NaN where no ray gets through.
     """
-    rays = unit_rays(imager, depth, pupil_points, field)
-    chief = unit_rays(imager, depth, np.zeros(2), field)
-    radius2 = chief_length(imager, chief) ** 2
+    rays = trace_lenslet(imager, depth, pupil_points, field)
+    chief = trace_lenslet(imager, depth, np.zeros(2), field)
+    radius2 = chief_ray_length(imager, chief) ** 2
     offset = rays.landing - chief.landing.reshape((1,) * (rays.path.ndim) + (2,))
     cosines = direction_cosines(rays.tangent)
     along, offset2 = jnp.sum(offset * cosines, -1), jnp.sum(offset**2, -1)
@@ -331,11 +333,11 @@ def wavefront_rms(
     Parameters
     ----------
     imager, depth, field
-        As for `unit_rays`.
+        As for `trace_lenslet`.
     radius
         Of the pupil, mm. Half the aperture's diameter by default.
     """
-    points, weights = pupil_disc(pupil_radius(imager, radius))
+    points, weights = pupil_quadrature(pupil_radius(imager, radius))
     return safe_sqrt(jnp.sum(weights * _without_tilt(wavefront(imager, depth, points, field), points, weights) ** 2))
 
 
@@ -358,7 +360,7 @@ def best_focus(
     imager, depth, field, radius
         As for `wavefront_rms`.
     """
-    points, weights = pupil_disc(pupil_radius(imager, radius))
+    points, weights = pupil_quadrature(pupil_radius(imager, radius))
 
     def error(vergence):
         moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence - imager.array.air_behind)
@@ -374,10 +376,10 @@ def best_focus(
     return 1 / jax.lax.fori_loop(0, _FOCUS_STEPS, step, vergence) - imager.array.air_behind
 
 
-def chief_length(imager: Imager, chief: UnitRay) -> Float[Array, ""]:
+def chief_ray_length(imager: Imager, chief: LensletRay) -> Float[Array, ""]:
     """From the vertex, as it is seen from the sensor, to the sensor along the chief ray, mm."""
     squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.air_behind
-    if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `refraction.as_air`
+    if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `refraction.equivalent_air`
         behind = behind * n / jnp.sqrt(n**2 + (n**2 - 1) * squared)
     return (imager.sensor_distance + behind) * jnp.sqrt(1 + squared)
 
@@ -396,7 +398,9 @@ def _without_tilt(error: Array, points: Array, weights: Array) -> Array:
     return error - points @ slopes
 
 
-def pupil_disc(radius: Float[ArrayLike, ""], rings: int = 8) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
+def pupil_quadrature(
+    radius: Float[ArrayLike, ""], rings: int = 8
+) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
     """Points and weights of an average over a disc, exact for polynomials of `(x, y)` up to degree `4 rings - 2`.
 
     Gauss-Legendre in the squared radius, equal angles around: the product rule of Abramowitz and Stegun 25.4.61.
@@ -416,16 +420,16 @@ def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch
     return tangent / jnp.sqrt(1 + jnp.sum(tangent**2, -1, keepdims=True))
 
 
-def _ray(imager: Imager, depth: Array, point: Array, field: Array) -> UnitRay:
+def _ray(imager: Imager, depth: Array, point: Array, field: Array) -> LensletRay:
     """Quantities with `_chief` are those of the ray through the vertex."""
-    ray = refracted(imager, depth, point, field)
+    ray = refract(imager, depth, point, field)
     if imager.array.thin_lens_focal_length is None:
-        return UnitRay(ray.landing, ray.tangent, _thick_path(imager, depth, ray, field), ray.valid)
+        return LensletRay(ray.landing, ray.tangent, _thick_path(imager, depth, ray, field), ray.valid)
     v, reduced = imager.reduced_sensor_distance, imager.reduced_depth(depth)
     vergence, tilt = 1 / imager.array.focal_length - 1 / reduced, -field / reduced
     # |point - image| - |image| = v' (s - s_chief), from the object on; then v (s - s_chief) along the ray.
     longer = (vergence * dot(point, point) - 2 * dot(point, tilt)) / (secant(ray.tangent) + secant(tilt))
-    return UnitRay(ray.landing, ray.tangent, longer * (v * vergence - 1), ray.valid)
+    return LensletRay(ray.landing, ray.tangent, longer * (v * vergence - 1), ray.valid)
 
 
 def _thick_path(imager: Imager, depth: Array, ray: Refraction, field: Array) -> Array:
@@ -433,7 +437,7 @@ def _thick_path(imager: Imager, depth: Array, ray: Refraction, field: Array) -> 
     array, v = imager.array, imager.sensor_distance
     n, t = array.refractive_index, array.substrate_thickness
     plane_first = array.orientation == "plano"
-    air_chief = as_air(n, t, depth, -field) if plane_first else jnp.zeros_like(ray.air)
+    air_chief = equivalent_air(n, t, depth, -field) if plane_first else jnp.zeros_like(ray.air)
     h, h_chief = depth + ray.air, depth + air_chief
     q, q_chief = ray.slope, -field / h_chief
     change = ray.point / h + field * (ray.air - air_chief) / (h * h_chief)

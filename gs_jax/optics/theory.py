@@ -45,7 +45,7 @@ def lateral_resolution(wavelength: Real, numerical_aperture: Real, pixel: Real, 
     return jnp.maximum(diffraction_limit(wavelength, numerical_aperture, 1), pixel) / magnification
 
 
-def airy_deviation(wavelength: Real, distance: Real, diameter: Real) -> Result:
+def airy_sigma(wavelength: Real, distance: Real, diameter: Real) -> Result:
     """Standard deviation of the Gaussian as wide at half its height as the Airy disc, `1.029 lambda v / D`, mm."""
     return 1.029 * jnp.asarray(wavelength) * distance / diameter / FWHM
 
@@ -80,40 +80,42 @@ def object_blur(focal_length: Real, diameter: Real, reduced_depth: Real, sensor_
     return blur(focal_length, diameter, reduced_depth, sensor_distance) * reduced_depth / sensor_distance
 
 
-def near_limit(focal_length: Real, f_number: Real, reduced_depth: Real, confusion: Real) -> Result:
+def near_limit(focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real) -> Result:
     """The nearest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
 
-    `z_N = z f^2 / (f^2 - c F f + c F z)`, where the patch on the sensor is `confusion`, a diameter in mm.
+    `z_N = z f^2 / (f^2 - c F f + c F z)`, where the patch on the sensor is `circle_of_confusion`, a diameter in mm.
     """
     squared = jnp.asarray(focal_length) ** 2
-    return squared * reduced_depth / (squared + confusion * f_number * (reduced_depth - focal_length))
+    return squared * reduced_depth / (squared + circle_of_confusion * f_number * (reduced_depth - focal_length))
 
 
-def far_limit(focal_length: Real, f_number: Real, reduced_depth: Real, confusion: Real) -> Result:
+def far_limit(focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real) -> Result:
     """The farthest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
 
     `z_F = z f^2 / (f^2 + c F f - c F z)`; infinite from the hyperfocal distance `f^2 / (c F) + f` on.
     """
     squared = jnp.asarray(focal_length) ** 2
     return safe_quotient(
-        reduced_depth * squared, squared - confusion * f_number * (jnp.asarray(reduced_depth) - focal_length)
+        reduced_depth * squared, squared - circle_of_confusion * f_number * (jnp.asarray(reduced_depth) - focal_length)
     )
 
 
-def depth_of_field(focal_length: Real, f_number: Real, reduced_depth: Real, confusion: Real) -> Result:
+def depth_of_field(focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real) -> Result:
     """Depth of field `z_F - z_N`, the exact difference of Eq. 8, mm; infinite from the hyperfocal distance on."""
-    arguments = (focal_length, f_number, reduced_depth, confusion)
+    arguments = (focal_length, f_number, reduced_depth, circle_of_confusion)
     return far_limit(*arguments) - near_limit(*arguments)
 
 
-def approximate_depth_of_field(focal_length: Real, f_number: Real, reduced_depth: Real, confusion: Real) -> Result:
+def approximate_depth_of_field(
+    focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real
+) -> Result:
     """The paper's approximation of it, `2 F c z^2 f^2 / (f^4 - F^2 c^2 z^2)` (Eq. 7), mm.
 
     It leaves `f` out beside `z`, so it is larger than `depth_of_field`, by the factor `z / (z - f)` for a small
-    confusion: 1.3 for the paper's lens at 20 mm.
+    circle_of_confusion: 1.3 for the paper's lens at 20 mm.
     """
     squared = jnp.asarray(focal_length) ** 2
-    spread = jnp.asarray(f_number) * confusion * reduced_depth
+    spread = jnp.asarray(f_number) * circle_of_confusion * reduced_depth
     return safe_quotient(2 * spread * reduced_depth * squared, squared**2 - spread**2)
 
 

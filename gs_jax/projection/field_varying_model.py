@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
 from ..grid import Grid
-from ..optics.field_varying import FullOptics, Halo
+from ..optics.field_varying import FieldVaryingPsf, StrayLight
 from ..optics.psf_core import clear_area, ring_edges
 from .bilinear import Shapes, volume_to_image
 from .convolution import convolved, doubled, image_in_groups, with_margin
@@ -32,11 +32,11 @@ _MARGIN = 12
 
 
 def full_image(
-    volume: Float[Array, "depth y x"], imager: Imager, grid: Grid, optics: FullOptics
+    volume: Float[Array, "depth y x"], imager: Imager, grid: Grid, optics: FieldVaryingPsf
 ) -> Float[Array, "row column"]:
-    """`gs_jax.forward` with `FullOptics`."""
-    nodes = _on_nodes(volume, grid, optics.halo.grid)
-    return _cores_image(volume, imager, grid, optics) + halo_image(nodes, imager, optics.halo, grid.origin)
+    """`gs_jax.forward` with `FieldVaryingPsf`."""
+    nodes = _on_nodes(volume, grid, optics.stray_light.grid)
+    return _cores_image(volume, imager, grid, optics) + halo_image(nodes, imager, optics.stray_light, grid.origin)
 
 
 def halved(imager: Imager) -> Imager:
@@ -57,13 +57,13 @@ def _cores_image(volume, imager, grid, optics):
     dtype = volume.dtype
 
     def sharp(imager, plane, number):
-        depth, voxels, stretch, light, _, _ = plane
+        depth, voxels, distortion, light, _, _ = plane
         # Chief rays of this apparent depth land where the cores of the true one do.
-        magnification = imager.magnification(depth) * stretch[number]
+        magnification = imager.magnification(depth) * distortion[number]
         at = grid.at(imager.reduced_sensor_distance / magnification - imager.reduced_depth(0.0))
         if imager.tilt is not None:
             # Cores are drawn to the axis of the lens, which leans.
-            drawn = (1 / stretch[number] - 1) * imager.lean(depth[None])[0]
+            drawn = (1 / distortion[number] - 1) * imager.axis_offset(depth[None])[0]
             at = eqx.tree_at(lambda g: g.origin, at, at.origin + drawn)
         weight = RingLight(*rings[number])
         rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
@@ -81,7 +81,7 @@ def _cores_image(volume, imager, grid, optics):
         return fine, coarse + convolved(outer, wide_kernels, whole=True, symmetric=True)
 
     kernels = (part.astype(dtype) for part in (optics.kernel, optics.wide_kernels))
-    planes = grid.depths, volume, optics.stretch, optics.light, *kernels
+    planes = grid.depths, volume, optics.distortion, optics.light, *kernels
     whole = [n + small - 1 for n in wide_halved.sensor.shape]
     dark = jnp.zeros(sensor.shape, dtype), jnp.zeros(whole, dtype)
     fine, coarse = image_in_groups(add_depths, dark, planes, _TOGETHER)
@@ -89,7 +89,7 @@ def _cores_image(volume, imager, grid, optics):
 
 
 def halo_image(
-    nodes: Float[Array, "depth y x"], imager: Imager, optics: Halo, origin: Float[Array, "2"]
+    nodes: Float[Array, "depth y x"], imager: Imager, optics: StrayLight, origin: Float[Array, "2"]
 ) -> Float[Array, "row column"]:
     """The halo of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm."""
     dtype = nodes.dtype

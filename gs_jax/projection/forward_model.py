@@ -7,8 +7,8 @@ from jaxtyping import Array, Float, Num
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.field_varying import FullOptics
-from ..optics.lens_types import KindOptics, of_kinds
+from ..optics.field_varying import FieldVaryingPsf
+from ..optics.lens_types import PerTypePsf, split_by_type
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import convolved, image_in_groups, with_margin
 from .field_varying_model import full_image
@@ -16,7 +16,7 @@ from .field_varying_model import full_image
 # Depths that share a transform back, for the memory of as many sharp images.
 _TOGETHER = 2
 
-Optics = Float[Array | np.ndarray, "plane tall wide"] | FullOptics | KindOptics | None
+Optics = Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | PerTypePsf | None
 
 
 @jax.jit
@@ -36,8 +36,8 @@ def forward(
     Eq. (2) a voxel counts the same at every depth. Chief rays that miss the sensor by less than half a PSF count with
     what spreads onto it.
 
-    With `FullOptics` each lens's spot is where exact rays put it, at every distance from the lens's axis, and a voxel
-    is the light that it sends out in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
+    With `FieldVaryingPsf` each lens's spot is where exact rays put it, at every distance from the lens's axis, and a
+    voxel is the light that it sends out in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
 
     Linear in the volume and in the PSF; differentiable with respect to everything that is continuous.
 
@@ -50,14 +50,14 @@ def forward(
     optics
         `gs_jax.optics_of` makes it by name. None: points, which makes this the adjoint of `backproject`. An array:
         PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size.
-        `FullOptics`: all light, by tables for these depths. `KindOptics`: either of these for each kind of lens.
+        `FieldVaryingPsf`: all light, by tables for these depths. `PerTypePsf`: either of these for each type of lens.
 
     Returns
     -------
     Array
         `sensor.shape`, of the volume's type. With a PSF it is as exact as an FFT of that type, so dark pixels may
-        be about 1e-7 of the brightest below zero in float32; with `FullOptics`, a few percent of the light's mean, as
-        the halo ripples.
+        be about 1e-7 of the brightest below zero in float32; with `FieldVaryingPsf`, a few percent of the light's mean,
+        as the halo ripples.
 
     Raises
     ------
@@ -81,11 +81,11 @@ def forward(
     volume = as_volume(volume, imager)
     if optics is None:
         return backproject_adjoint(volume, imager, grid)
-    if isinstance(optics, KindOptics):
-        each = zip(of_kinds(imager, optics.lenses), optics.optics, strict=True)
+    if isinstance(optics, PerTypePsf):
+        each = zip(split_by_type(imager, optics.lenses), optics.optics, strict=True)
         images = [forward(volume, one, grid, its) for one, its in each]
         return sum(images[1:], images[0])
-    if isinstance(optics, FullOptics):
+    if isinstance(optics, FieldVaryingPsf):
         if len(optics.kernel) != grid.depths.size:
             raise ValueError(
                 f"`optics` must be of {grid.depths.size} depths, as the grid is, got {len(optics.kernel)}."

@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.field_varying import full_optics, halo_nodes
-from ..optics.lens_types import KindOptics, lenses_by_kind, of_kinds, relative_areas
+from ..lenses import lenses_by_type
+from ..optics.field_varying import field_varying_psf, make_polar_grid
+from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type
 from ..optics.psf import psf_of_depth
 from .forward_model import Optics
 
@@ -40,8 +41,8 @@ def optics_of(
 
     Returns
     -------
-    None, Array, FullOptics or KindOptics
-        Tables for these depths, in their order; of lenses that differ, for each kind.
+    None, Array, FieldVaryingPsf or PerTypePsf
+        Tables for these depths, in their order; of lenses that differ, for each type.
 
     Raises
     ------
@@ -64,13 +65,15 @@ def optics_of(
         return None
     depths = np.asarray(depths)
     if not imager.array.alike:
-        each = of_kinds(imager, lenses := lenses_by_kind(imager))
+        each = split_by_type(imager, lenses := lenses_by_type(imager.array))
         if level == "full":
-            nodes = halo_nodes(imager, depths)
-            return KindOptics(lenses, tuple(full_optics(one, depths, nodes=nodes, progress=progress) for one in each))
+            nodes = make_polar_grid(imager, depths)
+            return PerTypePsf(
+                lenses, tuple(field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in each)
+            )
         light = zip(each, relative_areas(each).tolist(), strict=True)
-        return KindOptics(lenses, tuple(share * _near(one, depths, progress) for one, share in light))
-    return full_optics(imager, depths, progress=progress) if level == "full" else _near(imager, depths, progress)
+        return PerTypePsf(lenses, tuple(share * _near(one, depths, progress) for one, share in light))
+    return field_varying_psf(imager, depths, progress=progress) if level == "full" else _near(imager, depths, progress)
 
 
 def _near(imager, depths, progress):

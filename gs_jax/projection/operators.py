@@ -25,9 +25,9 @@ class ImagingOperator(lx.AbstractLinearOperator):
         What images, and the voxels.
     optics
         As for `forward`. With None each lens is a pinhole, and the transpose is `backproject`. A PSF at each depth, or
-        `FullOptics`, is a table that `gs_jax.optics_of` makes beforehand: it stays what it is when the imager changes,
-        and no derivative by the shape of the lenses passes through it. Chief rays, and with `FullOptics` the clear
-        areas, are computed from the imager at each use and differentiated.
+        `FieldVaryingPsf`, is a table that `gs_jax.optics_of` makes beforehand: it stays what it is when the imager
+        changes, and no derivative by the shape of the lenses passes through it. Chief rays, and with `FieldVaryingPsf`
+        the clear areas, are computed from the imager at each use and differentiated.
 
     Examples
     --------

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 
 from ..base.progress import Progress
 from ..geometry import Imager
-from ..optics.field_varying import CORE_REACH, halo_nodes, halo_of, kernel_size
-from ..optics.psf_core import Cores, core_tables, drawn, ring_edges
-from ..optics.raytrace import on_host
+from ..optics.field_varying import CORE_REACH, kernel_size, make_polar_grid, trace_stray_light
+from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
+from ..optics.raytrace import to_numpy
 from ..typing import Points
 from .field_varying_model import halo_image
 from .rays import Envelope, RingLight
@@ -36,11 +36,12 @@ _RINGS = tuple(np.arange(1, 29) / 8)
 class Ring(NamedTuple):
     """The ring of the field whose cores stamps are of.
 
-    `ends`: inner and outer, mm. `stretch`, `light`: of `gs_jax.optics.psf_core.Cores`, at each depth of the stamps.
+    `ends`: inner and outer, mm. `distortion`, `light`: of `gs_jax.optics.psf_core.PsfCores`, at each depth of the
+    stamps.
     """
 
     ends: tuple[float, float]
-    stretch: Float[np.ndarray, " depth"]
+    distortion: Float[np.ndarray, " depth"]
     light: Float[np.ndarray, "depth coefficient"]
 
 
@@ -118,7 +119,7 @@ def forward_points(
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         some = points[start : start + _POINTS]
-        beside = some[:, :2] - on_host(imager).lean(some[:, 2])
+        beside = some[:, :2] - to_numpy(imager).axis_offset(some[:, 2])
         pairs = KDTree(beside).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
             # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
@@ -146,9 +147,9 @@ def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
 def _core(depth, imager, stamps):
     """The core's distortion and the parameters of its weight, for each point."""
     if stamps.ring is None:
-        return np.ones_like(depth), on_host(imager).reduced_depth(depth)[:, None]
+        return np.ones_like(depth), to_numpy(imager).reduced_depth(depth)[:, None]
     between = lambda part: np.interp(depth, stamps.depths, part)
-    return between(stamps.ring.stretch), np.stack([between(part) for part in stamps.ring.light.T], -1)
+    return between(stamps.ring.distortion), np.stack([between(part) for part in stamps.ring.light.T], -1)
 
 
 @partial(jax.jit, donate_argnums=0)
@@ -195,7 +196,7 @@ def _add_spots(
 def full_image_of_points(
     points: Float[np.ndarray, "point 4"], imager: Imager, progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
-    """The image of points with all of their light: what `forward` does with `FullOptics`, without a grid.
+    """The image of points with all of their light: what `forward` does with `FieldVaryingPsf`, without a grid.
 
     Cores are stamps in narrow rings of the field, interpolated between depths that are 0.25 mm apart; the halo is
     interpolated between depths that are 0.5 mm apart. On the ray-traced 120 points nearer depths change nothing.
@@ -214,16 +215,16 @@ def full_image_of_points(
     few = depths.size <= steps + 1
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2
-    grid = halo_nodes(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    tables = core_tables(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress)
-    coarse, cores = fine[::every], Cores(*(part[::every] for part in tables))
-    halo = halo_of(imager, coarse, grid, cores, _RINGS, progress)
+    grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
+    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress)
+    coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
+    halo = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_shared(points, coarse, grid), imager.sensor_distance.dtype)
     image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
     size = kernel_size(imager, halo)
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for ends, *parts, profiles in rings:
-        kernels = np.stack([drawn(profile, STEPS * size, STEPS) for profile in profiles])
+        kernels = np.stack([render_kernel(profile, STEPS * size, STEPS) for profile in profiles])
         spots = stamps(fine, kernels.astype(np.float32), Ring(ends, *parts))
         image += forward_points(points, imager, spots, progress)
     # The halo's ripple goes below zero in places. Without it there would be more light than there is.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..optics.field_varying import HaloGrid, polar_shares
+from ..optics.field_varying import PolarGrid, polar_weights
 from .linear_map import linear_call
 
 # Rings of polar nodes, from the axis on, that are closer to each other than pixels are.
@@ -67,7 +67,7 @@ def _part(index, weight, columns):
 
 
 @cache
-def splat_table(halo: HaloGrid) -> Table:
+def splat_table(halo: PolarGrid) -> Table:
     """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
     reach = math.ceil(halo.nodes(halo.fields)[-2])
     node, index, share = _polar(halo, halo.fields, reach)
@@ -75,7 +75,7 @@ def splat_table(halo: HaloGrid) -> Table:
 
 
 @cache
-def spread_table(halo: HaloGrid) -> Table:
+def spread_table(halo: PolarGrid) -> Table:
     """From polar nodes to the pixels about a lens: the density of light, interpolated, so that none is lost.
 
     About the axis the nodes are closer than the pixels, and are shared by the four around them instead.
@@ -94,7 +94,7 @@ def spread_table(halo: HaloGrid) -> Table:
     return _table(2 * reach + 1, pixel, node, share, halo.radii * halo.angles, to_polar=False)
 
 
-def _near_axis(halo: HaloGrid, reach: int):
+def _near_axis(halo: PolarGrid, reach: int):
     """Entries (square node, polar node, share) of the inner polar nodes, each shared by the four pixels around it."""
     node = np.arange(_INNER * halo.angles)
     radius, angle = halo.nodes(_INNER)[node // halo.angles], 2 * np.pi * (node % halo.angles) / halo.angles
@@ -108,11 +108,11 @@ def _near_axis(halo: HaloGrid, reach: int):
     return (np.concatenate(part) for part in zip(*parts, strict=True))
 
 
-def _polar(halo: HaloGrid, count: int, reach: int):
+def _polar(halo: PolarGrid, count: int, reach: int):
     """Entries (square node, polar node, share) of the bilinear interpolation between polar nodes."""
     side = np.arange(-reach, reach + 1)
     y, x = (part.ravel() for part in np.meshgrid(side, side, indexing="ij"))
-    return polar_shares(halo, count, x, y)
+    return polar_weights(halo, count, x, y)
 
 
 def _table(patch, square, polar, share, polars, *, to_polar):

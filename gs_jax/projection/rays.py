@@ -90,7 +90,7 @@ def trace(
     magnification = imager.magnifications(grid.depths)
     magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
-    (x, y), (x_lean, y_lean) = imager.centers[order].T, imager.lean(grid.depths).T
+    (x, y), (x_lean, y_lean) = imager.centers[order].T, imager.axis_offset(grid.depths).T
 
     def axis(center, origin, voxels, pixels, middle, lean):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)

@@ -14,8 +14,9 @@ from ..detection.background import between, square_levels
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
-from ..optics.field_varying import FullOptics
-from ..optics.lens_types import KindOptics, kind_weights, lenses_by_kind, of_kinds
+from ..lenses import lenses_by_type
+from ..optics.field_varying import FieldVaryingPsf
+from ..optics.lens_types import PerTypePsf, split_by_type, type_weights
 from ..optics.psf_core import apparent_depths
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
@@ -91,9 +92,9 @@ def sights_of(imager: Imager, grid: Grid) -> tuple[Sight, ...]:
     depths = np.asarray(grid.depths, np.float64)
     if imager.array.alike:
         return (Sight(imager, grid.at(apparent_depths(imager, depths))),)
-    each = of_kinds(imager, lenses_by_kind(imager))
+    each = split_by_type(imager, lenses_by_type(imager.array))
     side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
-    weights = kind_weights(each, depths, side)[..., None, None].astype(np.float32)
+    weights = type_weights(each, depths, side)[..., None, None].astype(np.float32)
     pairs = zip(each, weights, strict=True)
     return tuple(Sight(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in pairs)
 
@@ -164,8 +165,8 @@ def _coarser(imager, grid):
 
 def slow_waves(imager: Imager, optics: Optics) -> int:
     """Of the image's longest cosine waves each way, those that a background makes which `optics` holds all of."""
-    if isinstance(optics, KindOptics):
+    if isinstance(optics, PerTypePsf):
         optics = optics.optics[0]
-    if not isinstance(optics, FullOptics):
+    if not isinstance(optics, FieldVaryingPsf):
         return 0
-    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.halo.grid.pixel))
+    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.stray_light.grid.pixel))

@@ -121,11 +121,11 @@ def _points(image, imager, grid, sharp, progress):
     from ..detection.consistency import signal
     from ..detection.evidence import point_evidence
     from ..detection.locate import NOT_TRUSTED, find_points
-    from ..optics.lens_types import blur_of
+    from ..optics.lens_types import blur_warning
 
     light = signal(image)
     points = find_points(light, imager, grid, progress=progress)
-    warning = blur_of(sharp, "points", NOT_TRUSTED)
+    warning = blur_warning(sharp, "points", NOT_TRUSTED)
     columns = point_evidence(points, light, imager, grid)._asdict()
     return points, columns | {"confident": np.full(len(points), int(warning is None))}, warning
 

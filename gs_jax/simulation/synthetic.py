@@ -22,8 +22,9 @@ from ..grid import Grid
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
 from ..layouts import Number
-from ..optics.field_varying import full_optics, halo_nodes
-from ..optics.lens_types import lenses_by_kind, of_kinds, relative_areas
+from ..lenses import lenses_by_type
+from ..optics.field_varying import field_varying_psf, make_polar_grid
+from ..optics.lens_types import relative_areas, split_by_type
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
@@ -295,7 +296,7 @@ def simulate(
 
     if imager.array.alike:
         return image_of(imager)
-    each = of_kinds(imager, lenses_by_kind(imager))
+    each = split_by_type(imager, lenses_by_type(imager.array))
     light = np.ones(len(each)) if optics == "full" else relative_areas(each)
     images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
     return np.sum(images, 0)
@@ -355,8 +356,8 @@ def _optics_of_depth(imager, grid, kind):
     depths = np.asarray(grid.depths, np.float64)
     if kind == "full":
         extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
-        nodes = halo_nodes(imager, depths, extent=extent)
-        return lambda depth: full_optics(imager, np.array([depth], np.float64), nodes=nodes)
+        nodes = make_polar_grid(imager, depths, extent=extent)
+        return lambda depth: field_varying_psf(imager, np.array([depth], np.float64), polar_grid=nodes)
     kernel = psf_of_depth(imager, depths, kind)
     return lambda depth: kernel(depth)[None]
 

@@ -24,7 +24,7 @@ from ...design.spots import encircled_radius, psf_width
 from ...geometry import Imager
 from ...optics import aberrations
 from ...optics.psf import GOLDEN_ANGLE, diffraction_psf, window_fraction
-from ...optics.raytrace import unit_rays
+from ...optics.raytrace import trace_lenslet
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)
@@ -52,8 +52,8 @@ class Slider(NamedTuple):
 
 def start_of(design: Design, study: Study | None = None) -> Parent:
     """The design as the start of all moves, with the study's circle of confusion."""
-    confusion = None if study is None or study.confusion_um is None else study.confusion_um / 1000
-    return parent_of(design, depth_count=_DEPTHS, confusion=confusion)
+    circle_of_confusion = None if study is None or study.confusion_um is None else study.confusion_um / 1000
+    return parent_of(design, depth_count=_DEPTHS, circle_of_confusion=circle_of_confusion)
 
 
 def make_sliders(design: Design) -> dict[str, Slider]:
@@ -204,7 +204,7 @@ def _microscope(start: Parent, values: Mapping[str, Any]) -> Microscope:
         dataclasses.replace(start.imager, array=array, sensor_distance=values["sensor_distance_mm"]),
         (near + far) / 2 + (far - near) * shares,
         field_radius=values["field_radius_mm"],
-        confusion=start.confusion,
+        circle_of_confusion=start.circle_of_confusion,
         plate_scale=scale,
         largest_magnification=start.largest_magnification,
         cells=start.cells,
@@ -281,7 +281,7 @@ def _landing(unit: Imager, depth: Array, height: Array, radius: Array):
     order = np.arange(_RAYS) + 0.5
     spiral = np.sqrt(order / _RAYS) * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)])
     beside = jnp.zeros_like(height)
-    rays = unit_rays(unit, depth, radius * jnp.asarray(spiral.T, radius.dtype), (height, beside))
+    rays = trace_lenslet(unit, depth, radius * jnp.asarray(spiral.T, radius.dtype), (height, beside))
     return rays.landing - unit.views(jnp.stack([height, beside, depth])[None], np.array([0])).spot, rays.valid
 
 
@@ -313,11 +313,11 @@ def find_violations(
                 span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (row.low, row.high)))
                 target = f"{SIGNS[table.kind]} {table.target:g}"
                 sentences.append(f"Target missed: {TERMS[table.name].meaning} ({table.name}) is {span}, not {target}.")
-    confusion, blur = 1000 * float(start.confusion), numbers["blur_um"]
-    if (out := int((blur > confusion).sum())) > 0:
+    circle_of_confusion, blur = 1000 * float(start.circle_of_confusion), numbers["blur_um"]
+    if (out := int((blur > circle_of_confusion).sum())) > 0:
         sentences.append(
             f"{out} of {len(blur)} depths are out of focus: a thin lens blurs a point over up to {blur.max():.3g} um "
-            f"of the sensor, more than the circle of confusion, {confusion:.3g} um."
+            f"of the sensor, more than the circle of confusion, {circle_of_confusion:.3g} um."
         )
     wide, promised = numbers["spot_width_um"], numbers["lateral_resolution_um"]
     if (wide > _FAR * promised).any():

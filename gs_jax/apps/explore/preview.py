@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 from ...codesign.parameters import Parent
 from ...geometry import Imager, Sensor, envelope
 from ...grid import Grid
-from ...optics.raytrace import on_host
+from ...optics.raytrace import to_numpy
 from ...simulation.phantoms import random_points
 from .evaluation import SIZE, Values, lens_unit, moved_imager, pupil_samples, spot
 
@@ -44,7 +44,7 @@ def map_ghosts(imager: Imager, near: float, far: float) -> GhostMap:
     left, right, bottom, top = imager.sensor.extent
     half_x, half_y = (side / 2 for side in imager.array.size)
     box = (min(left, -half_x), min(top, -half_y), max(right, half_x), max(bottom, half_y))
-    host = on_host(imager)
+    host = to_numpy(imager)
     # On the axis, at each depth and in the middle of them.
     axis = host.views_of_all(np.column_stack([np.zeros((_GHOST_DEPTHS + 1, 2)), [*depths, (near + far) / 2]]))
     images, offsets = axis.spot[:, -1], axis.offset
@@ -144,7 +144,7 @@ def _bin(spot: np.ndarray, coarse: int) -> np.ndarray:
 
 def _dots(imager: Imager, points: np.ndarray, lenses: tuple[int, ...]) -> np.ndarray:
     """Chief-ray images of points by some lenses, each shared by the four nearest pixels."""
-    host = on_host(imager)
+    host = to_numpy(imager)
     views = host.views(points[None], np.array(lenses)[:, None])
     spots, light = host.sensor.to_pixels(views.spot), np.asarray(host.brightness(views))
     corner, image = np.floor(spots).astype(int), np.zeros(imager.sensor.shape)

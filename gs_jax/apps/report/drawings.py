@@ -317,7 +317,7 @@ class Spots(NamedTuple):
 
 
 def one_lens(imager: Imager, index: int = 0) -> Imager:
-    """The same with one kind of lens, where they differ."""
+    """The same with one type of lens, where they differ."""
     return imager if imager.array.alike else eqx.tree_at(lambda i: i.array, imager, imager.array.lens(index))
 
 

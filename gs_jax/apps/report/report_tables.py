@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ...base.errors import InputError
 from ...design.design import Design, span_of
-from ...design.sheet import confusion_of
+from ...design.sheet import circle_of_confusion_of
 from ...io.files import read_text
 from ...typing import PathLike
 
@@ -47,12 +47,12 @@ class Row(NamedTuple):
 
 def sheet_rows(design: Design, sheet: Mapping[str, Any]) -> list[Row]:
     """The datasheet by depth."""
-    confusion = 1000 * confusion_of(design, None)
+    circle_of_confusion = 1000 * circle_of_confusion_of(design, None)
     promised = sheet["lateral_resolution_um"]
 
     def fault(key: str, i: int, value: float | None) -> str:
-        if key == "blur_um" and value is not None and value > confusion:
-            return f"out of focus: more than the circle of confusion, {confusion:.3g} um"
+        if key == "blur_um" and value is not None and value > circle_of_confusion:
+            return f"out of focus: more than the circle of confusion, {circle_of_confusion:.3g} um"
         if key == "spot_width_um" and value is not None and value > _FAR * promised[i]:
             return "more than twice what Eq. 5 promises"
         if key == "occupancy" and value is not None and value > 1:

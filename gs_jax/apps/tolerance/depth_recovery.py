@@ -30,7 +30,7 @@ from ...calibration.unknowns import (
     residuals,
 )
 from ...geometry import Imager
-from ...optics.raytrace import on_host
+from ...optics.raytrace import to_numpy
 from .device_model import Errors, built, no_errors
 
 # Lenses that must see a point: one says no depth.
@@ -111,7 +111,7 @@ def _changed(imager: Imager, name: str) -> Imager:
 
 def _seen(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> Sights:
     """The lenses within the field radius of each point whose image is on the sensor."""
-    views = on_host(imager).views_of_all(points)
+    views = to_numpy(imager).views_of_all(points)
     ends = views.spot.transpose(1, 0, 2)
     left, right, bottom, top = imager.sensor.extent
     on = (ends > (left, top)).all(-1) & (ends < (right, bottom)).all(-1)

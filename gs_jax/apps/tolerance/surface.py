@@ -35,7 +35,7 @@ def lens_squares(
     narrow as it is. Between them slopes count by the share of the light that their height takes from the core.
     """
     squared = jnp.asarray((np.arange(_RINGS) + 0.5) / _RINGS) * radius**2
-    height, slope = step_squares(array.steepness(squared) * jnp.sqrt(squared), layer, pixel)
+    height, slope = step_squares(array.sag_slope_over_r(squared) * jnp.sqrt(squared), layer, pixel)
     moved = -jnp.expm1(log_strehl_of_height(height, array.refractive_index, wavelength))
     return jnp.mean(height), jnp.mean(slope * moved)
 

@@ -16,7 +16,7 @@ from ...geometry import Imager, Sensor
 from ...grid import Grid
 from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ...lenses import MicrolensArray
-from ...optics.field_varying import FullOptics, HaloGrid, full_optics, halo_nodes
+from ...optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf, make_polar_grid
 from ...projection.forward_model import forward
 from ...simulation.synthetic import Camera, electrons, expose
 from ...typing import Volume
@@ -62,7 +62,7 @@ class Device(NamedTuple):
     known: Imager
     depths: np.ndarray
     scene_depths: np.ndarray
-    optics: FullOptics
+    optics: FieldVaryingPsf
 
 
 class Example(NamedTuple):
@@ -114,15 +114,15 @@ def device_of(seed: int, number: int, kind: Kind) -> Device:
     return Device(imager, known, depths, scene_depths, tables(imager, scene_depths, kind))
 
 
-def tables(imager: Imager, depths: np.ndarray, kind: Kind) -> FullOptics:
+def tables(imager: Imager, depths: np.ndarray, kind: Kind) -> FieldVaryingPsf:
     """All of a microscope's light; of any example of a kind of the same shape."""
-    return in_float32(full_optics(imager, depths, nodes=_nodes(kind)))
+    return in_float32(field_varying_psf(imager, depths, polar_grid=_nodes(kind)))
 
 
 @cache
-def _nodes(kind: Kind) -> HaloGrid:
+def _nodes(kind: Kind) -> PolarGrid:
     typical = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((kind.pixels, kind.pixels), kind.pixel), 5.8, FIELD_RADIUS)
-    return halo_nodes(typical, _DEPTHS, extent=2 * _FARTHEST * kind.side)
+    return make_polar_grid(typical, _DEPTHS, extent=2 * _FARTHEST * kind.side)
 
 
 def _layout(kind, rng):
