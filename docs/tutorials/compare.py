@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Design and compare two microscopes
 #
-# The paper's microscope has large lenses. A search made them a sixth as wide: the spot is several times sharper, and a
-# 27th of the light is left. Which is better depends on what is looked at, and for how long.
+# The paper's microscope has large lenses. An optimisation made them a sixth as wide: the spot is several times sharper,
+# with a 27th of the light. Which design is better depends on the scene and the exposure.
 
 # %%
 import jax
@@ -13,19 +13,19 @@ import gs_jax as gs
 from gs_jax.design.sheet import datasheet
 from gs_jax.simulation.phantoms import random_points
 
-HALF = 5.0  # mm of the plate and the sensor, from the middle to the edge
+HALF = 5.0  # half width of the plate and the sensor, mm
 POINTS = 40
 
 # %% [markdown]
 # ## Two designs
 #
-# `geomscope` is the paper's; of the other here are the numbers that the search found
-# (`gs-jax metrics geomscope-optimized` has the rest). Both are cut to the middle of their plate, to be quick.
+# `geomscope` is the paper's design; the other has the lens parameters of `geomscope-optimized`
+# (`gs-jax metrics geomscope-optimized` lists the rest). Both are cropped to the middle of their plate, for speed.
 
 
 # %%
 def middle(design, half=HALF):
-    """The middle of a design, with its sensor."""
+    """Crop a design and its sensor to the middle."""
     centers = tuple(c for c in design.array.centers_mm if max(map(abs, c)) < half)
     pixels = round(2 * half / 0.009)
     array = design.array.model_copy(update={"centers_mm": centers, "size_mm": (2 * half, 2 * half)})
@@ -40,10 +40,10 @@ small = paper.model_copy(update={"name": "small lenses", "lens": lens, "imaging"
 print(small)
 
 # %% [markdown]
-# ## What the equations and exact rays say
+# ## Equations and exact rays
 #
-# A datasheet has the paper's Eqs. 1 to 11 and, by exact rays, how wide a spot is in the object. The formula for
-# resolution (Eq. 5) knows no aberrations: it ranks the two the wrong way round.
+# A datasheet has the paper's Eqs. 1 to 11 and, by exact rays, the width of a spot in the object. The formula for
+# resolution (Eq. 5) ignores aberrations, and ranks the two designs the wrong way round.
 
 # %%
 depths = [18.0, 19.0, 20.0, 21.0, 22.0, 23.0]
@@ -60,7 +60,7 @@ plt.show()
 # %% [markdown]
 # ## The same points through both
 #
-# For the same time: the small lenses get what their area lets through.
+# Both expose for the same time, so the small lenses collect less light.
 
 # %%
 truth = random_points(POINTS, (1.2 * HALF, 1.2 * HALF), (18.5, 22.5), seed=1)
@@ -82,7 +82,7 @@ for axis, design in zip(axes, (paper, small), strict=True):
 plt.show()
 
 # %% [markdown]
-# Points are easy: both find them, and the paper's lenses locate them better, as they have more light and magnify more.
-# A sharp spot pays where a scene is extended: volumes at several exposures, by these two and by conics, are in the
-# [experiments](../../experiments/results/codesign.md#co-design-the-lens). To search for a design of your own, see
+# Points are easy: both designs find them, and the paper's lenses localise them better, because they have more light and
+# magnify more. Sharp spots pay for extended scenes: volumes at several exposures, by these two and by conics, are in
+# the [experiments](../../experiments/results/codesign.md#co-design-the-lens). To search for a design of your own, see
 # [the next tutorial](objective.md).

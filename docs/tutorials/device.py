@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Your own device, from a pinhole to a volume
 #
-# An array and a camera of one's own: what the vendor says is about right, and how the array sits over the sensor is
-# not known at all. Captures of a pinhole at known places tell. The page for the [lab](../../design/LAB.md) has the same
-# with commands, and what to do when it goes wrong.
+# For your own array and camera the vendor's data are approximate, and the position of the array over the sensor is
+# unknown. Captures of a pinhole at known positions determine both. The [laboratory guide](../../design/LAB.md) shows
+# the same with commands, and what to do about problems.
 
 # %%
 import dataclasses
@@ -21,7 +21,7 @@ POINTS = 25
 # %% [markdown]
 # ## What is known
 #
-# Lens centres from a list, focal length, pixel pitch, and a sensor that is about where the thin lens formula wants it.
+# Lens centres from a list, focal length, pixel pitch, and a sensor at about the distance of the thin-lens formula.
 
 # %%
 side = PIXELS * 0.007
@@ -31,10 +31,10 @@ listed = gs.Imager(array, gs.Sensor((PIXELS, PIXELS), 0.007), sensor_distance=5.
 print(f"{len(centers)} lenses of f = {float(array.focal_length):.2f} mm")
 
 # %% [markdown]
-# ## What is true
+# ## The true device
 #
-# The device as it was glued: turned by almost 5 degrees, shifted, tilted, and 0.2 mm farther away. Nobody knows this
-# cell; it makes the captures that a camera would.
+# The device as it was glued: turned by almost 5 degrees, shifted, tilted, and 0.2 mm farther away. This cell stands in
+# for the camera; the calibration does not use its values.
 
 # %%
 glued = dataclasses.replace(listed, sensor_distance=5.8, rotation=0.083, shift=(0.12, -0.21), tilt=(0.004, 0.007))
@@ -42,7 +42,7 @@ camera, keys = gs.Camera(), iter(jax.random.split(jax.random.key(0), 10))
 
 
 def photograph(points):
-    """What the camera delivers of some points."""
+    """Capture some points with the true device."""
     light = gs.simulate(np.asarray(points), glued)
     return np.asarray(gs.expose(light, camera, next(keys), peak_electrons=20_000))
 
@@ -50,8 +50,7 @@ def photograph(points):
 # %% [markdown]
 # ## A pinhole
 #
-# At three depths on the axis, and once beside it, one capture each. Where it was, in the sensor's frame, is written
-# down.
+# One capture each at three depths on the axis, and one beside it, with the positions in the frame of the sensor.
 
 # %%
 places = np.array([[0.0, 0.0, 18.0], [0.0, 0.0, 20.5], [1.5, 0.0, 20.5], [0.0, 0.0, 23.0]])
@@ -65,8 +64,8 @@ plt.show()
 # %% [markdown]
 # ## Calibrate
 #
-# The spots are matched to the lenses at any rotation, then everything is fitted to them. Standard deviations say how
-# well each number is known; what is left of the spots says if the model is right: below 0.1 pixel is good.
+# `calibrate` matches spots to lenses at any rotation, then fits the geometry. Standard deviations give the uncertainty
+# of each parameter, the residuals show whether the model is right: below 0.1 pixel is good.
 
 # %%
 found = gs.calibrate(captures, places, listed)
@@ -77,7 +76,7 @@ print(f"residuals: {found.rms:.3f} pixels RMS")
 # %% [markdown]
 # ## A volume
 #
-# A scene that the calibration has not seen, reconstructed as the device was listed, and as it was found.
+# A scene that the calibration has not seen, reconstructed with the listed and with the calibrated geometry.
 
 # %%
 scene = random_points(POINTS, (0.5 * side, 0.5 * side), (18.5, 22.5), seed=2)
@@ -87,7 +86,7 @@ blind = gs.localization(gs.find_points(capture, listed, grid), scene)
 points = gs.find_points(capture, found.imager, grid)
 score = gs.localization(points, scene)
 print(f"as listed: {len(blind.pairs)} of {len(scene)} points, F1 {blind.f1:.2f}")
-print(f"as found: {len(score.pairs)} of {len(scene)} points, F1 {score.f1:.2f}")
+print(f"calibrated: {len(score.pairs)} of {len(scene)} points, F1 {score.f1:.2f}")
 print(f"errors: {1000 * score.lateral_rmse:.1f} um laterally, {1000 * score.axial_rmse:.0f} um axially")
 
 # %%

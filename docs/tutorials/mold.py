@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A mold
 #
-# From a layout of lenses to a file that a printer takes: a negative, into which the array is cast. What is written is
-# read back and measured.
+# From a layout of lenses to a file for a 3-D printer: a negative mold, into which the array is cast. The written file
+# is read back and measured.
 
 # %%
 from matplotlib import pyplot as plt
@@ -13,12 +13,12 @@ from gs_jax.mold.export import mask_plan
 from gs_jax.mold.solids import MoldShape
 
 LENSES = 40
-CHORD = 0.001  # mm that a facet may be beside its lens
+CHORD = 0.001  # largest distance of a facet from the lens surface, mm
 
 # %% [markdown]
 # ## A layout
 #
-# Random, with a wanted distance of neighbours, and no hole that no lens covers.
+# Random, with a given mean distance of neighbours, and without gaps between the lenses.
 
 # %%
 side = 1.25 * LENSES**0.5
@@ -37,7 +37,7 @@ plt.show()
 # %% [markdown]
 # ## The mold
 #
-# The report says what was checked before the file was written, and what was measured in it after.
+# The report lists the checks before the file is written, and the measurements after.
 
 # %%
 report = gs.make_mold(design, "mold.stl", chord=CHORD)
@@ -46,7 +46,7 @@ for check in report["checks"]:
 print(f"{report['file_bytes'] / 1e6:.1f} MB, {report['facets']} facets")
 
 # %% [markdown]
-# The picture that lies beside the file:
+# `make_mold` also writes a picture:
 
 # %%
 picture = plt.imread("mold.png")
@@ -56,11 +56,11 @@ axis.axis("off")
 plt.show()
 
 # %% [markdown]
-# ## What the printer does
+# ## Shrinkage
 #
-# Facets are not the only error. A material that shrinks by 0.3 % makes smaller lenses nearer to each other; the mold
-# can be made larger by as much. `MoldShape` also has the wall that holds the resin, the floor, and the draft that lets
-# the cast out.
+# Facets are not the only error. A material that shrinks by 0.3 % makes smaller lenses, closer to each other; a larger
+# mold compensates for this. `MoldShape` also sets the wall that holds the resin, the floor, and the draft that
+# releases the cast.
 
 # %%
 larger = gs.make_mold(design, "larger.stl", chord=CHORD, shape=MoldShape(shrinkage=0.003))
@@ -69,8 +69,8 @@ print([round(b / a, 4) for a, b in zip(report["size_mm"], larger["size_mm"], str
 # %% [markdown]
 # ## The mask
 #
-# Where lenses do not touch, light between them has to be stopped. This plate is covered by lenses, so there is nothing
-# to be masked, and it is said so; smaller lenses have a mask to be cut, with the marks of the mold.
+# Where lenses do not touch, a mask must block the light between them. Lenses cover all of this plate, so there is
+# nothing to mask, and `mask_plan` says so; for smaller lenses it draws a mask, with the alignment marks of the mold.
 
 # %%
 try:
@@ -85,5 +85,5 @@ for x, y, diameter in plan.circles:
     axis.add_patch(Circle((x, y), diameter / 2, color="w"))
 for ring in plan.openings:
     axis.fill(*ring.T, color="w")
-axis.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="lets light through where it is white")
+axis.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="white: transparent")
 plt.show()

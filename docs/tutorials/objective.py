@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own objective in an optimisation
 #
-# Everything that the package computes of a microscope is differentiable, so what you want of it can be written down as
-# a function and searched for, beside the terms that are there.
+# All quantities that the package computes for a microscope are differentiable, so a study can optimise functions of
+# your own beside the built-in terms.
 
 # %%
 import equinox as eqx
@@ -18,20 +18,20 @@ from gs_jax.codesign.study import Study
 
 STEPS = 200
 
-# Searches end within a billionth of the minimum in double precision.
+# Double precision, so that searches converge.
 jax.config.update("jax_enable_x64", True)
 
 # %% [markdown]
 # ## A term
 #
-# A function of a `Microscope` (depths, magnification, spots, ...) that gives a number or one for each depth. Here: how
-# much the magnification changes over the depths, in percent. A stack whose planes are all of one scale is easier to
-# read. The name ends in the unit that the function returns.
+# A term is a function of a `Microscope` (depths, magnification, spots, ...) that returns one number, or one per depth.
+# This one is the change of the magnification over the depths, in percent: a stack whose planes have equal scale is
+# easier to read. The name of a term ends in its unit.
 
 
 # %%
 def scale_change(microscope):
-    """Largest over smallest magnification, above one, percent."""
+    """Largest over smallest magnification, minus one, in percent."""
     m = microscope.magnification
     return 100 * (jnp.max(m) / jnp.min(m) - 1)
 
@@ -41,8 +41,8 @@ TERMS["scale_change_percent"] = Term("change of the magnification over the depth
 # %% [markdown]
 # ## A study
 #
-# What is free, between which bounds, what is wanted, and how it is searched for: the tables of a
-# [study file](../../design/README.md#studies), which may as well be a dictionary. A term has a target (`at_most`,
+# A study holds the free parameters with their bounds, the terms, and the solvers. It has the tables of a
+# [study file](../../design/README.md#studies), here as a dictionary. A term has a target (`at_most`,
 # `at_least`, `equal`) or a direction (`minimise`, `maximise`, with the value that counts as one).
 
 # %%
@@ -73,7 +73,7 @@ for row in as_records(outcome):
 print(outcome.design)
 
 # %% [markdown]
-# ## The way there
+# ## Convergence
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
@@ -84,15 +84,15 @@ plt.show()
 # %% [markdown]
 # ## Without a study
 #
-# `gs.optimize` takes any function of an imager, and solvers of `optimistix` and `optax`. How sharp can spots be over
-# four depths when the sensor and the lenses may change, and a thin microscope is worth something, too?
+# `gs.optimize` takes any function of an imager, and solvers of `optimistix` and `optax`. Here it minimises the width of
+# the spots over four depths plus a penalty on the thickness, over sensor distance and lens shape.
 
 # %%
 scope, depths = gs.geomscope(sensor_distance_mm=4.0).imager(), jnp.linspace(18.0, 21.0, 4)
 
 
 def loss(scope):
-    """RMS width of the spots in the object by exact rays, mm, and a twentieth of the sensor's distance."""
+    """RMS width of the spots in the object by exact rays, mm, plus a twentieth of the sensor distance."""
     return jnp.sqrt(jnp.mean(gs.objectives.spot_width(scope, depths) ** 2)) + 0.05 * scope.sensor_distance
 
 
@@ -111,15 +111,14 @@ print("converged:", found.result == optx.RESULTS.successful, "after", found.stat
 gs.Design.from_imager(found.imager, name="mine", working_distance_mm=(18.0, 21.0))
 
 # %% [markdown]
-# Whatever else you want to do with it, the gradient of anything is one line away: here of the spot's width by the
-# sensor's distance.
+# The gradient of any such function takes one line, here of the width of the spot with respect to the sensor distance.
 
 
 # %%
 @jax.jit
 @jax.value_and_grad
 def width(distance):
-    """Mean width of the spot in the object, um."""
+    """Mean width of the spot in the object in micrometres, and its derivative."""
     return 1000 * gs.objectives.spot_width(eqx.tree_at(lambda i: i.sensor_distance, scope, distance), depths).mean()
 
 
@@ -130,5 +129,5 @@ axes[0].plot(distances, values)
 axes[0].set(xlabel="sensor distance, mm", ylabel="width, um")
 axes[1].plot(distances, slopes)
 axes[1].axhline(0, color="0.7")
-axes[1].set(xlabel="sensor distance, mm", ylabel="its slope, um / mm")
+axes[1].set(xlabel="sensor distance, mm", ylabel="slope, um / mm")
 plt.show()

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Reconstruct a capture
 #
-# A microscope, a scene, its capture with noise, and three ways back to a volume. Everything is simulated, so that the
-# truth is known; of a real capture the first four cells become `gs.read_design` and `gs.read_capture`.
+# A microscope, a scene, its capture with noise, and three reconstructions. Everything is simulated, so the
+# truth is known; for a real capture `gs.read_design` and `gs.read_capture` replace the first four cells.
 
 # %%
 import jax
@@ -17,7 +17,7 @@ PIXELS = 1280  # of each side of the sensor, 9 um each
 # %% [markdown]
 # ## The microscope
 #
-# The paper's array and distances, over the middle of its sensor, with pixels twice as wide.
+# The paper's array and distances, cropped to the middle of its sensor, with pixels twice as wide.
 
 # %%
 paper = gs.geomscope().imager()
@@ -30,8 +30,8 @@ print(f"{near.sum()} lenses, magnification {float(scope.magnification(20.0)):.2f
 # %% [markdown]
 # ## A capture
 #
-# Two letters, 18.5 and 21 mm away. `simulate` follows all of the light of every lens by exact rays; `expose` is the
-# camera, with its shot noise, read noise and converter.
+# Two letters at 18.5 and 21 mm. `simulate` images all light through every lens by exact rays; `expose` models the
+# camera, with shot noise, read noise and quantisation.
 
 # %%
 left = letters("G", depth=18.5, height=1.2, pitch=0.02) + (-0.7, 0, 0, 0)
@@ -47,8 +47,8 @@ plt.show()
 # %% [markdown]
 # ## Back-projection
 #
-# The paper's reconstruction: each voxel is the sum of the pixels that its lenses image it to. One pass, no iteration.
-# What is sharp in one plane is a haze in the others.
+# The paper's reconstruction: each voxel is the sum of the pixels to which its lenses image it. One pass, no iteration.
+# An object that is sharp in one plane is a haze in the others.
 
 # %%
 grid = gs.Grid(np.arange(18.0, 22.01, 0.5), (71, 101), 0.03)
@@ -57,7 +57,7 @@ truth = np.asarray(gs.rasterize(scene, grid))
 
 
 def planes(volumes):
-    """The two depths of the letters, of several volumes."""
+    """Plot several volumes at the two depths of the letters."""
     figure, axes = plt.subplots(len(volumes), 2, figsize=(7, 2.6 * len(volumes)), layout="constrained", squeeze=False)
     for row, (name, volume) in zip(axes, volumes.items(), strict=True):
         for axis, index in zip(row, (1, 6), strict=True):
@@ -70,10 +70,10 @@ def planes(volumes):
 planes({"truth": truth, "back-projection": plain})
 
 # %% [markdown]
-# ## Without the haze
+# ## Removing the haze
 #
-# A network looks at a slice and its neighbours and keeps what is in focus. Iterative methods explain the capture
-# instead: Richardson-Lucy with the model of all light takes longer, and leaves less.
+# A network looks at a slice and its neighbours, and keeps objects in focus. Iterative methods fit the capture
+# instead: Richardson-Lucy with the full model takes longer, and leaves less haze.
 
 # %%
 clean = gs.suppress(plain)
@@ -81,22 +81,22 @@ fitted = gs.reconstruct(capture, scope, grid, gs.RichardsonLucy(steps=15, accele
 planes({"network": clean, "Richardson-Lucy": fitted})
 
 # %% [markdown]
-# ## How good it is
+# ## Quality
 #
-# An empty volume scores well where most of the scene is dark, so it stands beside every other. `reproject` needs no
-# truth: it images the volume again and says how much of the capture is left over.
+# An empty volume scores well if most of the scene is dark, so the table includes it. `reproject` needs no
+# truth: it images the volume again and compares the image with the capture.
 
 # %%
 print(f"{'':18} PSNR, dB")
 for name, volume in {"empty": 0 * plain, "back-projection": plain, "network": clean, "Richardson-Lucy": fitted}.items():
     print(f"{name:18} {gs.quality(volume, truth).psnr_db:8.1f}")
 again = gs.reproject(fitted, capture, scope, grid)
-print(f"left of the capture: {100 * again.error:.0f} %, correlation {again.correlation:.3f}")
+print(f"unexplained: {100 * again.error:.0f} %, correlation {again.correlation:.3f}")
 
 # %% [markdown]
-# ## On the disk
+# ## Files
 #
-# The volume opens in Fiji and napari to scale; see [viewers](../howto/viewers.md).
+# Fiji and napari open the volume to scale; see [viewers](../howto/viewers.md).
 
 # %%
 gs.write_volume("letters.ome.tif", fitted, grid)

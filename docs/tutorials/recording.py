@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A recording
 #
-# Beads that drift: a recording of several frames becomes volumes in time, and tracks. Recordings are work for the
-# command line, which reads ahead, writes behind and can be resumed; a script may call it, too.
+# A recording of drifting beads becomes a time series of volumes, and tracks. The command line processes recordings: it
+# overlaps reading, computing and writing, and can resume; a script can call it, too.
 
 # %%
 import csv
@@ -24,7 +24,7 @@ BEADS = 8
 
 
 def run(command):
-    """What a command of gs-jax says, as a terminal shows it; of this Python's gs-jax."""
+    """Run a command with this Python's gs-jax, and print its output."""
     print("$", command)
     words = [sys.executable, "-m", *command.replace("gs-jax", "gs_jax", 1).split()]
     done = subprocess.run(words, capture_output=True, text=True)
@@ -34,7 +34,7 @@ def run(command):
 # %% [markdown]
 # ## The frames
 #
-# The middle of the paper's microscope, and beads that move by 20 to 60 um from frame to frame.
+# The middle of the paper's microscope, and beads that move by 20 to 60 um per frame.
 
 # %%
 side = PIXELS * 0.009
@@ -59,8 +59,8 @@ tifffile.imwrite("recording.tif", np.stack(frames))
 # %% [markdown]
 # ## One command
 #
-# Planes 0.5 mm apart, 20 frames a second, points of every frame, and which point is which bead: at most 200 um from
-# frame to frame.
+# Planes 0.5 mm apart, 20 frames a second, points of every frame, and tracks of beads that move at most 200 um per
+# frame.
 
 # %%
 run(
@@ -71,7 +71,7 @@ run(
 # %% [markdown]
 # ## Tracks
 #
-# The table has a line for each point of each frame, and the column `particle`.
+# The table has a row for each point of each frame, with the column `particle`.
 
 # %%
 with open("beads.csv") as file:
@@ -87,19 +87,19 @@ axis.legend()
 plt.show()
 
 # %% [markdown]
-# ## What is on the disk
+# ## Files
 #
-# One OME-Zarr with the axes `(t, z, y, x)`, to scale in space and time, which napari opens while it is being written.
+# One OME-Zarr with the axes `(t, z, y, x)`, scaled in space and time; napari can open it while it is written.
 
 # %%
 series = read_series("volumes.zarr")
 assert series
 for level in series.levels:
     print(level.shape, level.dtype)
-print(f"a step is {series.scale[0]:g} s, {series.scale[1]:g} um in depth and {series.scale[2]:g} um laterally")
+print(f"spacing: {series.scale[0]:g} s, {series.scale[1]:g} um in depth and {series.scale[2]:g} um laterally")
 
 # %% [markdown]
-# `gs-jax info volumes.zarr` says which command made it, of which files.
+# `gs-jax info volumes.zarr` shows which command made it, from which files.
 #
-# Had it been killed, the same command with `--resume` would make the frames that are missing, and those alone. See
-# [workers](workers.md) for more than one process.
+# After an interruption the same command with `--resume` computes the missing frames only. See
+# [workers](workers.md) for several processes.

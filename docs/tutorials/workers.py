@@ -1,8 +1,8 @@
 # %% [markdown]
 # # GPU and cluster
 #
-# The same program runs on one core, on all of a machine, on a GPU, and on many machines. What runs where is decided
-# when JAX starts and when work is shared out; nothing in a script changes.
+# The same program runs on one core, on all cores of a machine, on a GPU, and on many machines, without changes to
+# the script.
 
 # %%
 import subprocess
@@ -21,10 +21,10 @@ PIXELS = (400, 800, 1600)  # of each side of the sensor
 FRAMES = 4
 
 # %% [markdown]
-# ## What is there
+# ## Devices
 #
-# `pip install 'gs-jax[gpu]'` brings JAX for NVIDIA's GPUs, best [on Python 3.12 or newer](../install.md#gpu). JAX takes
-# a GPU if it finds one; here is what built this page. `JAX_PLATFORMS=cpu` in the environment keeps it on processors.
+# `pip install 'gs-jax[gpu]'` installs JAX for NVIDIA GPUs, best [on Python 3.12 or newer](../install.md#gpu). JAX uses
+# a GPU if it finds one. `JAX_PLATFORMS=cpu` in the environment keeps it on the processor. This page was built on:
 
 # %%
 print(jax.devices())
@@ -32,8 +32,8 @@ print(jax.devices())
 # %% [markdown]
 # ## On one device
 #
-# The first call compiles; later ones of the same shapes do not. Time ends when the result is there, as JAX returns
-# before it has computed.
+# The first call compiles; later calls with the same shapes do not. JAX returns before the computation ends, so timings
+# have to wait for the result.
 
 # %%
 seconds = {}
@@ -55,14 +55,14 @@ axis.set(xlabel="pixels along a side", ylabel="back-projection, ms")
 plt.show()
 
 # %% [markdown]
-# It is local: twice the field takes four times as long, no more. A process that sees several GPUs shares the depths out
-# to all of them.
+# The cost is proportional to the area: twice the field takes four times as long. A process with several GPUs
+# distributes the depths over all of them.
 #
 # ## In several processes
 #
 # Frames of a recording, starts of a search, points of a Pareto front and training scenes are independent jobs.
-# `--workers 2` shares them out to two processes, by [Dask](https://distributed.dask.org)
-# (`pip install 'gs-jax[cluster]'`), and the numbers are those of one.
+# `--workers 2` distributes them over two processes, by [Dask](https://distributed.dask.org)
+# (`pip install 'gs-jax[cluster]'`), with the same results as one process.
 
 # %%
 side = 400 * 0.018
@@ -77,12 +77,12 @@ for output, more in {"one.zarr": [], "two.zarr": ["--workers", "2"]}.items():
     began = time.perf_counter()
     options = ["--voxel-um", "80", "-q", "-o", output, *more]
     done = subprocess.run([*common, *options], capture_output=True, text=True, check=True)
-    print(done.stdout, f"with starting: {time.perf_counter() - began:.0f} s", sep="")
+    print(done.stdout, f"total with start: {time.perf_counter() - began:.0f} s", sep="")
 
 # %%
 one, two = (np.asarray(zarr.open_group(name, mode="r")["0"]) for name in ("one.zarr", "two.zarr"))
 print(one.shape, "equal" if np.array_equal(one, two) else "different")
 
 # %% [markdown]
-# Starting processes, imports and compiling are most of that: few small frames are no work for several. On how many it
-# pays, what it costs, and a script for SLURM, has [the page on clusters](../../design/CLUSTER.md).
+# Most of this time is the start of processes, imports and compilation: a few small frames do not need several workers.
+# [The page on clusters](../../design/CLUSTER.md) has a cost model, and a script for SLURM.
