@@ -22,16 +22,16 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
-from gs_jax.mold.export import Mesh, printable, read_mesh, write_mesh
+from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.make import draw_solid
-from gs_jax.mold.measurement import quality, verify
+from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
     MoldShape,
     array_solid,
     array_volume,
     cast_solid,
-    engravings,
-    mold_block,
+    engraving_tools,
+    mold_bounds,
     mold_solid,
     mold_volume,
     plate_thickness,
@@ -69,10 +69,10 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
     with tempfile.TemporaryDirectory() as folder:
         meshes = [_through_file(solid, Path(folder) / "part.stl") for solid in (part, mold)]
     volumes = [mesh.solid().volume() for mesh in meshes]
-    block = float(np.prod(np.diff(mold_block(array, shape), axis=0)))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
+    block = float(np.prod(np.diff(mold_bounds(array, shape), axis=0)))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
     cast = cast_solid(array, part, shape).volume()
-    numbers = quality(verify(meshes[1], array), imager)
+    numbers = summarize(measure_lenslets(meshes[1], array), imager)
     return {
         "chord_um": chord_um,
         "facets": len(meshes[0].facets),
@@ -86,7 +86,7 @@ def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
 
 
 def _through_file(solid, path: Path) -> Mesh:
-    write_mesh(path, printable(solid), "part")
+    write_mesh(path, float32_mesh(solid), "part")
     return read_mesh(path)
 
 
@@ -105,7 +105,7 @@ def draw(design: Design, records: list[dict]) -> Figure:
 
 
 def _draw_facets(axes, array: MicrolensArray) -> None:
-    mesh = printable(array_solid(array, 2e-3))
+    mesh = float32_mesh(array_solid(array, 2e-3))
     x, y, z = mesh.vertices.T
     height = -plate_thickness(array) - z
     corners = mesh.vertices[mesh.facets]

@@ -64,7 +64,7 @@ Better designs, and their molds:
     objectives           What a microscope is judged by, as functions of an imager and depths; all *differentiable*
     run_study            Search for a design that does what a study wants
     read_study           The study in a TOML file
-    make_mold            Writes the mold of a design, or the array, to print; and a picture and a report beside it
+    make_mold            Writes the mold of a design, or the array, for printing, with a picture and a report
 
 How good it is:
 

@@ -12,8 +12,8 @@ from ezdxf.filemanagement import readfile
 from gs_jax import InputError, MicrolensArray
 from gs_jax.__main__ import commands
 from gs_jax.io.provenance import read_provenance
-from gs_jax.mold.export import mask_plan, write_mask
-from gs_jax.mold.solids import MoldShape, mark_plans, mold_block
+from gs_jax.mold.export import make_mask, write_mask
+from gs_jax.mold.solids import MoldShape, alignment_marks, mold_bounds
 
 DESIGNS = Path(__file__).parents[1] / "design"
 # One alone, two that overlap, one across the edge of the plate.
@@ -28,18 +28,18 @@ def area(ring) -> float:
 
 
 def test_openings_are_the_lenses_on_the_plate():
-    mask = mask_plan(ARRAY)
+    mask = make_mask(ARRAY)
     np.testing.assert_allclose(mask.circles, [[-2, 1, 1]])
     assert sum(map(area, mask.openings)) == pytest.approx(PAIR + math.pi / 8, rel=1e-3)
     assert max(np.abs(ring).max() for ring in mask.openings) <= 3
-    low, high = mold_block(ARRAY, MoldShape())
+    low, high = mold_bounds(ARRAY, MoldShape())
     np.testing.assert_allclose([mask.outline.min(0), mask.outline.max(0)], [low[:2], high[:2]])
-    assert sum(map(area, mask.marks)) == pytest.approx(sum(plan.area() for plan in mark_plans(ARRAY, MoldShape())))
+    assert sum(map(area, mask.marks)) == pytest.approx(sum(plan.area() for plan in alignment_marks(ARRAY, MoldShape())))
     assert len(mask.marks) == 3
 
 
 def test_dxf(tmp_path):
-    write_mask(tmp_path / "a.dxf", mask_plan(ARRAY))
+    write_mask(tmp_path / "a.dxf", make_mask(ARRAY))
     document = readfile(tmp_path / "a.dxf")
     assert document.units == 4 and not document.audit().errors  # mm
     found = {layer: [e for e in document.modelspace() if e.dxf.layer == layer] for layer in ("OPENINGS", "MARKS")}
@@ -49,9 +49,9 @@ def test_dxf(tmp_path):
 
 
 def test_svg(tmp_path):
-    write_mask(tmp_path / "a.svg", mask_plan(ARRAY))
+    write_mask(tmp_path / "a.svg", make_mask(ARRAY))
     root = ElementTree.parse(tmp_path / "a.svg").getroot()
-    assert root.get("width") == f"{np.ptp(mask_plan(ARRAY).outline[:, 0]):.10g}mm"
+    assert root.get("width") == f"{np.ptp(make_mask(ARRAY).outline[:, 0]):.10g}mm"
     (circle,) = root.iterfind(".//{*}circle")
     # The y axis of SVG points down, that of the drawing up.
     assert (circle.get("cx"), circle.get("cy"), circle.get("r")) == ("-2", "1", "0.5")
@@ -62,7 +62,7 @@ def test_svg(tmp_path):
 def test_gds_has_polygons_without_holes(tmp_path):
     gdstk = pytest.importorskip("gdstk")
     ring = [(math.cos(a), math.sin(a)) for a in np.arange(6) * math.pi / 3]
-    mask = mask_plan(MicrolensArray(np.array(ring), 2.0, 1.43, 1.4, 1.0, size=(6.0, 6.0)))
+    mask = make_mask(MicrolensArray(np.array(ring), 2.0, 1.43, 1.4, 1.0, size=(6.0, 6.0)))
     assert sorted(area(ring) > 0 for ring in mask.openings) == [False, True]
     write_mask(tmp_path / "a.gds", mask)
     library = gdstk.read_gds(tmp_path / "a.gds")
@@ -73,8 +73,8 @@ def test_gds_has_polygons_without_holes(tmp_path):
 
 def test_nothing_to_mask_is_said(tmp_path):
     covered = MicrolensArray([[0.0, 0.0], [0.5, 0.0]], 3.0, 1.43, 3.0, 1.0, size=(1.0, 1.0))
-    with pytest.raises(InputError, match="found lenses that cover the plate"):
-        mask_plan(covered)
+    with pytest.raises(InputError, match="lenses cover it"):
+        make_mask(covered)
     result = CliRunner().invoke(commands, ["mask", str(DESIGNS / "geomscope.toml"), "-o", str(tmp_path / "a.svg")])
     assert isinstance(result.exception, InputError) and "geomscope.toml: " in str(result.exception)
     assert not list(tmp_path.iterdir())

@@ -12,19 +12,19 @@ from hypothesis import given, settings, strategies as st
 from gs_jax import MicrolensArray
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.mold.export import printable
-from gs_jax.mold.lenslets import cap_sag, caps_of, surface
+from gs_jax.mold.export import float32_mesh
+from gs_jax.mold.lenslets import lenslet_height, lenslets_of, surface_height
 from gs_jax.mold.manufacturability import check_solid
-from gs_jax.mold.measurement import verify
+from gs_jax.mold.measurement import measure_lenslets
 from gs_jax.mold.solids import (
-    ENGRAVED,
+    ENGRAVING_DEPTH,
     MoldShape,
     array_solid,
     array_volume,
-    caps_volume,
     cast_solid,
-    engravings,
-    mold_block,
+    engraving_tools,
+    lenslets_volume,
+    mold_bounds,
     mold_solid,
     mold_volume,
     plate_thickness,
@@ -58,7 +58,7 @@ def lattice(spacing, *, hexagonal=False):
 
 def assert_sound(array, chord=CHORD):
     """Watertight, manifold, one body without handles, of the right volume, once rounded to float32."""
-    mesh = printable(array_solid(array, chord))
+    mesh = float32_mesh(array_solid(array, chord))
     findings = check_solid(mesh, array_volume(array), "array", volume_tolerance(array, chord))
     assert [finding for finding in findings if finding.level != "ok"] == []
     return mesh
@@ -66,7 +66,7 @@ def assert_sound(array, chord=CHORD):
 
 def test_a_single_lens_has_the_volume_of_the_formula():
     array = lenses([[0.2, -0.1]], (3.0, 2.6))
-    part, sag = array_solid(array, 5e-4), cap_sag(array)
+    part, sag = array_solid(array, 5e-4), lenslet_height(array)
     assert part.status() == m3.Error.NoError and part.genus() == 0
     expected = 3.0 * 2.6 * plate_thickness(array) + math.pi * sag**2 * (3 * 2.0 - sag) / 3
     # 1e-4 of the volume is what is promised at a chord error of 0.5 um.
@@ -89,20 +89,20 @@ def test_the_caps_volume_agrees_with_a_sum_over_directions():
     base = math.sqrt(3.0)
     inner = (8 - (4 - edge**2) ** 1.5) / 3 - base * edge**2 / 2
     # A midpoint rule on a function with kinks: 1 / count^2.
-    np.testing.assert_allclose(caps_volume(array), inner.sum() * 2 * math.pi / 20_000, rtol=1e-7)
+    np.testing.assert_allclose(lenslets_volume(array), inner.sum() * 2 * math.pi / 20_000, rtol=1e-7)
 
 
 def test_the_caps_volume_agrees_with_a_sum_over_the_plate():
     array = random_lenses()
     x, y = ((np.arange(1000) + 0.5) / 1000 * side - side / 2 for side in array.size)
-    mean = surface(caps_of(array), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].mean()
+    mean = surface_height(lenslets_of(array), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].mean()
     # Rims and grooves are kinks, not steps: a midpoint rule on a million points.
-    np.testing.assert_allclose(caps_volume(array), mean * 20.0, rtol=1e-5)
+    np.testing.assert_allclose(lenslets_volume(array), mean * 20.0, rtol=1e-5)
 
 
 def lens_facets(array, chord=CHORD):
     """Corners of the facets that are not the plano face's or the sides', as heights over the land, lenses up."""
-    mesh = printable(array_solid(array, chord))
+    mesh = float32_mesh(array_solid(array, chord))
     corners = mesh.vertices[mesh.facets].astype(float)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     corners = corners[normal[:, 2] < -1e-5 * np.linalg.norm(normal, axis=1)]
@@ -112,12 +112,12 @@ def lens_facets(array, chord=CHORD):
 def outside(array, points):
     """Distance of points from the surface of whichever lens they are nearest to, to first order, mm; the lens."""
     offs = []
-    for cap in caps_of(array):
+    for cap in lenslets_of(array):
         squared = ((points[:, :2] - cap.center) ** 2).sum(axis=1)
         # The edge's corners are a little outside its circle.
-        here = squared <= (cap.reach + CHORD) ** 2
+        here = squared <= (cap.semi_aperture + CHORD) ** 2
         squared = np.where(here, squared, 0)
-        off = (points[:, 2] - cap_sag(array) + cap.sag(squared)) / np.sqrt(
+        off = (points[:, 2] - lenslet_height(array) + cap.sag(squared)) / np.sqrt(
             1 + squared * cap.sag_slope_over_r(squared) ** 2
         )
         offs.append(np.where(here, off, np.inf))
@@ -189,7 +189,7 @@ def test_any_layout_is_sound(count, width, height, slope, grid, seed):
         centers = centers[(np.abs(centers) <= (width / 2, height / 2)).all(axis=1)]
         centers = centers if len(centers) else np.zeros((1, 2))
     array = lenses(centers, (width, height), diameter=4 * math.sin(slope), thickness=2.5)
-    assert_sound(array, chord=cap_sag(array) / 30)
+    assert_sound(array, chord=lenslet_height(array) / 30)
 
 
 def test_lenses_in_float32_are_sound():
@@ -205,7 +205,7 @@ def test_the_paper_s_array():
     # The bar is 1e-4; the lift brings it to 2e-6.
     assert off < 1e-5
     assert len(mesh.facets) < 250_000
-    found = verify(mesh, array)
+    found = measure_lenslets(mesh, array)
     np.testing.assert_allclose(found.center, np.asarray(array.centers), atol=1e-3)
     np.testing.assert_allclose(found.radius, 2.0, rtol=1e-3)
 
@@ -266,14 +266,14 @@ SHAPES = [
 def test_the_mold_is_sound_and_the_cast_fills_it(shape):
     array = random_lenses()
     part = array_solid(array, CHORD)
-    mold, low_high = mold_solid(array, part, shape), mold_block(array, shape)
-    findings = check_solid(printable(mold), mold_volume(array, shape), "mold")
+    mold, low_high = mold_solid(array, part, shape), mold_bounds(array, shape)
+    findings = check_solid(float32_mesh(mold), mold_volume(array, shape), "mold")
     assert [finding for finding in findings if finding.level != "ok"] == []
     np.testing.assert_allclose(np.reshape(mold.bounding_box(), (2, 3)), low_high, atol=1e-12)
     cast = cast_solid(array, part, shape)
     assert (mold ^ cast).volume() < 1e-9
     block = np.prod(np.diff(low_high, axis=0))
-    engraved = sum((tool.trim_by_plane([0, 0, -1], -shape.headroom)).volume() for tool in engravings(array, shape))
+    engraved = sum((tool.trim_by_plane([0, 0, -1], -shape.headroom)).volume() for tool in engraving_tools(array, shape))
     # The same facets on both sides: rounding alone.
     np.testing.assert_allclose(mold.volume() + cast.volume() + engraved, block, rtol=1e-12)
 
@@ -290,7 +290,7 @@ def test_shrinkage_is_made_up_for():
 def test_the_walls_open_by_the_draft():
     array, shape = random_lenses(), MoldShape(draft=0.1, headroom=0.5, marks=False)
     mold = mold_solid(array, array_solid(array, CHORD), shape)
-    high = mold_block(array, shape)[1]
+    high = mold_bounds(array, shape)[1]
     for height in (-0.5, 0.0, 0.4):
         opening = high[0] * high[1] * 4 - mold.slice(height).area()
         wider = 2 * (height + plate_thickness(array)) * math.tan(0.1)
@@ -300,8 +300,8 @@ def test_the_walls_open_by_the_draft():
 
 def test_the_marks_tell_the_corner_without_one():
     array, shape = random_lenses(), MoldShape(wall=3.0)
-    high = mold_block(array, shape)[1]
-    rim = mold_solid(array, array_solid(array, CHORD), shape).slice(-ENGRAVED / 2)
+    high = mold_bounds(array, shape)[1]
+    rim = mold_solid(array, array_solid(array, CHORD), shape).slice(-ENGRAVING_DEPTH / 2)
     outline = lambda sx, sy: m3.CrossSection.square([3.0, 3.0], center=True).translate(
         [sx * (high[0] - 1.5), sy * (high[1] - 1.5)]
     )
@@ -314,16 +314,16 @@ def test_the_marks_tell_the_corner_without_one():
 @pytest.mark.parametrize("label", ["geomscope-p1", "$x_1$ & 50 %", "W" * 200, "q"])
 def test_a_label_fits_on_the_rim(label):
     array, shape = random_lenses(), MoldShape(label=label, marks=False)
-    (tool,) = engravings(array, shape)
-    low, high = mold_block(array, shape)
+    (tool,) = engraving_tools(array, shape)
+    low, high = mold_bounds(array, shape)
     x0, y0, z0, x1, y1, _ = tool.bounding_box()
     assert low[0] + 4 <= x0 < x1 <= high[0] - 4 and low[1] < y0 < y1 < low[1] + 4
-    assert z0 == pytest.approx(-ENGRAVED)
+    assert z0 == pytest.approx(-ENGRAVING_DEPTH)
 
 
 @pytest.mark.parametrize("label", ["", "   ", "\n", "日本"])
 def test_a_label_that_cannot_be_drawn_is_left_out(label):
-    assert engravings(random_lenses(), MoldShape(label=label, marks=False)) == []
+    assert engraving_tools(random_lenses(), MoldShape(label=label, marks=False)) == []
 
 
 @pytest.mark.parametrize(

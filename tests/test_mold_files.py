@@ -9,11 +9,11 @@ import trimesh
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
-from gs_jax.mold.export import Mesh, printable, read_mesh, write_mesh
-from gs_jax.mold.make import judge
+from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
+from gs_jax.mold.make import check_measurement
 from gs_jax.mold.manufacturability import check_solid
-from gs_jax.mold.measurement import quality, verify
-from gs_jax.mold.solids import MoldShape, array_solid, array_volume, engravings, mold_block, mold_solid
+from gs_jax.mold.measurement import measure_lenslets, summarize
+from gs_jax.mold.solids import MoldShape, array_solid, array_volume, engraving_tools, mold_bounds, mold_solid
 
 from .test_mold import CHORD, lenses, random_lenses
 
@@ -37,7 +37,7 @@ def volume_of(corners):
 
 def test_stl_holds_the_solid(tmp_path):
     part = array_solid(random_lenses(), CHORD)
-    write_mesh(tmp_path / "a.stl", printable(part), "small array")
+    write_mesh(tmp_path / "a.stl", float32_mesh(part), "small array")
     assert (tmp_path / "a.stl").read_bytes()[:80].rstrip() == b"gs_jax, unit: mm, small array"
     normal, corners = corners_in_stl(tmp_path / "a.stl")
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -53,7 +53,7 @@ def test_stl_holds_the_solid(tmp_path):
 def test_another_reader_finds_it_watertight(tmp_path, suffix):
     array = random_lenses()
     path = tmp_path / f"a{suffix}"
-    write_mesh(path, printable(array_solid(array, 2e-4)), 'a <b> & "c"')
+    write_mesh(path, float32_mesh(array_solid(array, 2e-4)), 'a <b> & "c"')
     mesh = trimesh.load_mesh(path)
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
     # The bar, at a finer chord error than the default: small lenses have more rim.
@@ -61,14 +61,14 @@ def test_another_reader_finds_it_watertight(tmp_path, suffix):
 
 
 def test_3mf_says_millimetres(tmp_path):
-    write_mesh(tmp_path / "a.3mf", printable(array_solid(random_lenses(), CHORD)), "a")
+    write_mesh(tmp_path / "a.3mf", float32_mesh(array_solid(random_lenses(), CHORD)), "a")
     with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
         assert b'unit="millimeter"' in archive.read("3D/3dmodel.model")[:2000]
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
 def test_what_is_written_is_read_back(tmp_path, suffix):
-    mesh = printable(array_solid(random_lenses(), CHORD))
+    mesh = float32_mesh(array_solid(random_lenses(), CHORD))
     write_mesh(tmp_path / f"a{suffix}", mesh, "a")
     again = read_mesh(tmp_path / f"a{suffix}")
     np.testing.assert_array_equal(np.float32(again.vertices), mesh.vertices)
@@ -78,12 +78,12 @@ def test_what_is_written_is_read_back(tmp_path, suffix):
 def test_mold_array_and_marks_fill_the_block(tmp_path):
     array, shape = random_lenses(), MoldShape(label="fill")
     part = array_solid(array, CHORD)
-    write_mesh(tmp_path / "array.stl", printable(part), "array")
-    write_mesh(tmp_path / "mold.stl", printable(mold_solid(array, part, shape)), "mold")
+    write_mesh(tmp_path / "array.stl", float32_mesh(part), "array")
+    write_mesh(tmp_path / "mold.stl", float32_mesh(mold_solid(array, part, shape)), "mold")
     filled = sum(volume_of(corners_in_stl(tmp_path / name)[1]) for name in ("array.stl", "mold.stl"))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engravings(array, shape))
+    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
     # The bar is 1e-5; the rounding to float32 leaves less.
-    np.testing.assert_allclose(filled + engraved, np.prod(np.diff(mold_block(array, shape), axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(filled + engraved, np.prod(np.diff(mold_bounds(array, shape), axis=0)), rtol=1e-6)
 
 
 def test_vertices_that_float32_cannot_tell_apart_are_merged():
@@ -93,13 +93,13 @@ def test_vertices_that_float32_cannot_tell_apart_are_merged():
     facets = np.array([[0, 2, 1], [3, 4, 5], [0, 1, 5], [0, 5, 4], [1, 2, 3], [1, 3, 5], [2, 0, 4], [2, 4, 3]])
     cut = Mesh(corners, facets)
     assert not cut.solid().is_empty()
-    mesh = printable(cut.solid())
+    mesh = float32_mesh(cut.solid())
     assert len(mesh.vertices) == 4 and len(mesh.facets) == 4
     assert all(finding.level == "ok" for finding in check_solid(mesh, 8 * 8 / 2 * 8 / 3, "tetrahedron"))
 
 
 def test_what_is_no_solid_is_found():
-    mesh = printable(array_solid(random_lenses(), CHORD))
+    mesh = float32_mesh(array_solid(random_lenses(), CHORD))
     levels = lambda mesh, volume: {f.check: f.level for f in check_solid(mesh, volume, "part")}
     volume = mesh.solid().volume()
     assert set(levels(mesh, volume).values()) == {"ok"}
@@ -113,11 +113,11 @@ def test_what_is_no_solid_is_found():
 
 @pytest.mark.parametrize("name", ["a.obj", "a", "a.stl.txt"])
 def test_another_suffix_is_refused(tmp_path, name):
-    mesh = printable(array_solid(random_lenses(), CHORD))
+    mesh = float32_mesh(array_solid(random_lenses(), CHORD))
     with pytest.raises(InputError, match="allowed: .stl, .3mf"):
         write_mesh(tmp_path / name, mesh, "a")
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match="allowed: .stl, .3mf"):
+    with pytest.raises(InputError, match="one of .stl, .3mf"):
         read_mesh(tmp_path / name)
 
 
@@ -132,7 +132,7 @@ def test_a_broken_file_is_refused(tmp_path, name, data):
 
 def test_nothing_is_left_of_a_file_that_could_not_be_written(tmp_path):
     with pytest.raises(InputError, match="no folder"):
-        write_mesh(tmp_path / "missing" / "a.stl", printable(array_solid(random_lenses(), CHORD)), "a")
+        write_mesh(tmp_path / "missing" / "a.stl", float32_mesh(array_solid(random_lenses(), CHORD)), "a")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -141,8 +141,8 @@ def test_lenses_are_where_they_should_be(tmp_path, shape):
     array = random_lenses()
     part = array_solid(array, 5e-4)
     solid = part if shape is None else mold_solid(array, part, shape)
-    write_mesh(tmp_path / "a.stl", printable(solid), "a")
-    found = verify(read_mesh(tmp_path / "a.stl"), array, scale=1.0 if shape is None else shape.scale)
+    write_mesh(tmp_path / "a.stl", float32_mesh(solid), "a")
+    found = measure_lenslets(read_mesh(tmp_path / "a.stl"), array, scale=1.0 if shape is None else shape.scale)
     # The bars are 1 um and 0.1 %. What is left is float32 and, in the radius, the lift of the vertices: 0.3 um of 2 mm.
     np.testing.assert_allclose(found.center, np.asarray(array.centers), atol=1e-5)
     np.testing.assert_allclose(found.radius, 2.0, rtol=3e-4)
@@ -156,14 +156,14 @@ def test_lenses_that_are_not_where_they_should_be_are_found():
     moved = np.clip(moved, (-2.5, -2.0), (2.5, 2.0))
     # The same rims and sag as a sphere of another radius would have are not kept: the plate's plane is where it was.
     other = lenses(moved, (5.0, 4.0), radius=2.001, thickness=1.0)
-    found = verify(printable(array_solid(other, 5e-4)), array)
+    found = measure_lenslets(float32_mesh(array_solid(other, 5e-4)), array)
     np.testing.assert_allclose(found.center, moved, atol=1e-4)
     np.testing.assert_allclose(found.radius, 2.001, atol=1e-3)
-    measured = quality(found, behind(array))
+    measured = summarize(found, behind(array))
     assert measured["center_deviation_max_um"] == pytest.approx(
         1000 * np.linalg.norm(moved - np.asarray(array.centers), axis=1).max(), abs=0.1
     )
-    assert judge(measured, chord=5e-4, radius=2.0)[0].level == "error"
+    assert check_measurement(measured, chord=5e-4, radius=2.0)[0].level == "error"
 
 
 def test_facets_cost_light_as_the_square_of_their_depth():
@@ -171,8 +171,8 @@ def test_facets_cost_light_as_the_square_of_their_depth():
     array = lenses([[0, 0]], (2.4, 2.4))
     measured = {}
     for chord in (2e-4, 4e-4):
-        found = verify(printable(array_solid(array, chord)), array)
-        measured[chord] = quality(found, behind(array))
+        found = measure_lenslets(float32_mesh(array_solid(array, chord)), array)
+        measured[chord] = summarize(found, behind(array))
     rms = {chord: numbers["surface_error_rms_um"] / 1000 for chord, numbers in measured.items()}
     # Not all facets are equilateral, or as deep as they may be.
     for chord, found in rms.items():
@@ -189,17 +189,19 @@ def test_facets_cost_light_as_the_square_of_their_depth():
 def test_a_file_without_lenses_is_refused():
     block = trimesh.creation.box((5, 4, 1))
     with pytest.raises(ValueError, match="no facet within"):
-        verify(Mesh(block.vertices, block.faces), random_lenses())
+        measure_lenslets(Mesh(block.vertices, block.faces), random_lenses())
 
 
 def test_a_lens_that_is_not_there_is_said():
     array = lenses([[-1.0, 0], [1.0, 0]], (5.0, 4.0))
     one = lenses([[-1.0, 0]], (5.0, 4.0))
-    found = verify(printable(array_solid(one, CHORD)), array)
+    found = measure_lenslets(float32_mesh(array_solid(one, CHORD)), array)
     assert np.isnan(found.radius).tolist() == [False, True]
-    measured = quality(found, behind(array))
+    measured = summarize(found, behind(array))
     assert measured["lenses_not_measured"] == [2] and measured["lenses_measured"] == 1
-    assert any(finding.check == "lenses not measured" for finding in judge(measured, chord=CHORD, radius=2.0))
+    assert any(
+        finding.check == "lenses not measured" for finding in check_measurement(measured, chord=CHORD, radius=2.0)
+    )
 
 
 def test_the_variance_of_an_equilateral_facet():
@@ -211,4 +213,4 @@ def test_the_variance_of_an_equilateral_facet():
 
 def test_float32_arrays_are_measured_alike():
     array = MicrolensArray(np.array([[0.1, 0.2]], np.float32), size=(3.0, 3.0))
-    assert verify(printable(array_solid(array, CHORD)), array).vertices[0] > 50
+    assert measure_lenslets(float32_mesh(array_solid(array, CHORD)), array).vertices[0] > 50

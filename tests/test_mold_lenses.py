@@ -12,17 +12,17 @@ from scipy.integrate import quad
 
 from gs_jax import MicrolensArray
 from gs_jax.design.design import Design
-from gs_jax.mold.export import mask_plan, printable
-from gs_jax.mold.lenslets import DRAFT, Cap, cap_sag, caps_of, facet_cap, visible_reaches
-from gs_jax.mold.make import judge, make_mold, preview
+from gs_jax.mold.export import float32_mesh, make_mask
+from gs_jax.mold.lenslets import DRAFT, Lenslet, lenslet_height, lenslets_of, tessellate, visible_radii
+from gs_jax.mold.make import check_measurement, draw_preview, make_mold
 from gs_jax.mold.manufacturability import check_design, check_solid
-from gs_jax.mold.measurement import quality, verify
+from gs_jax.mold.measurement import measure_lenslets, summarize
 from gs_jax.mold.solids import (
     MoldShape,
     array_solid,
     array_volume,
-    caps_volume,
-    coarsest_chord,
+    lenslets_volume,
+    max_chord,
     mold_solid,
     mold_volume,
     plate_thickness,
@@ -63,19 +63,19 @@ def assert_sound(array, chord=CHORD, shape=MoldShape()):
     tolerance = volume_tolerance(array, chord)
     mold = mold_solid(array, part, shape)
     findings = [
-        *check_solid(printable(part), array_volume(array), "array", tolerance),
-        *check_solid(printable(mold), mold_volume(array, shape), "mold", tolerance),
+        *check_solid(float32_mesh(part), array_volume(array), "array", tolerance),
+        *check_solid(float32_mesh(mold), mold_volume(array, shape), "mold", tolerance),
     ]
     assert [finding for finding in findings if finding.level != "ok"] == []
-    return printable(mold)
+    return float32_mesh(mold)
 
 
 @pytest.mark.parametrize("conic, terms", [(-1.0, ()), (0.3, ()), (-0.7, (0.02, -0.01)), (0.0, (-0.03,))])
 def test_one_lens_of_any_profile_has_its_volume(conic, terms):
     array = MicrolensArray([[0.1, 0.0]], size=(3.0, 2.6), conic_constant=conic, aspheric_terms=terms)
-    (cap,) = caps_of(array)
-    held, _ = quad(lambda r: 2 * math.pi * r * (cap.rim - float(cap.sag(np.array([r**2]))[0])), 0, 1, epsabs=1e-13)
-    np.testing.assert_allclose(caps_volume(array), held, rtol=1e-10)
+    (cap,) = lenslets_of(array)
+    held, _ = quad(lambda r: 2 * math.pi * r * (cap.rim_sag - float(cap.sag(np.array([r**2]))[0])), 0, 1, epsabs=1e-13)
+    np.testing.assert_allclose(lenslets_volume(array), held, rtol=1e-10)
     part = array_solid(array, 5e-4)
     np.testing.assert_allclose(part.volume(), array_volume(array), rtol=1e-5)
     assert_sound(array)
@@ -84,15 +84,15 @@ def test_one_lens_of_any_profile_has_its_volume(conic, terms):
 @pytest.mark.parametrize(
     "cap",
     [
-        pytest.param(Cap(np.zeros(2), 1.0, 2.0, -1.0), id="paraboloid"),
-        pytest.param(Cap(np.zeros(2), 1.3, 2.0, -8.0), id="hyperboloid"),
-        pytest.param(Cap(np.zeros(2), 1.0, 2.0, 0.0, (-0.1,)), id="hollow toward the rim"),
-        pytest.param(Cap(np.zeros(2), 1.0, 2.0, 0.5, (0.1, 0.05)), id="steep toward the rim"),
-        pytest.param(Cap(np.zeros(2), 1.9, 2.0, 0.0), id="steep sphere"),
+        pytest.param(Lenslet(np.zeros(2), 1.0, 2.0, -1.0), id="paraboloid"),
+        pytest.param(Lenslet(np.zeros(2), 1.3, 2.0, -8.0), id="hyperboloid"),
+        pytest.param(Lenslet(np.zeros(2), 1.0, 2.0, 0.0, (-0.1,)), id="hollow toward the rim"),
+        pytest.param(Lenslet(np.zeros(2), 1.0, 2.0, 0.5, (0.1, 0.05)), id="steep toward the rim"),
+        pytest.param(Lenslet(np.zeros(2), 1.9, 2.0, 0.0), id="steep sphere"),
     ],
 )
 def test_facets_of_any_profile_are_within_the_chord_error(cap):
-    found = facet_cap(cap, cap.reach, CHORD)
+    found = tessellate(cap, cap.semi_aperture, CHORD)
     corners = np.column_stack([found.points, -found.sag])[found.facets]
     weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
     points = np.einsum("qk,fkx->fqx", weights, corners).reshape(-1, 3)
@@ -106,7 +106,7 @@ def test_the_volume_of_unequal_lenses_is_that_of_the_highest():
     array = unequal()
     x, y = ((np.arange(2400) + 0.5) / 2400 * side - side / 2 for side in array.size)
     # Walls are steps of 0.1 mm on a few hundredths of a percent of the places.
-    np.testing.assert_allclose(caps_volume(array), heights(array, x, y).mean() * 12, rtol=2e-5)
+    np.testing.assert_allclose(lenslets_volume(array), heights(array, x, y).mean() * 12, rtol=2e-5)
     assert_sound(array)
     np.testing.assert_allclose(array_solid(array, 2e-4).volume(), array_volume(array), rtol=2e-5)
 
@@ -114,17 +114,17 @@ def test_the_volume_of_unequal_lenses_is_that_of_the_highest():
 def test_lists_of_equal_numbers_are_one_number():
     one = MicrolensArray(CENTERS, aperture_diameter=1.5, size=(4.0, 3.0))
     each = dataclasses.replace(one, radius_of_curvature=np.full(5, 2.0), conic_constant=np.zeros(5))
-    same = [printable(array_solid(array, CHORD)) for array in (one, each)]
+    same = [float32_mesh(array_solid(array, CHORD)) for array in (one, each)]
     np.testing.assert_array_equal(same[0].vertices, same[1].vertices)
     np.testing.assert_array_equal(same[0].facets, same[1].facets)
     # Quadrature over the cells' sectors, and over a grid.
-    np.testing.assert_allclose(caps_volume(one), caps_volume(each), rtol=1e-6)
+    np.testing.assert_allclose(lenslets_volume(one), lenslets_volume(each), rtol=1e-6)
 
 
 def test_lenses_meet_where_their_sags_are_equal():
     """Paraboloids meet where `r_1^2 / R_1 = r_2^2 / R_2`: on a circle of Apollonius, not half way."""
     array = MicrolensArray([[-0.5, 0], [0.5, 0]], [1.5, 3.0], 1.43, 1.6, size=(3.0, 2.0), conic_constant=-1.0)
-    mesh = printable(array_solid(array, 1e-4))
+    mesh = float32_mesh(array_solid(array, 1e-4))
     groove = -0.5 + 1 / (1 + math.sqrt(2))
     top = mesh.vertices[(np.abs(mesh.vertices[:, 1]) < 0.02) & (np.abs(mesh.vertices[:, 0]) < 0.4)]
     top = top[top[:, 2] < -0.7]
@@ -184,39 +184,39 @@ def test_any_lenses_are_sound(count, width, height, lattice, term, seed):
         substrate_thickness=2.0,
         size=(width, height),
     )
-    assert_sound(array, coarsest_chord(caps_of(array)) / 3)
+    assert_sound(array, max_chord(lenslets_of(array)) / 3)
 
 
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 def test_radius_and_conic_are_read_back(orientation):
     array = unequal(orientation=orientation)
-    found = verify(assert_sound(array, 2e-4), array)
+    found = measure_lenslets(assert_sound(array, 2e-4), array)
     mirrored = CENTERS * (1, -1 if orientation == "curved" else 1)
     np.testing.assert_allclose(found.center, mirrored, atol=1e-5)
     # The lift is a tenth of a micrometre.
     np.testing.assert_allclose(found.radius, RADII, rtol=3e-4)
     np.testing.assert_allclose(found.conic, CONICS, atol=2e-3)
     assert (found.conic_deviation < 1e-3).all()
-    measured = quality(found, behind(array))
+    measured = summarize(found, behind(array))
     assert measured["lenses_conic_measured"] == 5 and measured["conic_deviation_max"] < 2e-3
-    assert judge(measured, chord=2e-4, radius=1.6)[0].level == "ok"
+    assert check_measurement(measured, chord=2e-4, radius=1.6)[0].level == "ok"
 
 
 def test_another_conic_is_found():
     array = unequal()
     other = unequal(conic_constant=CONICS + 0.3)
     # The land is at the deepest rim: the vertices are where they were.
-    found = verify(printable(array_solid(other, 2e-4)), array)
+    found = measure_lenslets(float32_mesh(array_solid(other, 2e-4)), array)
     np.testing.assert_allclose(found.conic, CONICS + 0.3, atol=3e-3)
-    assert judge(quality(found, behind(array)), chord=2e-4, radius=1.6)[0].level == "error"
+    assert check_measurement(summarize(found, behind(array)), chord=2e-4, radius=1.6)[0].level == "error"
 
 
 def test_a_small_aperture_does_not_say_its_conic():
     array = MicrolensArray([[-0.5, 0], [0.5, 0]], 2.0, 1.43, [0.2, 0.9], size=(2.0, 1.0), conic_constant=-1.0)
-    found = verify(printable(array_solid(array, 5e-5)), array)
+    found = measure_lenslets(float32_mesh(array_solid(array, 5e-5)), array)
     assert np.isnan(found.conic).tolist() == [True, False]
     np.testing.assert_allclose(found.radius, 2.0, rtol=1e-3)
-    text = judge(quality(found, behind(array)), chord=5e-5, radius=2.0)[0].text
+    text = check_measurement(summarize(found, behind(array)), chord=5e-5, radius=2.0)[0].text
     assert "conic constants of 1 within" in text
 
 
@@ -229,22 +229,22 @@ def test_a_part_whose_curved_side_faces_the_object_is_turned_over_and_not_mirror
     up = array_solid(plano, CHORD).mirror([0, 0, 1])
     # Other facets of the same lenses, seen in the mirror from below.
     assert (standing - up).volume() + (up - standing).volume() < 1e-3 * up.volume()
-    np.testing.assert_allclose(mask_plan(curved).circles[:, :2], mask_plan(plano).circles[:, :2] * (1, -1))
+    np.testing.assert_allclose(make_mask(curved).circles[:, :2], make_mask(plano).circles[:, :2] * (1, -1))
 
 
 def test_what_neighbours_hide_is_not_facetted():
     near = MicrolensArray(CENTERS[:3], 2.0, 1.43, 1.5, size=(4.0, 3.0))
-    assert visible_reaches(caps_of(near), near.size) == pytest.approx([0.75] * 3)
+    assert visible_radii(lenslets_of(near), near.size) == pytest.approx([0.75] * 3)
     i, j = np.meshgrid(np.arange(-3, 4), np.arange(-3, 4))
     dense = MicrolensArray(0.4 * np.stack([i, j], axis=-1).reshape(-1, 2), 2.0, 1.43, 2.0, size=(2.8, 2.8))
-    reaches = visible_reaches(caps_of(dense), dense.size)
+    reaches = visible_radii(lenslets_of(dense), dense.size)
     # A cell's corner, and a tile or two.
     assert 0.2 * math.sqrt(2) < max(reaches) < 0.36
     assert_sound(dense)
 
 
 def test_openings_of_a_mask_are_as_wide_as_their_lenses():
-    mask = mask_plan(unequal(centers=CENTERS * 1.2))
+    mask = make_mask(unequal(centers=CENTERS * 1.2))
     alone = {round(float(d), 9) for d in mask.circles[:, 2]}
     assert alone <= set(DIAMETERS.tolist()) and len(alone) > 0
     area = lambda ring: float(ring[:, 0] @ np.roll(ring[:, 1], -1) - ring[:, 1] @ np.roll(ring[:, 0], -1)) / 2
@@ -283,7 +283,7 @@ def test_the_words_about_unequal_lenses_hold_the_numbers():
     each = small.imager().array
     one = dataclasses.replace(each, radius_of_curvature=2.0, conic_constant=0.0, aperture_diameter=1.4)
     same = {f.check: f.text for f in check_design(design(), MoldShape(), chord=1e-3, resolution=0.025)}
-    assert found["plate"] == same["plate"] and cap_sag(each) == cap_sag(one)
+    assert found["plate"] == same["plate"] and lenslet_height(each) == lenslet_height(one)
     # Discs of 1.4 and 1 mm on the plate, less the lens that they share; and the wall of the smaller one.
     share = float(found["coverage"].split(" %")[0])
     discs = m3.CrossSection.circle(0.7, 4000) + m3.CrossSection.circle(0.5, 4000).translate([1.1, 0.2])
@@ -303,7 +303,7 @@ def test_the_length_of_ridges_by_their_crossings():
 def test_the_picture_of_a_turned_part_has_the_designs_y():
     titles = {}
     for orientation in ("plano", "curved"):
-        axes = preview(unequal(orientation=orientation), MoldShape(), "x").axes[0]
+        axes = draw_preview(unequal(orientation=orientation), MoldShape(), "x").axes[0]
         titles[orientation] = axes.get_title(), axes.images[0].get_extent()
     assert titles["plano"][0].endswith("seen from the sensor") and titles["curved"][0].endswith("seen from the object")
     assert list(titles["plano"][1]) == [-2, 2, 1.5, -1.5] and list(titles["curved"][1]) == [-2, 2, -1.5, 1.5]
@@ -312,4 +312,4 @@ def test_the_picture_of_a_turned_part_has_the_designs_y():
 def test_a_lens_that_is_too_steep_is_named():
     with pytest.raises(ValueError, match="at most 1.932 mm for lens 2, got 1.99"):
         array_solid(unequal(aperture_diameter=[1.0, 1.99, 1, 1, 1], radius_of_curvature=1.0, conic_constant=0.0))
-    assert plate_thickness(unequal()) == pytest.approx(1 - cap_sag(unequal()))
+    assert plate_thickness(unequal()) == pytest.approx(1 - lenslet_height(unequal()))

@@ -17,7 +17,7 @@ from gs_jax.design.design import Design, read_design
 from gs_jax.layouts import coverage
 from gs_jax.mold import make
 from gs_jax.mold.make import make_mold
-from gs_jax.mold.manufacturability import Finding, check_design, refuse_errors
+from gs_jax.mold.manufacturability import CheckResult, check_design, raise_first_error
 from gs_jax.mold.solids import MoldShape, array_volume, plate_thickness
 
 DESIGN = """
@@ -101,8 +101,8 @@ def test_mold(folder, positive):
 
 
 def test_a_part_that_is_not_the_design_is_not_written(folder, monkeypatch):
-    wrong = lambda *_, **__: [Finding("lenses", "error", "read back, lenses are elsewhere.")]
-    monkeypatch.setattr(make, "judge", wrong)
+    wrong = lambda *_, **__: [CheckResult("lenses", "error", "read back, lenses are elsewhere.")]
+    monkeypatch.setattr(make, "check_measurement", wrong)
     with pytest.raises(RuntimeError, match="lenses are elsewhere"):
         make_mold(read_design("design.toml"), "part.stl", chord=2e-3)
     assert [path.name for path in folder.iterdir()] == ["design.toml"]
@@ -128,7 +128,7 @@ def test_the_options_change_the_mold(folder):
     [
         (("-o", "part.obj"), "allowed: .stl, .3mf"),
         (("-o", "missing/part.stl"), "no folder"),
-        (("-o", "part.stl", "--chord-um", 100), "the chord error: found 100 um, allowed: at most"),
+        (("-o", "part.stl", "--chord-um", 100), "the chord error must be at most"),
     ],
 )
 def test_wrong_input_is_one_line_and_writes_nothing(folder, arguments, message):
@@ -149,13 +149,19 @@ def test_a_wrong_number_is_refused(folder, option, value):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"array": {"substrate_thickness_mm": 0.0}}, "`array.substrate_thickness_mm`: found 0, allowed: more than"),
-        ({"array": {"substrate_thickness_mm": 0.1}}, "`array.substrate_thickness_mm`: found 0.1, allowed: more than"),
+        (
+            {"array": {"substrate_thickness_mm": 0.0}},
+            "`array.substrate_thickness_mm` must be more than the lenses' sag, 0.1265 mm, got 0",
+        ),
+        (
+            {"array": {"substrate_thickness_mm": 0.1}},
+            "`array.substrate_thickness_mm` must be more than the lenses' sag, 0.1265 mm, got 0.1",
+        ),
         (
             {"lens": {"aperture_diameter_mm": 3.95}, "array": {"substrate_thickness_mm": 3.0}},
-            "`lens.aperture_diameter_mm`: found 3.95, allowed: at most 3.864 mm",
+            "`lens.aperture_diameter_mm` must be positive and at most 3.864 mm, got 3.95; ",
         ),
-        ({"lens": {"focal_length_mm": 4.0}}, "`lens.focal_length_mm`: found 4, allowed: R / (n - 1) = 4.651 mm"),
+        ({"lens": {"focal_length_mm": 4.0}}, "`lens.focal_length_mm` must be R / (n - 1) = 4.651 mm"),
     ],
 )
 def test_a_design_that_cannot_be_made_is_refused(tmp_path, changes, message):
@@ -168,7 +174,7 @@ def test_a_design_that_cannot_be_made_is_refused(tmp_path, changes, message):
 def test_a_design_file_is_read_and_named(folder):
     report = make_mold("design.toml", "part.stl", positive=True, chord=6e-3)
     assert report["part"] == "array" and report["design"] == "small $x"
-    with pytest.raises(InputError, match="^design.toml: the chord error: found 100 um, allowed: at most"):
+    with pytest.raises(InputError, match="^design.toml: the chord error must be at most .* got 100 um"):
         make_mold("design.toml", "other.stl", chord=0.1)
     with pytest.raises(InputError, match="missing.toml"):
         make_mold("missing.toml", "other.stl")
@@ -183,9 +189,9 @@ def test_what_is_doubtful_is_said():
     assert findings_of(design(), resolution=0.1)["smallest feature"].level == "warning"
     assert findings_of(design(), resolution=1e-3)["facets"].level == "warning"
     assert findings_of(design(lens={"focal_length_mm": 2.0 / 0.43}))["focal length"].level == "ok"
-    refuse_errors(list(found.values()), "a warning is no error")
+    raise_first_error(list(found.values()), InputError)
     many = findings_of(design(), chord=1e-7)["facets"]
-    assert many.level == "error" and "allowed: at least 0.000" in many.text
+    assert many.level == "error" and "must be at least 0.000" in many.text
 
 
 def test_the_words_hold_the_numbers():

@@ -9,7 +9,7 @@ from matplotlib import pyplot as plt
 from matplotlib.patches import Circle
 
 import gs_jax as gs
-from gs_jax.mold.export import mask_plan
+from gs_jax.mold.export import make_mask
 from gs_jax.mold.solids import MoldShape
 
 LENSES = 40
@@ -74,11 +74,11 @@ print([round(b / a, 4) for a, b in zip(report["size_mm"], larger["size_mm"], str
 
 # %%
 try:
-    mask_plan(design.imager().array)
+    make_mask(design.imager().array)
 except gs.InputError as error:
     print(error)
 lens = design.lens.model_copy(update={"aperture_diameter_mm": 0.8})
-plan = mask_plan(design.model_copy(update={"lens": lens}).imager().array)
+plan = make_mask(design.model_copy(update={"lens": lens}).imager().array)
 figure, axis = plt.subplots(figsize=(4, 4), layout="constrained")
 axis.fill(*plan.outline.T, color="0.3")
 for x, y, diameter in plan.circles:

@@ -115,13 +115,13 @@ def mask_command(design: Path, output: Path):
     """
     from ..design.design import design_text, read_design
     from ..io.files import check_output
-    from ..mold.export import MASK_SUFFIXES, mask_plan, write_mask
+    from ..mold.export import MASK_SUFFIXES, make_mask, write_mask
 
     check_output(output, MASK_SUFFIXES)
     check_may_write(output, inputs=(design,))
     microscope = read_design(design)
     with errors_name_file(design):
-        mask = mask_plan(microscope.imager().array)
+        mask = make_mask(microscope.imager().array)
     write_mask(output, mask, provenance_of(design, design=design_text(microscope)))
     alone, rings = len(mask.circles), len(mask.openings)
     width, height = mask.outline.max(0) - mask.outline.min(0)

@@ -1,9 +1,8 @@
-"""The lenses of an array as the part has them: one a cap of its own, of any profile that falls from vertex to rim.
+"""Lenslet surfaces of a molded array, and their tessellation within a chordal tolerance.
 
-All vertices lie in one plane, and heights are over the land, the plane between the lenses. The land is at the deepest
-rim's sag: what is alike ends in it. A lens whose rim is higher stands on a wall, with a draft so that a cast can be
-peeled and that walls which touch are one body. The surface is the highest of caps, walls and land: lenses end where
-they meet, or at their discs. Lengths in mm, angles in radians.
+All vertices lie in one plane. Heights are measured from the base, the flat plate between the lenslets, which is as far
+below the vertices as the deepest rim. A lenslet with a higher rim stands on a wall with a draft angle. The surface is
+the maximum of lenslets, walls and base: neighbours end where they intersect. Lengths in mm, angles in radians.
 """
 
 import math
@@ -17,297 +16,257 @@ from scipy.spatial import Delaunay, KDTree
 
 from ..lenses import MicrolensArray, sag, sag_slope_over_r
 
-# Of walls, from the axis: usual for what is to come off a mold.
+# Draft of the walls: lets a cast be peeled, and joins walls that touch into one body.
 DRAFT = math.radians(5)
-# Steeper rims are neither printed nor peeled well, and hide their facets from above.
-STEEPEST = math.radians(75)
+# Steeper rims neither print nor peel well, and their facets are not visible from above.
+MAX_SLOPE = math.radians(75)
+# Rounds that split large facets; one or two are enough.
+_SPLIT_ROUNDS = 20
+_PROFILE_SAMPLES = 1025
 
-
-@dataclass(frozen=True)
-class Cap:
-    """One lens.
-
-    Parameters
-    ----------
-    center
-        Its vertex `(x, y)` in the part's frame, mm.
-    reach
-        Radius of its disc, mm.
-    radius, conic, terms
-        Of `MicrolensArray`'s surface: radius of curvature, conic constant, A_4, A_6, ....
-    """
-
-    center: Float[np.ndarray, "2"]
-    reach: float
-    radius: float
-    conic: float
-    terms: tuple[float, ...] = ()
-
-    def sag(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """How far the surface is below its vertex at a squared distance from the axis, mm."""
-        return sag(np.asarray(squared, float), self.radius, self.conic, self.terms)
-
-    def sag_slope_over_r(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """Slope over the distance from the axis, 1/mm."""
-        return sag_slope_over_r(np.asarray(squared, float), self.radius, self.conic, self.terms)
-
-    @property
-    def rim(self) -> float:
-        """Sag of the rim, mm."""
-        return float(self.sag(np.array([self.reach**2]))[0])
-
-    @property
-    def widest(self) -> float:
-        """Radius up to which the disc could be made, mm: the surface falls, by no more than `STEEPEST`."""
-        low, high = 0.0, self.reach
-        if self._is_made(high):
-            return high
-        # What is wrong somewhere is wrong at the first such place: profiles are asked at many.
-        radii = np.linspace(low, high, 1025)
-        first = next(i for i, r in enumerate(radii) if not self._is_made(r))
-        low, high = (radii[first - 1], radii[first]) if first else (0.0, 0.0)
-        for _ in range(60):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._is_made(middle) else (low, middle)
-        return float(low)
-
-    def _is_made(self, reach) -> bool:
-        squared = np.linspace(0, reach, 257) ** 2
-        if not ((1 + self.conic) * squared < self.radius**2).all():
-            return False
-        steep = self.sag_slope_over_r(squared)
-        return bool((steep > 0).all() and (steep * np.sqrt(squared) <= math.tan(STEEPEST)).all())
-
-
-def caps_of(array: MicrolensArray) -> list[Cap]:
-    """The lenses of an array, in the part's frame.
-
-    That is the design's if the plano side faces the object: x and y as the sensor's. A part lies with its lenses
-    toward -z, so one whose curved side faces the object has been turned over, about x: its y runs against the
-    sensor's. A part that was not turned but had its lenses on the other face would be mirrored.
-    """
-    count = len(array.centers)
-    numbers = (array.aperture_diameter, array.radius_of_curvature, array.conic_constant)
-    diameter, radius, conic = (np.broadcast_to(np.asarray(x, float), count).tolist() for x in numbers)
-    terms = tuple(np.asarray(array.aspheric_terms, float).tolist())
-    return [
-        Cap(center, d / 2, r, k, terms)
-        for center, d, r, k in zip(part_centers(array), diameter, radius, conic, strict=True)
-    ]
-
-
-def part_centers(array: MicrolensArray) -> Float[np.ndarray, "lens 2"]:
-    """The lens vertices in the part's frame, mm."""
-    return np.asarray(array.centers, float) * (1.0, 1.0 if array.orientation == "plano" else -1.0)
-
-
-def cap_sag(array: MicrolensArray) -> float:
-    """Height of the vertices over the land, mm: the deepest rim's sag, `R - sqrt(R^2 - D^2/4)` of spheres alike."""
-    return max(cap.rim for cap in caps_of(array))
-
-
-def surface(
-    caps: list[Cap], points: Float[np.ndarray, "point 2"], margin: float = 0.0
-) -> tuple[Float[np.ndarray, " point"], Int[np.ndarray, " point"]]:
-    """Height of the surface over the land at points `(x, y)`, mm, and whose lens it is.
-
-    That is -1 of walls and land, and where the lens is not higher than anything else by more than the margin, mm.
-    """
-    land = max(cap.rim for cap in caps)
-    height, second, owner = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), -1)
-    for number, (cap, (here, squared)) in enumerate(zip(caps, _around(caps, points, land), strict=True)):
-        beyond = np.sqrt(np.maximum(squared, cap.reach**2)) - cap.reach
-        its = land - cap.sag(np.minimum(squared, cap.reach**2)) - beyond / math.tan(DRAFT)
-        higher = its > height[here]
-        second[here] = np.maximum(second[here], np.minimum(its, height[here]))
-        height[here[higher]] = its[higher]
-        owner[here[higher]] = np.where(beyond[higher] > 0, -1, number)
-    return height, np.where(height - second > margin, owner, -1) if margin else owner
-
-
-def visible_reaches(caps: list[Cap], size: tuple[float, float]) -> list[float]:
-    """How far from its vertex each lens may be seen, mm: up to its disc, or less if others hide the rest of it.
-
-    The plate is cut into tiles. Over a tile a lens is no higher than at the tile's nearest point, and some lens is as
-    high as at its farthest point: a lens that is lower than that is not seen there.
-    """
-    land = max(cap.rim for cap in caps)
-    step = math.sqrt(math.prod(size) / (400 * len(caps)))
-    count = [math.ceil(side / step) for side in size]
-    middles = [(np.arange(n) + 0.5) * (side / n) - side / 2 for n, side in zip(count, size, strict=True)]
-    tiles = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
-    half = math.hypot(*(side / n for n, side in zip(count, size, strict=True))) / 2
-    least = np.zeros(len(tiles))
-    near = list(_around(caps, tiles, land, half))
-    for cap, (here, squared) in zip(caps, near, strict=True):
-        far = np.sqrt(squared) + half
-        here, far = here[far <= cap.reach], far[far <= cap.reach]
-        least[here] = np.maximum(least[here], land - cap.sag(far**2))
-    reaches = []
-    for cap, (here, squared) in zip(caps, near, strict=True):
-        distance = np.sqrt(squared)
-        highest = land - cap.sag(np.clip(distance - half, 0, cap.reach) ** 2)
-        reaches.append(min(cap.reach, float((distance + half)[highest >= least[here]].max(initial=half))))
-    return reaches
-
-
-def _around(caps, points, land, margin=0.0):
-    """For each lens the points on or near its cap and wall, and their squared distances from its axis."""
-    order = np.argsort(points[:, 0], kind="stable")
-    x = points[order, 0]
-    for cap in caps:
-        reach = cap.reach + (land - cap.rim) * math.tan(DRAFT) + margin
-        first, last = np.searchsorted(x, cap.center[0] + np.array([-reach, reach]))
-        here = order[first:last]
-        squared = ((points[here] - cap.center) ** 2).sum(axis=1)
-        yield here[squared < reach**2], squared[squared < reach**2]
-
-
-# How often facets that are too large are split. One or two rounds are enough; more would mean that none is.
-_ROUNDS = 20
-# Radii at which a profile is known.
-_RADII = 1025
-
-# Dunavant's rule of degree 4 on a triangle: a facet's distance from a sphere is a quadratic, its square a quartic.
+# Dunavant's quadrature of degree 4 on a triangle, exact for the squared distance of a facet from a sphere.
 NODES = np.array(
     [[1 - 2 * a if i == j else a for j in range(3)] for a in (0.445948490915965, 0.091576213509771) for i in range(3)]
 )
 WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-class Facets(NamedTuple):
-    """A cap's facets, counter-clockwise in (x, y).
+@dataclass(frozen=True)
+class Lenslet:
+    """One lens of the part: vertex `(x, y)`, radius of the clear disc, radius of curvature, all in mm, and
+    conic constant and aspheric terms as of `MicrolensArray`."""
 
-    Parameters
-    ----------
-    points
-        `(x, y)` from the axis, the ring of the edge first, mm.
-    sag
-        Of the vertices, mm. They are lifted off the surface by the facets' mean depth, but for the ring's.
-    facets
-        As indices of points.
-    ring
-        How many points the edge has.
+    center: Float[np.ndarray, "2"]
+    semi_aperture: float
+    radius: float
+    conic: float
+    terms: tuple[float, ...] = ()
+
+    def sag(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Depth of the surface below its vertex at squared distances from the axis, mm."""
+        return sag(np.asarray(squared, float), self.radius, self.conic, self.terms)
+
+    def sag_slope_over_r(self, squared: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Slope divided by the distance from the axis, 1/mm."""
+        return sag_slope_over_r(np.asarray(squared, float), self.radius, self.conic, self.terms)
+
+    @property
+    def rim_sag(self) -> float:
+        """Sag at the edge of the aperture, mm."""
+        return float(self.sag(np.array([self.semi_aperture**2]))[0])
+
+    @property
+    def max_semi_aperture(self) -> float:
+        """Largest manufacturable semi-aperture, mm: the slope is positive and at most `MAX_SLOPE` inside it."""
+        if self._is_manufacturable(self.semi_aperture):
+            return self.semi_aperture
+        radii = np.linspace(0.0, self.semi_aperture, 1025)
+        first = next(i for i, r in enumerate(radii) if not self._is_manufacturable(r))
+        low, high = (radii[first - 1], radii[first]) if first else (0.0, 0.0)
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._is_manufacturable(middle) else (low, middle)
+        return float(low)
+
+    def _is_manufacturable(self, semi_aperture) -> bool:
+        squared = np.linspace(0, semi_aperture, 257) ** 2
+        if not ((1 + self.conic) * squared < self.radius**2).all():
+            return False
+        slope_over_r = self.sag_slope_over_r(squared)
+        return bool((slope_over_r > 0).all() and (slope_over_r * np.sqrt(squared) <= math.tan(MAX_SLOPE)).all())
+
+
+def lenslets_of(array: MicrolensArray) -> list[Lenslet]:
+    """Lenslets of an array in the frame of the part.
+
+    Parts have their lenslets toward -z. An array whose plano side faces the object keeps the design's x and y. One
+    whose curved side faces the object is rotated about x, so that its y is reversed; a mirrored part would be wrong.
+    """
+    count = len(array.centers)
+    numbers = (array.aperture_diameter, array.radius_of_curvature, array.conic_constant)
+    diameter, radius, conic = (np.broadcast_to(np.asarray(x, float), count).tolist() for x in numbers)
+    terms = tuple(np.asarray(array.aspheric_terms, float).tolist())
+    return [
+        Lenslet(center, d / 2, r, k, terms)
+        for center, d, r, k in zip(part_centers(array), diameter, radius, conic, strict=True)
+    ]
+
+
+def part_centers(array: MicrolensArray) -> Float[np.ndarray, "lens 2"]:
+    """Vertices `(x, y)` in the frame of the part, mm."""
+    return np.asarray(array.centers, float) * (1.0, 1.0 if array.orientation == "plano" else -1.0)
+
+
+def lenslet_height(array: MicrolensArray) -> float:
+    """Height of the vertices above the base, mm: the largest rim sag."""
+    return max(lenslet.rim_sag for lenslet in lenslets_of(array))
+
+
+def surface_height(
+    lenslets: list[Lenslet], points: Float[np.ndarray, "point 2"], margin: float = 0.0
+) -> tuple[Float[np.ndarray, " point"], Int[np.ndarray, " point"]]:
+    """Height of the surface above the base at points `(x, y)`, mm, and the index of the lenslet there.
+
+    The index is -1 on walls and base, and where the lenslet is not more than `margin`, mm, above everything else.
+    """
+    top = max(lenslet.rim_sag for lenslet in lenslets)
+    height, second, owner = np.zeros(len(points)), np.zeros(len(points)), np.full(len(points), -1)
+    for number, (lenslet, (near, squared)) in enumerate(zip(lenslets, _near(lenslets, points, top), strict=True)):
+        edge = lenslet.semi_aperture
+        beyond = np.sqrt(np.maximum(squared, edge**2)) - edge
+        own = top - lenslet.sag(np.minimum(squared, edge**2)) - beyond / math.tan(DRAFT)
+        higher = own > height[near]
+        second[near] = np.maximum(second[near], np.minimum(own, height[near]))
+        height[near[higher]] = own[higher]
+        owner[near[higher]] = np.where(beyond[higher] > 0, -1, number)
+    return height, np.where(height - second > margin, owner, -1) if margin else owner
+
+
+def visible_radii(lenslets: list[Lenslet], size: tuple[float, float]) -> list[float]:
+    """Upper bounds of the distances from each vertex at which the lenslet is not hidden by others, mm.
+
+    The plate is cut into tiles. A lenslet is hidden in a tile if its height at the nearest point of the tile is below
+    another lenslet's height at the farthest point.
+    """
+    top = max(lenslet.rim_sag for lenslet in lenslets)
+    step = math.sqrt(math.prod(size) / (400 * len(lenslets)))
+    count = [math.ceil(side / step) for side in size]
+    middles = [(np.arange(n) + 0.5) * (side / n) - side / 2 for n, side in zip(count, size, strict=True)]
+    tiles = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    half = math.hypot(*(side / n for n, side in zip(count, size, strict=True))) / 2
+    lower_bound = np.zeros(len(tiles))
+    neighbourhoods = list(_near(lenslets, tiles, top, half))
+    for lenslet, (near, squared) in zip(lenslets, neighbourhoods, strict=True):
+        far = np.sqrt(squared) + half
+        near, far = near[far <= lenslet.semi_aperture], far[far <= lenslet.semi_aperture]
+        lower_bound[near] = np.maximum(lower_bound[near], top - lenslet.sag(far**2))
+    radii = []
+    for lenslet, (near, squared) in zip(lenslets, neighbourhoods, strict=True):
+        distance, edge = np.sqrt(squared), lenslet.semi_aperture
+        visible = top - lenslet.sag(np.clip(distance - half, 0, edge) ** 2) >= lower_bound[near]
+        radii.append(min(edge, float((distance + half)[visible].max(initial=half))))
+    return radii
+
+
+def _near(lenslets, points, top, margin=0.0):
+    """Yields for each lenslet the indices of points within its wall, and their squared distances from its axis."""
+    order = np.argsort(points[:, 0], kind="stable")
+    x = points[order, 0]
+    for lenslet in lenslets:
+        extent = lenslet.semi_aperture + (top - lenslet.rim_sag) * math.tan(DRAFT) + margin
+        first, last = np.searchsorted(x, lenslet.center[0] + np.array([-extent, extent]))
+        near = order[first:last]
+        squared = ((points[near] - lenslet.center) ** 2).sum(axis=1)
+        yield near[squared < extent**2], squared[squared < extent**2]
+
+
+class Tessellation(NamedTuple):
+    """Facets of a lenslet, counter-clockwise in (x, y), as indices of points.
+
+    Points are relative to the axis, mm; the first `num_edge` lie on the edge. `sag` is theirs, see `tessellate`.
     """
 
     points: Float[np.ndarray, "point 2"]
     sag: Float[np.ndarray, " point"]
     facets: Int[np.ndarray, "facet 3"]
-    ring: int
+    num_edge: int
 
 
-class _Maps(NamedTuple):
-    """A profile at some radii: how far they are along it and in maps to the plane, and its curvatures."""
+class _Profile(NamedTuple):
+    """A surface of revolution at some radii: arc length, maps to the plane, and curvatures."""
 
     radii: np.ndarray
     stretch: np.ndarray
-    along: np.ndarray
+    arc_length: np.ndarray
     conformal: np.ndarray
     equal_area: np.ndarray
     mean_curvature: np.ndarray
-    curvature: float
+    max_curvature: float
 
 
-def facet_cap(cap: Cap, reach: float, chord: float) -> Facets:
-    """Facets of a cap up to a distance from its axis.
+def tessellate(lenslet: Lenslet, radius: float, chord: float) -> Tessellation:
+    """Tessellates a lenslet up to a distance from its axis, within a chordal tolerance, both in mm.
 
-    Vertices on the surface itself would leave every facet of a convex lens inside it: the part would be too thin by
-    three quarters of the chord error. They are lifted by the mean depth of the facets, so that the surface is right on
-    average (in thickness and volume), and no farther from the lens than before.
-
-    Parameters
-    ----------
-    cap
-        The lens.
-    reach
-        Where the facets end, mm.
-    chord
-        The largest distance between a facet and the surface, mm.
+    A surface of revolution maps conformally to the plane by `ln q = int sqrt(1 + s'^2) / r dr`, so the Delaunay
+    triangulation of the mapped points is that of the surface; for a sphere this is the stereographic projection and
+    yields the convex hull. A facet with circumradius rho is at most `rho^2 kappa / 2` deep, with kappa the largest
+    principal curvature. Interior vertices are moved outward by the mean depth of the facets, so that thickness and
+    volume are unbiased.
 
     Raises
     ------
     RuntimeError
-        If no facets are found; those of rims that slope by 75 degrees and less are.
+        If the facets do not converge; they do for slopes up to `MAX_SLOPE`.
     """
-    maps = _maps(cap, reach)
-    radius = facet_circumradius(1 / maps.curvature, chord)
-    inside, side = _hexagonal(maps, radius)
-    # The edge is an arc in the plane, and on the surface it is as far from point to point as a facet is wide.
-    count = max(6, math.ceil(2 * math.pi * reach / min(side, math.sqrt(8 * reach * chord))))
+    profile = _profile(lenslet, radius)
+    circumradius = math.sqrt(2 * (1 / profile.max_curvature) * chord - chord**2)
+    inner, side = _hexagonal_points(profile, circumradius)
+    # Bound both the chordal error of the edge in the plane and its spacing on the surface.
+    count = max(6, math.ceil(2 * math.pi * radius / min(side, math.sqrt(8 * radius * chord))))
     step = 2 * math.pi / count
     angle = step * np.arange(count)
-    # As large as the disc, so that walls are, too: its corners are outside the circle by less than its chords inside.
-    ring = reach * math.sqrt(step / math.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = np.concatenate([ring, inside if len(inside) else np.zeros((1, 2))])
-    for _ in range(_ROUNDS):
-        flat = _scaled(points, maps.radii, maps.conformal)
+    # The polygon has the area of the disc.
+    edge = radius * math.sqrt(step / math.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = np.concatenate([edge, inner if len(inner) else np.zeros((1, 2))])
+    for _ in range(_SPLIT_ROUNDS):
+        flat = _rescale(points, profile.radii, profile.conformal)
         facets = _delaunay(flat)
-        vertices = np.column_stack([points, -cap.sag(np.minimum((points**2).sum(axis=1), reach**2))])
-        more = _splits(flat, vertices[facets], facets, radius)
-        more = _scaled(more, maps.conformal, maps.radii)
-        more = more[np.hypot(*more.T) < reach * math.cos(math.pi / count)]
-        crowded = {j for _, j in KDTree(more).query_pairs(side / 2)} if len(more) else set()
-        if not len(more):
-            return Facets(points, _lifted(cap, maps, vertices, facets, count, len(inside)), facets, count)
-        points = np.concatenate([points, more[[i for i in range(len(more)) if i not in crowded]]])
-    raise RuntimeError(f"facets within {chord} mm of {cap} were not found")
+        vertices = np.column_stack([points, -lenslet.sag(np.minimum((points**2).sum(axis=1), radius**2))])
+        added = _rescale(_split_points(flat, vertices, facets, circumradius), profile.conformal, profile.radii)
+        added = added[np.hypot(*added.T) < radius * math.cos(math.pi / count)]
+        if not len(added):
+            sag = _offset_sag(lenslet, profile, vertices, facets, count, len(inner))
+            return Tessellation(points, sag, facets, count)
+        crowded = {j for _, j in KDTree(added).query_pairs(side / 2)}
+        points = np.concatenate([points, added[[i for i in range(len(added)) if i not in crowded]]])
+    raise RuntimeError(f"the tessellation of {lenslet} did not converge within {chord} mm")
 
 
-def facet_circumradius(radius: float, chord: float) -> float:
-    """Circumradius of a triangle whose corners lie on a sphere and whose plane dips `chord` below it, mm."""
-    return math.sqrt(2 * radius * chord - chord**2)
+def estimate_facet_count(lenslets: list[Lenslet], radii: list[float], chord: float) -> float:
+    """Estimated number of facets: equilateral ones of `side^2 = 6 chord / kappa`, and 20 % for the edges."""
+    count = 0.0
+    for lenslet, radius in zip(lenslets, radii, strict=True):
+        curvature = _curvatures(lenslet, np.linspace(0, radius, 257))[1]
+        count += math.pi * radius**2 / (math.sqrt(3) / 4 * 6 / curvature * chord)
+    return 1.2 * count
 
 
-def largest_curvature(cap: Cap, reach: float) -> float:
-    """The largest principal curvature up to a distance from the axis, 1/mm."""
-    return _curvatures(cap, np.linspace(0, reach, 257))[1]
-
-
-def estimated_facets(caps: list[Cap], reaches: list[float], chord: float) -> float:
-    """About how many facets the lenses take: equilateral ones of `side^2 = 6 chord / kappa`, and a fifth for edges."""
-    facet = [math.sqrt(3) / 4 * 6 / largest_curvature(*pair) * chord for pair in zip(caps, reaches, strict=True)]
-    return 1.2 * sum(math.pi * reach**2 / area for reach, area in zip(reaches, facet, strict=True))
-
-
-def _maps(cap, reach) -> _Maps:
-    r = np.linspace(0, reach, _RADII)
-    steep = cap.sag_slope_over_r(r**2)
-    stretch = np.sqrt(1 + (r * steep) ** 2)
+def _profile(lenslet, radius) -> _Profile:
+    r = np.linspace(0, radius, _PROFILE_SAMPLES)
+    slope_over_r = lenslet.sag_slope_over_r(r**2)
+    stretch = np.sqrt(1 + (r * slope_over_r) ** 2)
     integral = lambda values: cumulative_simpson(values, x=r, initial=0)
     # (stretch - 1) / r, without a division by zero on the axis.
-    conformal = r * np.exp(integral(r * steep**2 / (1 + stretch)))
-    return _Maps(r, stretch, integral(stretch), conformal, np.sqrt(2 * integral(r * stretch)), *_curvatures(cap, r))
+    conformal = r * np.exp(integral(r * slope_over_r**2 / (1 + stretch)))
+    equal_area = np.sqrt(2 * integral(r * stretch))
+    return _Profile(r, stretch, integral(stretch), conformal, equal_area, *_curvatures(lenslet, r))
 
 
-def _curvatures(cap, r):
-    """The mean curvature at radii from 0 on, and the largest principal one, 1/mm."""
-    steep = cap.sag_slope_over_r(r**2)
-    stretch = np.sqrt(1 + (r * steep) ** 2)
-    meridian, parallel = np.gradient(r * steep, r, edge_order=2) / stretch**3, steep / stretch
-    return (meridian + parallel) / 2, float(max(np.abs(meridian).max(), parallel.max()))
+def _curvatures(lenslet, r):
+    """Mean curvature at increasing radii from 0, and the largest principal curvature, 1/mm."""
+    slope_over_r = lenslet.sag_slope_over_r(r**2)
+    stretch = np.sqrt(1 + (r * slope_over_r) ** 2)
+    meridional, sagittal = np.gradient(r * slope_over_r, r, edge_order=2) / stretch**3, slope_over_r / stretch
+    return (meridional + sagittal) / 2, float(max(np.abs(meridional).max(), sagittal.max()))
 
 
-def _scaled(points, radii, scaled):
-    """Points of the plane with other distances from the origin."""
+def _rescale(points, radii, mapped_radii):
     distance = np.hypot(*points.T)
-    return points * (np.interp(distance, radii, scaled) / np.maximum(distance, 1e-300))[:, None]
+    return points * (np.interp(distance, radii, mapped_radii) / np.maximum(distance, 1e-300))[:, None]
 
 
-def _hexagonal(maps: _Maps, radius):
-    """A hexagonal lattice over a cap, seen from above: nearly equilateral facets of the largest size.
-
-    It is laid out in the equal-area map, which at a radius stretches by the map's radius over it (`1 / cos(theta/2)` on
-    a sphere, Lambert's projection). It fits to a little over half of the way to the rim, where neighbours begin to cut
-    lenses off; what is too wide farther out is split.
-    """
-    limit, fits = maps.equal_area[-1], int(0.6 * _RADII)
-    side = 0.98 * math.sqrt(3) * radius * maps.radii[fits] / maps.equal_area[fits]
+def _hexagonal_points(profile: _Profile, circumradius):
+    """A hexagonal lattice in the equal-area map, as points `(x, y)`, and its spacing."""
+    # The map stretches more toward the rim. The spacing fits at 60 % of the way, where neighbours begin to cut
+    # lenslets off; facets that are too large farther out are split.
+    limit, fit = profile.equal_area[-1], int(0.6 * _PROFILE_SAMPLES)
+    side = 0.98 * math.sqrt(3) * circumradius * profile.radii[fit] / profile.equal_area[fit]
     count = math.ceil(limit / side) + 1
     i, j = np.meshgrid(*[np.arange(-2 * count, 2 * count + 1)] * 2)
     lattice = side * np.stack([i + j / 2, math.sqrt(3) / 2 * j], axis=-1).reshape(-1, 2)
     distance = np.hypot(*lattice.T)
-    room = maps.along[-1] - np.interp(distance, maps.equal_area, maps.along)
-    return _scaled(lattice[(distance < limit) & (room > side / 2)], maps.equal_area, maps.radii), side
+    from_edge = profile.arc_length[-1] - np.interp(distance, profile.equal_area, profile.arc_length)
+    return _rescale(lattice[(distance < limit) & (from_edge > side / 2)], profile.equal_area, profile.radii), side
 
 
 def _delaunay(flat):
@@ -317,37 +276,37 @@ def _delaunay(flat):
     return np.where(clockwise[:, None], facets[:, ::-1], facets)
 
 
-def _splits(flat, corners, facets, radius):
-    """The middle, in the map, of each facet that is too wide: of its circle, or of its longest edge."""
+def _split_points(flat, vertices, facets, max_circumradius):
+    """Points in the map that split large facets: circumcentres, or middles of the longest edges of obtuse facets."""
+    corners = vertices[facets]
     edges = np.roll(corners, -1, axis=1) - corners
     squared = (edges**2).sum(axis=2)
     obtuse = 2 * squared.max(axis=1) > squared.sum(axis=1)
     area2 = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    circle = np.sqrt(squared.prod(axis=1)) / (2 * np.maximum(area2, 1e-300))
-    around = np.where(obtuse, np.sqrt(squared.max(axis=1)) / 2, circle)
-    wide = np.flatnonzero(around > radius * (1 + 1e-6))
-    longest = squared[wide].argmax(axis=1)
-    a, b, c = (flat[facets[wide, (longest + k) % 3]] for k in range(3))
-    # The circumcentre as seen from one corner.
+    circumradius = np.sqrt(squared.prod(axis=1)) / (2 * np.maximum(area2, 1e-300))
+    enclosing = np.where(obtuse, np.sqrt(squared.max(axis=1)) / 2, circumradius)
+    large = np.flatnonzero(enclosing > max_circumradius * (1 + 1e-6))
+    longest = squared[large].argmax(axis=1)
+    a, b, c = (flat[facets[large, (longest + k) % 3]] for k in range(3))
     u, v = b - a, c - a
-    lengths = ((u**2).sum(axis=1)[:, None] * v - (v**2).sum(axis=1)[:, None] * u) / (2 * _cross(u, v))[:, None]
-    middle = a + np.stack([lengths[:, 1], -lengths[:, 0]], axis=1)
-    return np.where(obtuse[wide, None], (a + b) / 2, middle)
+    normal = ((u**2).sum(axis=1)[:, None] * v - (v**2).sum(axis=1)[:, None] * u) / (2 * _cross(u, v))[:, None]
+    circumcentre = a + np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+    return np.where(obtuse[large, None], (a + b) / 2, circumcentre)
 
 
-def _lifted(cap, maps: _Maps, vertices, facets, ring, lattice):
-    """Sags of vertices that are moved outward by the facets' mean depth: as that is, by the mean curvature."""
-    outward = np.interp(np.hypot(*vertices[:, :2].T), maps.radii, maps.stretch * maps.mean_curvature)
+def _offset_sag(lenslet, profile: _Profile, vertices, facets, num_edge, num_lattice):
+    """Sags of vertices moved outward by the mean depth of the facets, in proportion to the mean curvature."""
+    outward = np.interp(np.hypot(*vertices[:, :2].T), profile.radii, profile.stretch * profile.mean_curvature)
     corners = vertices[facets]
     nodes = np.einsum("qk,fkx->fqx", NODES, corners)
-    depth = -cap.sag((nodes[..., :2] ** 2).sum(axis=-1)) - nodes[..., 2]
+    depth = -lenslet.sag((nodes[..., :2] ** 2).sum(axis=-1)) - nodes[..., 2]
     a, b, c = corners[..., :2].transpose(1, 0, 2)
     area = _cross(b - a, c - a)
-    # Those of the lattice: what is beside the ring, or was split, is of other sizes, and mostly hidden by neighbours.
-    regular = ((facets >= ring) & (facets < ring + lattice)).all(axis=1)
-    share = area * regular if regular.any() else area
-    outward *= share @ (depth @ WEIGHTS) / (share @ outward[facets].mean(axis=1))
-    outward[:ring] = 0
+    # Facets at the edge and split ones have other sizes, and are mostly hidden by neighbours: the lattice decides.
+    regular = ((facets >= num_edge) & (facets < num_edge + num_lattice)).all(axis=1)
+    weight = area * regular if regular.any() else area
+    outward *= weight @ (depth @ WEIGHTS) / (weight @ outward[facets].mean(axis=1))
+    outward[:num_edge] = 0
     return -vertices[:, 2] - outward
 
 

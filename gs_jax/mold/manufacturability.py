@@ -1,6 +1,6 @@
-"""What is checked before a mold or an array is written: whether it can be made, and whether the solid is the design.
+"""Checks before a mold or an array is written: whether the design can be manufactured, and whether the solid is valid.
 
-Lengths in mm. An error stops the work; a warning is for the user to weigh.
+Errors stop the export; warnings are for the user to weigh. Lengths in mm.
 """
 
 import math
@@ -11,251 +11,218 @@ import manifold3d as m3
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..base.errors import InputError
 from ..design.design import Design
 from ..layouts import cell_edges, coverage, max_gap
 from ..lenses import MicrolensArray
 from .export import Mesh
-from .lenslets import STEEPEST, cap_sag, caps_of, estimated_facets, surface, visible_reaches
-from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, coarsest_chord, plate_thickness, too_wide
+from .lenslets import MAX_SLOPE, estimate_facet_count, lenslet_height, lenslets_of, surface_height, visible_radii
+from .solids import MAX_FACETS, VOLUME_TOLERANCE, MoldShape, aperture_fault, max_chord, plate_thickness
 
-# Thinner sheets of cast silicone tear when they are peeled off, thinner prints warp.
-THINNEST_MM = 0.3
-# Of steps in a surface, RMS: a Strehl ratio of 0.8, Marechal's criterion.
-MOST_WAVES = 1 / 14
-# Places a side of the plate at which lenses that differ are looked at: what is counted is right to a percent.
-_PLACES = 1000
+# Thinner sheets of cast silicone tear when they are peeled off; thinner prints warp.
+MIN_THICKNESS_MM = 0.3
+# RMS wavefront error for a Strehl ratio of 0.8, Marechal's criterion.
+MAX_WAVES = 1 / 14
+# Samples per side of the plate for unequal lenses; areas and lengths are right to a percent.
+_SAMPLES = 1000
 
 
 @dataclass(frozen=True)
-class Finding:
-    """The outcome of one check, in words."""
+class CheckResult:
+    """Outcome of one check."""
 
     check: str
     level: Literal["ok", "warning", "error"]
     text: str
 
 
-def refuse_errors(findings: list[Finding], place: str) -> None:
-    """`InputError` with the first error among the findings, if there is one."""
-    for finding in findings:
-        if finding.level == "error":
-            raise InputError(f"{place}: {finding.text}")
+def raise_first_error(results: list[CheckResult], error: type[Exception], prefix: str = "") -> None:
+    """Raises `error` with the text of the first result of level "error", if there is one."""
+    for result in results:
+        if result.level == "error":
+            raise error(f"{prefix or result.check}: {result.text}")
 
 
 def check_design(
     design: Design, shape: MoldShape, *, chord: float, resolution: float, layer: float | None = None
-) -> list[Finding]:
-    """What can be said before anything is built.
+) -> list[CheckResult]:
+    """Checks a design before its solid is built.
 
-    Parameters
-    ----------
-    design
-        The microscope.
-    shape
-        What is around the array in its mold.
-    chord
-        The largest distance between a facet and its lens, mm.
-    resolution
-        The smallest feature that the printer makes, mm.
-    layer
-        Thickness of its layers, mm, if it prints any.
+    `chord` is the chordal tolerance of the facets, `resolution` the smallest feature that the printer makes, and
+    `layer` the thickness of its layers, if it prints layers, all in mm.
     """
     imager = design.imager()
     array = imager.array
-    # What cannot be made is not looked at any closer.
-    if (first := _slope(array)).level == "error":
-        return [first]
+    # Rims that are too steep have no solid to check further.
+    if (slope := _check_slope(array)).level == "error":
+        return [slope]
     return [
-        _focal_length(array),
-        _plate(array),
-        _walls(shape),
-        first,
-        _spacing(array, resolution),
-        _ridges(array, resolution),
-        _holes(array),
-        _chord(array, chord, resolution),
-        *([] if layer is None else [_layers(array, float(imager.wavelength), layer)]),
+        _check_focal_length(array),
+        _check_plate(array),
+        _check_walls(shape),
+        slope,
+        _check_spacing(array, resolution),
+        _check_ridges(array, resolution),
+        _check_coverage(array),
+        _check_chord(array, chord, resolution),
+        *([] if layer is None else [_check_layers(array, float(imager.wavelength), layer)]),
     ]
 
 
-def _focal_length(array: MicrolensArray) -> Finding:
+def _warn_if(condition: bool, check: str, text: str, warning: str, otherwise: str = ".") -> CheckResult:
+    return CheckResult(check, "warning", text + warning) if condition else CheckResult(check, "ok", text + otherwise)
+
+
+def _check_focal_length(array: MicrolensArray) -> CheckResult:
     given = array.thin_lens_focal_length
     f = np.asarray(array.radius_of_curvature, float) / (float(array.refractive_index) - 1)
+    low, high = f"{np.min(f):.4g}", f"{np.max(f):.4g}"
+    expected = f"R / (n - 1) = {low if low == high else f'{low} to {high}'} mm"
     if given is None or np.allclose(given, f, rtol=1e-3, atol=0):
-        return Finding("focal length", "ok", f"the lenses' focal length is R / (n - 1) = {_range(f)} mm.")
-    allowed = f"R / (n - 1) = {_range(f)} mm, which is what a part has, or no such key"
-    return Finding("focal length", "error", f"`lens.focal_length_mm`: found {float(given):g}, allowed: {allowed}.")
+        return CheckResult("focal length", "ok", f"the focal length of the lenses is {expected}.")
+    text = f"`lens.focal_length_mm` must be {expected}, as of the part, or absent, got {float(given):g}."
+    return CheckResult("focal length", "error", text)
 
 
-def _range(values) -> str:
-    """One number, or from the least to the largest."""
-    low, high = f"{np.min(values):.4g}", f"{np.max(values):.4g}"
-    return low if low == high else f"{low} to {high}"
-
-
-def _plate(array: MicrolensArray) -> Finding:
-    t, sag, between = float(array.substrate_thickness), cap_sag(array), plate_thickness(array)
+def _check_plate(array: MicrolensArray) -> CheckResult:
+    t, sag, between = float(array.substrate_thickness), lenslet_height(array), plate_thickness(array)
     if between <= 0:
-        text = f"`array.substrate_thickness_mm`: found {t:g}, allowed: more than the lenses' sag, {sag:.4g} mm."
-        return Finding("plate", "error", text)
-    text = f"the array is {t:g} mm thick at the lenses' vertices (sag {sag:.4g} mm) and {between:.4g} mm between them."
-    if between < THINNEST_MM:
-        return Finding("plate", "warning", f"{text} Less than {THINNEST_MM} mm tears easily.")
-    return Finding("plate", "ok", text)
+        text = f"`array.substrate_thickness_mm` must be more than the lenses' sag, {sag:.4g} mm, got {t:g}."
+        return CheckResult("plate", "error", text)
+    text = f"the array is {t:g} mm thick at the lenses' vertices (sag {sag:.4g} mm) and {between:.4g} mm between them"
+    return _warn_if(between < MIN_THICKNESS_MM, "plate", text, f". Less than {MIN_THICKNESS_MM} mm tears easily.")
 
 
-def _walls(shape: MoldShape) -> Finding:
-    thinnest = min(shape.wall, shape.floor)
+def _check_walls(shape: MoldShape) -> CheckResult:
     text = f"the mold's walls are {shape.wall:g} mm and its floor {shape.floor:g} mm thick"
-    if thinnest < THINNEST_MM:
-        return Finding("walls", "warning", f"{text}; less than {THINNEST_MM} mm warps.")
-    return Finding("walls", "ok", f"{text}.")
+    is_thin = min(shape.wall, shape.floor) < MIN_THICKNESS_MM
+    return _warn_if(is_thin, "walls", text, f"; less than {MIN_THICKNESS_MM} mm warps.")
 
 
-def _slope(array: MicrolensArray) -> Finding:
-    caps = caps_of(array)
-    if fault := too_wide(caps):
-        allowed = f"at most {fault.allowed}, with lenses that slope by {math.degrees(STEEPEST):g} degrees"
-        text = f"`lens.aperture_diameter_mm`: found {fault.found}, allowed: {allowed}."
-        return Finding("edge slope", "error", text)
-    radii = [np.linspace(0, cap.reach, 257) for cap in caps]
-    slope = max(float((r * cap.sag_slope_over_r(r**2)).max()) for cap, r in zip(caps, radii, strict=True))
+def _check_slope(array: MicrolensArray) -> CheckResult:
+    lenslets = lenslets_of(array)
+    if fault := aperture_fault(lenslets):
+        limit = f"lenses may slope by at most {math.degrees(MAX_SLOPE):g} degrees"
+        return CheckResult("edge slope", "error", f"`lens.aperture_diameter_mm` {fault}; {limit}.")
+    radii = [np.linspace(0, each.semi_aperture, 257) for each in lenslets]
+    slope = max(float((r * each.sag_slope_over_r(r**2)).max()) for each, r in zip(lenslets, radii, strict=True))
     degrees, critical = math.degrees(math.atan(slope)), math.degrees(math.asin(1 / float(array.refractive_index)))
-    is_sphere = array.alike and caps[0].conic == 0 and not caps[0].terms
+    is_sphere = array.alike and lenslets[0].conic == 0 and not lenslets[0].terms
     text = f"the lenses slope by {'asin(D / 2R) =' if is_sphere else 'up to'} {degrees:.3g} degrees"
-    if degrees > critical:
-        reason = f"beyond {critical:.3g} degrees, asin(1 / n), light along the axis is totally reflected"
-        return Finding("edge slope", "warning", f"{text}; {reason}.")
-    return Finding("edge slope", "ok", f"{text}.")
+    reflected = f"; beyond {critical:.3g} degrees, asin(1 / n), light along the axis is totally reflected."
+    return _warn_if(degrees > critical, "edge slope", text, reflected)
 
 
-def _spacing(array: MicrolensArray, resolution: float) -> Finding:
-    caps = caps_of(array)
-    if len(caps) == 1:
-        return Finding("smallest feature", "ok", f"a single lens, {2 * caps[0].reach:g} mm wide.")
-    centers = np.stack([cap.center for cap in caps])
+def _check_spacing(array: MicrolensArray, resolution: float) -> CheckResult:
+    lenslets = lenslets_of(array)
+    if len(lenslets) == 1:
+        return CheckResult("smallest feature", "ok", f"a single lens, {2 * lenslets[0].semi_aperture:g} mm wide.")
+    centers = np.stack([each.center for each in lenslets])
     distance, nearest = map(np.asarray, KDTree(centers).query(centers, k=2))
     first = int(distance[:, 1].argmin())
-    pair = [caps[first], caps[int(nearest[first, 1])]]
+    pair = [lenslets[first], lenslets[int(nearest[first, 1])]]
     along = np.linspace(0, 1, 1001)[:, None]
-    height, _ = surface(pair, pair[0].center * (1 - along) + pair[1].center * along)
-    groove, spacing = max(cap.rim for cap in pair) - height.min(), distance[first, 1]
+    height, _ = surface_height(pair, pair[0].center * (1 - along) + pair[1].center * along)
+    groove, spacing = max(each.rim_sag for each in pair) - float(height.min()), distance[first, 1]
     text = f"the closest lenses are {spacing:.4g} mm apart, with a groove {1000 * groove:.4g} um deep between them"
-    if groove < resolution:
-        return Finding(
-            "smallest feature", "warning", f"{text}: the printer's {1000 * resolution:g} um will not show it."
-        )
-    return Finding("smallest feature", "ok", f"{text}; the printer makes {1000 * resolution:g} um.")
+    shallow = f": shallower than the printer's resolution, {1000 * resolution:g} um."
+    resolved = f"; the printer resolves {1000 * resolution:g} um."
+    return _warn_if(groove < resolution, "smallest feature", text, shallow, resolved)
 
 
-def _ridges(array: MicrolensArray, resolution: float) -> Finding:
-    """The mold's ridges between lenses are sharp: a printer rounds them to its resolution."""
-    total = _length_of_ridges(array)
+def _check_ridges(array: MicrolensArray, resolution: float) -> CheckResult:
+    """The share of the plate that a printer rounds: ridges of the mold between lenses, as wide as the resolution."""
+    total = _ridge_length(array)
     share = total * resolution / math.prod(array.size)
     text = f"{total:.4g} mm of sharp edges between lenses: rounded over {1000 * resolution:g} um they are "
-    return Finding("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
+    return CheckResult("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
 
 
-def _length_of_ridges(array: MicrolensArray) -> float:
+def _ridge_length(array: MicrolensArray) -> float:
     if not array.alike:
-        # Cauchy and Crofton: as often as lines of a grid cross it.
-        owner = _owners(array)
-        steps = np.array(array.size) / _PLACES
-        crossings = [
-            ((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in ((owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1]))
-        ]
+        # The Cauchy-Crofton formula: lengths from crossings with the lines of a grid.
+        owner = _owner_map(array)
+        steps = np.array(array.size) / _SAMPLES
+        neighbours = (owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1])
+        crossings = [((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in neighbours]
         return math.pi / 4 * float(crossings @ steps[::-1])
-    centers, reach = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
+    centers, radius = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
     edges, side = cell_edges(centers, array.size), np.array(array.size) / 2
-    half = np.sqrt(np.maximum(reach**2 - edges.height**2, 0))
+    half = np.sqrt(np.maximum(radius**2 - edges.height**2, 0))
     first, last = (np.clip(t, -half, half) for t in (edges.low, edges.high))
     between = (np.abs(centers[edges.lens] + (edges.start + edges.end) / 2) < side * (1 - 1e-6)).all(axis=1)
     # Each ridge is an edge of two cells.
     return float((last - first)[between].sum()) / 2
 
 
-def _owners(array: MicrolensArray):
-    """The lens that is seen at places of a grid over the plate, -1 for none."""
-    x, y = (((np.arange(_PLACES) + 0.5) / _PLACES - 0.5) * side for side in array.size)
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return surface(caps_of(array), places)[1].reshape(_PLACES, _PLACES)
+def _owner_map(array: MicrolensArray) -> np.ndarray:
+    """The index of the visible lens on a grid over the plate, -1 for none."""
+    x, y = (((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * side for side in array.size)
+    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return surface_height(lenslets_of(array), points)[1].reshape(_SAMPLES, _SAMPLES)
 
 
-def _holes(array: MicrolensArray) -> Finding:
+def _check_coverage(array: MicrolensArray) -> CheckResult:
     centers = np.asarray(array.centers, float)
     if array.alike:
         share = 1 - coverage(centers, array.size, diameter=float(array.aperture_diameter))
     else:
-        share = float((_owners(array) < 0).mean())
-    hole = max_gap(centers, array.size)
+        share = float((_owner_map(array) < 0).mean())
+    gap = max_gap(centers, array.size)
     if share < 1e-6:
-        return Finding("coverage", "ok", "lenses cover the whole plate.")
+        return CheckResult("coverage", "ok", "lenses cover the whole plate.")
     area = share * math.prod(array.size)
-    text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is no lens, up to {hole:.3g} mm from the nearest lens"
-    return Finding("coverage", "warning", f"{text}: without a mask (`gs-jax mask`) light goes through it unfocused.")
+    text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is no lens, up to {gap:.3g} mm from the nearest lens"
+    return CheckResult("coverage", "warning", f"{text}: light passes there unfocused without a mask (`gs-jax mask`).")
 
 
-def _chord(array: MicrolensArray, chord: float, resolution: float) -> Finding:
-    caps = caps_of(array)
-    limit = coarsest_chord(caps)
-    if chord > limit:
-        allowed = f"at most {1000 * limit:.4g} um, a tenth of the height of a lens"
-        return Finding("facets", "error", f"the chord error: found {1000 * chord:g} um, allowed: {allowed}.")
-    if (count := estimated_facets(caps, visible_reaches(caps, array.size), chord)) > MAX_FACETS:
-        allowed = f"at least {1000 * chord * count / MAX_FACETS:.2g} um; it takes about {count:.2g} facets"
-        return Finding("facets", "error", f"the chord error: found {1000 * chord:g} um, allowed: {allowed}.")
+def _check_chord(array: MicrolensArray, chord: float, resolution: float) -> CheckResult:
+    lenslets, given = lenslets_of(array), f"got {1000 * chord:g} um"
+    if chord > (limit := max_chord(lenslets)):
+        text = f"the chord error must be at most {1000 * limit:.4g} um, a tenth of the height of a lens, {given}."
+        return CheckResult("facets", "error", text)
+    if (count := estimate_facet_count(lenslets, visible_radii(lenslets, array.size), chord)) > MAX_FACETS:
+        least = 1000 * chord * count / MAX_FACETS
+        text = f"the chord error must be at least {least:.2g} um, {given}, which takes about {count:.2g} facets."
+        return CheckResult("facets", "error", text)
     text = f"facets within {1000 * chord:g} um of the lenses"
-    if chord > resolution / 4:
-        return Finding("facets", "warning", f"{text}: the printer, with {1000 * resolution:g} um, may show them.")
-    return Finding("facets", "ok", f"{text}.")
+    visible = f": the printer, with {1000 * resolution:g} um, may show them."
+    return _warn_if(chord > resolution / 4, "facets", text, visible)
 
 
-def _layers(array: MicrolensArray, wavelength: float, layer: float) -> Finding:
-    """Steps of the surface: evenly spread errors of a layer have a standard deviation of a layer over root 12."""
-    sag = cap_sag(array)
+def _check_layers(array: MicrolensArray, wavelength: float, layer: float) -> CheckResult:
+    # The standard deviation of a uniform error of one layer is the layer over root 12.
     waves = (float(array.refractive_index) - 1) * layer / math.sqrt(12) / wavelength
-    text = f"a lens is {sag / layer:.3g} layers of {1000 * layer:g} um high; their steps are {waves:.2g} waves RMS"
-    if waves > MOST_WAVES:
-        finest = 1000 * layer * MOST_WAVES / waves
-        return Finding("layers", "warning", f"{text}: smooth them, or print layers of {finest:.2g} um.")
-    return Finding("layers", "ok", f"{text}.")
+    layers = lenslet_height(array) / layer
+    text = f"a lens is {layers:.3g} layers of {1000 * layer:g} um high; their steps are {waves:.2g} waves RMS"
+    finest = 1000 * layer * MAX_WAVES / waves
+    return _warn_if(waves > MAX_WAVES, "layers", text, f": smooth them, or print layers of {finest:.2g} um.")
 
 
-def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUME_TOLERANCE) -> list[Finding]:
-    """Whether a mesh, rounded as it will be written, is one solid without handles and of the right volume.
+def check_solid(mesh: Mesh, expected: float, name: str, tolerance: float = VOLUME_TOLERANCE) -> list[CheckResult]:
+    """Checks that a mesh, rounded as it will be written, is one solid without handles.
 
-    Parameters
-    ----------
-    mesh
-        What will be written.
-    expected
-        Its volume, mm^3.
-    name
-        What it is, for the words.
-    tolerance
-        Of its volume, as a fraction.
+    `expected` is its analytic volume, mm^3, and `tolerance` relative; `name` is that of the part.
     """
     edges = np.concatenate([mesh.facets[:, [0, 1]], mesh.facets[:, [1, 2]], mesh.facets[:, [2, 0]]])
-    forward, backward = (
-        np.sort(edges @ np.array(radix)) for radix in ((len(mesh.vertices), 1), (1, len(mesh.vertices)))
-    )
-    tight = bool((forward == backward).all() and (forward[1:] != forward[:-1]).all())
+    count = len(mesh.vertices)
+    forward, backward = np.sort(edges @ np.array([count, 1])), np.sort(edges @ np.array([1, count]))
+    watertight = bool((forward == backward).all() and (forward[1:] != forward[:-1]).all())
     solid = mesh.solid()
-    sound = solid.status() == m3.Error.NoError
-    bodies = len(solid.decompose()) if sound else 0
+    manifold = solid.status() == m3.Error.NoError
+    bodies = len(solid.decompose()) if manifold else 0
     volume = solid.volume()
-    off = float(abs(volume / expected - 1))
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    size = " x ".join(f"{side:.4g}" for side in (high - low).tolist())
+    error = float(abs(volume / expected - 1))
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(mesh.vertices, axis=0).tolist())
+    passed = {
+        "watertight": (watertight, f"every edge of the {name} has one facet on either side"),
+        "manifold": (manifold, f"the {name} is a manifold ({solid.status().name})"),
+        "genus": ((bodies, solid.genus()) == (1, 0), f"the {name} is one body without handles"),
+        "volume": (error < tolerance, f"the {name} has {volume:.6g} mm3, {error:.1e} off the analytic volume"),
+    }
     return [
-        _judged("watertight", tight, f"every edge of the {name} has one facet on either side"),
-        _judged("manifold", sound, f"the {name} is a manifold ({solid.status().name})"),
-        _judged("genus", (bodies, solid.genus()) == (1, 0), f"the {name} is one body without handles"),
-        _judged("volume", off < tolerance, f"the {name} has {volume:.6g} mm3, {off:.1e} off the analytic volume"),
-        Finding("size", "ok", f"the {name} is {size} mm (x, y, z), of {len(mesh.facets):,} facets."),
+        *(
+            CheckResult(check, "ok", f"{text}.") if ok else CheckResult(check, "error", f"not true: {text}.")
+            for check, (ok, text) in passed.items()
+        ),
+        CheckResult("size", "ok", f"the {name} is {size} mm (x, y, z), of {len(mesh.facets):,} facets."),
     ]
-
-
-def _judged(check: str, passed: bool, text: str) -> Finding:
-    return Finding(check, "ok" if passed else "error", f"{text}." if passed else f"found untrue: {text}.")

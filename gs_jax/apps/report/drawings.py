@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from ...design.design import Design
 from ...geometry import Imager
 from ...layouts import cell_edges
-from ...mold.lenslets import cap_sag, caps_of, surface
+from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics.psf import diffraction_psf, window_fraction
 from ...pictures.style import round_length
 
@@ -183,9 +183,9 @@ def _glass(design: Design, imager: Imager, plano: bool, thickness: float, width:
     x = np.linspace(-width / 2, width / 2, _PROFILE)
     fall = np.zeros_like(x)
     if design.lens.focal_length_mm is None:
-        caps = caps_of(imager.array)
+        caps = lenslets_of(imager.array)
         y = min((cap.center for cap in caps), key=lambda center: float(np.hypot(*center)))[1]
-        fall = cap_sag(imager.array) - surface(caps, np.column_stack([x, np.full_like(x, y)]))[0]
+        fall = lenslet_height(imager.array) - surface_height(caps, np.column_stack([x, np.full_like(x, y)]))[0]
     curved = thickness - fall if plano else fall
     flat = 0.0 if plano else thickness
     return " ".join(

@@ -7,8 +7,7 @@ from jaxtyping import Float, Num
 
 from ...grid import Grid
 from ...lenses import MicrolensArray
-from ...mold.make import coarse_solid
-from ...mold.solids import MoldShape
+from ...mold.solids import MoldShape, preview_solid
 from ...pictures.volume_pictures import brightness, in_range, packed, png, thinned
 
 # Bytes of all slices before they are compressed; pixels of a projection's side; voxels in space, and a side's.
@@ -112,7 +111,7 @@ def scatter(points: Float[np.ndarray, "point 4"], grid: Grid | None) -> dict[str
 
 def part(array: MicrolensArray) -> dict[str, Any]:
     """The mold for the browser: corners as shares of its box, three of them a facet."""
-    mesh = coarse_solid(array, MoldShape()).to_mesh64()
+    mesh = preview_solid(array, MoldShape()).to_mesh64()
     corners, facets = mesh.vert_properties[:, :3], mesh.tri_verts
     low, high = corners.min(0), corners.max(0)
     shares = np.round((corners - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
