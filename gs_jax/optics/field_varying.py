@@ -55,7 +55,7 @@ class PolarGrid(NamedTuple):
     """Polar nodes about a lens's axis, on the object's side and on the sensor's.
 
     `step`: distance of the inner nodes in the object, mm; `pixel`: of those on the sensor. `bend`: radius at which
-    they begin to sample_profile, in steps. `angles`, `fields`, `radii`: numbers of nodes, around and outward on either
+    they begin to spread, in steps. `angles`, `fields`, `radii`: numbers of nodes, around and outward on either
     side.
     """
 
@@ -218,7 +218,7 @@ class FieldVaryingPsf(eqx.Module):
         Of the inner ring, on the sensor's pixels, with the sum 1.
     wide_kernels
         Of the outer rings, on pixels twice as large.
-    halo
+    stray_light
         The rest.
     rings
         Where the rings end, in field radii.
@@ -228,7 +228,7 @@ class FieldVaryingPsf(eqx.Module):
     light: Float[Array, "depth ring coefficient"]
     kernel: Float[Array, "depth size size"]
     wide_kernels: Float[Array, "depth outer small small"]
-    halo: StrayLight
+    stray_light: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
 
 
@@ -237,7 +237,7 @@ def field_varying_psf(
     depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
     *,
     extent: float | None = None,
-    nodes: PolarGrid | None = None,
+    polar_grid: PolarGrid | None = None,
     rings: Sequence[float] = RINGS,
     progress: Progress | None = None,
 ) -> FieldVaryingPsf:
@@ -254,9 +254,9 @@ def field_varying_psf(
         Of the planes, mm, in their order.
     extent
         Size of the object, mm: no light is followed that comes from farther off. By default the sensor's.
-    nodes
-        Of the halo, by `make_polar_grid`: what is compiled for tables of some nodes serves others of the same. By
-        default those that suit the depths.
+    polar_grid
+        Of the stray light, by `make_polar_grid`: what is compiled for tables of some nodes serves others of the same.
+        By default those that suit the depths.
     rings
         Where the rings of the field end that have a core each, in field radii. Fewer are faster and less true,
         such as `(1.0, 2.5)`.
@@ -270,8 +270,8 @@ def field_varying_psf(
     depths = np.asarray(depths, np.float64)
     leaves, structure = jax.tree.flatten(imager)
     same = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
-    nodes = nodes or make_polar_grid(imager, depths, extent=extent)
-    return _tables(_Wanted(same, nodes, tuple(rings), imager, depths, progress))
+    polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
+    return _tables(_Wanted(same, polar_grid, tuple(rings), imager, depths, progress))
 
 
 @dataclasses.dataclass(frozen=True)

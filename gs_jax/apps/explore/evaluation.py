@@ -116,7 +116,7 @@ def live_terms(start: Parent, study: Study | None) -> tuple[str, ...]:
 
     def is_live(name: str) -> bool:
         term = TERMS[name]
-        return not term.random and name != "lens_shortage" and (term.kinds or len(start.lenses) == 1)
+        return not term.random and name != "lens_shortage" and (term.types or len(start.lenses) == 1)
 
     return () if study is None else tuple(table.name for table in study.terms if is_live(table.name))
 
