@@ -26,11 +26,11 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.codesign.objectives import TERMS
-from gs_jax.codesign.parameters import candidate, parent_of, start_values
+from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
 from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study, read_study
+from gs_jax.codesign.terms import TERMS
 from gs_jax.design.checks import plate_as_air
 from gs_jax.design.design import Design, read_design
 from gs_jax.pictures.style import PALETTE
@@ -94,7 +94,7 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
     design, study = posed(kind, span, steps)
     sweep = sweep_of(design, study)
     search, judge = searcher(sweep), judge_of(design, study)
-    first, found = start_values(sweep.problem.parent), []
+    first, found = start_values(sweep.problem.imager, sweep.problem.at), []
     for number, light in enumerate(lights):
         limits = limits_of(light, span, design)
         start = found[-1]["values"] if found else first
@@ -140,14 +140,14 @@ def judge_of(design: Design, study: Study):
     """From parameters to the error of the planes between, and the width by the kind in focus at the worst depth."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
     half = (far - near) / (PLANES - 1) / 2
-    between = parent_of(design, depths_mm=(near + half, far - half), depth_count=PLANES - 1, exposure=study.exposure)
-    whole = parent_of(design, depths_mm=(near, far), depth_count=2 * PLANES - 1)
+    between = evaluated(design, depths_mm=(near + half, far - half), depth_count=PLANES - 1, exposure=study.exposure)
+    whole = evaluated(design, depths_mm=(near, far), depth_count=2 * PLANES - 1)
 
     @jax.jit
     def judged(values):
         values = {name: x for name, x in values.items() if name not in ("depth_span_mm", "centers_mm")}
-        error = TERMS["volume_error"].function(candidate(between, values))
-        return error, TERMS["psf_width_um"].function(candidate(whole, values))
+        error = TERMS["volume_error"].function(*candidate(*between, values))
+        return error, TERMS["psf_width_um"].function(*candidate(*whole, values))
 
     def judge(values) -> tuple[float, float]:
         error, widths = judged(values)

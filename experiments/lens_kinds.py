@@ -98,7 +98,7 @@ def run(study: Study, start: Design, kinds=tuple(KINDS), *, progress: Progress) 
         sweep = sweep_of(design, question)
         found[kind] = []
         for limits, point, values in zip(question.pareto[0].targets, front.points, front.values, strict=True):
-            made = new_design(design, sweep.problem.parent, point.values)
+            made = new_design(design, sweep.problem.imager, sweep.problem.at, point.values)
             record = {"light_percent_at_least": limits, "light_percent": float(values[1]), "feasible": point.feasible}
             record |= {"width_um": float(values[0]), "design": made} | judged(made)
             found[kind].append(record)

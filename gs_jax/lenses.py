@@ -8,19 +8,10 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .base.arrays import (
-    FINITE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    Rule,
-    as_float,
-    as_float_or_none,
-    as_pair,
-    check_fields,
-    library_of,
-)
+from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Rule, as_float, as_float_or_none, check_fields, library_of
 from .base.errors import InputError
 from .typing import Scalar, Scalars
 
@@ -28,6 +19,7 @@ from .typing import Scalar, Scalars
 Orientation = Literal["plano", "curved"]
 # Numbers that lenses may have of their own.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
+_SIZE: Rule = ("positive, or infinite", lambda x: x > 0)
 _INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
 
 
@@ -59,7 +51,10 @@ class MicrolensArray(eqx.Module):
     aspheric_terms
         `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
     others
-        Lenses on the same plate that are not looked at, but end these where their surfaces meet; see `subset`.
+        Lenses on the same plate that are not imaged through, but end these where their surfaces meet; see `subset`.
+    types
+        The number of each lens's type, where lenses differ. It follows from their numbers and is kept for arrays whose
+        numbers JAX traces.
 
     Raises
     ------
@@ -82,11 +77,20 @@ class MicrolensArray(eqx.Module):
     aperture_diameter: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
-    size: tuple[float, float] = eqx.field(static=True, converter=as_pair, default=(math.inf, math.inf))
+    size: Float[Array, "2"] = eqx.field(converter=as_float, default=(math.inf, math.inf))
     orientation: Orientation = eqx.field(static=True, default="plano")
     conic_constant: Float[Array, "*each"] = eqx.field(converter=as_float, default=0.0)
     aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
     others: "MicrolensArray | None" = None
+    types: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def __post_init__(self):
+        numbers = [getattr(self, name) for name in EACH]
+        shapes = {np.shape(number) for number in numbers} - {()}
+        if not shapes:
+            self.types = None
+        elif shapes == {np.shape(self.centers)[:1]} and not any(isinstance(number, Tracer) for number in numbers):
+            self.types = _types(numbers)
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
@@ -94,11 +98,19 @@ class MicrolensArray(eqx.Module):
         for name in EACH:
             if (shape := getattr(self, name).shape) not in ((), self.centers.shape[:1]):
                 raise ValueError(f"`{name}` must be one number or {self.centers.shape[:1]}, got {shape}.")
+        if self.size.shape != (2,):
+            raise ValueError(f"`size` must be (x, y), got {self.size.shape}.")
         if self.orientation not in ("plano", "curved"):
             raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
         check_fields(self, radius_of_curvature=POSITIVE, aperture_diameter=POSITIVE, thin_lens_focal_length=POSITIVE)
-        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE)
+        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE, size=_SIZE)
         check_fields(self, centers=FINITE, conic_constant=FINITE, aspheric_terms=FINITE)
+
+    @property
+    def plate(self) -> tuple[float, float]:
+        """`size` as plain numbers. Host code."""
+        x, y = np.asarray(self.size, float).tolist()
+        return x, y
 
     @property
     def alike(self) -> bool:
@@ -183,19 +195,24 @@ class MicrolensArray(eqx.Module):
 
 
 def lenses_by_type(array: MicrolensArray) -> tuple[tuple[int, ...], ...]:
-    """Indices of the lenses of each type: lenses with the same numbers, in the order of their first lens. Host code."""
-    count = len(array.centers)
-    numbers = [np.broadcast_to(np.asarray(getattr(array, name)), count) for name in EACH]
-    _, first, number = np.unique(np.stack(numbers, -1), axis=0, return_index=True, return_inverse=True)
-    return tuple(tuple(np.flatnonzero(number.ravel() == n).tolist()) for n in np.argsort(first))
+    """Indices of the lenses of each type: lenses with the same numbers, in the order of their first lens."""
+    types = type_of_lens(array)
+    return tuple(tuple(np.flatnonzero(types == number).tolist()) for number in range(types.max() + 1))
 
 
 def type_of_lens(array: MicrolensArray) -> Int[np.ndarray, " lens"]:
-    """The number of each lens's type, in the order of `lenses_by_type`. Host code."""
-    types = np.zeros(len(array.centers), int)
-    for number, which in enumerate(lenses_by_type(array)):
-        types[list(which)] = number
-    return types
+    """The number of each lens's type, in the order of `lenses_by_type`. The array's numbers may be traced by JAX."""
+    if array.alike:
+        return np.zeros(len(array.centers), int)
+    numbers = [getattr(array, name) for name in EACH]
+    # Traced numbers have no values yet: the types are those of the array that they were made from.
+    return np.array(array.types if any(isinstance(x, Tracer) for x in numbers) else _types(numbers))
+
+
+def _types(numbers: Sequence[Scalars]) -> tuple[int, ...]:
+    each = np.stack(np.broadcast_arrays(*numbers), -1)
+    _, first, same = np.unique(each, axis=0, return_index=True, return_inverse=True)
+    return tuple(np.argsort(np.argsort(first))[same.ravel()].tolist())
 
 
 def sag(

@@ -132,7 +132,7 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
 
 def test_random_starts(table1):
     problem = problem_of(table1, study())
-    values = start_values(problem.parent)
+    values = start_values(problem.imager, problem.at)
     assert random_start(problem, values, 0) == values
     first, second = (random_start(problem, values, start) for start in (1, 2))
     assert all(FREE[name][0] < first[name] < FREE[name][1] and first[name] != second[name] for name in FREE)

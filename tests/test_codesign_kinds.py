@@ -2,24 +2,27 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax import random_layout
+from gs_jax import objectives, random_layout
 from gs_jax.base.errors import InputError
-from gs_jax.codesign.objectives import TERMS
-from gs_jax.codesign.parameters import candidate, new_design, parent_of, start_values
+from gs_jax.codesign.parameters import candidate, evaluated, new_design, start_values
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study
+from gs_jax.codesign.terms import TERMS
 from gs_jax.design.builtin import geomscope
+from gs_jax.design.datasheet import datasheet
 from gs_jax.design.design import Design
-from gs_jax.design.sheet import datasheet
 from gs_jax.layouts import interleave
+from gs_jax.lenses import lenses_by_type
+from gs_jax.objectives.conditions import per_type
 from gs_jax.optics.apertures import clear_diameter
 
 KINDS = [name for name, term in TERMS.items() if term.types]
@@ -50,7 +53,7 @@ def study(**changes):
 
 def two_kinds(**options):
     design = started(conics(**options), study(kinds=2))
-    return design, parent_of(design, depths_mm=(15.0, 30.0), depth_count=3)
+    return design, evaluated(design, depths_mm=(15.0, 30.0), depth_count=3)
 
 
 def test_lenses_are_dealt_with_radii_spread_over_the_depths():
@@ -90,21 +93,22 @@ def test_kinds_that_cannot_be():
 @pytest.mark.integration
 def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     design, parent = two_kinds()
-    values = start_values(parent)
+    values = start_values(*parent)
     assert {name for name, x in values.items() if x.shape == (2,)} >= {"radius_of_curvature_mm", "conic_constant"}
     moved = {"conic_constant": jnp.array([-0.7, -0.5]), "aperture_diameter_mm": jnp.array([0.7, 0.65])}
-    moved |= {"pitch_mm": 1.1 * parent.pitch}
-    found, made = candidate(parent, moved), new_design(design, parent, moved)
-    array, first = made.imager().array, list(parent.lenses[0])
+    moved |= {"pitch_mm": 1.1 * values["pitch_mm"]}
+    (found, at), made = candidate(*parent, moved), new_design(design, *parent, moved)
+    array, which = made.imager().array, lenses_by_type(parent[0].array)
+    first = which[0]
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.conic_constant) == -0.7), first)
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.aperture_diameter) == 0.7), first)
-    np.testing.assert_allclose(found.imager.array.radius_of_curvature, array.radius_of_curvature, atol=1e-4)
+    np.testing.assert_allclose(found.array.radius_of_curvature, array.radius_of_curvature, atol=1e-4)
     # Rounded to 1e-4 mm; 64 directions against 512.
-    np.testing.assert_allclose(found.clear_diameter, clear_diameter(array), rtol=1e-3)
-    for kind, which in zip(found.types, parent.lenses, strict=True):
-        np.testing.assert_allclose(kind.clear_diameter, clear_diameter(array.subset(which)), rtol=1e-3)
+    np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(array), rtol=1e-3)
+    for part, lenses in zip(per_type(found, at), which, strict=True):
+        np.testing.assert_allclose(objectives.clear_diameter(*part), clear_diameter(array.subset(lenses)), rtol=1e-3)
     # Kinds that come to the same are one number again.
-    same = new_design(design, parent, {"radius_of_curvature_mm": jnp.array([1.34001, 1.34003])})
+    same = new_design(design, *parent, {"radius_of_curvature_mm": jnp.array([1.34001, 1.34003])})
     assert same.lens.radius_of_curvature_mm == 1.34
 
 
@@ -112,25 +116,26 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
 def test_where_lenses_overlap_they_end_as_those_of_the_file():
     """With a pitch that scales them all, as the plate's size cannot be traced."""
     design, parent = two_kinds(diameter=1.3)
-    values = {"pitch_mm": 0.9 * parent.pitch}
-    found, array = candidate(parent, values), new_design(design, parent, values).imager().array
-    np.testing.assert_allclose(found.clear_diameter, clear_diameter(array), rtol=1e-3)
+    values = {"pitch_mm": 0.9 * start_values(*parent)["pitch_mm"]}
+    (found, at), array = candidate(*parent, values), new_design(design, *parent, values).imager().array
+    np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(array), rtol=1e-3)
 
 
 @pytest.mark.integration
 def test_terms_of_kinds_that_are_alike_are_those_of_one():
     """The same lenses, counted as one kind and as two."""
-    one = parent_of(conics(), depths_mm=(15.0, 30.0), depth_count=3)
+    one = evaluated(conics(), depths_mm=(15.0, 30.0), depth_count=3)
     _, two = two_kinds()
     alike = {"radius_of_curvature_mm": jnp.full(2, 1.34)}
     key = jax.random.key(0)
 
-    @jax.jit
-    def terms(c):
-        call = lambda term: term.function(c, key) if term.random else term.function(c)
+    @eqx.filter_jit
+    def terms(parent, values):
+        found = candidate(*parent, values)
+        call = lambda term: term.function(*found, key) if term.random else term.function(*found)
         return {name: call(TERMS[name]) for name in KINDS}
 
-    single, several = terms(candidate(one, {})), terms(candidate(two, alike))
+    single, several = terms(one, {}), terms(two, alike)
     for name in KINDS:
         expected = np.broadcast_to(single[name], several[name].shape)
         np.testing.assert_allclose(several[name], expected, rtol=1e-6, err_msg=name)
@@ -139,25 +144,25 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
 @pytest.mark.integration
 def test_the_best_kind_at_each_depth_is_the_datasheets():
     design, parent = two_kinds()
-    found, sheet = candidate(parent, {}), datasheet(design, [15.0, 22.5, 30.0])
-    widths = jax.jit(TERMS["psf_width_um"].function)(found)
+    found, sheet = candidate(*parent, {}), datasheet(design, [15.0, 22.5, 30.0])
+    widths = jax.jit(TERMS["psf_width_um"].function)(*found)
     np.testing.assert_allclose(widths, sheet["spot_width_um"], rtol=1e-3)
     assert set(sheet["sharpest_kind"]) == {1, 2}
-    np.testing.assert_allclose(TERMS["coverage"].function(found), sheet["coverage"], rtol=1e-3)
-    slopes = TERMS["edge_slope_deg"].function(found)
+    np.testing.assert_allclose(TERMS["coverage"].function(*found), sheet["coverage"], rtol=1e-3)
+    slopes = TERMS["edge_slope_deg"].function(*found)
     assert slopes.shape == (2,) and slopes[0] != slopes[1]
 
 
 def test_webs_are_between_apertures_of_their_own_size():
     _, parent = two_kinds()
     diameters = np.array([0.7, 0.5])
-    found = candidate(parent, {"aperture_diameter_mm": jnp.array(diameters)})
-    centers, each = np.asarray(found.imager.array.centers), np.asarray(found.imager.array.aperture_diameter)
+    found = candidate(*parent, {"aperture_diameter_mm": jnp.array(diameters)})
+    centers, each = np.asarray(found[0].array.centers), np.asarray(found[0].array.aperture_diameter)
     least = [
         min(np.hypot(*(centers[i] - centers[j])) - (each[i] + each[j]) / 2 for j in range(12) if j != i)
         for i in range(12)
     ]
-    np.testing.assert_allclose(TERMS["web_mm"].function(found), least, rtol=1e-12)
+    np.testing.assert_allclose(TERMS["web_mm"].function(*found), least, rtol=1e-12)
 
 
 @pytest.mark.integration
@@ -165,12 +170,14 @@ def test_gradients():
     """By what is free of each kind, apart and where discs overlap; every entry, so that ties do not matter."""
     _, parent = two_kinds()
     names = ("volume_error", "crowded_precision_um", "light_percent", "web_mm", "psf_width_um")
-    values = {name: start_values(parent)[name] for name in ("radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm")}
+    values = {
+        name: start_values(*parent)[name] for name in ("radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm")
+    }
     values |= {"conic_constant": jnp.array([-0.7, -0.5]), "aperture_diameter_mm": jnp.array([0.6, 0.7])}
-    terms = jax.jit(lambda values: [TERMS[name].function(candidate(parent, values)) for name in names])
+    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*parent, values)) for name in names])
     check_grads(terms, (values,), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
     values["aperture_diameter_mm"] = jnp.array([1.3, 1.21])
-    light = jax.jit(lambda values: TERMS["light_percent"].function(candidate(parent, values)))
+    light = jax.jit(lambda values: TERMS["light_percent"].function(*candidate(*parent, values)))
     check_grads(light, (values,), order=1, modes=["rev"], eps=1e-7, atol=1e-3, rtol=1e-3)
 
 
@@ -178,7 +185,7 @@ def test_gradients():
 def test_one_kind_is_as_before():
     """`kinds = 1` changes nothing, to the last digit."""
     few = {"stages": [{"solver": "lbfgsb", "steps": 3}], "terms": [{"name": "psf_width_um", "minimise": 100.0}]}
-    plain, one = (run_study(conics(4, 2.4), study(**few, **kinds)) for kinds in ({}, {"kinds": 1}))
+    plain, one = (run_study(conics(4, 2.4), study(**few, **types)) for types in ({}, {"kinds": 1}))
     assert plain.log == one.log and plain.design.lens == one.design.lens
 
 
@@ -206,15 +213,15 @@ def test_what_is_found_goes_on_as_a_design_of_two_kinds(searches):
     """What is written is read as its kinds, and judged as it was."""
     design = searches[1].design
     again = problem_of(design, study(kinds=2))
-    assert len(again.parent.lenses) == 2
-    value = TERMS["volume_error"].function(candidate(again.parent, {}))
+    assert len(lenses_by_type(again.imager.array)) == 2
+    value = TERMS["volume_error"].function(*candidate(again.imager, again.at, {}))
     assert float(value) == pytest.approx(searches[1].after[0].high, rel=1e-6)
 
 
 def test_dealt_lenses_are_balanced():
     centers = np.array(list(itertools.product(np.arange(6.0), np.arange(6.0))))
-    for kinds in (1, 2, 3):
-        assert np.bincount(interleave(centers, kinds)).tolist() == [36 // kinds] * kinds
+    for count in (1, 2, 3):
+        assert np.bincount(interleave(centers, count)).tolist() == [36 // count] * count
     np.testing.assert_array_equal(interleave(np.zeros((1, 2)), 1), [0])
     which = interleave(centers, 2).reshape(6, 6)
     assert (which[1:] != which[:-1]).mean() + (which[:, 1:] != which[:, :-1]).mean() > 1.2  # at random: 1

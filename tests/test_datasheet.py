@@ -1,8 +1,8 @@
+import dataclasses
 import io
 import json
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +10,13 @@ import pytest
 from jax.test_util import check_grads
 from rich.console import Console
 
-from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax import Imager, MicrolensArray, Sensor, objectives
 from gs_jax.design.builtin import geomscope
+from gs_jax.design.datasheet import datasheet, summary, tables
 from gs_jax.design.design import read_design
-from gs_jax.design.microscope import Microscope
-from gs_jax.design.problems import findings
-from gs_jax.design.sheet import datasheet, summary, tables
-from gs_jax.lenses import lenses_by_type
+from gs_jax.design.diagnostics import findings
+from gs_jax.objectives.conditions import per_type
+from gs_jax.objectives.paraxial import third_order_wavefront
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
 from gs_jax.optics.apertures import clear_diameter, pitch, voronoi_cells
@@ -166,8 +166,26 @@ def test_wrong_arguments_are_named(table1, arguments, words):
 def test_an_infinite_plate_has_no_density():
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`imager.array.size` must be finite, got \(inf, inf\)"):
-        one = jnp.array(1.0)
-        Microscope(imager, grid.depths, one, circle_of_confusion=one)
+        objectives.occupancy(imager, grid.depths)
+
+
+BY_DEPTH = (
+    "lenses_per_point",
+    "occupancy",
+    "coverage",
+    "depth_of_field",
+    "approximate_depth_of_field",
+    "near_limit",
+    "far_limit",
+    "focus_distance",
+    "sensor_blur",
+    "blur",
+    "lateral_resolution",
+    "axial_resolution",
+    "light",
+    "field_of_view",
+    "log_strehl",
+)
 
 
 @pytest.mark.integration
@@ -178,34 +196,19 @@ def test_gradients_by_everything_that_is_continuous():
     @jax.jit
     def values(centers, radius, index, diameter, thickness, v, depths, field_radius, um):
         moved = MicrolensArray(
-            centers,
+            um * centers,
             radius_of_curvature=radius,
             refractive_index=index,
             aperture_diameter=diameter,
             substrate_thickness=thickness,
-            size=(2.0, 2.0),
+            size=2 * jnp.stack([um, um]),
         )
-        m = Microscope(
-            Imager(moved, imager.sensor, v, 1.0, wavelength=um * 1e-3),
-            depths,
-            field_radius=field_radius,
-            circle_of_confusion=um * 1e-2,
-            plate_scale=um,
-        )
-        sharp = m.depth_of_field, m.approximate_depth_of_field, m.near_limit, m.far_limit, m.middle.depth_of_field
-        focus = m.focus_distance, m.blur, m.object_blur, linear_rms(m.wavefront(jnp.array([0.0, 0.1])))
-        resolution = m.lateral_resolution, m.axial_resolution, jnp.log(m.lateral_resolution)
-        return (
-            m.magnification,
-            m.scale,
-            m.lenses_per_point,
-            m.occupancy,
-            m.coverage,
-            sharp,
-            focus,
-            resolution,
-            pitch(centers),
-        )
+        imager = Imager(moved, Sensor((40, 40), 1e-3), v, 1.0, wavelength=um * 1e-3)
+        at = objectives.Conditions(depths, um * 1e-2, field_radius=field_radius)
+        named = [getattr(objectives, name) for name in BY_DEPTH]
+        wavefront = third_order_wavefront(imager, at, jnp.array([0.0, 0.1]))
+        values = [jnp.log(objectives.lateral_resolution(imager, at)), linear_rms(wavefront), pitch(centers)]
+        return [function(imager, at) for function in named], objectives.depth_of_field(imager, at.middle), values
 
     one = jnp.array
     arguments = (array.centers, one(2.0), one(1.43), one(0.5), one(1.0), one(5.8), grid.depths, one(0.4), one(0.52))
@@ -221,18 +224,16 @@ def test_the_clear_aperture_follows_the_imager(how):
     diameter = jnp.array([1.0, 1.0, 0.9, 0.9]) if how == "kinds" else jnp.array(1.0)
     array = MicrolensArray(centers, aperture_diameter=diameter, size=(2.0, 2.0))
     imager = Imager(array, Sensor((40, 40), 1e-3), 5.8, 0.4)
-    cells = voronoi_cells(np.asarray(centers), array.size) if how == "by cells" else None
-    lenses = lenses_by_type(imager.array) if how == "kinds" else ()
-    m = Microscope(
-        imager, jnp.array([20.0]), jnp.array(0.4), jnp.array(0.01), cells=cells, directions=16, lenses=lenses
-    )
+    cells = voronoi_cells(np.asarray(centers), array.plate) if how == "by cells" else None
+    at = objectives.Conditions([20.0], 0.01, cells=cells, directions=16)
 
     @jax.jit
     def values(diameter, centers):
-        where = lambda m: (m.imager.array.aperture_diameter, m.imager.array.centers)
-        changed = eqx.tree_at(where, m, (diameter, centers))
-        each = [(kind.f_number, kind.lateral_resolution, kind.depth_of_field) for kind in changed.each]
-        return changed.coverage, each
+        changed = dataclasses.replace(array, aperture_diameter=diameter, centers=centers)
+        parts = per_type(dataclasses.replace(imager, array=changed), at)
+        named = objectives.f_number, objectives.lateral_resolution, objectives.depth_of_field
+        each = [[function(*part) for function in named] for part in parts]
+        return objectives.coverage(dataclasses.replace(imager, array=changed), at), each
 
     # Steps of 1e-6 of numbers of order one.
     check_grads(values, (diameter, centers), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
@@ -254,7 +255,7 @@ def test_the_built_in_design_matches_its_file():
 def test_the_command(tmp_path, monkeypatch, capsys, table1):
     design = Path(__file__).parents[1] / "design" / "geomscope-table1.toml"
     output = tmp_path / "sheet.json"
-    options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
+    options = ("--depths", "20:22:1", "--circle_of_confusion-um", "18", "--json", output)
     status, out, err = run(monkeypatch, capsys, "metrics", design, *options)
     assert (status, err) == (0, "")
     assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], circle_of_confusion=0.018)
@@ -266,7 +267,7 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     [
         (["--json", "sheet.txt"], "sheet.txt"),
         (["--depths", "20:22"], "allowed: START:STOP:STEP"),
-        (["--confusion-um", "0"], "allowed: 0.01 to 1e"),
+        (["--circle_of_confusion-um", "0"], "allowed: 0.01 to 1e"),
     ],
 )
 def test_wrong_options_are_one_line(tmp_path, monkeypatch, capsys, options, words):

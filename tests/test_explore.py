@@ -17,8 +17,8 @@ from gs_jax.apps.explore.evaluation import complete_values, evaluate_design, mak
 from gs_jax.apps.explore.server import Server, Session
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
+from gs_jax.design.datasheet import datasheet
 from gs_jax.design.design import Design
-from gs_jax.design.sheet import datasheet
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run
@@ -84,7 +84,8 @@ def test_numbers_are_those_of_the_datasheet(either):
 def test_the_saved_design_is_the_one_shown(either):
     """With the pitch too: the pattern and its plate are scaled."""
     start = start_of(either)
-    values = complete_values(make_sliders(either), MOVES | {"pitch_mm": 1.2 * float(start.pitch)})
+    sliders = make_sliders(either)
+    values = complete_values(sliders, MOVES | {"pitch_mm": 1.2 * sliders["pitch_mm"].start})
     saved = evaluation.moved_design(either, start, values, {"command": "x"})
     assert saved.provenance == {"command": "x"} and saved.imaging.working_distance_mm == (17.0, 26.0)
     np.testing.assert_allclose(saved.array.centers_mm, 1.2 * np.array(either.array.centers_mm), atol=1e-4)
@@ -112,7 +113,7 @@ def test_moves_compile_nothing(either):
 
 def test_targets_and_assumptions_in_words(design):
     start = start_of(design, STUDY)
-    moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * float(start.pitch)}
+    moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * make_sliders(design)["pitch_mm"].start}
     values = complete_values(make_sliders(design), moves)
     result = evaluate_design(start, values, evaluation.live_terms(start, STUDY))
     sentences = evaluation.find_violations(design, STUDY, start, values, result)

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,11 +12,13 @@ from scipy.special import j1
 from gs_jax.codesign import linear_error
 from gs_jax.codesign.fisher import localization_bound
 from gs_jax.codesign.linear_error import lost_power, noise_density
-from gs_jax.codesign.objectives import TERMS
-from gs_jax.codesign.parameters import candidate, parent_of, start_values
+from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.precision import crowded_bound
+from gs_jax.codesign.terms import TERMS
 from gs_jax.codesign.transfer import lens_electrons, lit_density, spots, transfer_power
 from gs_jax.design.builtin import geomscope
+from gs_jax.geometry import Imager
+from gs_jax.objectives import Conditions, clear_diameter
 from gs_jax.optics.psf import diffraction_psf
 
 CENTERS = ((-1.313, 0.437), (0.221, 0.119), (1.127, -0.741), (0.333, 1.416), (-0.629, -1.243))
@@ -28,7 +31,16 @@ def parent(centers=CENTERS, orientation="plano", **options):
     array = design.array.model_copy(update={"centers_mm": centers, "size_mm": (4.0, 4.0)})
     lens = design.lens.model_copy(update={"orientation": orientation})
     design = design.model_copy(update={"array": array, "lens": lens})
-    return parent_of(design, depths_mm=(18.0, 23.0), depth_count=2, **options)
+    return evaluated(design, depths_mm=(18.0, 23.0), depth_count=2, **options)
+
+
+class Case(NamedTuple):
+    imager: Imager
+    at: Conditions
+
+
+def case(values, **options):
+    return Case(*candidate(*parent(**options), values))
 
 
 def ideal(c, depth, sensor_distance, diameter):
@@ -37,12 +49,11 @@ def ideal(c, depth, sensor_distance, diameter):
     where = lambda i: (i.array.thin_lens_focal_length, i.sensor_distance, i.array.aperture_diameter)
     values = c.imager.array.focal_length, jnp.array(sensor_distance), jnp.array(diameter)
     imager = eqx.tree_at(where, imager, values, is_leaf=lambda x: x is None)
-    judged = {"depths": jnp.array([depth]), "field_radius": jnp.array(1e-3)}
-    return dataclasses.replace(c, imager=imager, **judged)
+    return Case(imager, dataclasses.replace(c.at, depths=jnp.array([depth])))
 
 
 def perfect(frequency, c):
-    share = frequency * c.imager.wavelength * float(c.imager.reduced_sensor_distance) / float(c.clear_diameter)
+    share = frequency * c.imager.wavelength * float(c.imager.reduced_sensor_distance) / float(clear_diameter(*c))
     share = np.minimum(share, 1)
     clear = 2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2))
     return clear * np.sinc(frequency * c.imager.sensor.pixel_pitch)
@@ -51,14 +62,14 @@ def perfect(frequency, c):
 @pytest.mark.parametrize("off", [0.0, 0.5])
 def test_transfer_of_an_ideal_lens(off):
     """A patch out of focus is an even disc: 2 J1(x) / x. The mean over a field of 1 um is good to that over 4 mm."""
-    c = candidate(parent(), {})
+    c = case({})
     f, z = float(c.imager.array.focal_length), 20.0
     v = 1 / (1 / f - 1 / float(c.imager.reduced_depth(z))) + off
     c = ideal(c, z, v, 0.8)
     frequency = np.array([0.3, 3.0, 20.0, 60.0, 110.0])
     patch = 2 * np.pi * frequency * 0.4 * off / (v - off)
     expected = perfect(frequency, c) ** 2 * (np.where(patch, 2 * j1(patch) / np.where(patch, patch, 1), 1) ** 2)
-    found = jax.jit(transfer_power)(c, jnp.array(frequency))[0]
+    found = jax.jit(transfer_power)(*c, jnp.array(frequency))[0]
     # A fixed rule of 16 rings: to 1e-3 of the whole at ten periods across the patch.
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3 if off else 0)
 
@@ -66,12 +77,14 @@ def test_transfer_of_an_ideal_lens(off):
 @pytest.mark.integration
 def test_a_lens_and_a_plane_are_wieners_filter():
     """One plane under one lens: 1 / (1 + S H^2 L^2 M^2 w / n), over the object's frequencies."""
-    c = candidate(parent(((0.0, 0.0),), exposure=300.0), {})
-    c = dataclasses.replace(c, depths=c.depths[:1])
+    c = case({}, centers=((0.0, 0.0),), exposure=300.0)
+    c = c._replace(at=dataclasses.replace(c.at, depths=c.at.depths[:1]))
     nodes = (np.arange(4000) + 0.5) / 4000 * 12.5
     spectrum = linear_error._spectrum(nodes)
-    power = transfer_power(c, jnp.array(nodes / float(c.magnification[0])))[0]
-    signal = spectrum * power * (lit_density(c)[0] * c.magnification[0]) ** 2 / noise_density(c, [c])
+    power = transfer_power(*c, jnp.array(nodes / float(c.imager.magnification(c.at.depths)[0])))[0]
+    signal = (
+        spectrum * power * (lit_density(*c)[0] * c.imager.magnification(c.at.depths)[0]) ** 2 / noise_density(*c, [c])
+    )
     expected = np.sum(nodes * spectrum / (1 + signal)) / np.sum(nodes * spectrum)
     # The lens is above the object, so that the envelope is 1; 16 nodes against 4000 are good to 2e-3.
     np.testing.assert_allclose(jax.jit(lost_power)([c], jnp.zeros((1, 2)))[0], expected, rtol=3e-3)
@@ -84,7 +97,7 @@ def test_planes_that_no_parallax_tells_apart():
     rng = np.random.default_rng(0)
     losses = []
     for centers in ([(0.0, 0.0)], rng.uniform(-2, 2, (40, 2)).tolist()):
-        c = candidate(parent(tuple(map(tuple, centers)), exposure=1e9), {"aperture_diameter_mm": jnp.array(0.3)})
+        c = case({"aperture_diameter_mm": jnp.array(0.3)}, centers=tuple(map(tuple, centers)), exposure=1e9)
         losses.append(np.asarray(jax.jit(lost_power)([c], jnp.zeros((1, 2)))))
     assert losses[0].mean() == pytest.approx(0.5, abs=0.02)
     assert losses[1].max() < 0.1
@@ -95,14 +108,13 @@ def test_a_pinhole_pays_at_equal_exposure():
     """Of a lens in focus without aberrations, a third of the diameter has a ninth of the light."""
     found = {}
     for exposure in (1e3, 1e5):
-        c = candidate(parent(exposure=exposure), {})
+        c = case({}, exposure=exposure)
         f = float(c.imager.array.focal_length)
         v = 1 / (1 / f - 1 / float(c.imager.reduced_depth(20.0)))
         sharp = [ideal(c, 20.0, v, d) for d in (0.9, 0.3)]
-        wide = {"field_radius": jnp.array(3.0)}
-        sharp = [dataclasses.replace(s, imager=dataclasses.replace(s.imager, field_radius=3.0), **wide) for s in sharp]
-        np.testing.assert_allclose(lens_electrons(sharp[0]), 9 * lens_electrons(sharp[1]), rtol=1e-12)
-        found[exposure] = [[float(jnp.ravel(TERMS[n].function(s))[0]) for s in sharp] for n in NAMES]
+        sharp = [s._replace(imager=dataclasses.replace(s.imager, field_radius=3.0)) for s in sharp]
+        np.testing.assert_allclose(lens_electrons(*sharp[0]), 9 * lens_electrons(*sharp[1]), rtol=1e-12)
+        found[exposure] = [[float(jnp.ravel(TERMS[n].function(*s))[0]) for s in sharp] for n in NAMES]
         assert all(wide < narrow for wide, narrow in found[exposure])
     assert all(bright[0] < dim[0] for bright, dim in zip(found[1e5], found[1e3], strict=True))
 
@@ -111,12 +123,12 @@ def test_a_pinhole_pays_at_equal_exposure():
 def test_the_bound_is_that_of_the_pixels():
     """Against the bound that sums up pixels of the diffraction PSF, in a bright background: both have the same noise
     then, and differ by what is beyond the pixels' highest frequency and by the mean over the field."""
-    c = candidate(parent(exposure=3e3), {"aperture_diameter_mm": jnp.array(0.3)})
-    c = dataclasses.replace(c, depths=jnp.array([20.0]))
-    background = float(noise_density(c, [c]) * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
-    psf = diffraction_psf(c.imager, 20.0, size=65, radius=c.clear_diameter / 2, field=(1.5, 0.0), samples=6)
+    c = case({"aperture_diameter_mm": jnp.array(0.3)}, exposure=3e3)
+    c = c._replace(at=dataclasses.replace(c.at, depths=jnp.array([20.0])))
+    background = float(noise_density(*c, [c]) * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
+    psf = diffraction_psf(c.imager, 20.0, size=65, radius=clear_diameter(*c) / 2, field=(1.5, 0.0), samples=6)
     points = jnp.array([[0.1, -0.2, 20.0]])
-    light = {"photons": lens_electrons(c)[0], "background": background, "read_noise": linear_error.READ_NOISE}
+    light = {"photons": lens_electrons(*c)[0], "background": background, "read_noise": linear_error.READ_NOISE}
     pixels = localization_bound(c.imager, points, spot=psf, size=65, **light)
     np.testing.assert_allclose(jax.jit(crowded_bound)([c], PLACES)[0], pixels, rtol=0.15)
 
@@ -124,12 +136,12 @@ def test_the_bound_is_that_of_the_pixels():
 @pytest.mark.integration
 def test_spots_have_the_transfer_function():
     """Where all light is in the window and nothing is cut off below zero: the Fourier transform gives it back."""
-    c = candidate(parent(), {"aperture_diameter_mm": jnp.array(0.4), "sensor_distance_mm": jnp.array(5.6)})
-    found = jax.jit(lambda c: spots(c, 65))(c)
+    c = case({"aperture_diameter_mm": jnp.array(0.4), "sensor_distance_mm": jnp.array(5.6)})
+    found = jax.jit(lambda c: spots(*c, 65))(c)
     np.testing.assert_allclose(found.sum((1, 2)), 1, rtol=1e-9)
     frequency = np.fft.fftfreq(65)[[1, 4, 12]]
     seen = np.abs(np.fft.fft(found.sum(1)))[:, [1, 4, 12]]
-    power = transfer_power(c, jnp.array(frequency / c.imager.sensor.pixel_pitch))
+    power = transfer_power(*c, jnp.array(frequency / c.imager.sensor.pixel_pitch))
     # Linear between 24 frequencies, and the mean over directions: to 3 % of the whole.
     np.testing.assert_allclose(seen, np.sqrt(power), atol=0.03)
 
@@ -140,9 +152,9 @@ def test_gradients(orientation):
     """By everything that shapes a lens, and by the lenses' places, some of which are too far away to see the object."""
     free = {"aspheric_terms": (-0.1, 0.1), "centers_mm": (-9.0, 9.0)}
     judged = parent((*CENTERS, (-1.9, -1.9), (1.9, 1.9)), orientation=orientation, free=free, exposure=2e3)
-    judged = eqx.tree_at(lambda p: p.imager, judged, dataclasses.replace(judged.imager, field_radius=1.0))
+    judged = dataclasses.replace(judged[0], field_radius=1.0), judged[1]
     names = ("conic_constant", "radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm", "centers_mm")
-    values = {name: start_values(judged)[name] for name in names}
+    values = {name: start_values(*judged)[name] for name in names}
     values |= {"aperture_diameter_mm": jnp.array(0.7), "aspheric_terms": jnp.array([0.01, -0.02])}
-    terms = jax.jit(lambda values: [TERMS[name].function(candidate(judged, values)) for name in NAMES])
+    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*judged, values)) for name in NAMES])
     check_grads(terms, (values,), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)

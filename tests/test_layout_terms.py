@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gs_jax.codesign import layout_terms
-from gs_jax.codesign.objectives import TERMS
-from gs_jax.codesign.parameters import candidate, parent_of, start_values
+from gs_jax.codesign.parameters import candidate, evaluated, start_values
+from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design
 from gs_jax.design.tables import ArrayTable, ImagingTable, LensTable, SensorTable
 from gs_jax.geometry import field_limit
@@ -33,7 +33,7 @@ def small_design(centers, side, field_radius, pixel, shape=(96, 80)):
 @pytest.fixture(scope="module")
 def parent():
     """Five lenses on a plate of 1.2 mm, a sensor of 96 x 80 pixels."""
-    return parent_of(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, free={"centers_mm": (-10.0, 10.0)})
+    return evaluated(small_design(CENTERS, 1.2, 0.5, 20.0), depth_count=3, free={"centers_mm": (-10.0, 10.0)})
 
 
 @pytest.mark.integration
@@ -41,12 +41,12 @@ def parent():
 def test_values_and_gradients_are_finite(parent, name):
     """Also where two lenses coincide; their gradients are checked where they are written."""
     term = TERMS[name]
-    values = start_values(parent)
+    values = start_values(*parent)
     values["centers_mm"] = values["centers_mm"].at[1].set(values["centers_mm"][0])
 
     def total(values):
-        found = candidate(parent, values)
-        return jnp.sum(term.function(found, jax.random.key(0)) if term.random else term.function(found))
+        found = candidate(*parent, values)
+        return jnp.sum(term.function(*found, jax.random.key(0)) if term.random else term.function(*found))
 
     value, slopes = jax.jit(jax.value_and_grad(total))(values)
     assert np.isfinite(value) and all(np.isfinite(slope).all() for slope in slopes.values())
@@ -61,12 +61,12 @@ def test_scenes_are_imaged_whole(monkeypatch, distance):
         layout_terms, "reconstruction_loss", lambda *_, **options: found.update(options) or jnp.ones(())
     )
     free = {"sensor_distance_mm": (2.0, distance)}
-    far = candidate(parent_of(design, free=free), {"sensor_distance_mm": jnp.array(distance)})
-    TERMS["reconstruction_error"].function(far, jax.random.key(0))
+    far = candidate(*evaluated(design, free=free), {"sensor_distance_mm": jnp.array(distance)})
+    TERMS["reconstruction_error"].function(*far, jax.random.key(0))
     (rows, columns), grid = found["window"], found["grid"]
     reach, corner = field_limit(0.05), np.array([grid.x[-1], grid.y[-1]])
     # The lens that is farthest from the corner, away from the scene's middle.
-    image = corner + reach + float(far.magnification.max()) * reach
+    image = corner + reach + float(far[0].magnification(far[1].depths).max()) * reach
     assert (image <= np.array([columns, rows]) * 0.002 / 2 + 1e-9).all()
     # And no more: a window costs time.
     assert (image >= np.array([columns, rows]) * 0.002 / 2 * 0.97).all()
@@ -76,7 +76,7 @@ def test_scenes_are_imaged_whole(monkeypatch, distance):
 def test_points_are_located_to_a_small_part_of_a_pixel(parent):
     """Spots of one pixel, 20 um, of 1000 photons a lens through five lenses: 20 / sqrt(5000) um by the lenses' share of
     light, over the magnification of a quarter; read noise and a point's depth cost more, a few times."""
-    found = np.asarray(TERMS["localization_um"].function(candidate(parent, {}), jax.random.key(0)))
+    found = np.asarray(TERMS["localization_um"].function(*candidate(*parent, {}), jax.random.key(0)))
     least = 20 / np.sqrt(5000) / 0.3
     assert (least < found[:2]).all() and (found[:2] < 20 * least).all() and found[2] < 1000
 
@@ -89,8 +89,8 @@ def test_spectrum_of_random_lenses_and_of_a_lattice():
     keys = jax.random.split(jax.random.key(1), 8)
 
     def found(centers):
-        judged = candidate(parent_of(small_design(centers.tolist(), 12.0, 4.0, 200.0), depth_count=2), {})
-        return np.mean([(flat(judged, key), condition(judged, key)) for key in keys], axis=0)
+        judged = candidate(*evaluated(small_design(centers.tolist(), 12.0, 4.0, 200.0), depth_count=2), {})
+        return np.mean([(flat(*judged, key), condition(*judged, key)) for key in keys], axis=0)
 
     random = found(rng.uniform(-6, 6, (150, 2)))
     lattice = found(hexagonal_layout((12.0, 12.0), pitch=1.0))

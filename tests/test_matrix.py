@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gs_jax.design.sheet import datasheet
 
 import gs_jax as gs
 from gs_jax import Design, Grid, InputError
@@ -20,7 +21,6 @@ from gs_jax.apps.report.page import write_report
 from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
-from gs_jax.design.sheet import datasheet
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import COARSE, voxel_grid

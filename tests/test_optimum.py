@@ -78,33 +78,57 @@ def test_kinds_of_lenses_stay_kinds():
     np.testing.assert_allclose(found.array.radius_of_curvature, [2.4, 2.6, 2.4], atol=1e-6)
 
 
+def test_objectives_of_lens_types_under_trace():
+    """The best type at each depth, by a search: numbers that JAX traces are still of two types."""
+    scope = small(radius_of_curvature=[2.0, 2.4, 2.0])
+    width = lambda scope: gs.objectives.spot_width(scope, [18.0, 24.0])
+    np.testing.assert_allclose(jax.jit(width)(scope), width(scope), rtol=1e-9)
+    loss = lambda scope: jnp.sum(width(scope) ** 2)
+    found = gs.optimize(loss, scope, free=gs.free("radius_of_curvature"), steps=20)
+    radii = np.asarray(found.imager.array.radius_of_curvature)
+    assert float(found.value) < float(loss(scope)) and radii[0] == radii[2] != radii[1]
+
+
+def test_a_pitch_scales_centers_and_plate():
+    scope, free = small(), gs.free("pitch")
+    wider = free.replaced(scope, {"pitch": 1.5 * free.values(scope)["pitch"]})
+    np.testing.assert_allclose(wider.array.centers, 1.5 * scope.array.centers)
+    np.testing.assert_allclose(wider.array.size, 1.5 * scope.array.size)
+    crowded = lambda scope: (gs.objectives.lenses_per_point(scope) - 2.0) ** 2
+    found = gs.optimize(crowded, scope, free=free, bounds={"pitch": (0.2, 5.0)})
+    assert float(gs.objectives.lenses_per_point(found.imager)) == pytest.approx(2.0, abs=1e-3)
+
+
 UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotations
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: UNCHECKED(in_focus, gs.geomscope(), free=FREE), "imager: found .*allowed: an Imager, as"),
+        (lambda: UNCHECKED(in_focus, gs.geomscope(), free=FREE), "imager must be an Imager, as .*, got "),
         (
             lambda: UNCHECKED(in_focus, small(), free="shift"),
-            "free: found 'shift', allowed: what `gs_jax.free` makes",
+            "free must be a Free, as `gs_jax.free` makes it, got 'shift'",
         ),
         (
             lambda: UNCHECKED(in_focus, small(), free=FREE, solver="bfgs"),
-            "solver: found 'bfgs', allowed: a solver of",
+            "solver must be a solver of .*, got 'bfgs'",
         ),
-        (lambda: gs.optimize(in_focus, small(), free=FREE, steps=0), "steps: found 0, allowed: 1 or more"),
-        (lambda: gs.free("pitch"), "free: found 'pitch', allowed: sensor_distance, rotation"),
-        (lambda: gs.free(), "free: found no name"),
+        (lambda: gs.optimize(in_focus, small(), free=FREE, steps=0), "steps must be 1 or more, got 0"),
+        (lambda: gs.free("spacing"), "names must be among sensor_distance, rotation.*, got 'spacing'"),
+        (lambda: gs.free(), "at least one name must be given"),
         (
             lambda: gs.optimize(in_focus, small(), free=gs.free("tilt")),
-            "tilt of an imager without one, allowed: with one",
+            "tilt must be a number of the imager",
         ),
-        (lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"shift": (0, 1)}), "bounds: found some of shift"),
-        (lambda: gs.optimize(in_focus, small(), free=FREE, solver=LBFGSB()), "bounds: found none of sensor_distance"),
+        (
+            lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"shift": (0, 1)}),
+            "among the free .*, got shift",
+        ),
+        (lambda: gs.optimize(in_focus, small(), free=FREE, solver=LBFGSB()), "got none of sensor_distance"),
         (
             lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"sensor_distance": (6.0, 5.0)}),
-            "found 6.0 to 5.0 of sensor_distance, allowed: low below high",
+            "bounds of sensor_distance must be finite, the lower one first, got 6.0 to 5.0",
         ),
         (
             lambda: gs.optimize(lambda s: s.wavelength, small(), free=FREE, solver=optx.LevenbergMarquardt(1e-3, 1e-3)),

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from gs_jax import objectives
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.bounds import Bounds
-from gs_jax.codesign.parameters import NAMES, candidate, new_design, parent_of, start_values
+from gs_jax.codesign.parameters import NAMES, candidate, evaluated, new_design, start_values
 from gs_jax.design.builtin import geomscope
 from gs_jax.layouts import coverage
 from gs_jax.optics.apertures import clear_diameter, pitch
@@ -23,7 +24,7 @@ def design():
 
 @pytest.fixture(scope="module")
 def parent(design):
-    return parent_of(design, depths_mm=(18.0, 23.0), circle_of_confusion=0.036)
+    return evaluated(design, depths_mm=(18.0, 23.0), circle_of_confusion=0.036)
 
 
 def test_bounds_are_invertible_from_the_number():
@@ -54,26 +55,27 @@ def test_bounds_have_gradients():
 
 
 def test_without_values_it_is_the_parent(design, parent):
-    found = candidate(parent, {})
-    imager = design.imager()
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found.imager, imager)
+    (found, at), imager = candidate(*parent, {}), design.imager()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found, imager)
     # Two exact computations of the same areas: from the Voronoi cells' edges, and lens by lens.
-    np.testing.assert_allclose(found.clear_diameter, clear_diameter(imager.array), rtol=1e-9)
-    np.testing.assert_allclose(found.depths, [18, 19, 20, 21, 22, 23], rtol=1e-12)
-    np.testing.assert_allclose(found.coverage, coverage(np.array(design.array.centers_mm), (20.0, 20.0), diameter=2.0))
+    np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(imager.array), rtol=1e-9)
+    np.testing.assert_allclose(at.depths, [18, 19, 20, 21, 22, 23], rtol=1e-12)
+    np.testing.assert_allclose(
+        objectives.coverage(found, at), coverage(np.array(design.array.centers_mm), (20.0, 20.0), diameter=2.0)
+    )
 
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
-    parent = parent_of(design, free=MOVING if moving else {})
-    values = {"pitch_mm": 1.1 * parent.pitch, "aperture_diameter_mm": jnp.array(1.3)}
-    found = candidate(parent, values)
-    scaled = new_design(design, parent, values)
-    np.testing.assert_allclose(found.plate, [22.0, 22.0], rtol=1e-12)
-    np.testing.assert_allclose(pitch(found.imager.array.centers)[0], values["pitch_mm"], rtol=1e-9)
+    parent = evaluated(design, free=MOVING if moving else {})
+    values = {"pitch_mm": 1.1 * start_values(*parent)["pitch_mm"], "aperture_diameter_mm": jnp.array(1.3)}
+    found, at = candidate(*parent, values)
+    scaled = new_design(design, *parent, values)
+    np.testing.assert_allclose(found.array.size, [22.0, 22.0], rtol=1e-12)
+    np.testing.assert_allclose(pitch(found.array.centers)[0], values["pitch_mm"], rtol=1e-9)
     # The written design is rounded to 1e-4 mm.
-    np.testing.assert_allclose(found.clear_diameter, clear_diameter(scaled.imager().array), rtol=1e-4)
-    np.testing.assert_allclose(found.lenses_per_point, 200 * np.pi * 9 / 22**2, rtol=1e-12)
+    np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(scaled.imager().array), rtol=1e-4)
+    np.testing.assert_allclose(objectives.lenses_per_point(found), 200 * np.pi * 9 / 22**2, rtol=1e-12)
 
 
 @pytest.mark.integration
@@ -82,12 +84,13 @@ def test_everything_has_gradients(moving):
     small = geomscope().model_copy(
         update={"array": geomscope().array.model_copy(update={"centers_mm": ((-3.0, 1.0), (-2.1, 0.2), (0.1, 0.4))})}
     )
-    parent = parent_of(small, free=MOVING if moving else {})
-    values = {name: x for name, x in start_values(parent).items() if moving or name != "centers_mm"}
+    parent = evaluated(small, free=MOVING if moving else {})
+    values = {name: x for name, x in start_values(*parent).items() if moving or name != "centers_mm"}
 
     def what(values):
-        found = candidate(parent, values)
-        return found.clear_diameter, found.coverage, found.plate, found.magnification, found.lenses_per_point
+        found, at = candidate(*parent, values)
+        density = objectives.coverage(found, at), objectives.lenses_per_point(found)
+        return objectives.clear_diameter(found, at), density, found.array.size, found.magnification(at.depths)
 
     check_grads(jax.jit(what), (values,), order=1, eps=1e-5)
 
@@ -95,43 +98,48 @@ def test_everything_has_gradients(moving):
 def test_no_candidate_magnifies_more(design):
     """Whatever is free within its bounds: over their corners, and the design itself."""
     free = {"sensor_distance_mm": (2.0, 5.0), "refractive_index": (1.3, 1.8), "depth_span_mm": (1.0, 20.0)}
-    parent = parent_of(design, depths_mm=(18.0, 23.0), free=free)
+    parent = evaluated(design, depths_mm=(18.0, 23.0), free=free)
     corners = [dict(zip(free, map(jnp.array, corner), strict=True)) for corner in itertools.product(*free.values())]
+
+    def largest(corner):
+        imager, at = candidate(*parent, corner)
+        return float(imager.magnification(at.depths).max())
+
     # A sensor at 5.8 mm in the design, beyond the bound: it is judged too.
-    found = max(float(candidate(parent, corner).magnification.max()) for corner in ({}, *corners))
-    assert found <= parent.largest_magnification
-    np.testing.assert_allclose(parent.largest_magnification, 5.8 / (10.5 + 1 / 1.8), rtol=1e-12)
+    found = max(map(largest, ({}, *corners)))
+    assert found <= parent[1].largest_magnification
+    np.testing.assert_allclose(parent[1].largest_magnification, 5.8 / (10.5 + 1 / 1.8), rtol=1e-12)
     # With the curved side in front the glass is behind, and makes the sensor's distance longer.
     turned = design.model_copy(update={"lens": design.lens.model_copy(update={"orientation": "curved"})})
-    parent = parent_of(turned, depths_mm=(18.0, 23.0), free=free)
-    found = max(float(candidate(parent, corner).magnification.max()) for corner in ({}, *corners))
-    assert found <= parent.largest_magnification
-    np.testing.assert_allclose(parent.largest_magnification, (5.8 + 1 / 1.3) / 10.5, rtol=1e-12)
+    parent = evaluated(turned, depths_mm=(18.0, 23.0), free=free)
+    found = max(map(largest, ({}, *corners)))
+    assert found <= parent[1].largest_magnification
+    np.testing.assert_allclose(parent[1].largest_magnification, (5.8 + 1 / 1.3) / 10.5, rtol=1e-12)
 
 
 def test_a_new_design_holds_the_values(design, parent):
-    values = start_values(parent) | {"sensor_distance_mm": jnp.array(3.123456), "depth_span_mm": jnp.array(4.0)}
-    found = new_design(design, parent, values)
+    values = start_values(*parent) | {"sensor_distance_mm": jnp.array(3.123456), "depth_span_mm": jnp.array(4.0)}
+    found = new_design(design, *parent, values)
     assert found.imaging.sensor_distance_mm == 3.1235
     assert found.imaging.working_distance_mm == (18.5, 22.5)
     assert found.lens == design.lens and found.array == design.array
-    conic = new_design(design, parent, values | {"conic_constant": jnp.array(-0.87654321)}).lens.conic_constant
+    conic = new_design(design, *parent, values | {"conic_constant": jnp.array(-0.87654321)}).lens.conic_constant
     assert conic == -0.8765432
-    assert set(start_values(parent)) == set(NAMES)
+    assert set(start_values(*parent)) == set(NAMES)
 
 
 def test_aspheric_terms_of_a_lens_without_any(design):
     """Where they are free there are two of them, zero at first; a file holds them to seven digits."""
-    parent = parent_of(design, free={"aspheric_terms": (-0.1, 0.1)})
-    np.testing.assert_array_equal(start_values(parent)["aspheric_terms"], [0, 0])
-    values = {"aspheric_terms": jnp.array([0.012345, -0.0000123]), "pitch_mm": 1.1 * parent.pitch}
-    np.testing.assert_array_equal(candidate(parent, values).imager.array.aspheric_terms, values["aspheric_terms"])
-    found = new_design(design, parent, values)
+    parent = evaluated(design, free={"aspheric_terms": (-0.1, 0.1)})
+    np.testing.assert_array_equal(start_values(*parent)["aspheric_terms"], [0, 0])
+    values = {"aspheric_terms": jnp.array([0.012345, -0.0000123]), "pitch_mm": 1.1 * start_values(*parent)["pitch_mm"]}
+    np.testing.assert_array_equal(candidate(*parent, values)[0].array.aspheric_terms, values["aspheric_terms"])
+    found = new_design(design, *parent, values)
     assert found.lens.aspheric_terms == (0.012345, -0.0000123)
-    again = parent_of(found, free={"aspheric_terms": (-0.1, 0.1)})
-    np.testing.assert_array_equal(start_values(again)["aspheric_terms"], [0.012345, -0.0000123])
+    again = evaluated(found, free={"aspheric_terms": (-0.1, 0.1)})
+    np.testing.assert_array_equal(start_values(*again)["aspheric_terms"], [0.012345, -0.0000123])
 
 
 def test_values_that_make_no_microscope(design, parent):
     with pytest.raises(InputError, match="make no microscope: `lens.aperture_diameter_mm`: found 3.0"):
-        new_design(design, parent, {"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)})
+        new_design(design, *parent, {"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)})

@@ -10,10 +10,10 @@ from gs_jax.apps.training.recipes import unrolled_cases
 from gs_jax.apps.training.simulated_captures import SCENES
 from gs_jax.apps.training.training_slices import stacks
 from gs_jax.base.progress import Progress
-from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study
+from gs_jax.codesign.terms import TERMS, Term
 from gs_jax.design.builtin import geomscope
 
 from .test_pareto import STUDY
@@ -101,7 +101,7 @@ def test_terms_of_ones_own(two, monkeypatch):
         return run_study(geomscope(), study, workers=two).design.imaging.sensor_distance_mm
 
     times = 3
-    own = Term("thrice the sensor's distance", lambda c: times * c.imager.sensor_distance)
+    own = Term("thrice the sensor's distance", lambda imager, at: times * imager.sensor_distance)
     with monkeypatch.context() as patch:
         for name in ("own_mm", "thickness_mm"):
             patch.setitem(TERMS, name, own)

@@ -5,10 +5,11 @@ from typing import get_args
 import pytest
 
 from gs_jax.base.errors import InputError
-from gs_jax.codesign import objectives
-from gs_jax.codesign.objectives import TERMS, Term
+from gs_jax.codesign import terms
 from gs_jax.codesign.parameters import NAMES
 from gs_jax.codesign.study import KINDS, Solver, Study, TermTable, parent_path, read_study
+from gs_jax.codesign.terms import TERMS, Term
+from gs_jax.objectives import spot_width
 
 STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
 
@@ -94,7 +95,7 @@ def test_the_readme_names_everything():
 
 def test_terms_of_other_packages_are_found(monkeypatch):
     """By entry points, when a study names them."""
-    mine = Term("twice the sensor's distance", lambda c: 2 * c.imager.sensor_distance)
+    mine = Term("twice the sensor's distance", lambda imager, at: 2 * imager.sensor_distance)
 
     class Point:
         name = "mine_mm"
@@ -103,8 +104,18 @@ def test_terms_of_other_packages_are_found(monkeypatch):
             return mine
 
     found = lambda group, name: [Point()] if (group, name) == ("gs_jax.terms", "mine_mm") else []
-    monkeypatch.setattr(objectives, "entry_points", found)
-    monkeypatch.setattr(objectives, "TERMS", dict(objectives.TERMS))
-    assert TermTable(name="mine_mm", at_most=3.0).kind == "at_most" and objectives.TERMS["mine_mm"] is mine
+    monkeypatch.setattr(terms, "entry_points", found)
+    monkeypatch.setattr(terms, "TERMS", dict(TERMS))
+    assert TermTable(name="mine_mm", at_most=3.0).kind == "at_most" and terms.TERMS["mine_mm"] is mine
     with pytest.raises(ValueError, match="found the name 'other_mm', allowed: .* or [0-9]+ others"):
         TermTable(name="other_mm", at_most=3.0)
+
+
+def test_terms_of_a_module_are_imported(monkeypatch):
+    monkeypatch.setattr(terms, "TERMS", dict(TERMS))
+    assert TermTable(name="gs_jax.objectives:spot_width", minimise=0.1).is_goal
+    term = terms.TERMS["gs_jax.objectives:spot_width"]
+    assert term.function is spot_width and term.meaning.startswith("Width of the spot")
+    for name in ("no_such_module:cost", "gs_jax.objectives:no_such", "gs_jax.objectives:__doc__"):
+        with pytest.raises(ValueError, match="`module:name`"):
+            TermTable(name=name, minimise=1.0)

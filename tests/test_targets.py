@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.study import TermTable
 from gs_jax.codesign.targets import Row, assess, evaluate, residual, worst_of
+from gs_jax.codesign.terms import TERMS, Term
 
 KEY = jax.random.key(0)
 
@@ -16,11 +16,11 @@ KEY = jax.random.key(0)
 @pytest.fixture
 def entries(monkeypatch):
     """A term that is whatever it is asked of, and one that is its logarithm."""
-    monkeypatch.setitem(TERMS, "occupancy", Term("itself", lambda x: x))
-    monkeypatch.setitem(TERMS, "strehl", Term("its exponential", jnp.log, log=True))
-    monkeypatch.setitem(TERMS, "blur_um", Term("noise", lambda x, key: x + jax.random.normal(key), random=True))
-    # What stands for a candidate here is an array, which the checked signature would refuse.
-    return lambda table, x, margin=0.0: inspect.unwrap(residual)(table, jnp.array(2.0), x, KEY, margin=margin)
+    monkeypatch.setitem(TERMS, "occupancy", Term("itself", lambda x, at: x))
+    monkeypatch.setitem(TERMS, "strehl", Term("its exponential", lambda x, at: jnp.log(x), log=True))
+    monkeypatch.setitem(TERMS, "blur_um", Term("noise", lambda x, at, key: x + jax.random.normal(key), random=True))
+    # What stands for an imager here is an array, which the checked signature would refuse.
+    return lambda table, x, margin=0.0: inspect.unwrap(residual)(table, jnp.array(2.0), x, None, KEY, margin=margin)
 
 
 def table(kind, *, name="occupancy", **more):
@@ -92,5 +92,5 @@ def test_assessment(kind, met, worst):
 
 def test_random_terms_take_the_key(entries):
     name = "blur_um"
-    draw = lambda seed: inspect.unwrap(evaluate)(name, X, jax.random.key(seed))
+    draw = lambda seed: inspect.unwrap(evaluate)(name, X, None, jax.random.key(seed))
     assert (draw(0) == draw(0)).all() and (draw(0) != draw(1)).all()

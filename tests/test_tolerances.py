@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gs_jax.cli.tolerance import command
 from jax.test_util import check_grads
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -23,11 +24,10 @@ from gs_jax.apps.tolerance.surface import lens_squares, step_squares
 from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Question, together, tolerance
 from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
 from gs_jax.apps.tolerance.tolerance_spec import Tolerances
-from gs_jax.cli.fabrication import tolerance_command as command
-from gs_jax.design.microscope import Microscope
-from gs_jax.design.sheet import microscopes_of
-from gs_jax.design.spots import field_heights
+from gs_jax.design.datasheet import parts_of
 from gs_jax.geometry import envelope
+from gs_jax.objectives import Conditions
+from gs_jax.objectives.conditions import field_heights
 from gs_jax.optics import theory
 from gs_jax.optics.psf import axial_strehl, strehl
 from gs_jax.optics.raytrace import pupil_quadrature
@@ -82,9 +82,8 @@ def pinholes(design) -> Bench:
     return bench._replace(offsets=nothing, changes=0 * bench.changes)
 
 
-def judged(imager: Imager) -> Microscope:
-    one, depths = jnp.ones(()), jnp.array(DEPTHS)
-    return Microscope(imager, depths, imager.field_radius * one, 0.01 * one)
+def judged(imager: Imager) -> tuple[Imager, Conditions]:
+    return imager, Conditions(DEPTHS, 0.01)
 
 
 def single(**lens) -> Imager:
@@ -143,14 +142,14 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
     nominal = judged(single())
     spreads = without(without(spreads_of(Tolerances(layer_um=0, roughness_nm=0)), "tilt"), "position")
     errors = jax.tree.map(lambda x: 3 * x, in_units(drawn(jax.random.key(seed), 1), spreads))
-    width, ratio = map(np.exp, log_sharpness(nominal, errors, jnp.array(0.005)))
-    imager = built(nominal.imager, errors)
+    width, ratio = map(np.exp, log_sharpness(*nominal, errors, jnp.array(0.005)))
+    imager = built(nominal[0], errors)
     points, weights = map(np.asarray, pupil_quadrature(0.2))
     airy = float(theory.airy_sigma(imager.wavelength, imager.sensor_distance, 0.4))
     sag, v = np.asarray(imager.array.sag((points**2).sum(1))), float(imager.sensor_distance)
     for row, depth in enumerate(DEPTHS[:2]):
         squares, shares = [], []
-        for height in np.asarray(field_heights(nominal)):
+        for height in np.asarray(field_heights(*nominal)):
             landing, _, _ = optiland_rays(imager, depth, points, height)
             squares.append(weights @ ((landing - weights @ landing) ** 2).sum(1) / 2)
             shares.append(float(envelope(height**2, float(imager.reduced_depth(depth)), imager.field_radius)))
@@ -225,8 +224,9 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
 @pytest.mark.integration
 def test_gradients_are_finite_differences(design, outcome):
     spreads, nothing = spreads_of(outcome.tolerances), no_errors(len(design.array.centers_mm))
-    microscopes = tuple(microscopes_of(design, np.array(DEPTHS)))
-    question = _Question(microscopes, bench_of(design.imager(), np.array(DEPTHS)), jnp.array(0.005))
+    designed = parts_of(design, np.array(DEPTHS))
+    parts = tuple((one, dataclasses.replace(at, clear_diameter=None)) for one, at in designed)
+    question = _Question(parts, bench_of(design.imager(), np.array(DEPTHS)), jnp.array(0.005))
     fields = ["radius", "conic", "index", "sensor_distance"]
     ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(spreads, f)}) for f in fields for s in (1, -1)]
     found = _of_devices(question, jax.tree.map(lambda *parts: jnp.stack(parts), *ends))

@@ -12,9 +12,9 @@ import optimistix as optx
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.codesign.objectives import TERMS, Term
 from gs_jax.codesign.outcome import as_records
 from gs_jax.codesign.study import Study
+from gs_jax.codesign.terms import TERMS, Term
 
 STEPS = 200
 
@@ -24,15 +24,15 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## A term
 #
-# A term is a function of a `Microscope` (depths, magnification, spots, ...) that returns one number, or one per depth.
-# This one is the change of the magnification over the depths, in percent: a stack whose planes have equal scale is
-# easier to read. The name of a term ends in its unit.
+# A function of an imager and the conditions (`at.depths`) that gives a number or one for each depth. Here: how
+# much the magnification changes over the depths, in percent. A stack whose planes are all of one scale is easier to
+# read. The name ends in the unit that the function returns.
 
 
 # %%
-def scale_change(microscope):
-    """Largest over smallest magnification, minus one, in percent."""
-    m = microscope.magnification
+def scale_change(imager, at):
+    """Largest over smallest magnification, above one, percent."""
+    m = imager.magnification(at.depths)
     return 100 * (jnp.max(m) / jnp.min(m) - 1)
 
 

@@ -46,9 +46,9 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
     """
     from rich.console import Console
 
+    from ..design.datasheet import datasheet, summary, tables
     from ..design.design import read_design
-    from ..design.problems import findings
-    from ..design.sheet import datasheet, summary, tables
+    from ..design.diagnostics import findings
 
     if output:
         check_output(output, [".json"])

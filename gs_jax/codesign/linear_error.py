@@ -28,8 +28,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..design.microscope import Microscope
-from ..geometry import envelope
+from ..geometry import Imager, envelope
+from ..objectives.conditions import Conditions, field_radius
+from ..objectives.paraxial import occupancy
 from .transfer import PLACE, directions, lit_density, transfer_power
 
 # Of a scene: lit part of a plane, and the distance over which its correlation falls to 1/e, mm.
@@ -40,30 +41,30 @@ READ_NOISE = 2.0
 _NODES = 16
 
 
-def lost_power(types: Sequence[Microscope], places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
+def lost_power(parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
     """Mean squared error of the best linear estimate over the scene's variance, at each depth: 0 to 1.
 
     Parameters
     ----------
-    types
-        The lenses of each type, with depths, sensor and sensor distance in common; one if all lenses are alike. The
-        depths are the scene's planes.
+    parts
+        The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are the
+        scene's planes.
     places
         `(x, y)` of objects, mm: the lenses around each, where they are, give the parallax. They are averaged over.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    c = types[0]
-    dtype, finest = c.depths.dtype, 1 / (2 * PLACE)
+    imager, at = parts[0]
+    dtype, finest = at.depths.dtype, 1 / (2 * PLACE)
     # In the object, 1/mm; over a plane's area. On the sensor they are those of a mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
-    frequency = object_frequency / jnp.mean(c.magnification)
-    spectrum = _spectrum(c.magnification[:, None] * frequency[None])
-    amplitudes = [_amplitude(one, types, frequency, spectrum) for one in types]
-    ways, planes = directions(dtype), jnp.eye(c.depths.size, dtype=dtype)
+    frequency = object_frequency / jnp.mean(imager.magnification(at.depths))
+    spectrum = _spectrum(imager.magnification(at.depths)[:, None] * frequency[None])
+    amplitudes = [_amplitude(*part, parts, frequency, spectrum) for part in parts]
+    ways, planes = directions(dtype), jnp.eye(at.depths.size, dtype=dtype)
 
     def at_place(place):
-        views = [_view(one, place, ways) for one in types]
+        views = [_view(*part, place, ways) for part in parts]
 
         def at_frequency(frequency, amplitudes):
             real, imaginary = planes[None], 0.0
@@ -86,28 +87,28 @@ def lost_power(types: Sequence[Microscope], places: Float[Array, "place 2"]) -> 
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
 
-def _amplitude(c: Microscope, types, frequency, spectrum) -> Float[Array, "depth frequency"]:
+def _amplitude(imager, at, parts, frequency, spectrum) -> Float[Array, "depth frequency"]:
     """What a lens passes on of each plane, over the noise."""
-    amplitude = lit_density(c) * c.magnification / jnp.sqrt(noise_density(c, types))
-    return amplitude[:, None] * safe_sqrt(transfer_power(c, frequency) * spectrum)
+    amplitude = lit_density(imager, at) * imager.magnification(at.depths) / jnp.sqrt(noise_density(imager, at, parts))
+    return amplitude[:, None] * safe_sqrt(transfer_power(imager, at, frequency) * spectrum)
 
 
-def _view(c: Microscope, place, ways):
+def _view(imager, at, place, ways):
     """Weights of the lenses `(lens, depth)`, and the turns of their images over frequency `(way, lens, depth)`."""
-    beside = c.imager.array.centers - place[None]
+    beside = imager.array.centers - place[None]
     squared = jnp.sum(beside**2, 1)[:, None]
-    weight = safe_sqrt(envelope(squared, c.reduced[None], c.field_radius))
-    return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * c.magnification[None, None]
+    weight = safe_sqrt(envelope(squared, imager.reduced_depth(at.depths)[None], field_radius(imager, at)))
+    return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * imager.magnification(at.depths)[None, None]
 
 
-def noise_density(c: Microscope, types: Sequence[Microscope]) -> Float[Array, ""]:
+def noise_density(imager: Imager, at: Conditions, parts: Sequence[tuple[Imager, Conditions]]) -> Float[Array, ""]:
     """Electrons^2 per mm^2 of a sub-image: shot noise of all planes and of the sub-images over it, and read noise.
 
-    `c` is the type of lens whose sub-image it is, `types` are all: each as bright as its aperture is large.
+    `imager` has the type of lens whose sub-image it is, `parts` are all types: each as bright as its aperture is large.
     """
-    over = sum(one.occupancy * lit_density(one) for one in types)
-    shot = FILL * jnp.sum(lit_density(c) + over)
-    return shot + (READ_NOISE / c.imager.sensor.pixel_pitch) ** 2
+    over = sum(occupancy(*part) * lit_density(*part) for part in parts)
+    shot = FILL * jnp.sum(lit_density(imager, at) + over)
+    return shot + (READ_NOISE / imager.sensor.pixel_pitch) ** 2
 
 
 def _spectrum(frequency):

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..lenses import EACH, type_of_lens
+from ..optics.apertures import pitch
 from .bounded import LBFGSB
 from .bounds import Bounds, Box
 from .solve import CONVERGED, NOT_FINITE, Solver, least_change, run, stepper
@@ -28,6 +29,7 @@ _OF_ARRAY = (
     "aspheric_terms",
     "refractive_index",
     "substrate_thickness",
+    "size",
 )
 _OF_IMAGER = ("sensor_distance", "rotation", "shift", "tilt", "wavelength")
 
@@ -38,22 +40,27 @@ class Free(NamedTuple):
     names: tuple[str, ...]
 
     def values(self, imager: Imager) -> Values:
-        """The free numbers by name. What lenses have of their own is one number for each type of lens."""
+        """The free numbers by name. What lenses have of their own is one number for each lens type."""
         if missing := [name for name in self.names if _leaf(imager, name) is None]:
-            found = f"found {missing[0]} of an imager without one"
-            raise InputError(f"free: {found}, allowed: with one, which may be zero.")
+            raise InputError(f"free: {missing[0]} must be a number of the imager (it may be zero), got None.")
+        if "pitch" in self.names and len(imager.array.centers) < 2:
+            raise InputError("free: pitch must be that of two lenses or more, got a single lens.")
         values = {name: _leaf(imager, name) for name in self.names}
         for name in self.names:
-            if (lens_type := _type(imager, name)) is not None:
-                values[name] = values[name][np.unique(lens_type, return_index=True)[1]]
+            if (types := _types(imager, name)) is not None:
+                values[name] = values[name][np.unique(types, return_index=True)[1]]
         return values
 
     def replaced(self, imager: Imager, values: Values) -> Imager:
-        """The imager with other numbers; `imager` says which lens is of which type, so its own are not traced."""
-        types = [_type(imager, name) for name in self.names]
-        each = zip((values[name] for name in self.names), types, strict=True)
-        numbers = [value if one is None else value[one] for value, one in each]
-        return eqx.tree_at(lambda i: [_leaf(i, name) for name in self.names], imager, numbers)
+        """The imager with other numbers. A pitch scales the lens centres and the plate about the middle."""
+        names = [name for name in self.names if name != "pitch"]
+        types = [_types(imager, name) for name in names]
+        numbers = [values[n] if each is None else values[n][each] for n, each in zip(names, types, strict=True)]
+        scale = values["pitch"] / _leaf(imager, "pitch") if "pitch" in self.names else None
+        imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, numbers)
+        if scale is None:
+            return imager
+        return eqx.tree_at(lambda i: (i.array.centers, i.array.size), imager, replace_fn=lambda length: scale * length)
 
 
 def free(*names: str) -> Free:
@@ -66,8 +73,9 @@ def free(*names: str) -> Free:
     names
         Fields of `Imager` and of `MicrolensArray`: `"sensor_distance"`, `"rotation"`, `"shift"`, `"tilt"`,
         `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
-        `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`. Of lenses that differ, radius, aperture and
-        conic constant are free for each type, and which lens is of which type stays.
+        `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`, `"size"`. Where lenses differ, radius,
+        aperture and conic constant are free for each lens type, and the type of each lens stays. `"pitch"` is the mean
+        distance of nearest neighbours: it scales the pattern and the plate.
 
     Raises
     ------
@@ -80,11 +88,11 @@ def free(*names: str) -> Free:
     >>> gs.free("centers", "sensor_distance").names
     ('centers', 'sensor_distance')
     """
-    known = (*_OF_IMAGER, *_OF_ARRAY)
+    known = (*_OF_IMAGER, *_OF_ARRAY, "pitch")
     if wrong := [name for name in names if name not in known]:
-        raise InputError(f"free: found {wrong[0]!r}, allowed: {', '.join(known)}.")
+        raise InputError(f"free: names must be among {', '.join(known)}, got {wrong[0]!r}.")
     if not names:
-        raise InputError(f"free: found no name, allowed: one or more of {', '.join(known)}.")
+        raise InputError(f"free: at least one name must be given, of {', '.join(known)}.")
     return Free(tuple(dict.fromkeys(names)))
 
 
@@ -176,13 +184,13 @@ def optimize(
 def _check(imager, free, solver, steps):
     for name, found, wanted, words in (
         ("imager", imager, Imager, "an Imager, as `design.imager()` is"),
-        ("free", free, Free, "what `gs_jax.free` makes"),
+        ("free", free, Free, "a Free, as `gs_jax.free` makes it"),
         ("solver", solver, Solver, "a solver of optimistix or optax, or LBFGSB()"),
     ):
         if not isinstance(found, wanted):
-            raise InputError(f"{name}: found {short_repr(found)}, allowed: {words}.")
+            raise InputError(f"{name} must be {words}, got {short_repr(found)}.")
     if steps < 1:
-        raise InputError(f"steps: found {steps}, allowed: 1 or more.")
+        raise InputError(f"steps must be 1 or more, got {steps}.")
 
 
 class _Unbounded:
@@ -193,23 +201,25 @@ class _Unbounded:
 
 def _map(name, free, bounds, box):
     if name not in free.names:
-        raise InputError(f"bounds: found some of {name}, allowed: of what is free, {', '.join(free.names)}.")
+        raise InputError(f"bounds: names must be among the free ones, {', '.join(free.names)}, got {name}.")
     if name not in bounds:
         if box:
-            raise InputError(f"bounds: found none of {name}, allowed: of all that is free, for LBFGSB.")
+            raise InputError(f"bounds: LBFGSB needs bounds of all that is free, got none of {name}.")
         return _Unbounded
     low, high = (np.asarray(end, float) for end in bounds[name])
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
-        raise InputError(f"bounds: found {low} to {high} of {name}, allowed: low below high, both finite.")
+        raise InputError(f"bounds of {name} must be finite, the lower one first, got {low} to {high}.")
     return (Box if box else Bounds)(low, high)
 
 
 def _leaf(imager, name):
+    if name == "pitch":
+        return pitch(imager.array.centers)[0]
     return getattr(imager.array if name in _OF_ARRAY else imager, name)
 
 
-def _type(imager, name) -> np.ndarray | None:
-    """The number of each lens's type, where lenses have a number of their own."""
+def _types(imager, name) -> np.ndarray | None:
+    """The type of each lens, where lenses have a number of their own."""
     if name not in EACH or _leaf(imager, name).ndim == 0:
         return None
     return type_of_lens(imager.array)

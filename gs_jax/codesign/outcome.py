@@ -18,11 +18,11 @@ from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import lenses_by_type
 from ..pictures.style import PALETTE
-from .objectives import TERMS, unit_of
 from .search import Outcome, PathLike
 from .stages import best_end
 from .study import TermTable, labels
 from .targets import SIGNS, Row
+from .terms import TERMS, unit_of
 
 
 def before_and_after(outcome: Outcome) -> Table:

@@ -22,12 +22,12 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design
 from .checkpoint import Log
-from .objectives import unit_of, with_terms
 from .parameters import NAMES, Values, significant, start_values
 from .search import PathLike, opened
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
 from .targets import Row, worst_of
+from .terms import unit_of, with_terms
 
 
 class Point(NamedTuple):
@@ -119,7 +119,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     stream, points = workers.stream_of(build), {}
     front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
     with progress.counter("Trade-off", len(combinations)) as advance:
-        values = start_values(problem.parent)
+        values = start_values(problem.imager, problem.at)
         for some in (combinations[:1], combinations[1:]):
             first = len(points)
             for (number, *_), result in stream((first + i, limits, values) for i, limits in enumerate(some)):
@@ -133,7 +133,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
 def searcher(sweep: Sweep):
     """From the number of a point, its limits and where to start, to the point."""
     problem, kept, moving = sweep
-    entries = entries_of(problem.parent, [*kept, *moving])
+    entries = entries_of(problem, [*kept, *moving])
     stages = [make_stage(problem, index) for index in range(len(problem.study.stages))]
 
     def search(job):

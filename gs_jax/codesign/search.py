@@ -140,15 +140,15 @@ def _run_study(
         log, state = read_checkpoint(checkpoint, study, design)
         saved = (checkpoint, state) if state else None
     problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
-    values = start_values(problem.parent)
-    before = rows_of(study.terms, entries_of(problem.parent, study.terms), values)
+    values = start_values(problem.imager, problem.at)
+    before = rows_of(study.terms, entries_of(problem, study.terms), values)
     # Made when they are needed: what compiles is seen in the progress.
     stages = (make_stage(problem, index) for index in range(len(study.stages)))
     how = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
     values = run_stages(problem, stages, study.terms, values, **how)
-    found = new_design(design, problem.parent, values).model_copy(update={"name": study.name})
-    written = problem_of(found, study.model_copy(update={"depths_mm": None})).parent
-    after = rows_of(study.terms, entries_of(written, study.terms), start_values(written))
+    found = new_design(design, problem.imager, problem.at, values).model_copy(update={"name": study.name})
+    written = problem_of(found, study.model_copy(update={"depths_mm": None}))
+    after = rows_of(study.terms, entries_of(written, study.terms), start_values(written.imager, written.at))
     return Outcome(design, study, found, before, after, log, time.monotonic() - began)
 
 

@@ -18,20 +18,23 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design
+from ..geometry import Imager
 from ..lenses import lenses_by_type
+from ..objectives.conditions import Conditions
 from .bounds import Bounds, Box
 from .checkpoint import Log, restored
-from .objectives import TERMS, with_terms
-from .parameters import Parent, Values, candidate, parent_of, start_values
+from .parameters import Values, candidate, evaluated, start_values
 from .solve import NOT_FINITE, State, Stepper, run, solver_of, stepper
 from .study import MOST_TYPES, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
+from .terms import TERMS, with_terms
 
 
 class Problem(NamedTuple):
     """A design and a study as a solver sees them."""
 
-    parent: Parent
+    imager: Imager
+    at: Conditions
     study: Study
 
 
@@ -64,8 +67,7 @@ def problem_of(design: Design, study: Study) -> Problem:
     _check_free(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
     where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
-    parent = parent_of(design, **where, exposure=study.exposure, free=study.free)
-    return Problem(parent, study)
+    return Problem(*evaluated(design, **where, exposure=study.exposure, free=study.free), study)
 
 
 def _check_free(design: Design, study: Study) -> None:
@@ -93,7 +95,7 @@ def _check_types(count: int, study: Study) -> None:
 
 def make_stage(problem: Problem, index: int) -> Stage:
     """The solver of a stage."""
-    parent, study = problem
+    imager, at, study = problem
     table = study.stages[index]
     between = Box if table.solver == "lbfgsb" else Bounds
     bounds = {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
@@ -103,16 +105,16 @@ def make_stage(problem: Problem, index: int) -> Stage:
 
     def residuals(free, given, key):
         targets, values = given
-        found = candidate(parent, to_values(free, values))
+        found = candidate(imager, at, to_values(free, values))
         pairs = zip(terms, targets, strict=True)
-        return jnp.concatenate([residual(term, x, found, key, margin=study.margin) for term, x in pairs])
+        return jnp.concatenate([residual(term, x, *found, key, margin=study.margin) for term, x in pairs])
 
     def watch(free, values):
-        found = candidate(parent, to_values(free, values))
-        return [worst_of(term, evaluate(term.name, found, key)) for term in terms]
+        found = candidate(imager, at, to_values(free, values))
+        return [worst_of(term, evaluate(term.name, *found, key)) for term in terms]
 
     key = jax.random.fold_in(jax.random.key(study.seed), index)
-    values = start_values(parent)
+    values = start_values(imager, at)
     return Stage(
         number=index,
         table=table,
@@ -139,18 +141,18 @@ def _enough(problem: Problem, terms: Sequence[TermTable]) -> float:
     """A cost at which all targets are met: half the margin is missing of one entry. Zero if there is a goal."""
     if any(term.is_goal for term in terms):
         return 0.0
-    sizes = jax.eval_shape(entries_of(problem.parent, terms), start_values(problem.parent))
+    sizes = jax.eval_shape(entries_of(problem, terms), start_values(problem.imager, problem.at))
     least = min(term.weight / math.sqrt(size.size) for term, size in zip(terms, sizes, strict=True))
     return (least * problem.study.margin / 2) ** 2 / 2
 
 
-def entries_of(parent: Parent, terms: Sequence[TermTable]) -> Callable[[Values], list[Float[Array, " entry"]]]:
+def entries_of(problem: Problem, terms: Sequence[TermTable]) -> Callable[[Values], list[Float[Array, " entry"]]]:
     """The function from parameters to the entries of each term, compiled. Of what is random it is one draw."""
 
     @jax.jit
     def entries(values: Values):
-        found = candidate(parent, values)
-        return [evaluate(term.name, found, jax.random.key(0)) for term in terms]
+        found = candidate(problem.imager, problem.at, values)
+        return [evaluate(term.name, *found, jax.random.key(0)) for term in terms]
 
     return entries
 

@@ -9,7 +9,7 @@ kinds = 1                               # of lenses: 2 for two foci on one plate
 [free]                                  # name = [lowest, highest]; see gs_jax.codesign.parameters
 sensor_distance_mm = [2.0, 6.0]
 
-[[terms]]                               # see gs_jax.codesign.objectives
+[[terms]]                               # see gs_jax.codesign.terms
 name = "occupancy"
 at_most = 0.5
 
@@ -30,8 +30,8 @@ from ..io.files import read_text
 from ..io.toml import Table, one_line
 from ..lenses import Orientation
 from ..typing import PathLike
-from .objectives import check_term
 from .parameters import NAMES
+from .terms import check_term
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
 # Of lenses: each is traced for itself.

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..design.microscope import Microscope
-from .objectives import TERMS
+from ..geometry import Imager
+from ..objectives.conditions import Conditions
 from .study import TermTable
+from .terms import TERMS
 
 # The worst of a term's entries, smoothly: their mean's power.
 _POWER = 8
@@ -29,14 +30,20 @@ class Row(NamedTuple):
     met: bool | None
 
 
-def evaluate(name: str, candidate: Microscope, key: Key[Array, ""]) -> Float[Array, " entry"]:
+def evaluate(name: str, imager: Imager, at: Conditions, key: Key[Array, ""]) -> Float[Array, " entry"]:
     """The entries of a term in its own unit."""
-    entries = _entries(name, candidate, key)
+    entries = _entries(name, imager, at, key)
     return jnp.exp(entries) if TERMS[name].log else entries
 
 
 def residual(
-    table: TermTable, target: Float[Array, ""], candidate: Microscope, key: Key[Array, ""], *, margin: float
+    table: TermTable,
+    target: Float[Array, ""],
+    imager: Imager,
+    at: Conditions,
+    key: Key[Array, ""],
+    *,
+    margin: float,
 ) -> Float[Array, " entry"]:
     """What a term lacks, relative to its target: zero where a limit holds, so that its square is smooth.
 
@@ -53,7 +60,7 @@ def residual(
     margin
         By which a limit is tightened.
     """
-    entries = _entries(table.name, candidate, key)
+    entries = _entries(table.name, imager, at, key)
     missing = _missing(table.kind, _ratio(table, entries, target), margin)
     return missing * (table.weight / math.sqrt(missing.size))
 
@@ -90,10 +97,9 @@ def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
     return jnp.where(positive, largest * jnp.where(positive, mean, 1) ** (1 / _POWER), 0)[None]
 
 
-def _entries(name, candidate, key):
+def _entries(name, imager, at, key):
     term = TERMS[name]
-    found = term.function(candidate, key) if term.random else term.function(candidate)
-    return jnp.ravel(found)
+    return jnp.ravel(term.function(imager, at, key) if term.random else term.function(imager, at))
 
 
 def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..design.microscope import Microscope
-from ..design.spots import field_heights
-from ..geometry import envelope
+from ..geometry import Imager, envelope
+from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
 from ..optics.raytrace import pupil_quadrature, trace_lenslet
 
 # What an exposure is counted for, mm.
@@ -31,7 +30,9 @@ def directions(dtype) -> Float[Array, "2 direction"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def transfer_power(c: Microscope, frequencies: Float[Array, " frequency"]) -> Float[Array, "depth frequency"]:
+def transfer_power(
+    imager: Imager, at: Conditions, frequencies: Float[Array, " frequency"]
+) -> Float[Array, "depth frequency"]:
     """Squared modulus of the transfer function, mean over a lens's field and over directions.
 
     The Fourier transform of exact rays through the clear aperture, which has all of defocus and aberrations, times the
@@ -40,16 +41,18 @@ def transfer_power(c: Microscope, frequencies: Float[Array, " frequency"]) -> Fl
 
     Parameters
     ----------
-    c
-        Where it is judged; the depths are its own.
+    imager
+        With lenses that are alike.
+    at
+        Depths, and the exposure.
     frequencies
         On the sensor, 1/mm.
     """
-    points, weights = pupil_quadrature(c.clear_diameter / 2, _RINGS)
-    heights, ways = field_heights(c), directions(c.depths.dtype)
+    points, weights = pupil_quadrature(clear_diameter(imager, at) / 2, _RINGS)
+    heights, ways = field_heights(imager, at), directions(at.depths.dtype)
 
     def power(depth, height):
-        rays = trace_lenslet(c.imager, depth, points, (height, jnp.zeros_like(height)))
+        rays = trace_lenslet(imager, depth, points, (height, jnp.zeros_like(height)))
         lit = jnp.where(rays.valid, weights, 0)
         # What is reflected totally at the rim is missing. From the middle of the spot, for small phases.
         middle = jnp.sum(lit[:, None] * rays.landing, 0) / jnp.maximum(jnp.sum(lit), 1e-6)
@@ -57,21 +60,21 @@ def transfer_power(c: Microscope, frequencies: Float[Array, " frequency"]) -> Fl
         parts = (jnp.einsum("r,frw->fw", lit, wave(phase)) for wave in (jnp.cos, jnp.sin))
         return jnp.mean(sum(part**2 for part in parts), 1)
 
-    found = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), c.depths)
-    weight = envelope(heights[None] ** 2, c.reduced[:, None], c.field_radius)
+    found = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), at.depths)
+    weight = envelope(heights[None] ** 2, imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
     mean = jnp.einsum("dh,dhf->df", weight / jnp.sum(weight, 1, keepdims=True), found)
-    others = _perfect(c, frequencies) * jnp.sinc(frequencies * c.imager.sensor.pixel_pitch)
+    others = _perfect(imager, at, frequencies) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
     return mean * (others**2)[None]
 
 
-def _perfect(c: Microscope, frequencies):
+def _perfect(imager: Imager, at: Conditions, frequencies):
     """Transfer function of a round aperture without aberrations."""
-    share = frequencies * c.imager.wavelength * c.imager.reduced_sensor_distance / c.clear_diameter
+    share = frequencies * imager.wavelength * imager.reduced_sensor_distance / clear_diameter(imager, at)
     share = jnp.minimum(share, 1 - 1e-6)  # where it ends its slope by the share is zero, and arccos has none
     return 2 / jnp.pi * (jnp.arccos(share) - share * safe_sqrt(1 - share**2))
 
 
-def spots(c: Microscope, size: int) -> Float[Array, "depth size size"]:
+def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size size"]:
     """Even spots with the transfer function's modulus, on the sensor's pixels, with the sum 1: PSFs for `forward`.
 
     What of a spot is not even, and where the transfer function is negative, is not in them; light beyond the window
@@ -82,9 +85,9 @@ def spots(c: Microscope, size: int) -> Float[Array, "depth size size"]:
     size
         Pixels along a side, odd.
     """
-    dtype, pixel = c.depths.dtype, c.imager.sensor.pixel_pitch
+    dtype, pixel = at.depths.dtype, imager.sensor.pixel_pitch
     own = jnp.asarray(np.linspace(0, np.sqrt(0.5), _READ), dtype)
-    modulus = safe_sqrt(transfer_power(c, own / pixel))
+    modulus = safe_sqrt(transfer_power(imager, at, own / pixel))
     along = np.fft.fftfreq(size)
     away = jnp.asarray(np.hypot(along[:, None], along[None]), dtype)
     table = jax.vmap(lambda values: jnp.interp(away, own, values))(modulus)
@@ -92,12 +95,12 @@ def spots(c: Microscope, size: int) -> Float[Array, "depth size size"]:
     return light / jnp.sum(light, (1, 2), keepdims=True)
 
 
-def lens_electrons(c: Microscope) -> Float[Array, " depth"]:
+def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis gets of a lit place of 40 um x 40 um, or of a point as bright as that."""
-    area = jnp.pi / 4 * c.clear_diameter**2
-    return c.exposure * area * (AWAY / c.reduced) ** 2
+    area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
+    return at.exposure * area * (AWAY / imager.reduced_depth(at.depths)) ** 2
 
 
-def lit_density(c: Microscope) -> Float[Array, " depth"]:
+def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons per mm^2 of the sensor behind a lens that images a lit plane."""
-    return lens_electrons(c) / (PLACE * c.magnification) ** 2
+    return lens_electrons(imager, at) / (PLACE * imager.magnification(at.depths)) ** 2

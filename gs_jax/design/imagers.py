@@ -14,8 +14,8 @@ from ..optics.apertures import clear_diameter
 def tables_of(imager: Imager) -> dict[str, Any]:
     """All tables but the working distance, which an imager has not."""
     array, sensor = imager.array, imager.sensor
-    if not np.isfinite(array.size).all():
-        raise InputError(f"`array.size`: found {array.size}, allowed: a plate of finite size.")
+    if not np.isfinite(array.plate).all():
+        raise InputError(f"`array.plate`: found {array.plate}, allowed: a plate of finite size.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
     return {
@@ -34,7 +34,7 @@ def tables_of(imager: Imager) -> dict[str, Any]:
             "focal_length_mm": None if focal_length is None else _decimal(focal_length),
         },
         "array": {
-            "size_mm": array.size,
+            "size_mm": array.plate,
             "substrate_thickness_mm": _decimal(array.substrate_thickness),
             "centers_mm": _decimal(array.centers),
         },

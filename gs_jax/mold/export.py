@@ -174,9 +174,9 @@ def make_mask(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
     InputError
         If the plate is infinite, or lenses cover all of it.
     """
-    if not np.isfinite(np.asarray(array.size, float)).all():
+    if not np.isfinite(np.asarray(array.plate, float)).all():
         raise InputError("`array.size_mm` must be finite, got an infinite plate.")
-    lenslets, side = lenslets_of(array), np.asarray(array.size, float)
+    lenslets, side = lenslets_of(array), np.asarray(array.plate, float)
     centers = np.stack([each.center for each in lenslets])
     radii = np.array([each.semi_aperture for each in lenslets])
     alone = np.all(np.abs(centers) + radii[:, None] <= side / 2, axis=1)

@@ -194,7 +194,7 @@ def report_text(report: dict[str, Any]) -> str:
 def draw_preview(array: MicrolensArray, shape: MoldShape | None, name: str) -> Figure:
     """A height map of the lenses, and the mold of a shape, or the array if it is None, in perspective."""
     figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
-    x, y = (np.linspace(-side / 2, side / 2, _MAP_PIXELS) for side in array.size)
+    x, y = (np.linspace(-side / 2, side / 2, _MAP_PIXELS) for side in array.plate)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     height = surface_height(lenslets_of(array), points)[0].reshape(_MAP_PIXELS, _MAP_PIXELS)
     shaded = LightSource(azdeg=315, altdeg=50).hillshade(height, dx=x[1] - x[0], dy=y[1] - y[0])

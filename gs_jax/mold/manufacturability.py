@@ -132,7 +132,7 @@ def _check_spacing(array: MicrolensArray, resolution: float) -> CheckResult:
 def _check_ridges(array: MicrolensArray, resolution: float) -> CheckResult:
     """The share of the plate that a printer rounds: ridges of the mold between lenses, as wide as the resolution."""
     total = _ridge_length(array)
-    share = total * resolution / math.prod(array.size)
+    share = total * resolution / math.prod(array.plate)
     text = f"{total:.4g} mm of sharp edges between lenses: rounded over {1000 * resolution:g} um they are "
     return CheckResult("sharp edges", "warning" if share > 0.1 else "ok", f"{text}{100 * share:.2g} % of the plate.")
 
@@ -141,12 +141,12 @@ def _ridge_length(array: MicrolensArray) -> float:
     if not array.alike:
         # The Cauchy-Crofton formula: lengths from crossings with the lines of a grid.
         owner = _owner_map(array)
-        steps = np.array(array.size) / _SAMPLES
+        steps = np.array(array.plate) / _SAMPLES
         neighbours = (owner[1:], owner[:-1]), (owner[:, 1:], owner[:, :-1])
         crossings = [((a != b) & (a >= 0) & (b >= 0)).sum() for a, b in neighbours]
         return math.pi / 4 * float(crossings @ steps[::-1])
     centers, radius = np.asarray(array.centers, float), float(array.aperture_diameter) / 2
-    edges, side = cell_edges(centers, array.size), np.array(array.size) / 2
+    edges, side = cell_edges(centers, array.plate), np.array(array.plate) / 2
     half = np.sqrt(np.maximum(radius**2 - edges.height**2, 0))
     first, last = (np.clip(t, -half, half) for t in (edges.low, edges.high))
     between = (np.abs(centers[edges.lens] + (edges.start + edges.end) / 2) < side * (1 - 1e-6)).all(axis=1)
@@ -156,7 +156,7 @@ def _ridge_length(array: MicrolensArray) -> float:
 
 def _owner_map(array: MicrolensArray) -> np.ndarray:
     """The index of the visible lens on a grid over the plate, -1 for none."""
-    x, y = (((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * side for side in array.size)
+    x, y = (((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * side for side in array.plate)
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     return surface_height(lenslets_of(array), points)[1].reshape(_SAMPLES, _SAMPLES)
 
@@ -164,13 +164,13 @@ def _owner_map(array: MicrolensArray) -> np.ndarray:
 def _check_coverage(array: MicrolensArray) -> CheckResult:
     centers = np.asarray(array.centers, float)
     if array.alike:
-        share = 1 - coverage(centers, array.size, diameter=float(array.aperture_diameter))
+        share = 1 - coverage(centers, array.plate, diameter=float(array.aperture_diameter))
     else:
         share = float((_owner_map(array) < 0).mean())
-    gap = max_gap(centers, array.size)
+    gap = max_gap(centers, array.plate)
     if share < 1e-6:
         return CheckResult("coverage", "ok", "lenses cover the whole plate.")
-    area = share * math.prod(array.size)
+    area = share * math.prod(array.plate)
     text = f"{100 * share:.3g} % of the plate ({area:.3g} mm2) is no lens, up to {gap:.3g} mm from the nearest lens"
     return CheckResult("coverage", "warning", f"{text}: light passes there unfocused without a mask (`gs-jax mask`).")
 
@@ -180,7 +180,7 @@ def _check_chord(array: MicrolensArray, chord: float, resolution: float) -> Chec
     if chord > (limit := max_chord(lenslets)):
         text = f"the chord error must be at most {1000 * limit:.4g} um, a tenth of the height of a lens, {given}."
         return CheckResult("facets", "error", text)
-    if (count := estimate_facet_count(lenslets, visible_radii(lenslets, array.size), chord)) > MAX_FACETS:
+    if (count := estimate_facet_count(lenslets, visible_radii(lenslets, array.plate), chord)) > MAX_FACETS:
         least = 1000 * chord * count / MAX_FACETS
         text = f"the chord error must be at least {least:.2g} um, {given}, which takes about {count:.2g} facets."
         return CheckResult("facets", "error", text)

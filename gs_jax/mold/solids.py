@@ -115,12 +115,12 @@ def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progres
     """
     check_array(array)
     lenslets, thickness = lenslets_of(array), plate_thickness(array)
-    coarsest, radii = max_chord(lenslets), visible_radii(lenslets, array.size)
+    coarsest, radii = max_chord(lenslets), visible_radii(lenslets, array.plate)
     if not 0 < chord <= coarsest:
         raise ValueError(f"`chord` must be positive and at most {coarsest:.4g} mm, got {chord}.")
     if (count := estimate_facet_count(lenslets, radii, chord)) > MAX_FACETS:
         raise ValueError(f"`chord` of {chord} mm takes about {count:.2g} facets, more than {MAX_FACETS:.2g}.")
-    height, (x, y) = lenslet_height(array), array.size
+    height, (x, y) = lenslet_height(array), array.plate
     pairs = list(zip(lenslets, radii, strict=True))
     bodies = [
         _lenslet_body(lenslet, radius, chord, height, thickness / 2)
@@ -142,7 +142,7 @@ def preview_solid(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold
     lenslets = lenslets_of(array)
     # Equilateral facets of a sphere are `side^2 / (6 R)` deep.
     smallest = min(lenslet.radius for lenslet in lenslets)
-    chord = math.prod(array.size) / (_PREVIEW_FACETS * 1.5 * math.sqrt(3) * smallest)
+    chord = math.prod(array.plate) / (_PREVIEW_FACETS * 1.5 * math.sqrt(3) * smallest)
     part = array_solid(array, min(chord, max_chord(lenslets)))
     return part if shape is None else mold_solid(array, part, shape)
 
@@ -166,7 +166,7 @@ def _lenslet_body(lenslet: Lenslet, radius, chord, top, depth) -> m3.Manifold:
 
 def check_array(array: MicrolensArray) -> None:
     """Raises `ValueError` for an array that has no solid, and `InputError` for lenses outside the plate."""
-    centers, half = np.asarray(array.centers, float), half_size(array.size)
+    centers, half = np.asarray(array.centers, float), half_size(array.plate)
     if not np.isfinite(centers).all():
         raise ValueError("`centers` must be finite.")
     if outside := int((np.abs(centers) > half * (1 + ROUNDING)).any(axis=1).sum()):
@@ -207,7 +207,7 @@ def cast_solid(array: MicrolensArray, part: m3.Manifold, shape: MoldShape) -> m3
 
 def _opening(array, shape, top) -> m3.Manifold:
     """The space between the walls, from the base up to a height."""
-    half, bottom = np.array(array.size) / 2 * shape.scale, -plate_thickness(array) * shape.scale
+    half, bottom = np.array(array.plate) / 2 * shape.scale, -plate_thickness(array) * shape.scale
     flare = (top - bottom) * math.tan(shape.draft)
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     rings = [np.column_stack([signs * (half + wider), np.full(4, z)]) for wider, z in ((0, bottom), (flare, top))]
@@ -217,7 +217,7 @@ def _opening(array, shape, top) -> m3.Manifold:
 def mold_bounds(array: MicrolensArray, shape: MoldShape) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the mold, mm."""
     depth = float(array.substrate_thickness) * shape.scale
-    opening = np.array(array.size) / 2 * shape.scale
+    opening = np.array(array.plate) / 2 * shape.scale
     opening = opening + (plate_thickness(array) * shape.scale + shape.headroom) * math.tan(shape.draft)
     high = np.array([*(opening + shape.wall), shape.headroom])
     return np.stack([[-high[0], -high[1], -depth - shape.floor], high])
@@ -273,12 +273,12 @@ def lenslets_volume(array: MicrolensArray) -> float:
     """
     lenslets = lenslets_of(array)
     if array.alike:
-        return _equal_lenslets_volume(lenslets[0], np.asarray(array.centers, float), array.size)
+        return _equal_lenslets_volume(lenslets[0], np.asarray(array.centers, float), array.plate)
     # Gauss's rule of two nodes in each cell of a grid; errors where a lens or wall ends in a cell nearly cancel, 1e-7.
     count, offset = _VOLUME_SAMPLES // 2, np.array([-1, 1]) / (2 * math.sqrt(3))
-    x, y = (((np.arange(count)[:, None] + 0.5 + offset).ravel() / count - 0.5) * side for side in array.size)
+    x, y = (((np.arange(count)[:, None] + 0.5 + offset).ravel() / count - 0.5) * side for side in array.plate)
     height, _ = surface_height(lenslets, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2))
-    return float(height.mean() * math.prod(array.size))
+    return float(height.mean() * math.prod(array.plate))
 
 
 def _equal_lenslets_volume(lenslet: Lenslet, centers, size) -> float:
@@ -311,7 +311,7 @@ def _equal_lenslets_volume(lenslet: Lenslet, centers, size) -> float:
 
 def array_volume(array: MicrolensArray) -> float:
     """Volume of the array: plate and lenses, mm^3."""
-    return math.prod(array.size) * plate_thickness(array) + lenslets_volume(array)
+    return math.prod(array.plate) * plate_thickness(array) + lenslets_volume(array)
 
 
 def mold_volume(array: MicrolensArray, shape: MoldShape) -> float:
@@ -319,7 +319,7 @@ def mold_volume(array: MicrolensArray, shape: MoldShape) -> float:
     block = math.prod(np.diff(mold_bounds(array, shape), axis=0)[0])
     depth = plate_thickness(array) * shape.scale + shape.headroom
     flare = depth * math.tan(shape.draft)
-    areas = [math.prod(side * shape.scale + wider for side in array.size) for wider in (0.0, flare, 2 * flare)]
+    areas = [math.prod(side * shape.scale + wider for side in array.plate) for wider in (0.0, flare, 2 * flare)]
     opening = depth * (areas[0] + 4 * areas[1] + areas[2]) / 6
     tools = engraving_tools(array, shape)
     engraved = sum(tool.trim_by_plane([0, 0, -1], -shape.headroom).volume() for tool in tools)
@@ -333,4 +333,4 @@ def volume_tolerance(array: MicrolensArray, chord: float) -> float:
     """
     height = lenslet_height(array)
     walls = sum(2 * math.pi * each.semi_aperture * (height - each.rim_sag) for each in lenslets_of(array))
-    return max(VOLUME_TOLERANCE, chord * (math.prod(array.size) / 4 + walls) / array_volume(array))
+    return max(VOLUME_TOLERANCE, chord * (math.prod(array.plate) / 4 + walls) / array_volume(array))

@@ -51,7 +51,7 @@ def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Arra
         _, near = lax.top_k(-jnp.sum(offset**2, axis=1), count + 1)
         normal, height = _bisectors(offset[near], array.aperture_diameter)
         # Where the plate goes on, a line beyond the disc closes the polygon, and changes nothing.
-        half = jnp.repeat(jnp.array(array.size, height.dtype) / 2, 2)
+        half = jnp.repeat(array.size / 2, 2)
         room = jnp.minimum(half - sides @ array.centers[lens], array.aperture_diameter)
         return _disc_within(jnp.concatenate([normal, sides]), jnp.concatenate([height, room]), radius)
 
@@ -77,11 +77,10 @@ def _edges(array: MicrolensArray, count: int) -> Float[Array, "lens direction"]:
 def _edges_of_discs(centers, radius, size, directions):
     """Where each disc ends, or the plate."""
     edges = jnp.broadcast_to(radius[:, None], (len(centers), len(directions)))
-    for axis, side in enumerate(size):
-        if math.isfinite(side):
-            along = directions[:, axis]
-            room = side / 2 - centers[:, axis, None] * jnp.sign(along)[None]
-            edges = jnp.minimum(edges, room / jnp.abs(along)[None])
+    for axis in range(2):
+        along = directions[:, axis]
+        room = size[axis] / 2 - centers[:, axis, None] * jnp.sign(along)[None]
+        edges = jnp.minimum(edges, room / jnp.abs(along)[None])
     return edges
 
 
@@ -138,10 +137,12 @@ def _covered(whole: MicrolensArray, place, direction, distance):
     others = jnp.where(own, -jnp.inf, jnp.minimum(2 * radius[0] * (below[0] - below), inner - apart))
     # Not their maximum: where that is computed again for its derivatives, and rounds otherwise, none of them is it.
     most = jnp.maximum(others[jnp.argmax(others)], distance**2 - rim[0] ** 2)
-    for axis, side in enumerate(whole.size):
-        if math.isfinite(side):
-            beyond = jnp.abs(center[axis] + distance * direction[axis]) - side / 2
-            most = jnp.maximum(most, rim[0] * beyond)
+    for axis in range(2):
+        # A plate without an edge there gives no slope either, which -inf would.
+        bounded = jnp.isfinite(whole.size[axis])
+        half = jnp.where(bounded, whole.size[axis], 0) / 2
+        beyond = jnp.abs(center[axis] + distance * direction[axis]) - half
+        most = jnp.where(bounded, jnp.maximum(most, rim[0] * beyond), most)
     return most
 
 
@@ -235,7 +236,7 @@ def _area_of_cells(array: MicrolensArray, cells: VoronoiCells):
     """Of all lenses."""
     centers = array.centers
     sides = jnp.array([[-1, 0], [1, 0], [0, -1], [0, 1]], centers.dtype)
-    half = jnp.repeat(jnp.array(array.size, centers.dtype) / 2, 2)
+    half = jnp.repeat(array.size / 2, 2)
     side = jnp.maximum(cells.beyond - len(centers), 0)
     own = centers[cells.lens]
     halfway, away = _bisectors(centers[jnp.minimum(cells.beyond, len(centers) - 1)] - own, array.aperture_diameter)

@@ -13,15 +13,18 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter
 
+from ... import objectives
 from ...base.errors import InputError
-from ...codesign.objectives import TERMS
-from ...codesign.parameters import Parent, parent_of
+from ...codesign.parameters import candidate, evaluated, start_values
 from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
+from ...codesign.terms import TERMS
+from ...design.datasheet import circle_of_confusion_of
 from ...design.design import Design
-from ...design.microscope import Microscope
-from ...design.spots import encircled_radius, psf_width
 from ...geometry import Imager
+from ...lenses import lenses_by_type
+from ...objectives.conditions import Conditions, per_type
+from ...objectives.paraxial import third_order_wavefront
 from ...optics import aberrations
 from ...optics.psf import GOLDEN_ANGLE, diffraction_psf, window_fraction
 from ...optics.raytrace import trace_lenslet
@@ -32,10 +35,8 @@ _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)
 SIZE = 49
 # Rays of a spot, the quantile of their distances that is its width, and the smoothing of ray counts, pixels.
 _RAYS, _QUANTILE, _SMOOTH = 2**15, 0.98, 1.0
-# Directions in which lenses that differ are cut off by their neighbours: gives the mean clear aperture to 1e-3.
-_EDGES = 64
 _LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm")
-# As in `gs_jax.design.problems`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
+# As in `gs_jax.design.diagnostics`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
 _FAR, _MAX_UNCOVERED = 2.0, 0.005
 
 Values = dict[str, float]
@@ -50,10 +51,23 @@ class Slider(NamedTuple):
     start: float
 
 
-def start_of(design: Design, study: Study | None = None) -> Parent:
+class Start(NamedTuple):
+    """The imager and the conditions from which the sliders of a design move."""
+
+    imager: Imager
+    at: Conditions
+
+    @property
+    def types(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the lenses of each type."""
+        return lenses_by_type(self.imager.array)
+
+
+def start_of(design: Design, study: Study | None = None) -> Start:
     """The design as the start of all moves, with the study's circle of confusion."""
     circle_of_confusion = None if study is None or study.confusion_um is None else study.confusion_um / 1000
-    return parent_of(design, depth_count=_DEPTHS, circle_of_confusion=circle_of_confusion)
+    circle_of_confusion = circle_of_confusion_of(design, circle_of_confusion)
+    return Start(*evaluated(design, depth_count=_DEPTHS, circle_of_confusion=circle_of_confusion))
 
 
 def make_sliders(design: Design) -> dict[str, Slider]:
@@ -61,8 +75,8 @@ def make_sliders(design: Design) -> dict[str, Slider]:
 
     An ideal lens has no curvature, a single lens no pitch.
     """
-    lens, imaging, start = design.lens, design.imaging, parent_of(design, depth_count=2)
-    of_type = f" of type 1 of {len(start.lenses)}, others in proportion" if len(start.lenses) > 1 else ""
+    lens, imaging, start = design.lens, design.imaging, start_of(design)
+    of_type = f" of type 1 of {len(start.types)}, others in proportion" if len(start.types) > 1 else ""
     radius, aperture = (float(np.ravel(x)[0]) for x in (lens.radius_of_curvature_mm, lens.aperture_diameter_mm))
     near, far = imaging.working_distance_mm
     ranges = {
@@ -74,7 +88,7 @@ def make_sliders(design: Design) -> dict[str, Slider]:
             radius,
         ),
         "aperture_diameter_mm": (f"aperture D{of_type}", 0.15, 1.5, aperture),
-        "pitch_mm": ("pitch", 0.6, 1.8, float(start.pitch)),
+        "pitch_mm": ("pitch", 0.6, 1.8, float(start_values(*start)["pitch_mm"])),
         "near_mm": ("nearest depth", 0.4, 1.6, near),
         "far_mm": ("farthest depth", 0.6, 2.0, far),
         "field_radius_mm": ("field radius", 0.3, 2.0, imaging.field_radius_mm),
@@ -107,7 +121,7 @@ def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
     return complete
 
 
-def live_terms(start: Parent, study: Study | None) -> tuple[str, ...]:
+def live_terms(start: Start, study: Study | None) -> tuple[str, ...]:
     """Names of the study's terms that are evaluated at each move.
 
     Not those of random scenes, `lens_shortage`, which needs the field radius when it is compiled, and those of one lens
@@ -116,7 +130,7 @@ def live_terms(start: Parent, study: Study | None) -> tuple[str, ...]:
 
     def is_live(name: str) -> bool:
         term = TERMS[name]
-        return not term.random and name != "lens_shortage" and (term.types or len(start.lenses) == 1)
+        return not term.random and name != "lens_shortage" and (term.types or len(start.types) == 1)
 
     return () if study is None else tuple(table.name for table in study.terms if is_live(table.name))
 
@@ -137,7 +151,7 @@ class Evaluation(NamedTuple):
     spots: Float[np.ndarray, "depth field row column"]
 
 
-def evaluate_design(start: Parent, values: Values, terms: tuple[str, ...] = ()) -> Evaluation:
+def evaluate_design(start: Start, values: Values, terms: tuple[str, ...] = ()) -> Evaluation:
     """Evaluate the design of these values, which `complete_values` has checked."""
     traced = {name: jnp.asarray(value) for name, value in values.items()}
     results, sharpest = _evaluate(start, traced, terms)
@@ -152,79 +166,65 @@ def evaluate_design(start: Parent, values: Values, terms: tuple[str, ...] = ()) 
 
 
 @eqx.filter_jit
-def _evaluate(start: Parent, values: dict[str, Array], terms: tuple[str, ...]):
-    m = _microscope(start, values)
-    by_type = [_numbers_of_type(one) for one in m.each]
+def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
+    imager, at = _moved(start, values)
+    parts = per_type(imager, at)
+    by_type = [_numbers_of_type(*part) for part in parts]
     numbers = {name: jnp.stack([each[name] for each in by_type]) for name in by_type[0]}
     sharpest = jnp.argmin(numbers["spot_width_um"], 0)
     numbers = {name: jnp.take_along_axis(each, sharpest[None], 0)[0] for name, each in numbers.items()}
-    numbers |= {"magnification": m.magnification, "occupancy": m.occupancy}
-    counts = np.array([len(lenses) for lenses in start.lenses])
-    shares = jnp.asarray(counts / counts.sum(), m.depths.dtype)
-    mean = lambda number: jnp.sum(shares * jnp.stack([number(one) for one in m.each]))
+    numbers |= {"magnification": imager.magnification(at.depths), "occupancy": objectives.occupancy(imager, at)}
+    counts = np.array([len(lenses) for lenses in start.types])
+    shares = jnp.asarray(counts / counts.sum(), at.depths.dtype)
+    mean = lambda quantity: jnp.sum(shares * jnp.stack([quantity(*part) for part in parts]))
     scalars = {
-        "focal_length_mm": mean(lambda one: one.focal_length),
-        "f_number": mean(lambda one: one.f_number),
-        "numerical_aperture": mean(lambda one: one.numerical_aperture),
-        "lenses_per_point": m.lenses_per_point,
-        "coverage": m.coverage,
-        "clear_diameter_mm": m.clear_diameter,
+        "focal_length_mm": mean(lambda one, _: one.array.focal_length),
+        "f_number": mean(objectives.f_number),
+        "numerical_aperture": mean(objectives.numerical_aperture),
+        "lenses_per_point": objectives.lenses_per_point(imager, at),
+        "coverage": objectives.coverage(imager, at),
+        "clear_diameter_mm": objectives.clear_diameter(imager, at),
     }
     key = jax.random.key(0)
-    entries = {name: evaluate_term(name, m, key) for name in terms}
-    return (m.depths, numbers, scalars, entries, jnp.stack([one.clear_diameter for one in m.each])), sharpest
+    entries = {name: evaluate_term(name, imager, at, key) for name in terms}
+    diameters = jnp.stack([objectives.clear_diameter(*part) for part in parts])
+    return (at.depths, numbers, scalars, entries, diameters), sharpest
 
 
-def _numbers_of_type(m: Microscope) -> dict[str, Array]:
-    axis = aberrations.linear_rms(m.wavefront(jnp.zeros(1)))[:, 0]
+def _numbers_of_type(imager: Imager, at: Conditions) -> dict[str, Array]:
+    axis = aberrations.linear_rms(third_order_wavefront(imager, at, jnp.zeros(1)))[:, 0]
     return {
-        "lateral_resolution_um": 1000 * m.lateral_resolution,
-        "axial_resolution_um": 1000 * m.axial_resolution,
-        "spot_width_um": 1000 * psf_width(m),
-        "spot_radius_um": 1000 * encircled_radius(m),
-        "blur_um": 1000 * m.blur,
-        "depth_of_field_mm": m.depth_of_field,
-        "strehl_on_axis": aberrations.strehl(axis, m.imager.wavelength),
+        "lateral_resolution_um": 1000 * objectives.lateral_resolution(imager, at),
+        "axial_resolution_um": 1000 * objectives.axial_resolution(imager, at),
+        "spot_width_um": 1000 * objectives.spot_width(imager, at),
+        "spot_radius_um": 1000 * objectives.encircled_radius(imager, at),
+        "blur_um": 1000 * objectives.sensor_blur(imager, at),
+        "depth_of_field_mm": objectives.depth_of_field(imager, at),
+        "strehl_on_axis": aberrations.strehl(axis, imager.wavelength),
     }
 
 
-def _microscope(start: Parent, values: Mapping[str, Any]) -> Microscope:
-    near, far, array = values["near_mm"], values["far_mm"], start.imager.array
-    scale = values.get("pitch_mm", start.pitch) / start.pitch
-    # A slider is the first lens's number.
-    moved = lambda name, numbers: values[name] * (numbers / numbers.ravel()[0]) if name in values else numbers
-    array = dataclasses.replace(
-        array,
-        centers=scale * array.centers,
-        radius_of_curvature=moved("radius_of_curvature_mm", array.radius_of_curvature),
-        aperture_diameter=moved("aperture_diameter_mm", array.aperture_diameter),
-    )
-    shares = jnp.linspace(-0.5, 0.5, start.depth_count, dtype=scale.dtype)
-    return Microscope(
-        dataclasses.replace(start.imager, array=array, sensor_distance=values["sensor_distance_mm"]),
-        (near + far) / 2 + (far - near) * shares,
-        field_radius=values["field_radius_mm"],
-        circle_of_confusion=start.circle_of_confusion,
-        plate_scale=scale,
-        largest_magnification=start.largest_magnification,
-        cells=start.cells,
-        directions=_EDGES,
-        lenses=start.lenses if len(start.lenses) > 1 else (),
-    )
+def _moved(start: Start, values: Mapping[str, Any]) -> tuple[Imager, Conditions]:
+    near, far, first = values["near_mm"], values["far_mm"], start_values(*start)
+    own = {name: values[name] for name in ("sensor_distance_mm", "pitch_mm") if name in values}
+    # A slider is the first type's number.
+    own |= {name: values[name] * (first[name] / first[name].ravel()[0]) for name in _LENS_KEYS if name in values}
+    imager, at = candidate(*start, own)
+    shares = jnp.linspace(-0.5, 0.5, at.depths.size, dtype=at.depths.dtype)
+    depths = (near + far) / 2 + (far - near) * shares
+    return imager, dataclasses.replace(at, depths=depths, field_radius=values["field_radius_mm"])
 
 
-def moved_imager(start: Parent, values: Values) -> Imager:
+def moved_imager(start: Start, values: Values) -> Imager:
     """The imager of these values."""
-    m = _microscope(start, {name: jnp.asarray(value) for name, value in values.items()})
-    width, height = (float(m.plate_scale) * side for side in m.imager.array.size)
-    array = dataclasses.replace(m.imager.array, size=(width, height))
-    return dataclasses.replace(m.imager, array=array, field_radius=values["field_radius_mm"])
+    imager, _ = _moved(start, {name: jnp.asarray(value) for name, value in values.items()})
+    return dataclasses.replace(imager, field_radius=values["field_radius_mm"])
 
 
-def moved_design(design: Design, start: Parent, values: Values, provenance: dict[str, Any]) -> Design:
+def moved_design(design: Design, start: Start, values: Values, provenance: dict[str, Any]) -> Design:
     """The design of these values as a file holds it, to 0.1 um; `InputError` if they make no microscope."""
     array, rounded = moved_imager(start, values).array, lambda x: np.round(np.asarray(x, float), 4)
-    size = rounded(array.size)
+    size = rounded(array.plate)
     own = {name: rounded(getattr(array, name.removesuffix("_mm"))) for name in _LENS_KEYS if name in values}
     own |= {name: rounded(values[name]) for name in ("sensor_distance_mm", "field_radius_mm")}
     return design.replace(
@@ -237,16 +237,16 @@ def moved_design(design: Design, start: Parent, values: Values, provenance: dict
     )
 
 
-def lens_unit(start: Parent, values: Values, number: int = 0) -> Imager:
+def lens_unit(start: Start, values: Values, number: int = 0) -> Imager:
     """The first lens of a type, alone on the axis. Static fields that do not change its spots stay as they were."""
     moved, own = moved_imager(start, values), start.imager
-    array = moved.array.lens(start.lenses[number][0])
-    array = dataclasses.replace(array, centers=jnp.zeros_like(array.centers), size=own.array.size)
+    array = moved.array.lens(start.types[number][0])
+    array = dataclasses.replace(array, centers=jnp.zeros_like(array.centers), size=own.array.plate)
     shift = jnp.zeros_like(moved.shift)
     return dataclasses.replace(moved, array=array, field_radius=own.field_radius, shift=shift, tilt=None)
 
 
-def pupil_samples(start: Parent) -> int:
+def pupil_samples(start: Start) -> int:
     """Samples per pixel that resolve the spots of the starting design: decides shapes, so no slider changes it."""
     return int(
         np.clip(math.ceil(1.5 * _fold(start.imager, float(jnp.max(start.imager.array.aperture_diameter)))), 2, 4)
@@ -292,7 +292,7 @@ def _diffract(unit: Imager, depth: Array, height: Array, radius: Array, samples:
 
 
 def find_violations(
-    design: Design, study: Study | None, start: Parent, values: Values, evaluation: Evaluation
+    design: Design, study: Study | None, start: Start, values: Values, evaluation: Evaluation
 ) -> list[str]:
     """Sentences on missed targets of the study, and on violated assumptions of the formulas."""
     sentences, numbers = [], evaluation.numbers
@@ -313,7 +313,8 @@ def find_violations(
                 span = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (row.low, row.high)))
                 target = f"{SIGNS[table.kind]} {table.target:g}"
                 sentences.append(f"Target missed: {TERMS[table.name].meaning} ({table.name}) is {span}, not {target}.")
-    circle_of_confusion, blur = 1000 * float(start.circle_of_confusion), numbers["blur_um"]
+    assert start.at.circle_of_confusion is not None
+    circle_of_confusion, blur = 1000 * float(start.at.circle_of_confusion), numbers["blur_um"]
     if (out := int((blur > circle_of_confusion).sum())) > 0:
         sentences.append(
             f"{out} of {len(blur)} depths are out of focus: a thin lens blurs a point over up to {blur.max():.3g} um "

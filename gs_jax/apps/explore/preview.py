@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.signal import fftconvolve
 
-from ...codesign.parameters import Parent
 from ...geometry import Imager, Sensor, envelope
 from ...grid import Grid
 from ...optics.raytrace import to_numpy
 from ...simulation.phantoms import random_points
-from .evaluation import SIZE, Values, lens_unit, moved_imager, pupil_samples, spot
+from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples, spot
 
 # Cells across the map of ghosts, and its depths.
 _CELLS, _GHOST_DEPTHS = 141, 9
@@ -42,7 +41,7 @@ def map_ghosts(imager: Imager, near: float, far: float) -> GhostMap:
     """
     depths = np.linspace(near, far, _GHOST_DEPTHS)
     left, right, bottom, top = imager.sensor.extent
-    half_x, half_y = (side / 2 for side in imager.array.size)
+    half_x, half_y = (side / 2 for side in imager.array.plate)
     box = (min(left, -half_x), min(top, -half_y), max(right, half_x), max(bottom, half_y))
     host = to_numpy(imager)
     # On the axis, at each depth and in the middle of them.
@@ -71,7 +70,7 @@ class Reconstruction(NamedTuple):
     contrast: float
 
 
-def reconstruct_points(start: Parent, values: Values, clear_diameters: Float[np.ndarray, " type"]) -> Reconstruction:
+def reconstruct_points(start: Start, values: Values, clear_diameters: Float[np.ndarray, " type"]) -> Reconstruction:
     """Image points in five planes with the spots of each lens type onto a coarse sensor, and back-project them.
 
     Light outside a spot's window is left out. `clear_diameters` are those of the types, mm.
@@ -82,12 +81,12 @@ def reconstruct_points(start: Parent, values: Values, clear_diameters: Float[np.
     sensor = Sensor((rows, columns), imager.sensor.pixel_pitch * coarse, imager.sensor.origin)
     small = dataclasses.replace(imager, sensor=sensor)
     depths = np.linspace(near, far, _PLANES)
-    side = 0.7 * min(*imager.array.size, *(n * sensor.pixel_pitch for n in sensor.shape))
+    side = 0.7 * min(*imager.array.plate, *(n * sensor.pixel_pitch for n in sensor.shape))
     points = random_points(_POINTS, (side, side), (near, far), seed=2)[:, :3]
     plane = np.arange(_POINTS) % _PLANES
     points[:, 2] = depths[plane]
     image, samples = np.zeros(sensor.shape), pupil_samples(start)
-    for number, (lenses, diameter) in enumerate(zip(start.lenses, clear_diameters, strict=True)):
+    for number, (lenses, diameter) in enumerate(zip(start.types, clear_diameters, strict=True)):
         unit = lens_unit(start, values, number)
         for k, depth in enumerate(depths):
             binned = _bin(spot(unit, float(depth), 0.0, diameter / 2, samples=samples), coarse)

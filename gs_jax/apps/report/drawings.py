@@ -199,7 +199,7 @@ def _glass(design: Design, imager: Imager, plano: bool, thickness: float, width:
 def _chief_rays(imager: Imager, depth: float, vertex: float, end: float, dot: float) -> list[str]:
     centers = np.asarray(imager.centers, float)
     landing = np.asarray(imager.project(np.array([[0.0, 0.0, depth]])), float)[:, 0]
-    pitch = np.sqrt(np.prod(imager.array.size) / len(centers))
+    pitch = np.sqrt(np.prod(imager.array.plate) / len(centers))
     near = (np.hypot(*centers.T) <= imager.field_radius) & (np.abs(centers[:, 1]) <= _BESIDE * pitch)
     rays = "".join(
         f"M{-depth:.4g} 0L{vertex:.4g} {center[0]:.4g}L{end:.4g} {place[0]:.4g}"
@@ -228,7 +228,7 @@ class Seen(NamedTuple):
 def lenses_seen(imager: Imager, depth: float) -> Seen:
     """Lenses within the field radius whose chief ray lands on the sensor, over the plate and the sensor, at a depth."""
     x_left, x_right, y_bottom, y_top = imager.sensor.extent
-    half_x, half_y = (side / 2 for side in imager.array.size)
+    half_x, half_y = (side / 2 for side in imager.array.plate)
     box = (min(x_left, -half_x), min(y_top, -half_y), max(x_right, half_x), max(y_bottom, half_y))
     step = max(box[2] - box[0], box[3] - box[1]) / _MAP
     columns, rows = (max(round((high - low) / step), 1) for low, high in ((box[0], box[2]), (box[1], box[3])))
@@ -255,7 +255,7 @@ def layout(imager: Imager, picture: str, box: tuple[float, float, float, float],
     width, height = right - left, bottom - top
     letter = max(width, height) / 34
     x0, x1, y1, y0 = imager.sensor.extent
-    plate_x, plate_y = imager.array.size
+    plate_x, plate_y = imager.array.plate
     said = f"Layout of {len(imager.array.centers)} lenses over {over}"
     seen = f"{left - letter:.5g} {top - letter:.5g} {width + 2 * letter:.5g} {height + 3.6 * letter:.5g}"
     bar = round_length(width / 5)
@@ -283,7 +283,7 @@ def _outlines(imager: Imager) -> str:
     angles = np.linspace(0, 2 * np.pi, max(6, min(48, _OUTLINE // count)), endpoint=False)
     direction = np.column_stack([np.cos(angles), np.sin(angles)])
     radius = np.repeat(np.broadcast_to(np.asarray(array.aperture_diameter, float) / 2, count)[:, None], len(angles), 1)
-    edges = cell_edges(centers, array.size)
+    edges = cell_edges(centers, array.plate)
     along = (edges.end - edges.start) / np.hypot(*(edges.end - edges.start).T)[:, None]
     normal = np.column_stack([along[:, 1], -along[:, 0]])
     normal *= np.sign((normal * edges.start).sum(1))[:, None]

@@ -10,9 +10,9 @@ from jaxtyping import Array, Num
 
 from ...base.errors import InputError
 from ...base.progress import Progress
+from ...design.datasheet import datasheet
 from ...design.design import Design, design_text
-from ...design.problems import findings
-from ...design.sheet import datasheet
+from ...design.diagnostics import findings
 from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text

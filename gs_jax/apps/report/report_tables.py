@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...base.errors import InputError
+from ...design.datasheet import circle_of_confusion_of
 from ...design.design import Design, span_of
-from ...design.sheet import circle_of_confusion_of
 from ...io.files import read_text
 from ...typing import PathLike
 
-# A spot so many times wider than promised is marked, as `gs_jax.design.problems` has it in words.
+# A spot so many times wider than promised is marked, as `gs_jax.design.diagnostics` has it in words.
 _FAR = 2.0
 _LEAST_STREHL = 0.01
 

@@ -12,10 +12,12 @@ from jaxtyping import Array, Bool, Float, Float64
 
 from ...base.errors import InputError
 from ...base.progress import Progress
+from ...design.datasheet import parts_of
 from ...design.design import Design
-from ...design.microscope import Microscope
-from ...design.sheet import microscopes_of
+from ...geometry import Imager
 from ...layouts import check_positive
+from ...objectives.conditions import Conditions
+from ...objectives.paraxial import axial_resolution
 from .depth_recovery import Bench, bench_of, depth_errors
 from .device_model import LEVELS, RULED, Errors, drawn, in_units, no_errors, spreads_of, without
 from .images import log_sharpness
@@ -87,9 +89,9 @@ class Outcome(NamedTuple):
 
 
 class _Question(NamedTuple):
-    """`microscopes`: of each type of lens. `pixel`: of the printer, mm."""
+    """`parts`: the lenses of each type and their conditions. `pixel`: of the printer, mm."""
 
-    microscopes: tuple[Microscope, ...]
+    parts: tuple[tuple[Imager, Conditions], ...]
     bench: Bench
     pixel: Float[Array, ""]
 
@@ -139,16 +141,18 @@ def tolerance(
     progress = progress or Progress()
     asked = np.linspace(*design.imaging.working_distance_mm, _DEPTHS) if depths is None else np.array(depths, float)
     _check(design, asked, draws, max_width, min_strehl, max_depth_error)
-    microscopes = tuple(dataclasses.replace(one, directions=_EDGES) for one in microscopes_of(design, asked))
+    # Each device has clear apertures of its own.
+    changes = {"directions": _EDGES, "clear_diameter": None}
+    parts = tuple((one, dataclasses.replace(at, **changes)) for one, at in parts_of(design, asked))
     with progress.step("Tracing cores"):
         bench = bench_of(design.imager(), asked, sources)
-    question = _Question(microscopes, bench, jnp.asarray(tolerances.pixel_um / 1000))
+    question = _Question(parts, bench, jnp.asarray(tolerances.pixel_um / 1000))
     spreads, lenses = spreads_of(tolerances), len(design.array.centers_mm)
     with progress.step("Gradients"):
         alone = _by_gradient(question, spreads)
     with progress.step("Nominal"):
         nominal, levels = _nominal_and_levels(question, spreads)
-    limits = _limits(microscopes, nominal, max_width, min_strehl, max_depth_error)
+    limits = _limits(parts, nominal, max_width, min_strehl, max_depth_error)
     others = [name for name, field in RULED.items() if float(getattr(spreads, field)) > 0]
     variants = [spreads, *(without(spreads, name) for name in others)]
     units = jax.vmap(lambda key: drawn(key, lenses))(jax.random.split(jax.random.key(seed), draws))
@@ -183,7 +187,7 @@ def _measured(question: _Question, errors: Errors) -> Measures:
 
 def _sharpness(question: _Question, errors: Errors) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:
     """`log_sharpness` of the type of lens that is best at each depth."""
-    each = [log_sharpness(one, errors, question.pixel) for one in question.microscopes]
+    each = [log_sharpness(*part, errors, question.pixel) for part in question.parts]
     widths, ratios = (jnp.stack(parts) for parts in zip(*each, strict=True))
     return jnp.min(widths, 0), jnp.max(ratios, 0)
 
@@ -246,9 +250,9 @@ def together(alone: dict[str, Measures]) -> Measures:
     return Measures(*(np.sqrt(square + shift**2) for square, shift in zip(squares, shifts, strict=True)))
 
 
-def _limits(microscopes: tuple[Microscope, ...], nominal: Measures, width, strehl, depth_error) -> Limits:
-    everywhere = np.ones(len(microscopes[0].depths))
-    axial = np.min([np.asarray(one.axial_resolution, np.float64) for one in microscopes], axis=0)
+def _limits(parts: tuple[tuple[Imager, Conditions], ...], nominal: Measures, width, strehl, depth_error) -> Limits:
+    everywhere = np.ones(len(parts[0][1].depths))
+    axial = np.min([np.asarray(axial_resolution(*part), np.float64) for part in parts], axis=0)
     designed = np.exp(nominal.log_strehl)
     return Limits(
         WIDER * np.exp(nominal.log_width) if width is None else width * everywhere,

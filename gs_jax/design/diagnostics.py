@@ -8,11 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import objectives
+from ..geometry import Imager
+from ..objectives.conditions import Conditions
+from ..objectives.paraxial import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.raytrace import trace_lenslet
+from .datasheet import circle_of_confusion_of, parts_of
 from .design import Design
-from .microscope import Microscope
-from .sheet import microscopes_of
 
 # Spots so many times wider than promised are said to be.
 _FAR = 2.0
@@ -39,10 +42,10 @@ def findings(design: Design, sheet: dict[str, Any], *, circle_of_confusion: floa
     InputError
         As `datasheet`.
     """
-    types = microscopes_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
-    focus = _focus(design, sheet, types)
-    # What a wavefront error does is said of lenses that are alike: each type has its own.
-    strehl = _strehl(design, sheet, types[0]) if len(types) == 1 else []
+    parts = parts_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
+    focus = _focus(design, sheet, parts, circle_of_confusion_of(design, circle_of_confusion))
+    # What a wavefront error does is said of lenses that are alike: each kind has its own.
+    strehl = _strehl(design, sheet, *parts[0]) if len(parts) == 1 else []
     checks = (_rays(sheet), focus, strehl, _pixels(design, sheet))
     return [sentence for check in (*checks, _pitch(sheet), _occupancy(sheet), _mask(sheet)) for sentence in check]
 
@@ -58,10 +61,10 @@ def _rays(sheet: dict[str, Any]) -> list[str]:
     ]
 
 
-def _sharp_cores(m: Microscope) -> list[str]:
+def _sharp_cores(imager: Imager, at: Conditions) -> list[str]:
     """Where most light falls into a core three pixels wide, on the axis."""
-    depths = jnp.geomspace(m.depths[0] / 2, 2 * m.depths[-1], _DEPTHS)
-    within = np.asarray(_light_within(m, depths, 1.5 * m.imager.sensor.pixel_pitch))
+    depths = jnp.geomspace(at.depths[0] / 2, 2 * at.depths[-1], _DEPTHS)
+    within = np.asarray(_light_within(imager, at, depths, 1.5 * imager.sensor.pixel_pitch))
     best = within.argmax()
     if best in (0, _DEPTHS - 1):
         return []
@@ -70,20 +73,18 @@ def _sharp_cores(m: Microscope) -> list[str]:
 
 
 @eqx.filter_jit
-def _light_within(m: Microscope, depths, radius):
+def _light_within(imager, at, depths, radius):
     """Of a point on a lens's axis, by exact rays, relative."""
-    radii = jnp.asarray((np.arange(_RAYS) + 0.5) / _RAYS, depths.dtype) * m.clear_diameter / 2
+    radii = jnp.asarray((np.arange(_RAYS) + 0.5) / _RAYS, depths.dtype) * objectives.clear_diameter(imager, at) / 2
     pupil = jnp.stack([radii, jnp.zeros_like(radii)], -1)
-    rays = jax.vmap(lambda depth: trace_lenslet(m.imager, depth, pupil))(depths)
+    rays = jax.vmap(lambda depth: trace_lenslet(imager, depth, pupil))(depths)
     return jnp.sum(jnp.where(rays.valid & (jnp.abs(rays.landing[..., 0]) < radius), radii, 0), -1)
 
 
-def _focus(design: Design, sheet: dict[str, Any], types: list[Microscope]) -> list[str]:
-    v, blurs, circle_of_confusion = (
-        design.imaging.sensor_distance_mm,
-        sheet["blur_um"],
-        float(types[0].circle_of_confusion),
-    )
+def _focus(
+    design: Design, sheet: dict[str, Any], parts: list[tuple[Imager, Conditions]], circle_of_confusion: float
+) -> list[str]:
+    v, blurs = design.imaging.sensor_distance_mm, sheet["blur_um"]
     outside = [i for i, blur in enumerate(blurs) if blur > circle_of_confusion * 1000]
     if not outside:
         return []
@@ -91,13 +92,19 @@ def _focus(design: Design, sheet: dict[str, Any], types: list[Microscope]) -> li
     return [
         *(_blurred(v, sheet, i) for i in sorted({outside[0], outside[-1]})),
         f"{len(outside)} of {len(blurs)} depths are out of focus: blurred by more than {limit}.",
-        *(_of(m, types, said) for m in types for said in (_sharp_range(design, m), *_sharp_cores(m))),
+        *(
+            _of_type(imager, parts, sentence)
+            for imager, at in parts
+            for sentence in (_sharp_range(design, imager, at), *_sharp_cores(imager, at))
+        ),
     ]
 
 
-def _of(m: Microscope, types: list[Microscope], said: str) -> str:
-    """Of which lenses something is said, where there are several types."""
-    return said if len(types) == 1 else f"Lenses of f = {float(m.focal_length):.4g} mm: {said[:1].lower()}{said[1:]}"
+def _of_type(imager: Imager, parts: list[tuple[Imager, Conditions]], sentence: str) -> str:
+    """Name the lens type in a sentence, where there are several."""
+    if len(parts) == 1:
+        return sentence
+    return f"Lenses of f = {float(imager.array.focal_length):.4g} mm: {sentence[:1].lower()}{sentence[1:]}"
 
 
 def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
@@ -109,27 +116,30 @@ def _blurred(v: float, sheet: dict[str, Any], i: int) -> str:
     return f"At {depth:g} mm the image forms {_length(abs(image - v))} {side} the sensor: {patch}."
 
 
-def _sharp_range(design: Design, m: Microscope) -> str:
-    v, f = design.imaging.sensor_distance_mm, float(m.focal_length)
-    if m.imager.reduced_sensor_distance <= f:
+def _sharp_range(design: Design, imager: Imager, at: Conditions) -> str:
+    v, f = design.imaging.sensor_distance_mm, float(imager.array.focal_length)
+    if imager.reduced_sensor_distance <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
-    in_focus = theory.depth_in_focus(f, float(m.imager.reduced_sensor_distance)) - m.imager.reduced_depth(0.0)
-    focused = dataclasses.replace(m, depths=in_focus[None])
-    near, far = max(float(focused.near_limit[0]), 0), float(focused.far_limit[0])
+    in_focus = theory.depth_in_focus(f, float(imager.reduced_sensor_distance)) - imager.reduced_depth(0.0)
+    focused = dataclasses.replace(at, depths=in_focus[None])
+    near, far = (
+        max(float(objectives.near_limit(imager, focused)[0]), 0),
+        float(objectives.far_limit(imager, focused)[0]),
+    )
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
     if far <= 0:
         return f"The sensor at {v:g} mm is so far that only points within the plate are in focus; {working}."
     return f"In focus by Eqs. 7 and 8, of a thin lens, are {near:.4g} to {far:.4g} mm; {working}."
 
 
-def _strehl(design: Design, sheet: dict[str, Any], m: Microscope) -> list[str]:
-    wavelength, pupil = float(m.imager.wavelength), float(m.clear_diameter) / 2
-    error = m.wavefront(jnp.zeros(1))
+def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Conditions) -> list[str]:
+    wavelength, pupil = float(imager.wavelength), float(objectives.clear_diameter(imager, at)) / 2
+    error = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
     waves = np.asarray(aberrations.linear_rms(error))[:, 0] / wavelength
     if waves.max() <= _STREHL_DOMAIN:
         return []
-    array, v = m.imager.array, m.imager.reduced_sensor_distance
-    half = np.asarray(aberrations.linear_field_radius(array, pupil, m.reduced, v, wavelength)) * 1000
+    array, v, reduced = imager.array, imager.reduced_sensor_distance, imager.reduced_depth(at.depths)
+    half = np.asarray(aberrations.linear_field_radius(array, pupil, reduced, v, wavelength)) * 1000
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
         "the Strehl ratios only say that the image is far from diffraction-limited.",

@@ -1,46 +1,50 @@
-"""The spots of a microscope's lenses by exact rays, over the field; differentiable."""
+"""Size of a point's spot by exact rays over the field of a lens."""
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..geometry import envelope
+from ..geometry import Imager, envelope
 from ..optics import theory
 from ..optics.raytrace import pupil_quadrature, trace_lenslet
-from .microscope import Microscope
+from .conditions import Depths, best_type, clear_diameter, conditions, field_heights, field_radius
 
-_FIELDS = 4
+# Share of the light within the encircled radius.
 _ENCIRCLED = 0.8
 
 
-def psf_width(c: Microscope) -> Float[Array, " depth"]:
+@best_type
+def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Width of the spot on the sensor, seen in the object, mm: that of a Gaussian of the same variance, at half height.
 
     Exact rays through the clear aperture, with all that defocus and aberrations do, averaged over the lens's field
     with its envelope; plus the variances of the pixel and of a Gaussian as wide as the Airy disc. Light far from the
     core counts, so for a caustic this is wider than the core.
     """
-    landing, weight, lit = _spots(c)
+    at = conditions(imager, depths)
+    landing, weight, lit = _spots(imager, at)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
-    airy = theory.airy_sigma(c.imager.wavelength, c.imager.reduced_sensor_distance, c.clear_diameter)
-    total = rays + airy**2 + c.imager.sensor.pixel_pitch**2 / 12
-    return theory.FWHM * jnp.sqrt(total) / c.magnification
+    airy = theory.airy_sigma(imager.wavelength, imager.reduced_sensor_distance, clear_diameter(imager, at))
+    total = rays + airy**2 + imager.sensor.pixel_pitch**2 / 12
+    return theory.FWHM * jnp.sqrt(total) / imager.magnification(at.depths)
 
 
-def encircled_radius(c: Microscope) -> Float[Array, " depth"]:
-    """Radius about the rays' centroid that holds 80 % of them, seen in the object, mm; rays as for `psf_width`.
+@best_type
+def encircled_radius(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
+    """Radius about the rays' centroid that holds 80 % of them, seen in the object, mm; rays as for `spot_width`.
 
     A ray counts as within by a logistic curve half a pixel wide: without it the radius would have a kink wherever
     one ray overtakes another.
     """
-    landing, weight, lit = _spots(c)
+    at = conditions(imager, depths)
+    landing, weight, lit = _spots(imager, at)
     radius = safe_sqrt(jnp.sum((landing - _centroid(landing, lit)) ** 2, -1))
     share = weight[..., None] * lit
     radius, share = (x.reshape(x.shape[0], -1) for x in (radius, share))
-    return jax.vmap(_quantile, (0, 0, None))(radius, share, c.imager.sensor.pixel_pitch / 2) / c.magnification
+    on_sensor = jax.vmap(_quantile, (0, 0, None))(radius, share, imager.sensor.pixel_pitch / 2)
+    return on_sensor / imager.magnification(at.depths)
 
 
 def _quantile(x: Float[Array, " entry"], share: Float[Array, " entry"], width: float) -> Float[Array, ""]:
@@ -64,23 +68,17 @@ def _quantile(x: Float[Array, " entry"], share: Float[Array, " entry"], width: f
     return at - jnp.where(lit, below(at) / jnp.where(lit, slope, 1), 0)
 
 
-def _spots(c: Microscope):
+def _spots(imager, at):
     """Where rays land, `(depth, field, ray, 2)`; the share of each height, and of each ray of it."""
-    points, weights = pupil_quadrature(c.clear_diameter / 2)
-    heights = field_heights(c)
-    trace = lambda z, h: trace_lenslet(c.imager, z, points, (h, jnp.zeros_like(h)))
-    rays = jax.vmap(jax.vmap(trace, (None, 0)), (0, None))(c.depths, heights)
+    points, weights = pupil_quadrature(clear_diameter(imager, at) / 2)
+    heights = field_heights(imager, at)
+    trace = lambda z, h: trace_lenslet(imager, z, points, (h, jnp.zeros_like(h)))
+    rays = jax.vmap(jax.vmap(trace, (None, 0)), (0, None))(at.depths, heights)
     lit = jnp.where(rays.valid, weights[None, None], 0)
     total = jnp.sum(lit, -1, keepdims=True)
-    weight = envelope(heights[None] ** 2, c.reduced[:, None], c.field_radius)
+    weight = envelope(heights[None] ** 2, imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
     return rays.landing, weight / jnp.sum(weight, -1, keepdims=True), lit / jnp.where(total > 0, total, 1)
 
 
 def _centroid(landing, lit):
     return jnp.sum(lit[..., None] * landing, -2, keepdims=True)
-
-
-def field_heights(c: Microscope) -> Float[Array, " field"]:
-    """Heights at which a lens is judged over its field, mm: the middles of rings of equal area."""
-    rings = (np.arange(_FIELDS) + 0.5) / _FIELDS
-    return c.field_radius * jnp.sqrt(jnp.asarray(rings, c.depths.dtype))

@@ -1,6 +1,5 @@
 """What a design promises, Eqs. 1-11 over its working distance, as numbers and as tables."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -10,46 +9,31 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from ..base.arrays import as_float
+from .. import objectives
 from ..base.errors import InputError, short_repr
+from ..geometry import Imager
 from ..layouts import check_positive, nearest_neighbour_distances
-from ..lenses import lenses_by_type
+from ..objectives.conditions import Conditions, per_type
+from ..objectives.paraxial import third_order_wavefront
 from ..optics import aberrations
 from ..optics.apertures import voronoi_cells
 from .design import Design
-from .microscope import Microscope
-from .spots import encircled_radius, psf_width
 
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7
 
 
-def microscope_of(
+def parts_of(
     design: Design, depths: Sequence[float] | np.ndarray, *, circle_of_confusion: float | None = None
-) -> Microscope:
-    """A design as it is judged at these depths, mm, with `datasheet`'s circle of confusion."""
-    imager = design.imager()
-    if not imager.array.alike:
-        raise InputError("`lens`: found lenses that differ, allowed: lenses that are alike.")
-    return microscopes_of(design, depths, circle_of_confusion=circle_of_confusion)[0]
+) -> list[tuple[Imager, Conditions]]:
+    """The lenses of each type of a design, in the order of their first lenses, and their conditions.
 
-
-def microscopes_of(
-    design: Design, depths: Sequence[float] | np.ndarray, *, circle_of_confusion: float | None = None
-) -> list[Microscope]:
-    """`microscope_of` with the lenses of each type alone, in the order of their first lenses."""
+    `depths` and the circle of confusion are in mm; the latter is two pixels by default.
+    """
     imager = design.imager()
-    alike = imager.array.alike
-    whole = Microscope(
-        imager,
-        as_float(depths),
-        field_radius=as_float(design.imaging.field_radius_mm),
-        circle_of_confusion=as_float(circle_of_confusion_of(design, circle_of_confusion)),
-        cells=voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if alike else None,
-        lenses=() if alike else lenses_by_type(imager.array),
-    )
-    # Each finds its own diameter, whatever of its imager is replaced.
-    return [dataclasses.replace(one, found_diameter=None) for one in whole.each]
+    cells = voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if imager.array.alike else None
+    at = Conditions(depths, circle_of_confusion_of(design, circle_of_confusion), cells=cells)
+    return per_type(imager, at)
 
 
 def datasheet(
@@ -77,70 +61,76 @@ def datasheet(
     Raises
     ------
     InputError
-        If a depth or the confusion is not positive and finite, or there is no depth.
+        If a depth or the circle_of_confusion is not positive and finite, or there is no depth.
     """
     depths = _checked(design, depths)
-    centers, types = (
+    centers, parts = (
         np.array(design.array.centers_mm),
-        microscopes_of(design, depths, circle_of_confusion=circle_of_confusion),
+        parts_of(design, depths, circle_of_confusion=circle_of_confusion),
     )
     distances = nearest_neighbour_distances(centers)
-    columns = [_columns(m) for m in types]
+    columns = [_columns(*part) for part in parts]
     best = np.argmin([column["spot_width_um"] for column in columns], 0)
     shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
     for name in ("lenses_per_point", "occupancy"):
         shown[name] = np.sum([column[name] for column in columns], 0).tolist()
-    lenses = [len(m.imager.array.centers) for m in types]
+    lenses = [len(imager.array.centers) for imager, _ in parts]
     mean = lambda values: _round(float(np.average(values, weights=lenses)))
     return {
         "depth_mm": depths,
         **{name: [_round(value) for value in values] for name, values in shown.items()},
-        "f_number": mean([float(m.f_number) for m in types]),
-        "numerical_aperture": mean([float(m.numerical_aperture) for m in types]),
-        "focal_length_mm": mean([float(m.focal_length) for m in types]),
+        "f_number": mean([float(objectives.f_number(*part)) for part in parts]),
+        "numerical_aperture": mean([float(objectives.numerical_aperture(*part)) for part in parts]),
+        "focal_length_mm": mean([float(imager.array.focal_length) for imager, _ in parts]),
         "pitch_mm": _round(float(distances.mean())),
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
-        "coverage": _round(sum(float(m.coverage) for m in types)),
-        **({"sharpest_kind": (best + 1).tolist(), "kinds": _type_rows(types, columns)} if len(types) > 1 else {}),
+        "coverage": _round(sum(float(objectives.coverage(*part)) for part in parts)),
+        **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
     }
 
 
-def _type_rows(types: Sequence[Microscope], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
-    for m, column in zip(types, columns, strict=True):
-        array = m.imager.array
+    for (imager, at), column in zip(parts, columns, strict=True):
+        array = imager.array
         numbers = {
             "radius_of_curvature_mm": array.radius_of_curvature,
             "aperture_diameter_mm": array.aperture_diameter,
             "conic_constant": array.conic_constant,
-            "focal_length_mm": m.focal_length,
-            "clear_diameter_mm": m.clear_diameter,
+            "focal_length_mm": array.focal_length,
+            "clear_diameter_mm": objectives.clear_diameter(imager, at),
         }
         spots = {name: [_round(float(x)) for x in column[name]] for name in ("spot_width_um", "spot_radius_um")}
         found.append({"lenses": len(array.centers), **{k: _round(float(x)) for k, x in numbers.items()}, **spots})
     return found
 
 
-def _columns(m: Microscope) -> dict[str, Any]:
-    axis = jnp.zeros(1)
-    width, radius = eqx.filter_jit(lambda m: (psf_width(m), encircled_radius(m)))(m)
+def _columns(imager: Imager, at: Conditions) -> dict[str, Any]:
+    wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
+    width, radius = _spot_sizes(imager, at)
+    magnification = imager.magnification(at.depths)
     return {
-        "magnification": m.magnification,
-        "scale": m.scale,
-        "lateral_resolution_um": m.lateral_resolution * 1000,
-        "axial_resolution_um": m.axial_resolution * 1000,
-        "depth_of_field_mm": m.depth_of_field,
-        "near_limit_mm": m.near_limit,
-        "far_limit_mm": m.far_limit,
-        "lenses_per_point": jnp.broadcast_to(m.lenses_per_point, m.depths.shape),
-        "occupancy": m.occupancy,
-        "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(m.wavefront(axis))[:, 0], m.imager.wavelength),
-        "focus_distance_mm": m.focus_distance,
-        "blur_um": m.blur * 1000,
+        "magnification": magnification,
+        "scale": 1 + magnification,
+        "lateral_resolution_um": objectives.lateral_resolution(imager, at) * 1000,
+        "axial_resolution_um": objectives.axial_resolution(imager, at) * 1000,
+        "depth_of_field_mm": objectives.depth_of_field(imager, at),
+        "near_limit_mm": objectives.near_limit(imager, at),
+        "far_limit_mm": objectives.far_limit(imager, at),
+        "lenses_per_point": jnp.broadcast_to(objectives.lenses_per_point(imager, at), at.depths.shape),
+        "occupancy": objectives.occupancy(imager, at),
+        "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(wavefront)[:, 0], imager.wavelength),
+        "focus_distance_mm": objectives.focus_distance(imager, at),
+        "blur_um": objectives.sensor_blur(imager, at) * 1000,
         "spot_width_um": width * 1000,
         "spot_radius_um": radius * 1000,
     }
+
+
+_spot_sizes = eqx.filter_jit(
+    lambda imager, at: (objectives.spot_width(imager, at), objectives.encircled_radius(imager, at))
+)
 
 
 def tables(sheet: dict[str, Any]) -> list[Table]:

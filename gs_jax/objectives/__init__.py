@@ -1,0 +1,49 @@
+"""Derived quantities of an imager at depths (Eqs. 4-11): a datasheet lists them, and a search optimises them.
+
+All are *differentiable* functions of an imager and of depths `(depth,)` from the array's front. Lengths are mm. In
+place of depths they take `Conditions`, which add constants that do not follow from the imager. `gs_jax.optimize` takes
+any function that is made of these; a study names them, with units. Where lenses differ, a function gives what its
+docstring says: one value for the whole plate, one row a lens type, or the value of the best type at each depth.
+Bare equation numbers mean the GEOMScope paper.
+
+Examples
+--------
+>>> import gs_jax as gs
+>>> scope = gs.geomscope().imager()
+>>> print(gs.objectives.occupancy(scope, [20.0]).round(2))  # N_e M^2, Eq. 11
+[1.11]
+"""
+
+from .conditions import Conditions as Conditions, clear_diameter as clear_diameter
+from .lens_shape import (
+    aperture_gap as aperture_gap,
+    edge_slope as edge_slope,
+    sag as sag,
+    spacing as spacing,
+    surface_radius as surface_radius,
+    uncovered_distance as uncovered_distance,
+)
+from .paraxial import (
+    approximate_depth_of_field as approximate_depth_of_field,
+    axial_resolution as axial_resolution,
+    blur as blur,
+    coverage as coverage,
+    depth_of_field as depth_of_field,
+    f_number as f_number,
+    far_limit as far_limit,
+    field_of_view as field_of_view,
+    focus_distance as focus_distance,
+    focus_offset as focus_offset,
+    lateral_resolution as lateral_resolution,
+    lenses_per_point as lenses_per_point,
+    light as light,
+    log_strehl as log_strehl,
+    near_limit as near_limit,
+    numerical_aperture as numerical_aperture,
+    occupancy as occupancy,
+    sensor_blur as sensor_blur,
+    strehl as strehl,
+    thickness as thickness,
+    wavefront_error as wavefront_error,
+)
+from .spot_size import encircled_radius as encircled_radius, spot_width as spot_width

@@ -1,0 +1,163 @@
+"""Conditions under which an imager is evaluated, its clear aperture, and quantities of several lens types."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields
+from ..geometry import Imager
+from ..lenses import lenses_by_type
+from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
+from ..optics.lens_types import split_by_type
+
+# Heights over the field at which a lens is evaluated.
+_FIELDS = 4
+
+
+class Conditions(eqx.Module):
+    """The depths at which an imager is evaluated, and constants that do not follow from the imager.
+
+    *Differentiable.*
+
+    Parameters
+    ----------
+    depths
+        From the array's front, `(depth,)`, mm.
+    circle_of_confusion
+        Diameter of the circle of confusion, mm; two pixels by default.
+    exposure
+        Electrons that a mm^2 of clear aperture at a distance of 20 mm collects from an emitter of 40 um x 40 um.
+    largest_magnification
+        An upper bound of all magnifications, for windows whose shape may not depend on traced numbers.
+    directions
+        In how many directions the edge of a clear aperture is computed, where lenses differ or move.
+    cells
+        Neighbours of each lens, for lenses that are alike and stay about where they are: a hundred times faster.
+    clear_diameter
+        Of the lenses, mm, where it is known; it is computed from the imager by default.
+    field_radius
+        `sqrt(A_e / pi)`, mm, in place of the imager's own, which decides shapes and cannot be traced.
+
+    Raises
+    ------
+    ValueError
+        If a depth is not positive and finite.
+    """
+
+    depths: Float[Array, " depth"] = eqx.field(converter=as_float)
+    circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
+    exposure: float = eqx.field(static=True, default=1e4)
+    largest_magnification: float = eqx.field(static=True, default=math.inf)
+    directions: int = eqx.field(static=True, default=512)
+    cells: VoronoiCells | None = None
+    clear_diameter: Float[Array, ""] | None = None
+    field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
+
+    def __check_init__(self):
+        check_fields(self, depths=POSITIVE)
+
+    @property
+    def middle(self) -> "Conditions":
+        """The same at the middle of the depths alone."""
+        return dataclasses.replace(self, depths=(self.depths[:1] + self.depths[-1:]) / 2)
+
+
+Depths = Conditions | Float[ArrayLike, " depth"] | Sequence[float]
+
+
+def conditions(imager: Imager, depths: Depths) -> Conditions:
+    """Depths as `Conditions`, in the imager's precision."""
+    if isinstance(depths, Conditions):
+        return depths
+    return Conditions(jnp.asarray(depths, imager.sensor_distance.dtype))
+
+
+def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
+    """The lenses of each type alone, and their conditions with the clear diameter; one pair if all are alike."""
+    at = conditions(imager, depths)
+    if imager.array.alike:
+        return [(imager, at)]
+    which = lenses_by_type(imager.array)
+    diameters = _clear_diameters(imager.array, at.directions, which)
+    return [
+        (one, dataclasses.replace(at, cells=None, clear_diameter=diameter))
+        for one, diameter in zip(split_by_type(imager, which), diameters, strict=True)
+    ]
+
+
+Quantity = Callable[[Imager, Depths], Float[Array, "..."]]
+
+
+def by_type(function: Quantity) -> Quantity:
+    """Extend a quantity of lenses that are alike to several types: one row each."""
+
+    @wraps(function)
+    def of_all(imager, depths):
+        values = [function(*part) for part in per_type(imager, depths)]
+        return values[0] if len(values) == 1 else jnp.stack(values)
+
+    return of_all
+
+
+def best_type(function: Quantity, *, best: Callable[..., Array] = jnp.argmin) -> Quantity:
+    """Extend a quantity of lenses that are alike to several types: the value of the best type at each depth."""
+
+    @wraps(function)
+    def of_best(imager, depths):
+        values = [function(*part) for part in per_type(imager, depths)]
+        if len(values) == 1:
+            return values[0]
+        stacked = jnp.stack(values)
+        return jnp.take_along_axis(stacked, best(stacked, axis=0, keepdims=True), 0)[0]
+
+    return of_best
+
+
+def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
+    """Diameter of the disc whose area is the mean clear aperture of all lenses."""
+    at, array = conditions(imager, depths), imager.array
+    if at.clear_diameter is not None:
+        return at.clear_diameter
+    if array.alike:
+        return _mean_diameter(array, at.cells)
+    which = lenses_by_type(array)
+    each = _clear_diameters(array, at.directions, which)
+    shares = np.array([len(lenses) for lenses in which]) / len(array.centers)
+    return jnp.sqrt(jnp.sum(jnp.asarray(shares, each.dtype) * each**2))
+
+
+_mean_diameter = jax.jit(lambda array, cells: diameter_of(array, cells=cells))
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _clear_diameters(array, directions, which):
+    return clear_diameters(array, which, directions=directions)
+
+
+def field_heights(imager: Imager, at: Conditions) -> Float[Array, " field"]:
+    """Heights beside a lens's axis at which it is evaluated: the middles of four rings of equal area."""
+    rings = (np.arange(_FIELDS) + 0.5) / _FIELDS
+    return field_radius(imager, at) * jnp.sqrt(jnp.asarray(rings, imager.sensor_distance.dtype))
+
+
+def finite_plate(imager: Imager) -> Float[Array, "2"]:
+    """Size of the plate; `ValueError` if it is infinite, where lenses have no density."""
+    size = imager.array.size
+    if not isinstance(size, Tracer) and not np.isfinite(size).all():
+        raise ValueError(f"`imager.array.size` must be finite, got {imager.array.plate}.")
+    return size
+
+
+def field_radius(imager: Imager, at: Conditions) -> Float[Array, ""]:
+    """The field radius of the conditions, or the imager's."""
+    if at.field_radius is not None:
+        return at.field_radius
+    return jnp.asarray(imager.field_radius, imager.sensor_distance.dtype)
