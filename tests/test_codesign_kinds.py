@@ -97,7 +97,7 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     assert {name for name, x in values.items() if x.shape == (2,)} >= {"radius_of_curvature_mm", "conic_constant"}
     moved = {"conic_constant": jnp.array([-0.7, -0.5]), "aperture_diameter_mm": jnp.array([0.7, 0.65])}
     moved |= {"pitch_mm": 1.1 * values["pitch_mm"]}
-    (found, at), made = candidate(*parent, moved), new_design(design, *parent, moved)
+    (found, at), made = candidate(*parent, values=moved), new_design(design, *parent, values=moved)
     array, which = made.imager().array, lenses_by_type(parent[0].array)
     first = which[0]
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.conic_constant) == -0.7), first)
@@ -108,7 +108,7 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     for part, lenses in zip(per_type(found, at), which, strict=True):
         np.testing.assert_allclose(objectives.clear_diameter(*part), clear_diameter(array.subset(lenses)), rtol=1e-3)
     # Kinds that come to the same are one number again.
-    same = new_design(design, *parent, {"radius_of_curvature_mm": jnp.array([1.34001, 1.34003])})
+    same = new_design(design, *parent, values={"radius_of_curvature_mm": jnp.array([1.34001, 1.34003])})
     assert same.lens.radius_of_curvature_mm == 1.34
 
 
@@ -117,7 +117,7 @@ def test_where_lenses_overlap_they_end_as_those_of_the_file():
     """With a pitch that scales them all, as the plate's size cannot be traced."""
     design, parent = two_kinds(diameter=1.3)
     values = {"pitch_mm": 0.9 * start_values(*parent)["pitch_mm"]}
-    (found, at), array = candidate(*parent, values), new_design(design, *parent, values).imager().array
+    (found, at), array = candidate(*parent, values=values), new_design(design, *parent, values=values).imager().array
     np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(array), rtol=1e-3)
 
 
@@ -131,7 +131,7 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
 
     @eqx.filter_jit
     def terms(parent, values):
-        found = candidate(*parent, values)
+        found = candidate(*parent, values=values)
         call = lambda term: term.function(*found, key) if term.random else term.function(*found)
         return {name: call(TERMS[name]) for name in KINDS}
 
@@ -144,7 +144,7 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
 @pytest.mark.integration
 def test_the_best_kind_at_each_depth_is_the_datasheets():
     design, parent = two_kinds()
-    found, sheet = candidate(*parent, {}), datasheet(design, [15.0, 22.5, 30.0])
+    found, sheet = candidate(*parent, values={}), datasheet(design, [15.0, 22.5, 30.0])
     widths = jax.jit(TERMS["psf_width_um"].function)(*found)
     np.testing.assert_allclose(widths, sheet["spot_width_um"], rtol=1e-3)
     assert set(sheet["sharpest_kind"]) == {1, 2}
@@ -156,7 +156,7 @@ def test_the_best_kind_at_each_depth_is_the_datasheets():
 def test_webs_are_between_apertures_of_their_own_size():
     _, parent = two_kinds()
     diameters = np.array([0.7, 0.5])
-    found = candidate(*parent, {"aperture_diameter_mm": jnp.array(diameters)})
+    found = candidate(*parent, values={"aperture_diameter_mm": jnp.array(diameters)})
     centers, each = np.asarray(found[0].array.centers), np.asarray(found[0].array.aperture_diameter)
     least = [
         min(np.hypot(*(centers[i] - centers[j])) - (each[i] + each[j]) / 2 for j in range(12) if j != i)
@@ -174,10 +174,10 @@ def test_gradients():
         name: start_values(*parent)[name] for name in ("radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm")
     }
     values |= {"conic_constant": jnp.array([-0.7, -0.5]), "aperture_diameter_mm": jnp.array([0.6, 0.7])}
-    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*parent, values)) for name in names])
+    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*parent, values=values)) for name in names])
     check_grads(terms, (values,), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
     values["aperture_diameter_mm"] = jnp.array([1.3, 1.21])
-    light = jax.jit(lambda values: TERMS["light_percent"].function(*candidate(*parent, values)))
+    light = jax.jit(lambda values: TERMS["light_percent"].function(*candidate(*parent, values=values)))
     check_grads(light, (values,), order=1, modes=["rev"], eps=1e-7, atol=1e-3, rtol=1e-3)
 
 

@@ -156,5 +156,5 @@ def test_gradients(orientation):
     names = ("conic_constant", "radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm", "centers_mm")
     values = {name: start_values(*judged)[name] for name in names}
     values |= {"aperture_diameter_mm": jnp.array(0.7), "aspheric_terms": jnp.array([0.01, -0.02])}
-    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*judged, values)) for name in NAMES])
+    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*judged, values=values)) for name in NAMES])
     check_grads(terms, (values,), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)

@@ -45,7 +45,7 @@ def test_values_and_gradients_are_finite(parent, name):
     values["centers_mm"] = values["centers_mm"].at[1].set(values["centers_mm"][0])
 
     def total(values):
-        found = candidate(*parent, values)
+        found = candidate(*parent, values=values)
         return jnp.sum(term.function(*found, jax.random.key(0)) if term.random else term.function(*found))
 
     value, slopes = jax.jit(jax.value_and_grad(total))(values)
@@ -76,7 +76,7 @@ def test_scenes_are_imaged_whole(monkeypatch, distance):
 def test_points_are_located_to_a_small_part_of_a_pixel(parent):
     """Spots of one pixel, 20 um, of 1000 photons a lens through five lenses: 20 / sqrt(5000) um by the lenses' share of
     light, over the magnification of a quarter; read noise and a point's depth cost more, a few times."""
-    found = np.asarray(TERMS["localization_um"].function(*candidate(*parent, {}), jax.random.key(0)))
+    found = np.asarray(TERMS["localization_um"].function(*candidate(*parent, values={}), jax.random.key(0)))
     least = 20 / np.sqrt(5000) / 0.3
     assert (least < found[:2]).all() and (found[:2] < 20 * least).all() and found[2] < 1000
 

@@ -189,7 +189,7 @@ def test_widths_have_gradients_by_the_shape(orientation):
     values = {name: start_values(*parent)[name] for name in names} | {"aperture_diameter_mm": jnp.array(1.1)}
     values["aspheric_terms"] = jnp.array([0.01, -0.02])
     shown = ("psf_width_um", "edge_slope_deg", "sag_mm", "least_radius_mm", "wavefront_waves", "light_percent")
-    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*parent, values)) for name in shown])
+    terms = jax.jit(lambda values: [TERMS[name].function(*candidate(*parent, values=values)) for name in shown])
     check_grads(terms, (values | {"conic_constant": jnp.array(-0.5)},), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
@@ -205,7 +205,7 @@ def test_terms_have_gradients():
     parent = small_parent(2)
     values = start_values(*parent) | {"sensor_distance_mm": jnp.array(5.7), "aperture_diameter_mm": jnp.array(1.1)}
     check_grads(
-        jax.jit(lambda values: everything(*candidate(*parent, values))), (values,), order=1, eps=1e-5, rtol=1e-3
+        jax.jit(lambda values: everything(*candidate(*parent, values=values))), (values,), order=1, eps=1e-5, rtol=1e-3
     )
 
 
@@ -216,7 +216,7 @@ def test_gradients_are_finite_where_lenses_coincide_and_rays_are_lost():
     centers = parent[0].array.centers.at[1].set(parent[0].array.centers[0])
     steep = {"radius_of_curvature_mm": jnp.array(0.5), "aperture_diameter_mm": jnp.array(1.9), "centers_mm": centers}
     values = start_values(*parent) | steep
-    sums = lambda values: {name: jnp.sum(x) for name, x in everything(*candidate(*parent, values)).items()}
+    sums = lambda values: {name: jnp.sum(x) for name, x in everything(*candidate(*parent, values=values)).items()}
     found, slopes = jax.jit(lambda values: (sums(values), jax.jacrev(sums)(values)))(values)
     finite = lambda name: all(np.isfinite(x).all() for x in (found[name], *slopes[name].values()))
     assert [name for name in CONTINUOUS if not finite(name)] == []

@@ -55,7 +55,7 @@ def test_bounds_have_gradients():
 
 
 def test_without_values_it_is_the_parent(design, parent):
-    (found, at), imager = candidate(*parent, {}), design.imager()
+    (found, at), imager = candidate(*parent, values={}), design.imager()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found, imager)
     # Two exact computations of the same areas: from the Voronoi cells' edges, and lens by lens.
     np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(imager.array), rtol=1e-9)
@@ -69,8 +69,8 @@ def test_without_values_it_is_the_parent(design, parent):
 def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
     parent = evaluated(design, free=MOVING if moving else {})
     values = {"pitch_mm": 1.1 * start_values(*parent)["pitch_mm"], "aperture_diameter_mm": jnp.array(1.3)}
-    found, at = candidate(*parent, values)
-    scaled = new_design(design, *parent, values)
+    found, at = candidate(*parent, values=values)
+    scaled = new_design(design, *parent, values=values)
     np.testing.assert_allclose(found.array.size, [22.0, 22.0], rtol=1e-12)
     np.testing.assert_allclose(pitch(found.array.centers)[0], values["pitch_mm"], rtol=1e-9)
     # The written design is rounded to 1e-4 mm.
@@ -88,7 +88,7 @@ def test_everything_has_gradients(moving):
     values = {name: x for name, x in start_values(*parent).items() if moving or name != "centers_mm"}
 
     def what(values):
-        found, at = candidate(*parent, values)
+        found, at = candidate(*parent, values=values)
         density = objectives.coverage(found, at), objectives.lenses_per_point(found)
         return objectives.clear_diameter(found, at), density, found.array.size, found.magnification(at.depths)
 
@@ -102,7 +102,7 @@ def test_no_candidate_magnifies_more(design):
     corners = [dict(zip(free, map(jnp.array, corner), strict=True)) for corner in itertools.product(*free.values())]
 
     def largest(corner):
-        imager, at = candidate(*parent, corner)
+        imager, at = candidate(*parent, values=corner)
         return float(imager.magnification(at.depths).max())
 
     # A sensor at 5.8 mm in the design, beyond the bound: it is judged too.
@@ -119,11 +119,11 @@ def test_no_candidate_magnifies_more(design):
 
 def test_a_new_design_holds_the_values(design, parent):
     values = start_values(*parent) | {"sensor_distance_mm": jnp.array(3.123456), "depth_span_mm": jnp.array(4.0)}
-    found = new_design(design, *parent, values)
+    found = new_design(design, *parent, values=values)
     assert found.imaging.sensor_distance_mm == 3.1235
     assert found.imaging.working_distance_mm == (18.5, 22.5)
     assert found.lens == design.lens and found.array == design.array
-    conic = new_design(design, *parent, values | {"conic_constant": jnp.array(-0.87654321)}).lens.conic_constant
+    conic = new_design(design, *parent, values=values | {"conic_constant": jnp.array(-0.87654321)}).lens.conic_constant
     assert conic == -0.8765432
     assert set(start_values(*parent)) == set(NAMES)
 
@@ -133,8 +133,8 @@ def test_aspheric_terms_of_a_lens_without_any(design):
     parent = evaluated(design, free={"aspheric_terms": (-0.1, 0.1)})
     np.testing.assert_array_equal(start_values(*parent)["aspheric_terms"], [0, 0])
     values = {"aspheric_terms": jnp.array([0.012345, -0.0000123]), "pitch_mm": 1.1 * start_values(*parent)["pitch_mm"]}
-    np.testing.assert_array_equal(candidate(*parent, values)[0].array.aspheric_terms, values["aspheric_terms"])
-    found = new_design(design, *parent, values)
+    np.testing.assert_array_equal(candidate(*parent, values=values)[0].array.aspheric_terms, values["aspheric_terms"])
+    found = new_design(design, *parent, values=values)
     assert found.lens.aspheric_terms == (0.012345, -0.0000123)
     again = evaluated(found, free={"aspheric_terms": (-0.1, 0.1)})
     np.testing.assert_array_equal(start_values(*again)["aspheric_terms"], [0.012345, -0.0000123])
@@ -142,4 +142,6 @@ def test_aspheric_terms_of_a_lens_without_any(design):
 
 def test_values_that_make_no_microscope(design, parent):
     with pytest.raises(InputError, match="make no microscope: `lens.aperture_diameter_mm`: found 3.0"):
-        new_design(design, *parent, {"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)})
+        new_design(
+            design, *parent, values={"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)}
+        )

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gs_jax.cli.tolerance import command
 from jax.test_util import check_grads
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -24,6 +23,7 @@ from gs_jax.apps.tolerance.surface import lens_squares, step_squares
 from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Question, together, tolerance
 from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
 from gs_jax.apps.tolerance.tolerance_spec import Tolerances
+from gs_jax.cli.fabrication import tolerance_command as command
 from gs_jax.design.datasheet import parts_of
 from gs_jax.geometry import envelope
 from gs_jax.objectives import Conditions

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.metadata import entry_points
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 from jaxtyping import Array, Float
 
@@ -159,7 +159,7 @@ def _imported(name: str) -> Term:
     if not callable(found):
         raise ValueError(f"`module:name` must name a callable or a `Term`, got {short_repr(found)}")
     words = (found.__doc__ or attribute).strip().splitlines()[0].rstrip(".")
-    return Term(words, found)
+    return Term(words, cast(Callable[..., Float[Array, "..."]], found))
 
 
 def with_terms(build: Callable[[], Built], names: Iterable[str]) -> Callable[[], Built]:
