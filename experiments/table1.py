@@ -13,7 +13,7 @@ from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
-from gs_jax.design.datasheet import datasheet
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory

@@ -61,7 +61,7 @@ Better designs, and their molds:
 
     optimize             Search for the imager of the least loss
     free                 Which numbers of an imager a search may change
-    objectives           What a microscope is judged by, as functions of an imager and depths; all *differentiable*
+    objectives           Derived quantities of an imager at depths (Eqs. 4-11), for datasheets and searches
     run_study            Search for a design that does what a study wants
     read_study           The study in a TOML file
     make_mold            Writes the mold of a design, or the array, for printing, with a picture and a report

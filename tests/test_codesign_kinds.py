@@ -18,7 +18,7 @@ from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.builtin import geomscope
-from gs_jax.design.datasheet import datasheet
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 from gs_jax.layouts import interleave
 from gs_jax.lenses import lenses_by_type

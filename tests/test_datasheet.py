@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gs_jax import Imager, MicrolensArray, Sensor, objectives
 from gs_jax.design.builtin import geomscope
-from gs_jax.design.datasheet import datasheet, summary, tables
+from gs_jax.design.datasheets import datasheet, summary, tables
 from gs_jax.design.design import read_design
 from gs_jax.design.diagnostics import findings
 from gs_jax.objectives.conditions import per_type

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from gs_jax import geomscope
 from gs_jax.base.errors import InputError, InputWarning
-from gs_jax.design.datasheet import datasheet
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design, read_design, write_design
 
 from .helpers import examples, needs

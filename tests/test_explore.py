@@ -17,7 +17,7 @@ from gs_jax.apps.explore.evaluation import complete_values, evaluate_design, mak
 from gs_jax.apps.explore.server import Server, Session
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
-from gs_jax.design.datasheet import datasheet
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
 
 from .browser import browser, watched

@@ -24,7 +24,7 @@ from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Ques
 from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
 from gs_jax.apps.tolerance.tolerance_spec import Tolerances
 from gs_jax.cli.fabrication import tolerance_command as command
-from gs_jax.design.datasheet import parts_of
+from gs_jax.design.datasheets import parts_of
 from gs_jax.geometry import envelope
 from gs_jax.objectives import Conditions
 from gs_jax.objectives.conditions import field_heights

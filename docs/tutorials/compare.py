@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.design.datasheet import datasheet
+from gs_jax.design.datasheets import datasheet
 from gs_jax.simulation.phantoms import random_points
 
 HALF = 5.0  # half width of the plate and the sensor, mm

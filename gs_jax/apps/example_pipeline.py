@@ -17,7 +17,7 @@ from ..base.progress import Progress
 from ..codesign.outcome import as_records, write_outcome
 from ..codesign.search import run_study
 from ..design.builtin import geomscope
-from ..design.datasheet import datasheet
+from ..design.datasheets import datasheet
 from ..design.design import Design, write_design
 from ..design.diagnostics import findings
 from ..detection.locate import find_points

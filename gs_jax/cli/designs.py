@@ -46,7 +46,7 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
     """
     from rich.console import Console
 
-    from ..design.datasheet import datasheet, summary, tables
+    from ..design.datasheets import datasheet, summary, tables
     from ..design.design import read_design
     from ..design.diagnostics import findings
 

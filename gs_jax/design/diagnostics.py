@@ -14,7 +14,7 @@ from ..objectives.conditions import Conditions
 from ..objectives.paraxial import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.raytrace import trace_lenslet
-from .datasheet import circle_of_confusion_of, parts_of
+from .datasheets import circle_of_confusion_of, parts_of
 from .design import Design
 
 # Spots so many times wider than promised are said to be.

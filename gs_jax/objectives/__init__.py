@@ -1,4 +1,4 @@
-"""Derived quantities of an imager at depths (Eqs. 4-11): a datasheet lists them, and a search optimises them.
+"""Derived quantities of an imager at depths (Eqs. 4-11), for datasheets and searches.
 
 All are *differentiable* functions of an imager and of depths `(depth,)` from the array's front. Lengths are mm. In
 place of depths they take `Conditions`, which add constants that do not follow from the imager. `gs_jax.optimize` takes

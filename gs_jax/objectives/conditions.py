@@ -73,7 +73,7 @@ class Conditions(eqx.Module):
 Depths = Conditions | Float[ArrayLike, " depth"] | Sequence[float]
 
 
-def conditions(imager: Imager, depths: Depths) -> Conditions:
+def as_conditions(imager: Imager, depths: Depths) -> Conditions:
     """Depths as `Conditions`, in the imager's precision."""
     if isinstance(depths, Conditions):
         return depths
@@ -82,7 +82,7 @@ def conditions(imager: Imager, depths: Depths) -> Conditions:
 
 def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
     """The lenses of each type alone, and their conditions with the clear diameter; one pair if all are alike."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     if imager.array.alike:
         return [(imager, at)]
     which = lenses_by_type(imager.array)
@@ -123,7 +123,7 @@ def best_type(function: Quantity, *, best: Callable[..., Array] = jnp.argmin) ->
 
 def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Diameter of the disc whose area is the mean clear aperture of all lenses."""
-    at, array = conditions(imager, depths), imager.array
+    at, array = as_conditions(imager, depths), imager.array
     if at.clear_diameter is not None:
         return at.clear_diameter
     if array.alike:

@@ -14,7 +14,6 @@ from .conditions import (
     best_type,
     by_type,
     clear_diameter,
-    conditions,
     field_heights,
     field_radius,
     finite_plate,
@@ -36,7 +35,7 @@ def numerical_aperture(imager: Imager, depths: Depths) -> Float[Array, ""]:
 @by_type
 def lateral_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Lateral resolution in focus, without aberrations (Eq. 5); a row a type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     pixel, magnification = imager.sensor.pixel_pitch, imager.magnification(at.depths)
     return theory.lateral_resolution(imager.wavelength, numerical_aperture(imager, at), pixel, magnification)
 
@@ -44,7 +43,7 @@ def lateral_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]
 @by_type
 def axial_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Axial resolution in focus, without aberrations (Eq. 6); a row a type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     lateral, reduced = lateral_resolution(imager, at), imager.reduced_depth(at.depths)
     return theory.axial_resolution(lateral, reduced, field_radius(imager, at))
 
@@ -74,7 +73,7 @@ def far_limit(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 
 def _focus(imager, depths):
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     circle_of_confusion = 2 * imager.sensor.pixel_pitch if at.circle_of_confusion is None else at.circle_of_confusion
     circle_of_confusion = jnp.asarray(circle_of_confusion, at.depths.dtype)
     return imager.array.focal_length, f_number(imager, at), imager.reduced_depth(at.depths), circle_of_confusion
@@ -83,7 +82,7 @@ def _focus(imager, depths):
 @by_type
 def focus_distance(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Sensor distance `v` at which a thin lens images each depth; infinite if it does not; a row a type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     reduced = theory.focus_distance(imager.array.focal_length, imager.reduced_depth(at.depths))
     return reduced - imager.array.air_behind
 
@@ -94,7 +93,7 @@ def focus_offset(imager: Imager, depths: Depths) -> Float[Array, ""]:
 
     It is 1 at the nearest and the farthest depth. In vergence, focus at infinity and beyond is nothing special.
     """
-    at, f = conditions(imager, depths), imager.array.focal_length
+    at, f = as_conditions(imager, depths), imager.array.focal_length
     near, far = imager.reduced_depth(at.depths[0]), imager.reduced_depth(at.depths[-1])
     in_focus = 1 / f - 1 / imager.reduced_sensor_distance
     return jnp.abs(2 * in_focus - 1 / near - 1 / far) / (1 / near - 1 / far)
@@ -103,7 +102,7 @@ def focus_offset(imager: Imager, depths: Depths) -> Float[Array, ""]:
 @by_type
 def sensor_blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Diameter of a thin lens's blur on the sensor; a row a type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     reduced, v = imager.reduced_depth(at.depths), imager.reduced_sensor_distance
     return theory.blur(imager.array.focal_length, clear_diameter(imager, at), reduced, v)
 
@@ -111,20 +110,20 @@ def sensor_blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 @best_type
 def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Diameter of a thin lens's blur in the object; of the best type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     reduced, v = imager.reduced_depth(at.depths), imager.reduced_sensor_distance
     return theory.object_blur(imager.array.focal_length, clear_diameter(imager, at), reduced, v)
 
 
 def lenses_per_point(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e`."""
-    count, radius = float(imager.array.centers.shape[0]), field_radius(imager, conditions(imager, depths))
+    count, radius = float(imager.array.centers.shape[0]), field_radius(imager, as_conditions(imager, depths))
     return theory.lenses_per_point(count, jnp.prod(finite_plate(imager)), radius)
 
 
 def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by all lenses."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     return theory.occupancy(lenses_per_point(imager, at), imager.magnification(at.depths))
 
 
@@ -136,13 +135,13 @@ def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
 
 def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Share of a point's light that its `N_e` lenses collect, `N_e pi a^2 / (4 pi z'^2)` for a clear radius `a`."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     return lenses_per_point(imager, at) * (clear_diameter(imager, at) / 4 / imager.reduced_depth(at.depths)) ** 2
 
 
 def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
     """Width of the object that is imaged at all, along x and y."""
-    at, sensor, plate = conditions(imager, depths), imager.sensor, finite_plate(imager)
+    at, sensor, plate = as_conditions(imager, depths), imager.sensor, finite_plate(imager)
     widths = jnp.array(sensor.shape[::-1], plate.dtype) * sensor.pixel_pitch
     magnification = imager.magnification(at.depths)[:, None]
     return theory.field_of_view(plate[None], widths[None], magnification, field_radius(imager, at))
@@ -155,7 +154,7 @@ def thickness(imager: Imager) -> Float[Array, ""]:
 
 def third_order_wavefront(imager: Imager, depths: Depths, heights: Float[Array, " field"]) -> WavefrontCoefficients:
     """Third-order errors of lenses that are alike at heights beside a lens's axis: `(depth, field)`, or broadcast."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     radius, reduced = clear_diameter(imager, at) / 2, imager.reduced_depth(at.depths)
     return aberrations.seidel_of_array(
         imager.array, radius, reduced[:, None], heights[None], imager.reduced_sensor_distance
@@ -165,7 +164,7 @@ def third_order_wavefront(imager: Imager, depths: Depths, heights: Float[Array, 
 @partial(best_type, best=jnp.argmax)
 def log_strehl(imager: Imager, depths: Depths) -> Float[Array, "depth field"]:
     """Logarithm of the Strehl ratio (Eq. 9 with Eq. 10) at four heights of the field; of the best type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     wavefront = third_order_wavefront(imager, at, field_heights(imager, at))
     return aberrations.log_strehl(aberrations.linear_rms(wavefront), imager.wavelength)
 
@@ -178,6 +177,6 @@ def strehl(imager: Imager, depths: Depths) -> Float[Array, "depth field"]:
 @best_type
 def wavefront_error(imager: Imager, depths: Depths) -> Float[Array, "depth field"]:
     """RMS of the third-order wavefront, astigmatism and field curvature included, in waves; of the best type."""
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     wavefront = third_order_wavefront(imager, at, field_heights(imager, at))
     return aberrations.independent_rms(wavefront) / imager.wavelength

@@ -8,7 +8,7 @@ from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
 from ..optics import theory
 from ..optics.raytrace import pupil_quadrature, trace_lenslet
-from .conditions import Depths, best_type, clear_diameter, conditions, field_heights, field_radius
+from .conditions import Depths, as_conditions, best_type, clear_diameter, field_heights, field_radius
 
 # Share of the light within the encircled radius.
 _ENCIRCLED = 0.8
@@ -22,7 +22,7 @@ def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     with its envelope; plus the variances of the pixel and of a Gaussian as wide as the Airy disc. Light far from the
     core counts, so for a caustic this is wider than the core.
     """
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     landing, weight, lit = _spots(imager, at)
     squared = jnp.sum(lit * jnp.sum((landing - _centroid(landing, lit)) ** 2, -1), -1) / 2
     rays = jnp.sum(weight * squared, -1)
@@ -38,7 +38,7 @@ def encircled_radius(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     A ray counts as within by a logistic curve half a pixel wide: without it the radius would have a kink wherever
     one ray overtakes another.
     """
-    at = conditions(imager, depths)
+    at = as_conditions(imager, depths)
     landing, weight, lit = _spots(imager, at)
     radius = safe_sqrt(jnp.sum((landing - _centroid(landing, lit)) ** 2, -1))
     share = weight[..., None] * lit

@@ -19,7 +19,7 @@ from ...codesign.parameters import candidate, evaluated, start_values
 from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
-from ...design.datasheet import circle_of_confusion_of
+from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design
 from ...geometry import Imager
 from ...lenses import lenses_by_type

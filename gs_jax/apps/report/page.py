@@ -10,7 +10,7 @@ from jaxtyping import Array, Num
 
 from ...base.errors import InputError
 from ...base.progress import Progress
-from ...design.datasheet import datasheet
+from ...design.datasheets import datasheet
 from ...design.design import Design, design_text
 from ...design.diagnostics import findings
 from ...geometry import Imager

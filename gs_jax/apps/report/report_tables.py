@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...base.errors import InputError
-from ...design.datasheet import circle_of_confusion_of
+from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design, span_of
 from ...io.files import read_text
 from ...typing import PathLike

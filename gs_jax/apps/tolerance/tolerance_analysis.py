@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Float64
 
 from ...base.errors import InputError
 from ...base.progress import Progress
-from ...design.datasheet import parts_of
+from ...design.datasheets import parts_of
 from ...design.design import Design
 from ...geometry import Imager
 from ...layouts import check_positive
