@@ -11,6 +11,7 @@ from ..optics import aberrations, theory
 from ..optics.aberrations import WavefrontCoefficients
 from .conditions import (
     Depths,
+    as_conditions,
     best_type,
     by_type,
     clear_diameter,
