@@ -7,7 +7,14 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax import Imager, MicrolensArray, Sensor
-from gs_jax.codesign.comb import comb_spectrum, condition_number, lens_shortage, readback, sidelobes, spectral_flatness
+from gs_jax.codesign.array_psf import (
+    comb_spectrum,
+    condition_number,
+    lens_shortage,
+    readback,
+    sidelobes,
+    spectral_flatness,
+)
 from gs_jax.geometry import envelope
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout
 

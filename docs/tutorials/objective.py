@@ -12,7 +12,7 @@ import optimistix as optx
 from matplotlib import pyplot as plt
 
 import gs_jax as gs
-from gs_jax.codesign.outcome import as_records
+from gs_jax.codesign.search_report import as_records
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS, Term
 

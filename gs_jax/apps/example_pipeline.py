@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from ..base.progress import Progress
-from ..codesign.outcome import as_records, write_outcome
 from ..codesign.search import run_study
+from ..codesign.search_report import as_records, write_outcome
 from ..design.builtin import geomscope
 from ..design.datasheets import datasheet
 from ..design.design import Design, write_design

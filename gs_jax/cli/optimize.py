@@ -34,7 +34,7 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
 
     from ..codesign import search
     from ..codesign.checkpoint import checkpoint_path
-    from ..codesign.outcome import before_and_after, check_outputs, write_outcome
+    from ..codesign.search_report import before_and_after, check_outputs, write_outcome
 
     check_outputs(output)
     beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..geometry import Imager, field_limit
 from ..grid import Grid
 from ..objectives.conditions import Conditions, finite_plate, per_type
-from .comb import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
+from .array_psf import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import localization_bound
 from .linear_error import lost_power
