@@ -28,7 +28,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
-from gs_jax.codesign.start import started
+from gs_jax.codesign.search import started
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.checks import plate_as_air

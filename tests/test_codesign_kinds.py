@@ -12,9 +12,8 @@ from jax.test_util import check_grads
 from gs_jax import objectives, random_layout
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.parameters import candidate, evaluated, new_design, start_values
-from gs_jax.codesign.search import run_study
+from gs_jax.codesign.search import run_study, started
 from gs_jax.codesign.stages import problem_of
-from gs_jax.codesign.start import started
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.builtin import geomscope

@@ -10,12 +10,10 @@ from jax.test_util import check_grads
 from scipy.special import j1
 
 from gs_jax.codesign import linear_error
-from gs_jax.codesign.fisher import localization_bound
-from gs_jax.codesign.linear_error import lost_power, noise_density
+from gs_jax.codesign.fisher import crowded_bound, localization_bound
+from gs_jax.codesign.linear_error import lens_electrons, lit_density, lost_power, noise_density, spots, transfer_power
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
-from gs_jax.codesign.precision import crowded_bound
 from gs_jax.codesign.terms import TERMS
-from gs_jax.codesign.transfer import lens_electrons, lit_density, spots, transfer_power
 from gs_jax.design.builtin import geomscope
 from gs_jax.geometry import Imager
 from gs_jax.objectives import Conditions, clear_diameter

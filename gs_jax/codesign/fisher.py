@@ -11,6 +11,7 @@ judges a layout without a reconstruction. Light on pixel `k` has mean `m_k` and 
 paper has no such bound. Images of one point by different lenses are taken as apart from each other.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -19,8 +20,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager
+from ..geometry import Imager, envelope
+from ..objectives.conditions import Conditions, field_radius
 from ..typing import Real
+from .linear_error import lens_electrons, noise_density, transfer_power
 
 # What is known before the image, standard deviations of x, y, z (mm) and of the logarithm of the brightness.
 PRIOR = (10.0, 10.0, 10.0, 10.0)
@@ -190,3 +193,60 @@ def _moved(psf, shift):
         padded, padded.shape, (0, 1), jnp.ones(2, psf.dtype), shift.astype(psf.dtype), "cubic", antialias=False
     )
     return moved[2:-2, 2:-2]
+
+
+# Frequencies, up to the pixels' own highest.
+_NODES = 24
+
+
+def crowded_bound(
+    parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, "place 2"]
+) -> Float[Array, "depth 3"]:
+    """The least standard deviations of x, y, z of points as bright as a lit place of 40 um x 40 um, mm.
+
+    Parameters
+    ----------
+    parts
+        The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are
+        those of the points.
+    places
+        `(x, y)` of points, mm. Root mean squares over them are given.
+    """
+    spots = [_spot(*part, parts) for part in parts]
+    prior = jnp.asarray(PRIOR[:3], parts[0][1].depths.dtype)
+
+    def at(place):
+        told = sum(_information(*part, spot, place) for part, spot in zip(parts, spots, strict=True))
+        return jnp.diagonal(jnp.linalg.inv(told + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
+
+    return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
+
+
+def _spot(imager, at, parts):
+    """At each depth of the spot of a lens its squared light, 1/mm^2, and of its derivative by x or y; and its noise."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    dtype, highest = at.depths.dtype, 1 / (2 * imager.sensor.pixel_pitch)
+    frequency = highest * jnp.asarray((nodes + 1) / 2, dtype)
+    ring = jnp.asarray(np.pi * weights, dtype) * highest * frequency
+    power = transfer_power(imager, at, frequency)
+    energy = jnp.sum(ring[None] * power, 1)
+    slope = jnp.sum(ring[None] * power * (2 * jnp.pi * frequency[None]) ** 2, 1) / 2
+    return energy, slope, noise_density(imager, at, parts)
+
+
+def _information(imager, at, spot, place) -> Float[Array, "depth 3 3"]:
+    """Information about `x, y, z` of a point at a place by these lenses."""
+    energy, slope, noise = spot
+    beside = imager.array.centers - place[None]
+    weight = envelope(jnp.sum(beside**2, 1)[None], imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
+    light = lens_electrons(imager, at)[:, None] * weight
+    told = light**2 * slope[:, None] / (noise + light * energy[:, None])
+    # How far images move, over the magnification: with the point, and with its depth.
+    moved = jnp.concatenate(
+        [
+            jnp.broadcast_to(jnp.eye(2, dtype=at.depths.dtype), (at.depths.size, len(beside), 2, 2)),
+            (beside[None] / imager.reduced_depth(at.depths)[:, None, None])[..., None],
+        ],
+        -1,
+    )
+    return jnp.einsum("dl,dlai,dlaj->dij", told * imager.magnification(at.depths)[:, None] ** 2, moved, moved)

@@ -18,10 +18,8 @@ from ..grid import Grid
 from ..objectives.conditions import Conditions, finite_plate, per_type
 from .array_psf import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
-from .fisher import localization_bound
-from .linear_error import lost_power
-from .precision import crowded_bound
-from .transfer import PLACE, lens_electrons, spots
+from .fisher import crowded_bound, localization_bound
+from .linear_error import PLACE, lens_electrons, lost_power, spots
 
 # Points whose ghosts are looked for, and places where; points that are located or whose combs are looked at; light of
 # one, electrons a lens.

@@ -15,9 +15,8 @@ from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..lenses import EACH, type_of_lens
 from ..optics.apertures import pitch
-from .bounded import LBFGSB
-from .bounds import Bounds, Box
-from .solve import CONVERGED, NOT_FINITE, Solver, least_change, run, stepper
+from .lbfgsb import LBFGSB
+from .solve import CONVERGED, NOT_FINITE, Bounds, Box, Solver, least_change, run, stepper
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -135,7 +134,7 @@ def optimize(
         What may change, of `gs_jax.free`.
     solver
         Of optimistix, a minimiser, or for residuals one of least squares; of optax, which runs all steps; or
-        `gs_jax.codesign.bounded.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
+        `gs_jax.codesign.lbfgsb.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
     bounds
         Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
         beyond it is moved inside.

@@ -12,16 +12,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from ..base.errors import errors_name_file
+import numpy as np
+
+from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
+from ..design.checks import plate_as_air
 from ..design.design import Design, read_design
+from ..layouts import interleave
+from ..lenses import lenses_by_type
 from ..typing import PathLike
 from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values
 from .solve import State
 from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
-from .start import started
 from .study import Study, read_study
 from .targets import Row
 
@@ -163,3 +167,44 @@ class _Saver:
         if self.path is not None and (state is None or time.monotonic() - self.last >= self.every):
             write_checkpoint(self.path, self.log, self.study, self.design, state)
             self.last = time.monotonic()
+
+
+def started(design: Design, study: Study) -> Design:
+    """A design with the orientation and the types of lenses that a study asks for.
+
+    Raises
+    ------
+    InputError
+        If its lenses differ and are not of so many types, or are ideal thin lenses, which have no radii to spread.
+    """
+    if study.orientation is not None:
+        design = _with(design, orientation=study.orientation)
+    if study.kinds is None:
+        return design
+    found = len(lenses_by_type(design.imager().array))
+    if found == study.kinds:
+        return design
+    if found > 1:
+        raise InputError(f"`kinds`: found {study.kinds} for a design of {found} types, allowed: {found}, or none.")
+    if design.lens.focal_length_mm is not None:
+        raise InputError("`kinds`: found it for a design with `lens.focal_length_mm`, allowed: for one without it.")
+    if study.kinds > (count := len(design.array.centers_mm)):
+        raise InputError(f"`kinds`: found {study.kinds} for a design of {count} lenses, allowed: up to {count}.")
+    radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.kinds)
+    which = interleave(np.array(design.array.centers_mm), study.kinds)
+    return _with(design, radius_of_curvature_mm=tuple(radius[which].tolist()))
+
+
+def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
+    """Of thin lenses that image the middles of equal parts of the depths, in vergence, over that of their middle."""
+    near, far = study.depths_mm or design.imaging.working_distance_mm
+    lens, array = design.lens, design.array
+    front, back = plate_as_air(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    ends = 1 / (near + front), 1 / (far + front)
+    share = (np.arange(types) + 0.5) / types
+    behind = 1 / (design.imaging.sensor_distance_mm + back)
+    return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
+
+
+def _with(design: Design, **lens) -> Design:
+    return design.model_copy(update={"lens": design.lens.model_copy(update=lens)})

@@ -21,10 +21,9 @@ from ..design.design import Design
 from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
-from .bounds import Bounds, Box
 from .checkpoint import Log, restored
 from .parameters import Values, candidate, evaluated, start_values
-from .solve import NOT_FINITE, State, Stepper, run, solver_of, stepper
+from .solve import NOT_FINITE, Bounds, Box, State, Stepper, run, solver_of, stepper
 from .study import MOST_TYPES, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_of
 from .terms import TERMS, with_terms
