@@ -1,4 +1,4 @@
-"""Writes what the endoscope's study starts from, beside this file: `python design/endoscope.py`."""
+"""Write `endoscope-start.toml`, the initial design of the endoscope's study: `python design/endoscope.py`."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ SIZE = (4.4, 4.4)
 
 
 def main() -> None:
-    """A sensor of 5 mm under 60 lenses, a rough guess of the distances."""
+    """Write 60 lenses over a sensor of 5 mm, with a rough guess of the distances."""
     centers = random_layout(60, SIZE, diameter=None, seed=0).round(4).tolist()
     design = Design(
         name="endoscope-start",

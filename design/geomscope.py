@@ -1,4 +1,4 @@
-"""Writes the paper's design, in focus and as printed, beside this file: `python design/geomscope.py`."""
+"""Write `geomscope.toml` (in focus) and `geomscope-table1.toml` (as printed): `python design/geomscope.py`."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ HERE = Path(__file__).parent
 
 
 def main() -> None:
-    """Both differ in the sensor distance only."""
+    """Write both designs, which differ in the sensor distance only."""
     paper = "Tian, Hu, Yang: GEOMScope, Table 1; layout: gs_jax.random_layout, seed 0"
     for name, distance, note in (
         ("geomscope", 5.8, "sensor where traced rays from 20 mm are sharpest"),

@@ -1,4 +1,4 @@
-"""Writes the page of all keys of design files and its drawing beside this file: `python design/keys.py`."""
+"""Write `KEYS.md` and `geometry.svg`, the page of all keys of design files: `python design/keys.py`."""
 
 import math
 from pathlib import Path
@@ -15,22 +15,22 @@ HERE = Path(__file__).parent
 PAGE, DRAWING = HERE / "KEYS.md", HERE / "geometry.svg"
 HEAD = f"""# Keys of a design file
 
-<!-- Written by `python design/keys.py` from the descriptions of the fields in gs_jax/designs: change them there. -->
+<!-- Written by `python design/keys.py` from the descriptions of the fields in gs_jax/design. Edit those instead. -->
 
-{FRAME} The array's own frame is the plate's; `[calibration]` says how it is turned and shifted on the sensor.
+{FRAME} The frame of the array is that of the plate; `[calibration]` rotates and shifts it on the sensor.
 
 ![Side view and image, with axes and distances](geometry.svg)
 
-`gs-jax new-design -o my.toml` writes a file with these words as comments, by questions or by options; from there on it
-is edited by hand. A missing or extra key, a value that is not allowed or parts that do not fit together are refused in
-one line. What is allowed but not usual gets a question: `sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?`
+`gs-jax new-design -o my.toml` writes a file with these descriptions as comments, from prompts or options; edit it by
+hand afterwards. Missing or extra keys, invalid values and inconsistent parts are reported in one line. Valid but
+unusual values cause a question: `sensor_distance_mm = 5800: did you mean 5.8 mm (5800 um)?`
 """
 TAIL = """
 ## Lens centres from a file
 
-`centers_file` is read as programs and people write it: x and y in a line for each lens, separated by commas, semicolons
-(with decimal points or commas), tabs or blanks, with a header or without, with other columns beside them. Columns are
-found by their names (`x_um`, `Pos X [µm]`, `center x`, `column`), or else named:
+`centers_file` is a text table with x and y of one lens per line, separated by commas, semicolons (with decimal points
+or commas), tabs or blanks, with or without a header or other columns. Columns are recognised by name (`x_um`,
+`Pos X [µm]`, `center x`, `column`), or named explicitly:
 
 ```toml
 [array]
@@ -39,27 +39,27 @@ substrate_thickness_mm = 1.0
 centers_file = "vendor.csv"
 centers_columns = ["Pos X", "Pos Y"]
 centers_unit = "um"
-centers_origin = "corner"            # of the plate, where both are least
-mirror = true                        # the list shows the other side of the plate
+centers_origin = "corner"            # of the plate, with the smallest x and y
+mirror = true                        # the list describes the other side of the plate
 ```
 
-Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` are numbers of each lens, in place of the
-keys of these names in `[lens]`.
+Columns `radius_of_curvature_mm`, `aperture_diameter_mm` and `conic_constant` hold a number for each lens, and replace
+the keys of these names in `[lens]`.
 
-Pixels (`"px"`) are those of a capture: the first pixel's middle is (0, 0), x the column, y the row. `mirror` turns the
-plate over about its y axis, x against -x; about its x axis is the same with half a turn. `gs-jax calibrate` finds both
-by itself, and turns and shifts the array.
+Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel, x the column, y the row. `mirror` turns
+the plate over about its y axis, x to -x; turning it over about its x axis is the same plus half a turn.
+`gs-jax calibrate` detects mirroring itself, and estimates rotation and shift.
 
 ## In an editor
 
 `gs-jax new-design --schema > gs-jax.schema.json` writes the JSON schema of design files. With the first line
-`#:schema ./gs-jax.schema.json` in a design beside it, editors with Taplo (in VS Code: "Even Better TOML") complete
-keys, show what they mean and underline what is wrong, without a network; `taplo lint my.toml` checks in a terminal.
+`#:schema ./gs-jax.schema.json` in a design beside it, editors with Taplo (in VS Code: "Even Better TOML") complete and
+describe keys and underline errors, without a network; `taplo lint my.toml` checks in a terminal.
 """
 
 
 def page() -> str:
-    """The page, in Markdown."""
+    """Return the page in Markdown."""
     tables: dict[str, list[Key]] = {}
     for key in design_keys().values():
         tables.setdefault(key.table, []).append(key)
@@ -83,7 +83,7 @@ def _row(key: Key) -> str:
 
 
 def drawing() -> Figure:
-    """Distances from the side, and directions in the image."""
+    """Draw the distances in a side view, and the directions in the image."""
     figure = Figure(figsize=(12, 5.2), layout="constrained")
     side, image = figure.subplots(1, 2, width_ratios=(1.35, 1))
     _side(side)
@@ -118,7 +118,7 @@ def _side(axes: Axes) -> None:
     axes.plot([z, VERTEX, SENSOR], [y, lens, landing], color="#cc0000", lw=1.2)
     axes.plot([z, SENSOR], [y, landing], "o", color="#cc0000", ms=4)
     axes.text((z + VERTEX) / 2 + 0.5, (y + lens) / 2 + 0.28, "chief ray", color="#cc0000", rotation=-13)
-    # What a lens sees.
+    # Field of a lens.
     axes.plot([VERTEX, NEAR + 0.9], [lens, lens], ":", color="0.35", lw=1)
     _span(axes, (NEAR + 0.7, lens), (NEAR + 0.7, lens - 2.3), "field_radius_mm", (0.15, -0.75), ha="left")
     _span(axes, (SENSOR, -4.5), (VERTEX, -4.5), "sensor_distance_mm,\nv > 0", (0, -0.25))
@@ -151,7 +151,7 @@ def _span(axes: Axes, start, end, text: str, offset, ha: str = "center") -> None
 
 
 def _image(axes: Axes) -> None:
-    """As images are shown: rows go down."""
+    """Draw the sensor with rows downward, as images are displayed."""
     width, height, angle, shift = 8.0, 6.4, math.radians(25), np.array([0.7, 0.45])
     axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, facecolor="0.95", edgecolor="0.35", lw=1.5))
     axes.text(-width / 2, -height / 2 - 0.15, "sensor, as its image is shown; pixel (row 0, column 0)", fontsize=9)
@@ -192,9 +192,9 @@ def _image(axes: Axes) -> None:
 
 
 def main() -> None:
-    """Both files."""
+    """Write both files."""
     PAGE.write_text(page(), encoding="utf-8")
-    # The same bytes whenever it is drawn.
+    # Reproducible bytes.
     with matplotlib.rc_context({"svg.hashsalt": "gs_jax", "svg.fonttype": "path"}):
         drawing().savefig(DRAWING, metadata={"Date": None}, bbox_inches="tight")
 
