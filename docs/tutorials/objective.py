@@ -24,14 +24,14 @@ jax.config.update("jax_enable_x64", True)
 # %% [markdown]
 # ## A term
 #
-# A function of an imager and the conditions (`at.depths`) that gives a number or one for each depth. Here: how
-# much the magnification changes over the depths, in percent. A stack whose planes are all of one scale is easier to
-# read. The name ends in the unit that the function returns.
+# A term is a function of an imager and its conditions (`at.depths`) that returns one number, or one per depth. This one
+# is the change of the magnification over the depths, in percent: a stack whose planes have equal scale is easier to
+# read. The name of a term ends in its unit.
 
 
 # %%
 def scale_change(imager, at):
-    """Largest over smallest magnification, above one, percent."""
+    """Largest over smallest magnification, minus one, in percent."""
     m = imager.magnification(at.depths)
     return 100 * (jnp.max(m) / jnp.min(m) - 1)
 
