@@ -15,16 +15,29 @@ from scipy.spatial.transform import Rotation
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
 from gs_jax.apps.report.report_tables import tolerance_facts
-from gs_jax.apps.tolerance.depth_recovery import Bench, bench_of, depth_errors
-from gs_jax.apps.tolerance.device_model import LEVELS, RULED, built, drawn, in_units, no_errors, spreads_of, without
-from gs_jax.apps.tolerance.images import log_sharpness
-from gs_jax.apps.tolerance.reading import read_tolerances
-from gs_jax.apps.tolerance.surface import lens_squares, step_squares
-from gs_jax.apps.tolerance.tolerance_analysis import Outcome, _of_devices, _Question, together, tolerance
-from gs_jax.apps.tolerance.tolerance_report import as_json, changes, costs, picture, sentences
-from gs_jax.apps.tolerance.tolerance_spec import Tolerances
+from gs_jax.apps.tolerance.device_model import (
+    CONSTANT,
+    ERROR_FIELDS,
+    depth_arguments,
+    depth_errors,
+    lens_squares,
+    log_sharpness,
+    no_errors,
+    perturb,
+    sample_errors,
+    standard_deviations,
+    step_squares,
+)
+from gs_jax.apps.tolerance.tolerance_analysis import (
+    Outcome,
+    combine_changes,
+    make_problem,
+    measure_devices,
+    tolerance,
+)
+from gs_jax.apps.tolerance.tolerance_report import as_json, picture, rank_tolerances, sentences, summarise_changes
+from gs_jax.apps.tolerance.tolerance_spec import ToleranceSpec, read_tolerances
 from gs_jax.cli.fabrication import tolerance_command as command
-from gs_jax.design.datasheets import parts_of
 from gs_jax.geometry import envelope
 from gs_jax.objectives import Conditions
 from gs_jax.objectives.conditions import field_heights
@@ -75,15 +88,11 @@ def outcome(design) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def pinholes(design) -> Bench:
-    """Of lenses whose cores are on their chief rays, which have closed forms."""
-    bench = bench_of(design.imager(), np.array(DEPTHS))
-    nothing = bench.offsets._replace(here=0 * bench.offsets.here, slope=0 * bench.offsets.slope)
-    return bench._replace(offsets=nothing, changes=0 * bench.changes)
-
-
-def judged(imager: Imager) -> tuple[Imager, Conditions]:
-    return imager, Conditions(DEPTHS, 0.01)
+def pinholes(design):
+    """Arguments of `depth_errors` for lenses whose cores are on their chief rays, which have closed forms."""
+    imager, cores, sources, points = depth_arguments(design.imager(), np.array(DEPTHS))
+    zero = cores.offsets._replace(here=0 * cores.offsets.here, slope=0 * cores.offsets.slope)
+    return imager, cores._replace(offsets=zero, slopes=0 * cores.slopes), sources, points
 
 
 def single(**lens) -> Imager:
@@ -139,11 +148,11 @@ def test_the_strehl_ratio_of_a_line_of_rays_is_that_of_all(orientation):
 def test_images_of_wrong_lenses_by_optilands_rays(seed):
     """Radius, conic, index and distance wrong at once, 3 standard deviations of the defaults and more."""
     pytest.importorskip("optiland")
-    nominal = judged(single())
-    spreads = without(without(spreads_of(Tolerances(layer_um=0, roughness_nm=0)), "tilt"), "position")
-    errors = jax.tree.map(lambda x: 3 * x, in_units(drawn(jax.random.key(seed), 1), spreads))
+    nominal = single(), Conditions(DEPTHS, 0.01)
+    deviations = standard_deviations(ToleranceSpec(layer_um=0, roughness_nm=0, tilt_deg=0, position_um=0))
+    errors = jax.tree.map(lambda x: 3 * x, sample_errors(jax.random.key(seed), 1, deviations))
     width, ratio = map(np.exp, log_sharpness(*nominal, errors, jnp.array(0.005)))
-    imager = built(nominal[0], errors)
+    imager = perturb(nominal[0], errors)
     points, weights = map(np.asarray, pupil_quadrature(0.2))
     airy = float(theory.airy_sigma(imager.wavelength, imager.sensor_distance, 0.4))
     sag, v = np.asarray(imager.array.sag((points**2).sum(1))), float(imager.sensor_distance)
@@ -168,13 +177,13 @@ def test_images_of_wrong_lenses_by_optilands_rays(seed):
 def test_wrong_distances_and_indices_have_closed_forms(design, pinholes):
     """`M = v/z'` is what is seen, whatever made it: `-z' dv / (v + dv)`, and the plate's `t/n`."""
     nothing, n, v = no_errors(len(design.array.centers_mm)), 1.43, 3.8
-    reduced = np.asarray(pinholes.points.points)[:, 2] + 1 / n
-    farther, after = depth_errors(pinholes, dataclasses.replace(nothing, sensor_distance=jnp.array(0.05)))
+    reduced = np.asarray(pinholes[3].points)[:, 2] + 1 / n
+    farther, after = depth_errors(*pinholes, errors=dataclasses.replace(nothing, sensor_distance=jnp.array(0.05)))
     np.testing.assert_allclose(farther, -reduced * 0.05 / (v + 0.05), rtol=1e-6)
     np.testing.assert_allclose(after, 0, atol=1e-9)
-    denser, _ = depth_errors(pinholes, dataclasses.replace(nothing, index=jnp.array(0.01)))
+    denser, _ = depth_errors(*pinholes, errors=dataclasses.replace(nothing, index=jnp.array(0.01)))
     np.testing.assert_allclose(denser, 1 / (n + 0.01) - 1 / n, rtol=1e-6)
-    leaning, after = depth_errors(pinholes, dataclasses.replace(nothing, tilt=jnp.array([0.01, -0.004])))
+    leaning, after = depth_errors(*pinholes, errors=dataclasses.replace(nothing, tilt=jnp.array([0.01, -0.004])))
     assert np.abs(leaning).max() > 0.05
     np.testing.assert_allclose(after, 0, atol=1e-9)
 
@@ -196,25 +205,25 @@ def lines(centers, point, v, tilt, rotation, shift, plate) -> np.ndarray:
 def test_depths_by_scipys_fits(design, pinholes, seed):
     """The device's spots, the calibration and the points by straight lines and SciPy; nothing of ours."""
     centers, nominal = np.array(design.array.centers_mm), design.imager()
-    spreads = dataclasses.replace(spreads_of(Tolerances()), radius=jnp.zeros(()), conic=jnp.zeros(()))
-    errors = in_units(drawn(jax.random.key(seed), len(centers)), spreads)
+    deviations = standard_deviations(ToleranceSpec(radius_percent=0, conic=0))
+    errors = sample_errors(jax.random.key(seed), len(centers), deviations)
     v, plate = 3.8 + float(errors.sensor_distance), 1 / (1.43 + float(errors.index))
     wrong, tilt = centers + np.asarray(errors.centers), np.asarray(errors.tilt)
     tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "x_scale": "jac"}
 
-    def spots(sights):
-        pairs = zip(np.asarray(sights.points), np.asarray(sights.lenses), np.asarray(sights.are), strict=True)
-        return [(p, seen[are], lines(wrong[seen[are]], p, v, tilt, 0, (0, 0), plate)) for p, seen, are in pairs]
+    def spots(points):
+        rows = zip(*map(np.asarray, points), strict=True)
+        return [(p, lenses[on], lines(wrong[lenses[on]], p, v, tilt, 0, (0, 0), plate)) for p, lenses, on in rows]
 
     def off(unknown, some):
         made = [lines(centers[at], p, unknown[0], unknown[1:3], unknown[3], unknown[4:], 1 / 1.43) for p, at, _ in some]
         return np.concatenate([(a - b[2]).ravel() for a, b in zip(made, some, strict=True)])
 
-    seen = spots(pinholes.sources)
+    seen = spots(pinholes[2])
     fitted = least_squares(off, [3.8, 0, 0, 0, 0, 0], args=(seen,), **tight).x
     assert nominal.tilt is None
-    for found, believed in zip(depth_errors(pinholes, errors), ([3.8, 0, 0, 0, 0, 0], fitted), strict=True):
-        for row, one in list(enumerate(spots(pinholes.points)))[::4]:
+    for found, believed in zip(depth_errors(*pinholes, errors=errors), ([3.8, 0, 0, 0, 0, 0], fitted), strict=True):
+        for row, one in list(enumerate(spots(pinholes[3])))[::4]:
             place = lambda q, one=one, believed=believed: off(believed, [(q, *one[1:])])
             z = least_squares(place, one[0], **tight).x[2]
             # Our steps end within 0.1 um: a thousandth of what can be told apart.
@@ -223,14 +232,12 @@ def test_depths_by_scipys_fits(design, pinholes, seed):
 
 @pytest.mark.integration
 def test_gradients_are_finite_differences(design, outcome):
-    spreads, nothing = spreads_of(outcome.tolerances), no_errors(len(design.array.centers_mm))
-    designed = parts_of(design, np.array(DEPTHS))
-    parts = tuple((one, dataclasses.replace(at, clear_diameter=None)) for one, at in designed)
-    question = _Question(parts, bench_of(design.imager(), np.array(DEPTHS)), jnp.array(0.005))
+    deviations, nothing = standard_deviations(outcome.tolerances), no_errors(len(design.array.centers_mm))
     fields = ["radius", "conic", "index", "sensor_distance"]
-    ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(spreads, f)}) for f in fields for s in (1, -1)]
-    found = _of_devices(question, jax.tree.map(lambda *parts: jnp.stack(parts), *ends))
-    names = {field: name for name, field in RULED.items()}
+    ends = [dataclasses.replace(nothing, **{f: s * 0.01 * getattr(deviations, f)}) for f in fields for s in (1, -1)]
+    problem = make_problem(design, np.array(DEPTHS))
+    found = measure_devices(problem, jax.tree.map(lambda *parts: jnp.stack(parts), *ends))
+    names = {field: name for name, field in ERROR_FIELDS.items()}
     for row, field in enumerate(fields):
         for part, by_gradient in zip(found, outcome.alone[names[field]], strict=True):
             slope = np.abs(part[2 * row] - part[2 * row + 1]) / 0.02
@@ -238,17 +245,17 @@ def test_gradients_are_finite_differences(design, outcome):
 
 
 @pytest.mark.integration
-def test_what_is_drawn_is_what_gradients_say(outcome):
+def test_random_devices_agree_with_gradients(outcome):
     """Where all is nearly linear; 100 devices have an RMS within 20 % or so."""
-    found = changes(outcome)
+    found = summarise_changes(outcome)
     for key in ("depth_error_um", "depth_error_calibrated_um"):
         assert found["all, drawn"][key] == pytest.approx(found["all, by gradient"][key], rel=0.25)
-    squares = [sum(np.asarray(outcome.alone[n].calibrated) ** 2 for n in RULED if n not in LEVELS)]
-    np.testing.assert_allclose(together(outcome.alone).calibrated, np.sqrt(squares[0]))
+    squares = [sum(np.asarray(outcome.alone[n].calibrated) ** 2 for n in ERROR_FIELDS if n not in CONSTANT)]
+    np.testing.assert_allclose(combine_changes(outcome.alone).calibrated, np.sqrt(squares[0]))
 
 
 @pytest.mark.integration
-def test_what_a_calibration_is_for(outcome):
+def test_calibration_removes_distance_and_tilt(outcome):
     """Distance and tilt are found by it and cost nothing; what remains is where lenses are, and what they are."""
     alone = outcome.alone
     assert all(np.abs(alone[name].calibrated).max() < 1e-3 for name in ("sensor distance", "tilt"))
@@ -268,8 +275,8 @@ def test_roughness_takes_light_from_the_core(outcome):
 @pytest.mark.integration
 def test_yields(design, outcome):
     assert 0 <= outcome.all_met.mean() <= min(met.mean() for met in outcome.met.values())
-    assert set(outcome.yields_without) == set(RULED) and costs(outcome)[0] in sentences(outcome)[1]
-    perfect = Tolerances(**dict.fromkeys(set(Tolerances.model_fields) - {"pixel_um"}, 0.0))
+    assert set(outcome.yields_without) == set(ERROR_FIELDS) and rank_tolerances(outcome)[0] in sentences(outcome)[1]
+    perfect = ToleranceSpec(**dict.fromkeys(set(ToleranceSpec.model_fields) - {"pixel_um"}, 0.0))
     good = tolerance(design, perfect, depths=DEPTHS, draws=2)
     assert good.all_met.all() and not good.yields_without
     assert "No tolerance alone costs yield" in sentences(good)[1]
@@ -285,9 +292,9 @@ def test_the_picture_and_the_numbers(outcome):
     assert numbers["depth_mm"] == list(DEPTHS) and len(numbers["places_mm"]) == 5
     low, middle, high = (numbers["drawn"]["spot_width_um"][key] for key in ("p5", "p50", "p95"))
     assert all(a < b < c for a, b, c in zip(low, middle, high, strict=True))
-    assert set(numbers["by_gradient"]) == {*RULED, "all"} and sorted(numbers["costs"]) == sorted(RULED)
+    assert set(numbers["by_gradient"]) == {*ERROR_FIELDS, "all"} and sorted(numbers["costs"]) == sorted(ERROR_FIELDS)
     shown = tolerance_facts(numbers)
-    assert {row[0] for row in shown.rows} > set(RULED) and {len(row) for row in shown.rows} == {6}
+    assert {row[0] for row in shown.rows} > set(ERROR_FIELDS) and {len(row) for row in shown.rows} == {6}
     assert shown.widths["devices, median"] == (numbers["depth_mm"], middle)
 
 
@@ -299,7 +306,7 @@ def test_the_command(folder, monkeypatch, capsys):
     assert (status, err) == (0, "") and "Yield:" in out and "all, by gradient" in out and "…" not in out
     assert max(map(len, out.split("- Yield")[0].splitlines())) <= 80
     numbers = json.loads((folder / "t.json").read_text())
-    assert numbers["tolerances"] == Tolerances(position_um=1.0, tilt_deg=0.3).model_dump()
+    assert numbers["tolerances"] == ToleranceSpec(position_um=1.0, tilt_deg=0.3).model_dump()
     assert numbers["drawn"]["devices"] == 20 and numbers["provenance"]["command"].startswith("gs-jax tolerance")
     assert {path.name for path in folder.iterdir()} == {"design.toml", "made.toml", "t.json", "t.png"}
 
@@ -338,10 +345,10 @@ def test_designs_that_have_no_answer(design):
 
 
 def test_files_and_options_say_the_same(folder):
-    (folder / "all.toml").write_text("\n".join(f"{k} = {v}" for k, v in Tolerances().model_dump().items()))
-    assert read_tolerances("all.toml") == Tolerances()
+    (folder / "all.toml").write_text("\n".join(f"{k} = {v}" for k, v in ToleranceSpec().model_dump().items()))
+    assert read_tolerances("all.toml") == ToleranceSpec()
     options = {param.name for param in command.params}
-    assert set(Tolerances.model_fields) <= options
+    assert set(ToleranceSpec.model_fields) <= options
     for text in ("roughness_nm = -1.0", "conic = true", "nonsense"):
         (folder / "bad.toml").write_text(text)
         with pytest.raises(InputError, match="bad.toml"):

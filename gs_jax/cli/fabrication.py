@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from ..apps.tolerance.tolerance_spec import Tolerances
+from ..apps.tolerance.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
@@ -130,7 +130,7 @@ def mask_command(design: Path, output: Path):
 
 def _options(command):
     """An option for each tolerance."""
-    for name, field in reversed(Tolerances.model_fields.items()):
+    for name, field in reversed(ToleranceSpec.model_fields.items()):
         least, most = (getattr(bound, side) for bound, side in zip(field.metadata, ("ge", "le"), strict=True))
         unit = name.rpartition("_")[2] if "_" in name else ""
         text = f"{str(field.title)[:1].upper()}{str(field.title)[1:]}.  [default: {field.default:g}]"
@@ -170,7 +170,7 @@ def tolerance_command(
     positions: Path | None,
     draws: int,
     seed: int,
-    **amounts: Any,
+    **tolerances: Any,
 ):
     """Show how well the microscope of DESIGN must be made: what tolerances do to spots and depths, and the yield.
 
@@ -181,9 +181,9 @@ def tolerance_command(
     import numpy as np
     from rich.console import Console
 
-    from ..apps.tolerance.reading import read_tolerances
     from ..apps.tolerance.tolerance_analysis import tolerance
     from ..apps.tolerance.tolerance_report import as_json, picture, sentences, tables
+    from ..apps.tolerance.tolerance_spec import read_tolerances
     from ..design.design import design_text, read_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
@@ -196,8 +196,8 @@ def tolerance_command(
         check_output(output, [".json"])
         check_output(drawing, [".png"])
         check_may_write(output, drawing, inputs=(design, file, positions))
-    given = {name: value for name, value in amounts.items() if value is not None}
-    chosen = (read_tolerances(file) if file else Tolerances()).model_copy(update=given)
+    given = {name: value for name, value in tolerances.items() if value is not None}
+    chosen = (read_tolerances(file) if file else ToleranceSpec()).model_copy(update=given)
     sources = None
     if positions:
         sources, _ = read_positions(positions, [])

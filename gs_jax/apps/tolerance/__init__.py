@@ -1,1 +1,1 @@
-"""How well a microscope must be made: what tolerances do to its spots and depths, and how many devices are good."""
+"""Tolerance analysis: effects of fabrication errors on spots and depths, and the yield."""

@@ -1,18 +1,53 @@
-"""Devices as they come out: what is wrong with each, and the microscope that it then is."""
+"""A device with fabrication errors: its imager, the sharpness of its images, and the errors of depths found with it.
+
+A printer makes a slope `s` of terraces, `layer` high and `layer / s` wide, and smooths their edges over its `pixel`, to
+ramps of that width. This differs from the wanted slope by a sawtooth of up to `(layer - pixel s) / 2` to both sides:
+the mean square is `(layer - pixel s)^2 / 12`, that of its slope `s (layer / pixel - s)`. Terraces narrower than a pixel
+vanish: a running mean over a pixel would leave a tail, but a printer's spot is rounder.
+
+A device puts the spots of a point where `gs_jax.calibration` expects cores: on chief rays, displaced as exact rays
+show. The displacement changes linearly with the lens's shape, as far as tolerances go. A point is located from its
+spots by least squares, with the geometry of the design, or with one that is first fitted to the spots of point sources
+at known positions. There is no noise: what is left is the device's error.
+"""
 
 import dataclasses
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Float64, Int, Key
 
+from ...base.errors import InputError
+from ...calibration.unknowns import (
+    FITTED,
+    Known,
+    Offsets,
+    Unknowns,
+    applied,
+    core_powers,
+    guessed,
+    offsets_of,
+    residuals,
+)
 from ...geometry import Imager
-from .tolerance_spec import Tolerances
+from ...lenses import MicrolensArray
+from ...objectives.conditions import Conditions, clear_diameter
+from ...objectives.spot_size import spot_width
+from ...optics.psf import axial_strehl
+from ...optics.raytrace import to_numpy
+from ...optics.theory import FWHM
+from ...typing import ScalarLike
+from .tolerance_spec import ToleranceSpec
 
-# What a tolerance is called, and the fields of `Errors` that it rules.
-RULED = {
+# The field of `Errors` that each tolerance sets.
+ERROR_FIELDS = {
     "position": "centers",
     "radius": "radius",
     "conic": "conic",
@@ -22,15 +57,25 @@ RULED = {
     "roughness": "roughness",
     "printed layers": "layer",
 }
-# Those that every device has as they are.
-LEVELS = ("roughness", "printed layers")
+# The tolerances that are the same for every device.
+CONSTANT = ("roughness", "printed layers")
+# Rings of equal area in a lens: terraces are wide in its middle only.
+_RINGS = 256
+# A single lens gives no depth.
+_MIN_LENSES = 2
+# Steps of the finite differences of core positions: relative, of the conic constant, and of the index.
+_STEPS = {"radius": 0.01, "conic": 0.05, "index": 0.005}
+# Depths at which cores are traced; interpolation has kinks there, which few asked depths meet.
+_CORE_DEPTHS = 4
+# Gauss-Newton steps: lens position errors leave a residual, which each step makes a few times smaller.
+_ITERATIONS = 10
 
 
 class Errors(eqx.Module):
-    """What is wrong with a device, each number in its unit or in standard deviations.
+    """The errors of a device, or their standard deviations.
 
     `centers` of the lenses `(lens, 2)`, mm; `radius`, relative; `conic`; `index`; `sensor_distance`, mm; `tilt`, slopes
-    `(x, y)`; `roughness`, RMS, and `layer` of the printer, mm.
+    `(x, y)`; RMS `roughness`, mm; `layer` of the printer, mm.
     """
 
     centers: Float[Array, "..."]
@@ -43,57 +88,234 @@ class Errors(eqx.Module):
     layer: Float[Array, "..."]
 
 
-def spreads_of(tolerances: Tolerances) -> Errors:
-    """Standard deviations, or levels, as numbers in mm and slopes."""
-    t = tolerances
-    return Errors(
-        centers=jnp.asarray(t.position_um / 1000),
-        radius=jnp.asarray(t.radius_percent / 100),
-        conic=jnp.asarray(t.conic),
-        index=jnp.asarray(t.index),
-        sensor_distance=jnp.asarray(t.sensor_distance_um / 1000),
-        tilt=jnp.asarray(math.tan(math.radians(t.tilt_deg))),
-        roughness=jnp.asarray(t.roughness_nm * 1e-6),
-        layer=jnp.asarray(t.layer_um / 1000),
-    )
+def standard_deviations(spec: ToleranceSpec) -> Errors:
+    """The tolerances in mm and slopes."""
+    numbers = {
+        "centers": spec.position_um / 1000,
+        "radius": spec.radius_percent / 100,
+        "conic": spec.conic,
+        "index": spec.index,
+        "sensor_distance": spec.sensor_distance_um / 1000,
+        "tilt": math.tan(math.radians(spec.tilt_deg)),
+        "roughness": spec.roughness_nm * 1e-6,
+        "layer": spec.layer_um / 1000,
+    }
+    return Errors(**{name: jnp.asarray(number) for name, number in numbers.items()})
 
 
 def no_errors(lenses: int) -> Errors:
-    """Of a device as it is designed."""
+    """The errors of a perfect device."""
     zero = jnp.zeros(())
     return Errors(jnp.zeros((lenses, 2)), zero, zero, zero, zero, jnp.zeros(2), zero, zero)
 
 
-def drawn(key: Key[Array, ""], lenses: int) -> Errors:
-    """A device, in standard deviations."""
+def sample_errors(key: Key[Array, ""], lenses: int, deviations: Errors) -> Errors:
+    """Sample the errors of a device."""
     flat, tree = jax.tree.flatten(no_errors(lenses))
     keys = jax.random.split(key, len(flat))
-    unit = jax.tree.unflatten(tree, [jax.random.normal(k, part.shape) for k, part in zip(keys, flat, strict=True)])
-    one = jnp.ones(())
-    return dataclasses.replace(unit, **{RULED[name]: one for name in LEVELS})
+    normal = jax.tree.unflatten(tree, [jax.random.normal(k, part.shape) for k, part in zip(keys, flat, strict=True)])
+    normal = dataclasses.replace(normal, **{ERROR_FIELDS[name]: jnp.ones(()) for name in CONSTANT})
+    return jax.tree.map(jnp.multiply, normal, deviations)
 
 
-def in_units(unit: Errors, spreads: Errors) -> Errors:
-    """What is wrong, from standard deviations."""
-    return jax.tree.map(jnp.multiply, unit, spreads)
+def without_tolerance(deviations: Errors, name: str) -> Errors:
+    """The standard deviations with one tolerance at zero."""
+    field = ERROR_FIELDS[name]
+    return dataclasses.replace(deviations, **{field: jnp.zeros_like(getattr(deviations, field))})
 
 
-def without(spreads: Errors, name: str) -> Errors:
-    """The same with one tolerance at zero."""
-    field = RULED[name]
-    return dataclasses.replace(spreads, **{field: jnp.zeros_like(getattr(spreads, field))})
-
-
-def built(imager: Imager, errors: Errors) -> Imager:
-    """The microscope that a device is."""
-    a = imager.array
+def perturb(imager: Imager, errors: Errors) -> Imager:
+    """The imager of a device with errors."""
     array = dataclasses.replace(
-        a,
-        centers=a.centers + errors.centers,
-        radius_of_curvature=a.radius_of_curvature * (1 + errors.radius),
-        conic_constant=a.conic_constant + errors.conic,
-        refractive_index=a.refractive_index + errors.index,
+        imager.array,
+        centers=imager.array.centers + errors.centers,
+        radius_of_curvature=imager.array.radius_of_curvature * (1 + errors.radius),
+        conic_constant=imager.array.conic_constant + errors.conic,
+        refractive_index=imager.array.refractive_index + errors.index,
     )
     tilt = errors.tilt if imager.tilt is None else imager.tilt + errors.tilt
     distance = imager.sensor_distance + errors.sensor_distance
     return dataclasses.replace(imager, array=array, sensor_distance=distance, tilt=tilt)
+
+
+def step_squares(
+    slope: Float[Array | np.ndarray, " place"], layer: ScalarLike, pixel: ScalarLike
+) -> tuple[Float[Array, " place"], Float[Array, " place"]]:
+    """Mean squares of a printed surface's height error, mm^2, and of its slope error, by the wanted slope."""
+    slope = jnp.asarray(slope)
+    left = jnp.maximum(layer - pixel * slope, 0)
+    return left**2 / 12, slope * left / pixel
+
+
+def lens_squares(
+    array: MicrolensArray, radius: ScalarLike, layer: ScalarLike, pixel: ScalarLike, wavelength: ScalarLike
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean squares of a lens's height error, mm^2, and of the slope error that bends rays, within a radius, mm.
+
+    Steps of many waves bend rays by their slope. Thin ones diffract a little light far away and leave the core as
+    narrow as it is. Between them slopes count by the share of the light that their height takes from the core.
+    """
+    squared = jnp.asarray((np.arange(_RINGS) + 0.5) / _RINGS) * radius**2
+    height, slope = step_squares(array.sag_slope_over_r(squared) * jnp.sqrt(squared), layer, pixel)
+    scattered = -jnp.expm1(log_strehl_of_height(height, array.refractive_index, wavelength))
+    return jnp.mean(height), jnp.mean(slope * scattered)
+
+
+def log_strehl_of_height(
+    square: ScalarLike | Float[Array, " place"], refractive_index: ScalarLike, wavelength: ScalarLike
+) -> Float[Array, "..."]:
+    """Logarithm of `exp(-(2 pi (n - 1) sigma / lambda)^2)`, the light that stays in the spot's core.
+
+    Exact for normally distributed heights; `square` is `sigma^2`, mm^2.
+    """
+    return -((2 * np.pi * (jnp.asarray(refractive_index) - 1) / wavelength) ** 2) * square
+
+
+def log_sharpness(
+    nominal: Imager, at: Conditions, errors: Errors, pixel: Float[Array, ""]
+) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:
+    """Logarithms of the spot width in the object, mm, and of the Strehl ratio on the axis.
+
+    Both are means over the plate (the width's square), whose tilt changes the lenses' distance from the sensor; the
+    width also over the field, as in `gs_jax.objectives.spot_width`. Slopes of the printer's steps widen spots by
+    `(n - 1)` times the slope times `v'`. `pixel` is the printer's, mm.
+    """
+    # Lens positions do not change images.
+    errors = dataclasses.replace(errors, centers=jnp.zeros_like(nominal.array.centers))
+    imager, radius = perturb(nominal, errors), clear_diameter(nominal, at) / 2
+    assert imager.tilt is not None
+    # The square of a width is a quadratic of the height: four places at the RMS coordinates give the lenses' mean.
+    x, y = jnp.sqrt(jnp.mean(nominal.centers**2, 0))
+    heights = jnp.stack([jnp.stack(place) for place in ((x, y), (x, -y), (-x, y), (-x, -y))]) @ imager.tilt
+
+    def at_height(height):
+        lifted = dataclasses.replace(imager, sensor_distance=imager.sensor_distance + height)
+        ratio = jax.vmap(lambda depth: axial_strehl(lifted, depth, radius=radius))(at.depths)
+        return spot_width(lifted, at), ratio
+
+    widths, ratios = jax.vmap(at_height)(heights)
+    array = imager.array
+    height_square, slope_square = lens_squares(array, radius, errors.layer, pixel, imager.wavelength)
+    # A printer's steps are along the radius: half of their slopes' square is along each axis.
+    bent = (array.refractive_index - 1) * imager.reduced_depth(at.depths)
+    squared = jnp.mean(widths**2, 0) + (FWHM * bent) ** 2 * slope_square / 2
+    scatter = log_strehl_of_height(errors.roughness**2 + height_square, array.refractive_index, imager.wavelength)
+    return jnp.log(squared) / 2, jnp.log(jnp.mean(ratios, 0)) + scatter
+
+
+class VisiblePoints(NamedTuple):
+    """Points, mm, and the lenses that see each; entries of `lenses` count where `seen`."""
+
+    points: Float[Array, "point 3"]
+    lenses: Int[Array, "point lens"]
+    seen: Bool[Array, "point lens"]
+
+
+class CoreModel(NamedTuple):
+    """Core positions of the design, and their derivatives by radius, conic constant and index."""
+
+    offsets: Offsets
+    slopes: Float[Array, "change type depth power"]
+
+
+def depth_arguments(
+    imager: Imager, depths: Float64[np.ndarray, " depth"], sources: Float64[np.ndarray, "source 3"] | None = None
+) -> tuple[Imager, CoreModel, VisiblePoints, VisiblePoints]:
+    """The imager, cores, sources and points that `depth_errors` takes.
+
+    Points are, at each of the depths, in the middle of the plate and half-way to its corners. The default sources are
+    on the axis at the nearest, the middle and the farthest depth, and a field radius beside it at the middle one.
+
+    Raises
+    ------
+    InputError
+        If fewer than two lenses see a point or a source.
+    """
+    if imager.tilt is None:
+        imager = dataclasses.replace(imager, tilt=np.zeros(2))
+    near, far = depths.min(), max(depths.max(), 1.01 * depths.min())
+    if sources is None:
+        middle = (near + far) / 2
+        sources = np.array([[0, 0, near], [0, 0, middle], [imager.field_radius, 0, middle], [0, 0, far]])
+    centers = np.asarray(imager.centers, np.float64)
+    x, y = np.abs(centers - centers.mean(0)).max(0) / 2
+    places = centers.mean(0) + np.array([[0, 0], [-x, -y], [x, -y], [-x, y], [x, y]])
+    points = np.array([[*place, depth] for depth in depths for place in places])
+    near, far = min(near, sources[:, 2].min()), max(far, sources[:, 2].max())
+    beyond = min(0.1 * (far - near), near / 2)
+    traced = np.linspace(near - beyond, far + beyond, _CORE_DEPTHS)
+    offsets, perfect, slopes = offsets_of(imager, traced), no_errors(len(centers)), []
+    here = np.asarray(offsets.here, np.float64)
+    for name, step in _STEPS.items():
+        changed = perturb(imager, dataclasses.replace(perfect, **{name: jnp.asarray(step)}))
+        slopes.append(jnp.asarray((core_powers(changed, traced) - here) / step))
+    cores = CoreModel(offsets, jnp.stack(slopes))
+    return imager, cores, _visible(imager, sources), _visible(imager, points)
+
+
+def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisiblePoints:
+    """With the lenses within the field radius of each point whose image is on the sensor."""
+    views = to_numpy(imager).views_of_all(points)
+    spots = views.spot.transpose(1, 0, 2)
+    left, right, bottom, top = imager.sensor.extent
+    on_sensor = (spots > (left, top)).all(-1) & (spots < (right, bottom)).all(-1)
+    seen = (np.hypot(*views.offset.T) < imager.field_radius) & on_sensor
+    count = seen.sum(1)
+    if count.min() < _MIN_LENSES:
+        x, y, z = points[count.argmin()]
+        found = f"a point at x {x:.4g}, y {y:.4g}, z {z:.4g} mm that {count.min()} lenses see"
+        raise InputError(f"`array.centers_mm`: found {found}, allowed: {_MIN_LENSES} or more, to know its depth.")
+    lenses = np.argsort(~seen, axis=1, kind="stable")[:, : count.max()]
+    return VisiblePoints(jnp.asarray(points), jnp.asarray(lenses), jnp.asarray(np.take_along_axis(seen, lenses, 1)))
+
+
+def depth_errors(
+    imager: Imager, cores: CoreModel, sources: VisiblePoints, points: VisiblePoints, errors: Errors
+) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
+    """Depth errors of points seen by a device, mm: with the geometry of the design, and with a calibrated one.
+
+    The imager is the design's, with a `tilt`; the device is calibrated by the sources.
+    """
+    device = perturb(imager, errors)
+    change = jnp.tensordot(jnp.stack([errors.radius, errors.conic, errors.index]), cores.slopes, 1)
+    offsets = cores.offsets._replace(here=cores.offsets.here + change)
+    photographed = _photograph(device, offsets, sources, imager, cores.offsets)
+    fitted = _least_squares(lambda unknowns: residuals(unknowns, photographed), guessed(FITTED, photographed))
+    assumed = jax.tree.map(lambda *two: jnp.stack(two), imager, applied(fitted, imager))
+
+    def error(assumed, point):
+        one = VisiblePoints(*(part[None] for part in point))
+        spots = _photograph(device, offsets, one, assumed, cores.offsets)
+        spots = spots._replace(unknown=jnp.array([[0, 0], [0, 1], [0, 2]]))
+        start = Unknowns(coordinates=point.points)
+        located = _least_squares(lambda unknowns: residuals(unknowns, spots), start)
+        assert located.coordinates is not None
+        return located.coordinates[2] - point.points[2]
+
+    designed, calibrated = jax.vmap(lambda assumed: jax.vmap(lambda point: error(assumed, point))(points))(assumed)
+    return designed, calibrated
+
+
+def _photograph(device: Imager, offsets: Offsets, points: VisiblePoints, assumed: Imager, known: Offsets) -> Known:
+    """The device's spots of points, as a calibration that assumes another imager takes them."""
+    count, most = points.lenses.shape
+    sources, lenses, seen = jnp.repeat(jnp.arange(count), most), points.lenses.ravel(), points.seen.ravel()
+    nowhere = jnp.zeros((count * most, 2), points.points.dtype)
+    spots = Known(device, points.points, jnp.zeros((0, 2), int), sources, lenses, nowhere, seen, offsets)
+    places = residuals(Unknowns(), spots) * device.sensor.pixel_pitch
+    return spots._replace(places=places, imager=assumed, offsets=known)
+
+
+def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns) -> Unknowns:
+    """Minimise a sum of squares by Gauss-Newton steps."""
+    state, unravel = ravel_pytree(start)
+    flat = lambda state: residual(unravel(state)).ravel()
+
+    def step(_, state):
+        slopes = jax.jacfwd(flat)(state)
+        # Units in which all unknowns move spots equally.
+        scale = 1 / jnp.sqrt(jnp.sum(slopes**2, 0))
+        q, r = jnp.linalg.qr(slopes * scale[None])
+        return state - scale * solve_triangular(r, q.T @ flat(state))
+
+    return unravel(jax.lax.fori_loop(0, _ITERATIONS, step, state))

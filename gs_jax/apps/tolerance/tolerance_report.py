@@ -1,4 +1,4 @@
-"""What tolerances cost, for people and for files: tables, sentences, a picture, and numbers with their units."""
+"""A tolerance analysis as tables, sentences, a figure, and numbers for JSON."""
 
 from typing import Any
 
@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from .device_model import RULED
-from .tolerance_analysis import LEAST_STREHL, Measures, Outcome, together
+from .device_model import ERROR_FIELDS
+from .tolerance_analysis import LEAST_STREHL, Measures, Outcome, combine_changes
 
-# How an amount is said: the fields of `Tolerances`, and what comes after each.
-_AMOUNTS = {
+# Each tolerance with its unit, by fields of `ToleranceSpec`.
+_FORMATS = {
     "position": "{position_um:g} um",
     "radius": "{radius_percent:g} %",
     "conic": "{conic:g}",
@@ -20,17 +20,18 @@ _AMOUNTS = {
     "roughness": "{roughness_nm:g} nm",
     "printed layers": "{layer_um:g}, {pixel_um:g} um",
 }
-# Of percentiles that are shown.
+# Percentiles that are shown.
 _LOW, _HIGH = 5, 95
 
 
-def changes(outcome: Outcome) -> dict[str, dict[str, float | None]]:
-    """RMS over depths and places of what each tolerance does alone, of all together by gradient, and of the devices.
+def summarise_changes(outcome: Outcome) -> dict[str, dict[str, float | None]]:
+    """RMS over depths and points of the change by each tolerance, by all together by gradient, and of the devices.
 
-    Keys are the columns of `tables`; the Strehl ratio counts where it is 0.1 or more as designed, None if nowhere.
+    The Strehl ratio counts at depths where it is 0.1 or more as designed; None if nowhere.
     """
     strong = np.exp(outcome.nominal.log_strehl) >= LEAST_STREHL
     drawn = Measures(*(each - one for each, one in zip(outcome.devices, outcome.nominal, strict=True)))
+    rows = {**outcome.alone, "all, by gradient": combine_changes(outcome.alone), "all, drawn": drawn}
     rms = lambda x: float(np.sqrt(np.mean(np.asarray(x) ** 2)))
     return {
         name: {
@@ -39,91 +40,79 @@ def changes(outcome: Outcome) -> dict[str, dict[str, float | None]]:
             "depth_error_um": 1000 * rms(each.designed),
             "depth_error_calibrated_um": 1000 * rms(each.calibrated),
         }
-        for name, each in {**outcome.alone, "all, by gradient": together(outcome.alone), "all, drawn": drawn}.items()
+        for name, each in rows.items()
     }
 
 
-def costs(outcome: Outcome) -> list[str]:
-    """The tolerances, the one that costs most first: by the yield without it, then by what it does to a target."""
-    found = changes(outcome)
-    whole = found["all, by gradient"]
-
-    def share(name: str) -> float:
-        keys = ("spot_width_percent", "strehl_percent", "depth_error_calibrated_um")
-        parts = [((found[name][key] or 0.0) / (whole[key] or 1.0)) ** 2 for key in keys]
-        return max(parts)
-
-    return sorted(RULED, key=lambda name: (outcome.yields_without.get(name, 0.0), share(name)), reverse=True)
+def rank_tolerances(outcome: Outcome) -> list[str]:
+    """The tolerances by cost: by the yield without each, then by its share in the change of a measure."""
+    changes = summarise_changes(outcome)
+    total = changes["all, by gradient"]
+    keys = ("spot_width_percent", "strehl_percent", "depth_error_calibrated_um")
+    share = lambda name: max(((changes[name][key] or 0.0) / (total[key] or 1.0)) ** 2 for key in keys)
+    return sorted(ERROR_FIELDS, key=lambda name: (outcome.yields_without.get(name, 0.0), share(name)), reverse=True)
 
 
 def sentences(outcome: Outcome) -> list[str]:
-    """What came out, in words."""
+    """The result in words."""
     percent = lambda x: f"{100 * x:.3g} %"
     parts = ", ".join(f"{name} {percent(met.mean())}" for name, met in outcome.met.items())
-    whole = outcome.all_met.mean()
-    said = [f"Yield: {percent(whole)} of {len(outcome.all_met)} devices keep all targets ({parts})."]
-    first = costs(outcome)[0]
+    whole, first = outcome.all_met.mean(), rank_tolerances(outcome)[0]
+    lines = [f"Yield: {percent(whole)} of {len(outcome.all_met)} devices meet all targets ({parts})."]
     gained = outcome.yields_without.get(first, whole)
     if gained > whole:
-        said.append(f"Costs most: {first} ({_amount(outcome, first)}). Without it the yield is {percent(gained)}.")
+        lines.append(f"Costs most: {first} ({_amount(outcome, first)}). Without it the yield is {percent(gained)}.")
     else:
-        said.append("No tolerance alone costs yield: none of them at zero makes it larger.")
-    rms = changes(outcome)["all, drawn"]
+        lines.append("No tolerance alone costs yield: setting one to zero does not raise it.")
+    rms = summarise_changes(outcome)["all, drawn"]
     before, after = rms["depth_error_um"], rms["depth_error_calibrated_um"]
-    said.append(f"Depths are {before:.3g} um off RMS by the design's geometry, {after:.3g} um once it is calibrated.")
+    lines.append(
+        f"The RMS depth error is {before:.3g} um with the design's geometry, {after:.3g} um after calibration."
+    )
     if not (np.exp(outcome.nominal.log_strehl) >= LEAST_STREHL).any():
-        text = f"below {LEAST_STREHL:g} at all depths: it says nothing of this design, and is no target."
-        said.append(f"The Strehl ratio is {text}")
-    return said
+        lines.append(f"The Strehl ratio is below {LEAST_STREHL:g} at all depths: it is no target for this design.")
+    return lines
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """What each tolerance does, and the devices depth by depth. All fit 80 columns."""
-    return [_by_tolerance(outcome), _by_depth(outcome)]
+    """The effect of each tolerance, and the devices depth by depth. Both fit 80 columns."""
+    cell = lambda value: "-" if value is None else "0" if value < 5e-4 else f"{value:.3g}"
+    by_tolerance = _table(
+        "Effect of each tolerance alone, by gradient: RMS over depths and points",
+        ("tolerance", "", "width\n%", "Strehl\n%", "depth\num", "calibrated\num", "yield %\nwithout"),
+    )
+    changes, whole = summarise_changes(outcome), f"{100 * outcome.all_met.mean():.3g}"
+    without = {name: f"{100 * value:.3g}" for name, value in outcome.yields_without.items()} | {"all, drawn": whole}
+    amounts = {name: _amount(outcome, name) for name in ERROR_FIELDS} | {
+        "all, drawn": f"{len(outcome.all_met)} devices"
+    }
+    for name in (*rank_tolerances(outcome), "all, by gradient", "all, drawn"):
+        by_tolerance.add_row(name, amounts.get(name, ""), *map(cell, changes[name].values()), without.get(name, ""))
+    by_depth = _table(
+        "By depth: as designed, and of the devices",
+        ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num"),
+    )
+    (width, strehl), (widths, strehls) = _linear(outcome.nominal), _linear(outcome.devices)
+    columns = (
+        outcome.depths,
+        *1000 * np.array([width, *np.percentile(widths, (50, _HIGH), axis=0)]),
+        *(np.where(ratio >= 1e-3, ratio, 0.0) for ratio in (strehl, *np.percentile(strehls, (50, _LOW), axis=0))),
+        *1000 * np.array(_rms_by_depth(outcome)),
+    )
+    for row in zip(*columns, strict=True):
+        by_depth.add_row(*(f"{x:.0f}" if x >= 100 else f"{x:.3g}" for x in row))
+    return [by_tolerance, by_depth]
 
 
-def _by_tolerance(outcome: Outcome) -> Table:
-    title = "What each tolerance does alone, by gradient: RMS over depths and places"
-    heads = ("tolerance", "", "width\n%", "Strehl\n%", "depth\num", "calibrated\num", "yield %\nwithout")
-    table, found = _empty(title, heads), changes(outcome)
-    for name in costs(outcome):
-        without = outcome.yields_without.get(name)
-        kept = "" if without is None else f"{100 * without:.3g}"
-        table.add_row(name, _amount(outcome, name), *map(_cell, found[name].values()), kept)
-    count, whole = len(outcome.all_met), 100 * outcome.all_met.mean()
-    table.add_row("all, by gradient", "", *map(_cell, found["all, by gradient"].values()), "")
-    table.add_row("all, drawn", f"{count} devices", *map(_cell, found["all, drawn"].values()), f"{whole:.3g}")
-    return table
-
-
-def _by_depth(outcome: Outcome) -> Table:
-    title = "By depth: as designed, and of the devices"
-    heads = ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num")
-    table = _empty(title, heads)
-    one, many = _linear(outcome.nominal), _linear(outcome.devices)
-    designed, calibrated = (1000 * errors for errors in _rms_by_depth(outcome))
-    for row, depth in enumerate(outcome.depths):
-        width, ratio = many[0][:, row], many[1][:, row]
-        cells = (1000 * one[0][row], *1000 * np.percentile(width, (50, _HIGH)))
-        ratios = (one[1][row], *np.percentile(ratio, (50, _LOW)))
-        cells = (depth, *cells, *(x if x >= 1e-3 else 0.0 for x in ratios), designed[row], calibrated[row])
-        table.add_row(*(f"{x:.0f}" if x >= 100 else f"{x:.3g}" for x in cells))
-    return table
-
-
-def _empty(title, heads) -> Table:
+def _table(title: str, heads: tuple[str, ...]) -> Table:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for head in heads:
         table.add_column(head, justify="left" if head in ("tolerance", "") else "right")
     return table
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None else "0" if value < 5e-4 else f"{value:.3g}"
-
-
 def _amount(outcome: Outcome, name: str) -> str:
-    return _AMOUNTS[name].format(**outcome.tolerances.model_dump())
+    return _FORMATS[name].format(**outcome.tolerances.model_dump())
 
 
 def _linear(measures: Measures) -> tuple[np.ndarray, np.ndarray]:
@@ -131,31 +120,36 @@ def _linear(measures: Measures) -> tuple[np.ndarray, np.ndarray]:
     return np.exp(measures.log_width), np.exp(measures.log_strehl)
 
 
+def _by_depth(errors, count: int) -> np.ndarray:
+    """Depth errors of all devices and points, `(_, depth)`."""
+    return errors.reshape(-1, count, errors.shape[-1] // count).transpose(0, 2, 1).reshape(-1, count)
+
+
 def _rms_by_depth(outcome: Outcome) -> list[np.ndarray]:
-    """Of depth errors over devices and places, mm: with the design's geometry and a calibrated one."""
-    pair, count = (outcome.devices.designed, outcome.devices.calibrated), len(outcome.depths)
-    return [np.sqrt((errors.reshape(len(errors), count, -1) ** 2).mean((0, 2))) for errors in pair]
+    """RMS depth errors, mm: with the geometry of the design, and of the calibrated device."""
+    pair = (outcome.devices.designed, outcome.devices.calibrated)
+    return [np.sqrt((_by_depth(errors, len(outcome.depths)) ** 2).mean(0)) for errors in pair]
 
 
 def as_json(outcome: Outcome) -> dict[str, Any]:
-    """The numbers of an outcome; lists have an entry a depth."""
-    one, many = _linear(outcome.nominal), _linear(outcome.devices)
+    """The numbers of an outcome; lists have an entry per depth."""
+    (width, strehl), (widths, strehls) = _linear(outcome.nominal), _linear(outcome.devices)
     count = len(outcome.depths)
 
-    def spread(values, factor=1.0):
-        low, middle, high = np.percentile(factor * values, (_LOW, 50, _HIGH), axis=0)
-        named = {"mean": factor * values.mean(0), "sd": factor * values.std(0), "p5": low, "p50": middle, "p95": high}
-        return {key: _rounded(value) for key, value in named.items()}
+    def distribution(values):
+        low, middle, high = np.percentile(values, (_LOW, 50, _HIGH), axis=0)
+        numbers = {"mean": values.mean(0), "sd": values.std(0), "p5": low, "p50": middle, "p95": high}
+        return {key: _rounded(value) for key, value in numbers.items()}
 
-    by_depth = lambda errors: errors.reshape(len(errors), count, -1).transpose(0, 2, 1).reshape(-1, count)
-    alone = {
+    rms = lambda errors: _rounded(1000 * np.sqrt((_by_depth(errors, count) ** 2).mean(0)))
+    by_gradient = {
         name: {
             "spot_width_percent": _rounded(100 * each.log_width),
             "strehl_percent": _rounded(100 * each.log_strehl),
-            "depth_error_um": _rounded(1000 * np.sqrt((each.designed.reshape(count, -1) ** 2).mean(1))),
-            "depth_error_calibrated_um": _rounded(1000 * np.sqrt((each.calibrated.reshape(count, -1) ** 2).mean(1))),
+            "depth_error_um": rms(each.designed),
+            "depth_error_calibrated_um": rms(each.calibrated),
         }
-        for name, each in {**outcome.alone, "all": together(outcome.alone)}.items()
+        for name, each in {**outcome.alone, "all": combine_changes(outcome.alone)}.items()
     }
     return {
         "design": outcome.design,
@@ -167,74 +161,74 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
             "min_strehl": _rounded(outcome.limits.strehl),
             "max_depth_error_um": _rounded(1000 * outcome.limits.depth_error),
         },
-        "nominal": {"spot_width_um": _rounded(1000 * one[0]), "strehl_on_axis": _rounded(one[1])},
+        "nominal": {"spot_width_um": _rounded(1000 * width), "strehl_on_axis": _rounded(strehl)},
         "drawn": {
             "devices": len(outcome.all_met),
-            "spot_width_um": spread(many[0], 1000),
-            "strehl_on_axis": spread(many[1]),
-            "depth_error_um": spread(by_depth(outcome.devices.designed), 1000),
-            "depth_error_calibrated_um": spread(by_depth(outcome.devices.calibrated), 1000),
+            "spot_width_um": distribution(1000 * widths),
+            "strehl_on_axis": distribution(strehls),
+            "depth_error_um": distribution(1000 * _by_depth(outcome.devices.designed, count)),
+            "depth_error_calibrated_um": distribution(1000 * _by_depth(outcome.devices.calibrated, count)),
         },
-        "by_gradient": alone,
-        "over_depths": changes(outcome),
+        "by_gradient": by_gradient,
+        "over_depths": summarise_changes(outcome),
         "yield": float(outcome.all_met.mean()),
         "yield_by_target": {name: float(met.mean()) for name, met in outcome.met.items()},
         "yield_without": outcome.yields_without,
-        "costs": costs(outcome),
+        "costs": rank_tolerances(outcome),
     }
 
 
 def _rounded(values) -> list[float]:
-    """Six digits, more than any of these is worth."""
+    """To six digits."""
     return [float(f"{value:.6g}") for value in np.asarray(values)]
 
 
 def picture(outcome: Outcome) -> Figure:
-    """Shares of the tolerances in each measure's mean square, and the devices' spread over the depths."""
+    """Shares of the tolerances in each measure's mean square, and the devices' measures by depth."""
     figure = Figure(figsize=(12, 8), dpi=100, layout="constrained")
     (shares, widths), (ratios, errors) = figure.subplots(2, 2)
     _draw_shares(shares, outcome)
-    one, many, limits = _linear(outcome.nominal), _linear(outcome.devices), outcome.limits
-    _draw_spread(widths, outcome.depths, 1000 * one[0], 1000 * many[0], 1000 * limits.width)
-    widths.set(ylabel="spot width in the object, um", ylim=(0, None), title="spot width")
-    _draw_spread(ratios, outcome.depths, one[1], many[1], np.where(limits.strehl > 0, limits.strehl, np.nan))
-    ratios.set(ylabel="Strehl ratio on the axis", ylim=(0, None), title="Strehl ratio")
-    labels = ("by the design's geometry", "calibrated")
-    for rms, label, color in zip(_rms_by_depth(outcome), labels, ("C1", "C0"), strict=True):
+    limits = outcome.limits
+    targets = (1000 * limits.width, np.where(limits.strehl > 0, limits.strehl, np.nan))
+    for axes, factor, nominal, devices, target in zip(
+        (widths, ratios), (1000, 1), _linear(outcome.nominal), _linear(outcome.devices), targets, strict=True
+    ):
+        low, middle, high = np.percentile(factor * devices, (_LOW, 50, _HIGH), axis=0)
+        axes.fill_between(outcome.depths, low, high, color="C0", alpha=0.25, label="devices, 5 to 95 %")
+        axes.plot(outcome.depths, middle, "C0o-", label="devices, median")
+        axes.plot(outcome.depths, factor * nominal, "k-", label="as designed")
+        axes.plot(outcome.depths, target, "k:", label="target")
+    for rms, label, color in zip(
+        _rms_by_depth(outcome), ("design's geometry", "calibrated"), ("C1", "C0"), strict=True
+    ):
         errors.plot(outcome.depths, 1000 * rms, "o-", color=color, label=label)
     errors.plot(outcome.depths, 1000 * limits.depth_error, "k:", label="target, of each point")
-    errors.set(ylabel="depth error, um RMS", ylim=(0, None), title="depth of a point, over devices and places")
+    widths.set(ylabel="spot width in the object, um", title="spot width")
+    ratios.set(ylabel="Strehl ratio on the axis", title="Strehl ratio")
+    errors.set(ylabel="depth error, um RMS", title="depth of a point, over devices and points")
     for axes in (widths, ratios, errors):
-        axes.set_xlabel("depth z, mm")
+        axes.set(xlabel="depth z, mm", ylim=(0, None))
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     name = "".join(c for c in outcome.design if " " <= c <= "~").replace("$", r"\$")
-    whole = f"{100 * outcome.all_met.mean():.3g} % of {len(outcome.all_met)} devices keep all targets"
+    whole = f"{100 * outcome.all_met.mean():.3g} % of {len(outcome.all_met)} devices meet all targets"
     figure.suptitle(f"{name}: {whole}")
     return figure
 
 
 def _draw_shares(axes, outcome: Outcome) -> None:
-    found = changes(outcome)
-    below = "" if found[next(iter(RULED))]["strehl_percent"] is not None else f",\nnot above {LEAST_STREHL:g}"
-    labels = ("spot width", f"Strehl ratio{below}", "depth", "depth,\ncalibrated")
-    rows = np.arange(len(labels))
-    values = np.array([[(x or 0.0) ** 2 for x in found[name].values()] for name in RULED])
+    changes = summarise_changes(outcome)
+    labels = ["spot width", "Strehl ratio", "depth", "depth,\ncalibrated"]
+    if changes["position"]["strehl_percent"] is None:
+        labels[1] += f",\nnot above {LEAST_STREHL:g}"
+    values = np.array([[(x or 0.0) ** 2 for x in changes[name].values()] for name in ERROR_FIELDS])
     total = values.sum(0)
     values = 100 * values / np.where(total > 0, total, 1)
-    left = np.zeros(len(labels))
-    for number, name in enumerate(RULED):
-        axes.barh(rows, values[number], left=left, color=f"C{number}", label=f"{name}, {_amount(outcome, name)}")
-        left += values[number]
+    rows, left = np.arange(len(labels)), np.cumsum(values, 0) - values
+    for number, name in enumerate(ERROR_FIELDS):
+        label = f"{name}, {_amount(outcome, name)}"
+        axes.barh(rows, values[number], left=left[number], color=f"C{number}", label=label)
     axes.set_yticks(rows, labels)
     axes.invert_yaxis()
-    axes.set(xlabel="share of the mean square change, by gradient, %", xlim=(0, 100), title="what costs what")
+    axes.set(xlabel="share of the mean square change, by gradient, %", xlim=(0, 100), title="shares of the tolerances")
     axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
-
-
-def _draw_spread(axes, depths, nominal, many, limit) -> None:
-    low, middle, high = np.percentile(many, (_LOW, 50, _HIGH), axis=0)
-    axes.fill_between(depths, low, high, color="C0", alpha=0.25, label="devices, 5 to 95 %")
-    axes.plot(depths, middle, "C0o-", label="devices, median")
-    axes.plot(depths, nominal, "k-", label="as designed")
-    axes.plot(depths, limit, "k:", label="target")
