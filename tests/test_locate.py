@@ -19,10 +19,11 @@ from gs_jax.design.design import read_design
 from gs_jax.detection.clustering import find_clusters
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.locate import find_points
+from gs_jax.layouts import interleave
 from gs_jax.metrics import localization
 from gs_jax.optics.psf_core import clear_area
 from gs_jax.simulation.phantoms import random_points
-from gs_jax.simulation.synthetic import Camera, expose, simulate_points
+from gs_jax.simulation.synthetic import Camera, expose, simulate, simulate_points
 
 from .helpers import needs
 
@@ -168,6 +169,28 @@ def test_what_only_half_of_the_lenses_see_is_a_ghost():
     assert len(find(capture)) == 0
     volume = backproject(capture.astype(np.float32), imager, grid)
     assert len(find_clusters(volume, grid, noise_floor=0)) >= 2
+
+
+@pytest.mark.integration
+def test_points_of_two_foci():
+    """All of the light and noise; one type is in focus at 20 mm, the other at 27 mm, about 23 mm both are read."""
+    design = geomscope()
+    centers = np.array(design.array.centers_mm)
+    centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:32]]
+    side = 2 * np.abs(centers).max() + 1.2
+    radii = np.array([2.03, 2.18])[interleave(centers, 2)]
+    small = design.replace(centers_mm=centers, size_mm=(side, side), shape=(1250, 1250), pixel_pitch_um=9.0)
+    imager = small.replace(radius_of_curvature_mm=radii).imager()
+    truth = random_points(20, (2.4, 2.4), (18.5, 29.5), seed=0)
+    # Cores are traced once for each depth.
+    truth[:, 2] = np.linspace(18.8, 29.3, 7)[np.arange(20) % 7]
+    image = simulate(truth, imager)
+    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=2e4))
+    found = find_points(capture, imager, Grid.over(imager.sensor, depths=[18.0, 30.0], pitch=0.1))
+    score = localization(found, truth, lateral=0.045, axial=0.43)
+    assert score.f1 >= 0.95
+    # A third of a pixel in the object, and what moves a spot of the outer lenses by as much.
+    assert score.lateral_rmse < 0.012 and score.axial_rmse < 0.1
 
 
 def test_two_lenses_may_be_blocked():

@@ -303,22 +303,34 @@ def _consistent(
     profile = spot_profile(seen, signal.light)
     spots, owner = seen.pixels[seen.seen], np.argwhere(seen.seen)
     tree = KDTree(spots)
-    left, height = seen.light.copy(), np.zeros(len(candidates))
+    left, height, points = seen.light.copy(), np.zeros_like(seen.light), np.zeros(len(candidates), bool)
     places = candidates / (voxels.pitch, voxels.pitch, float(voxels.depths[1] - voxels.depths[0]))
     for number, mine in enumerate(seen.seen):
-        if (np.linalg.norm(places[height > 0] - places[number], axis=1) < 1).any():
+        if (np.linalg.norm(places[points] - places[number], axis=1) < 1).any():
             continue
         one = select_readings(seen, slice(number, number + 1))._replace(light=left[number : number + 1].copy())
-        bright = agreed_level(one.light, one.seen, SHARE)[0] >= _OWN * np.median(seen.light[number, mine])
-        if not (bright and _lit(one, as_bright, tests)[0]):
+        excess = one.light - _OWN * _median_of_type(seen, seen.light, number)
+        if not (agreed_level(excess, one.seen, SHARE)[0] >= 0 and _lit(one, as_bright, tests)[0]):
             continue
-        height[number] = np.median(left[number, mine])
-        pixels = seen.pixels[number, mine]
-        for pixel, others in zip(pixels, tree.query_ball_point(pixels, REACH), strict=True):
+        points[number] = True
+        height[number] = np.maximum(_median_of_type(seen, left, number), 0)
+        pixels, heights = seen.pixels[number, mine], height[number, mine]
+        for pixel, own, others in zip(pixels, heights, tree.query_ball_point(pixels, REACH), strict=True):
             distance = np.hypot(*(spots[others] - pixel).T)
-            left[tuple(owner[others].T)] -= height[number] * np.interp(distance, np.arange(REACH + 1), profile)
-    points = height > 0
-    return candidates[points], select_readings(seen, points), (left + height[:, None])[points]
+            left[tuple(owner[others].T)] -= own * np.interp(distance, np.arange(REACH + 1), profile)
+    return candidates[points], select_readings(seen, points), (left + height)[points]
+
+
+def _median_of_type(
+    seen: Readings, light: Float64[np.ndarray, "point lens"], point: int
+) -> Float64[np.ndarray, " lens"]:
+    """Median light of one point over the lenses of each lens's type, as types are not equally sharp; 0 where unseen."""
+    median = np.zeros(light.shape[1])
+    kind = np.zeros(len(median), int) if seen.lens_type is None else seen.lens_type[point]
+    for number in np.unique(kind[seen.seen[point]]):
+        same = seen.seen[point] & (kind == number)
+        median[same] = np.median(light[point, same])
+    return median
 
 
 def _intensity(
