@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +12,20 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from experiments.calibration import NAMES, device, on_captures, true_values
-from gs_jax import Grid, Imager, InputError, Sensor, read_design, write_capture, write_design
+from gs_jax import (
+    Camera,
+    Grid,
+    Imager,
+    InputError,
+    MicrolensArray,
+    Sensor,
+    expose,
+    random_layout,
+    read_design,
+    simulate,
+    write_capture,
+    write_design,
+)
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import Calibration, calibrate
@@ -105,9 +119,13 @@ def test_an_ideal_lens_puts_its_core_on_the_chief_ray():
     np.testing.assert_allclose(core_offsets(focused, np.array([20.0]), np.linspace(0, 2, 3)), 0, atol=1e-4)
 
 
-def test_lenses_beside_the_sensor_are_left_out():
-    """A plate that is larger than the sensor, mounted to one side."""
+@pytest.mark.parametrize("types", [1, 2])
+def test_lenses_beside_the_sensor_are_left_out(types):
+    """A plate that is larger than the sensor, mounted to one side; numbers of single lenses stay theirs."""
     design = geomscope()
+    if types == 2:
+        centers = np.array(design.array.centers_mm)
+        design = design.replace(radius_of_curvature_mm=np.where(centers[:, 0] > 0, 2.0, 2.1))
     imager = eqx.tree_at(lambda i: i.shift, design.imager(), jnp.array([4.0, 0.0]))
     nothing = Spots(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     sources = Sources(POINTS, np.arange(3))
@@ -116,6 +134,9 @@ def test_lenses_beside_the_sensor_are_left_out():
     left, all_of_them = len(new.array.centers_mm), len(design.array.centers_mm)
     assert 0.5 * all_of_them < left < all_of_them
     assert new.provenance["lenses_beside_the_sensor"] == all_of_them - left
+    if types == 2:
+        expected = np.where(np.array(new.array.centers_mm)[:, 0] > 0, 2.0, 2.1)
+        np.testing.assert_array_equal(new.lens.radius_of_curvature_mm, expected)
 
 
 # Of an array, relative: what is near to a lens depends on the pitch.
@@ -249,6 +270,29 @@ def test_lenses_of_no_list_are_found():
     away = np.asarray(KDTree(np.asarray(actual.centers)).query(np.asarray(found.imager.centers))[0])
     assert len(away) >= 10 and np.median(away) < 0.002 and away.max() < 0.01
     check(found, actual, NAMES[:1])
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("numbers", [{"radius_of_curvature": (2.0, 2.1)}, {"aperture_diameter": (2.0, 1.0)}])
+def test_lenses_of_two_types_and_no_list_are_found(numbers):
+    """With all of the light and noise; the list has other places, and its types in another order."""
+    centers = np.asarray(random_layout(28, (7.5, 7.5), seed=1))
+    each = {name: np.resize(values, len(centers)) for name, values in numbers.items()}
+    actual = Imager(MicrolensArray(centers, size=(7.5, 7.5), **each), Sensor((1000, 1000), 0.009), 5.8, 2.5)
+    points = np.array([[0.4, -0.3, 18.0], [-0.5, 0.2, 22.0]])
+    images = [
+        expose(simulate(np.append(p, 1)[None], actual), Camera(), jax.random.key(0), peak_electrons=1e4) for p in points
+    ]
+    listed = {name: values[::-1] for name, values in each.items()}
+    array = dataclasses.replace(actual.array, centers=1.7 * centers[::-1], **listed)
+    design = dataclasses.replace(actual, array=array, sensor_distance=5.86)
+    found = calibrate(images, points, design, find_lenses=True)
+    away, lens = KDTree(centers).query(np.asarray(found.imager.centers))
+    assert len(away) >= 10 and away.max() < 0.01
+    for name, values in each.items():
+        np.testing.assert_allclose(getattr(found.imager.array, name), values[lens], rtol=1e-6)
+    off = float(found.imager.sensor_distance - actual.sensor_distance)
+    assert abs(off) < 4 * found.deviations["sensor_distance_mm"]
 
 
 def test_lenses_of_no_list_are_where_they_are_without_the_designs_tilt():

@@ -1,5 +1,6 @@
 """The geometry of a microscope from captures of point sources whose places are known, at least in part."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager
+from ..lenses import EACH
 from ..typing import Image
 from .matching import near_of
 from .sources import Sources, Spots, assigned
@@ -32,7 +34,6 @@ from .unknowns import (
     applied,
     found_points,
     guessed,
-    moved_lenses,
     offsets_of,
     residuals,
     weighed,
@@ -125,8 +126,8 @@ def calibrate(
     Raises
     ------
     InputError
-        If points and captures do not fit together, a pixel is not finite, `find_lenses` is asked for and lenses
-        differ, no pattern of lenses is seen, or the spots do not determine what is to be fitted.
+        If points and captures do not fit together, a pixel is not finite, no pattern of lenses is seen, or the spots do
+        not determine what is to be fitted.
 
     Examples
     --------
@@ -141,8 +142,6 @@ def calibrate(
     >>> print(round(float(found.imager.sensor_distance), 1), round(float(found.imager.rotation), 3), found.mirrored)
     5.9 0.02 False
     """
-    if find_lenses and not imager.array.alike:
-        raise InputError("find_lenses: found lenses that differ, allowed: lenses that are alike.")
     progress = progress or Progress()
     captures = np.arange(len(points)) if captures is None else captures
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
@@ -156,7 +155,10 @@ def calibrate(
         spots = threads.map(spots_in, images, [imager] * len(images), many)
         found = [each for each, _ in zip(spots, progress.track(images, "Finding spots"), strict=True)]
     with progress.step("Matching lenses"):
-        start = begin_without_lenses(found, sources, imager) if find_lenses else begin(found, sources, imager)
+        if find_lenses:
+            start = begin_without_lenses(found, sources, imager, images)
+        else:
+            start = begin(found, sources, imager)
     if find_lenses:
         fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
     loose = _ANYWHERE * near_of(start.imager.array.centers) if find_lenses else _PRINTED
@@ -167,7 +169,9 @@ def calibrate(
 def _seen_alone(found: Calibration) -> Calibration:
     """With the lenses that have spots."""
     seen, lenses = np.unique(found.spots.lenses, return_inverse=True)
-    array = moved_lenses(found.imager.array, found.imager.array.centers[seen])
+    array = found.imager.array
+    numbers = {name: value[seen] if (value := getattr(array, name)).ndim else value for name in EACH}
+    array = dataclasses.replace(array, centers=array.centers[seen], **numbers)
     imager = eqx.tree_at(lambda i: i.array, found.imager, array)
     return found._replace(imager=imager, spots=found.spots._replace(lenses=lenses))
 

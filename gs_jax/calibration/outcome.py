@@ -9,11 +9,13 @@ from pydantic import ValidationError
 from rich.table import Table
 
 from ..base.errors import InputError
+from ..design.centers import LENS_KEYS
 from ..design.checks import reach
 from ..design.design import Design
 from ..design.tables import CalibrationTable
 from ..io.provenance import Provenance
 from ..io.toml import one_line
+from ..lenses import EACH, MicrolensArray
 from .fit import Calibration
 
 # Length of the longest arrow in a picture, in sides of the sensor.
@@ -50,8 +52,10 @@ def calibrated(design: Design, found: Calibration, provenance: Provenance | None
         "calibrated_values": {name: float(f"{value:.9g}") for name, value in found.values.items()},
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in found.deviations.items()},
     }
+    lens = design.lens.model_copy(update=_of_each_lens(imager.array))
     new = design.model_copy(
         update={
+            "lens": lens,
             "array": array,
             "imaging": design.imaging.model_copy(update={"sensor_distance_mm": one(imager.sensor_distance)}),
             "calibration": places,
@@ -60,13 +64,21 @@ def calibrated(design: Design, found: Calibration, provenance: Provenance | None
     )
     distance, radius = reach(new)
     if new.sensor.origin_mm is None and (distance > radius).any():
-        on = tuple(pair for pair, off in zip(pairs, distance > radius, strict=True) if not off)
-        new = new.model_copy(update={"array": array.model_copy(update={"centers_mm": on})})
+        on = np.flatnonzero(distance <= radius)
+        kept = {key: tuple(values[k] for k in on) for key, values in _of_each_lens(imager.array).items()}
+        array = array.model_copy(update={"centers_mm": tuple(pairs[k] for k in on)})
+        new = new.model_copy(update={"array": array, "lens": lens.model_copy(update=kept)})
         new.provenance["lenses_beside_the_sensor"] = len(pairs) - len(on)
     try:
         return Design.model_validate(new.model_dump())
     except ValidationError as error:
         raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
+
+
+def _of_each_lens(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
+    """Values of the keys of `[lens]` that are lists, by the fewest decimals that give the array's numbers."""
+    numbers = {key: np.asarray(getattr(array, name)) for key, name in zip(LENS_KEYS, EACH, strict=True)}
+    return {key: tuple(float(str(one)) for one in value) for key, value in numbers.items() if value.ndim}
 
 
 def table(design: Design, found: Calibration) -> Table:

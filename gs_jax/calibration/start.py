@@ -1,17 +1,21 @@
 """Where a calibration begins: rotation, mirror, shift and sensor distance from the pattern of the lenses."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Array, Float64, Int, Shaped
 from scipy.spatial import KDTree
 
 from ..base.errors import InputError
+from ..detection.consistency import signal
 from ..geometry import Imager
-from ..lenses import MicrolensArray
+from ..lenses import EACH, MicrolensArray, lenses_by_type
+from ..optics.lens_types import FIELDS
+from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
 from .matching import Similarity, match, match_shift, meeting_lenses, near_of
 from .sources import Sources, assigned
@@ -27,6 +31,8 @@ _GUESSES = 6
 _SHARED = 0.5
 # How near lines pass that meet in a lens of no list, in field radii: 0.06 mm of the paper's.
 _MEETING = 0.02
+# Half the sides of the squares of a spot that tell a lens's type, pixels, and how often types are chosen again.
+_SQUARES, _ROUNDS = (1, 5), 10
 
 
 class Start(NamedTuple):
@@ -146,8 +152,15 @@ def _without(spots, point, imager: Imager):
     return spots[np.asarray(KDTree(views.spot[seen, 0]).query(spots)[0]) > near_of(imager.array.centers)]
 
 
-def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: Sources, imager: Imager) -> Start:
-    """Lens centres from what the captures of known points have in common, at the sensor distance that agrees best.
+def begin_without_lenses(
+    found: Sequence[Float64[np.ndarray, "_ 2"]],
+    sources: Sources,
+    imager: Imager,
+    images: Sequence[Shaped[Array | np.ndarray, "row column"]] = (),
+) -> Start:
+    """Finds lens centres in what the captures of known points have in common, at the best sensor distance.
+
+    Where the design's lenses are of several types, `images` tell which type each lens is, by the light of its spots.
 
     Raises
     ------
@@ -173,5 +186,65 @@ def begin_without_lenses(found: Sequence[Float64[np.ndarray, "_ 2"]], sources: S
     zero = jnp.zeros((), imager.sensor_distance.dtype)
     distance = imager.reduced_sensor_distance * step - imager.array.air_behind
     # Rotation, shift and tilt are in the lenses' places.
-    new = (moved_lenses(imager.array, centers), distance, zero, jnp.zeros(2, zero.dtype), None)
-    return Start(eqx.tree_at(where, imager, new, is_leaf=lambda leaf: leaf is None), False, sources)
+    types = [imager.array.lens(int(which[0])) for which in lenses_by_type(imager.array)]
+    new = (moved_lenses(types[0], centers), distance, zero, jnp.zeros(2, zero.dtype), None)
+    start = eqx.tree_at(where, imager, new, is_leaf=lambda leaf: leaf is None)
+    if len(types) > 1:
+        of_type = [eqx.tree_at(lambda i: i.array, start, moved_lenses(one, centers)) for one in types]
+        array = array_of_types(
+            types, centers, lens_types([images[int(k)] for k in sources.captures], spots, points, of_type)
+        )
+        start = eqx.tree_at(lambda i: i.array, start, array)
+    return Start(start, False, sources)
+
+
+def array_of_types(types: Sequence[MicrolensArray], centers, of_lens: Int[np.ndarray, " lens"]) -> MicrolensArray:
+    """Lenses at some centres, each with the numbers of its type."""
+    numbers = {name: np.array([float(getattr(one, name)) for one in types])[of_lens] for name in EACH}
+    return dataclasses.replace(types[0], centers=jnp.asarray(centers, types[0].centers.dtype), **numbers)
+
+
+def lens_types(
+    images: Sequence[Shaped[Array | np.ndarray, "row column"]],
+    spots: Sequence[Float64[np.ndarray, "_ 2"]],
+    points: Float64[np.ndarray, "image 3"],
+    imagers: Sequence[Imager],
+) -> Int[np.ndarray, " lens"]:
+    """The type of each lens, by the light of its spots in a small and in a large square, one point in each image.
+
+    Exact rays predict the light for each type, up to the brightness of the source and the camera's blur: a factor for
+    each capture and square. Types and factors are those of the least sum of absolute deviations of the logarithms.
+    """
+    host, count = to_numpy(imagers[0]), len(imagers[0].array.centers)
+    near, fields = near_of(host.array.centers), np.linspace(0, host.field_radius, FIELDS)
+    sides = [(2 * half + 1) * host.sensor.pixel_pitch for half in _SQUARES]
+    depths = np.unique(points[:, 2])
+    tables = np.array([[ensquared_light(one, depths, fields, side) for side in sides] for one in imagers])
+    off = np.full((len(imagers), len(images), len(sides), count), np.nan)
+    for number, (image, places, point) in enumerate(zip(images, spots, points, strict=True)):
+        views = host.views_of_all(point[None])
+        field = np.linalg.norm(views.offset[:, 0], axis=1)
+        distance, nearest = KDTree(places).query(views.spot[:, 0])
+        seen = np.flatnonzero((distance < near) & (field < host.field_radius))
+        light, middle = signal(image).light, np.rint(host.sensor.to_pixels(places[nearest[seen]])).astype(int)
+        for square, half in enumerate(_SQUARES):
+            side = np.arange(-half, half + 1)
+            at = [np.clip(part[:, None] + side, 0, size - 1) for part, size in zip(middle.T, light.shape, strict=True)]
+            total = light[at[0][:, :, None], at[1][:, None]].sum((1, 2))
+            table = tables[:, square, np.searchsorted(depths, point[2])]
+            expected = np.stack([np.interp(field[seen], fields, row) for row in table])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off[:, number, square, seen] = np.log(total) - np.log(expected)
+    off[~np.isfinite(off)] = np.nan
+    off = off[:, np.isfinite(off).any((0, 2, 3))]
+    least, best = np.inf, np.zeros(count, int)
+    # From the brightnesses of the sources by which some lens is of some type, the median over all lenses is found.
+    for number, lens in np.ndindex(len(imagers), count):
+        gain = off[number, :, :, lens]
+        for _ in range(_ROUNDS):
+            cost = np.nansum(np.abs(off - gain[..., None]), (1, 2))
+            of_lens = cost.argmin(0)
+            gain = np.nanmedian(off[of_lens, :, :, np.arange(count)], 0)
+        if (total := cost.min(0).sum()) < least and np.isfinite(gain).all():
+            least, best = total, of_lens
+    return best
