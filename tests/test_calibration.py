@@ -1,6 +1,7 @@
 """Calibration: spots and their lenses, geometry from spots that we put somewhere, and from ray-traced captures."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -277,7 +278,7 @@ def test_lenses_of_no_list_are_found():
 def test_lenses_of_two_types_and_no_list_are_found(numbers):
     """With all of the light and noise; the list has other places, and its types in another order."""
     centers = np.asarray(random_layout(28, (7.5, 7.5), seed=1))
-    each = {name: np.resize(values, len(centers)) for name, values in numbers.items()}
+    each: dict[str, Any] = {name: np.resize(values, len(centers)) for name, values in numbers.items()}
     actual = Imager(MicrolensArray(centers, size=(7.5, 7.5), **each), Sensor((1000, 1000), 0.009), 5.8, 2.5)
     points = np.array([[0.4, -0.3, 18.0], [-0.5, 0.2, 22.0]])
     images = [

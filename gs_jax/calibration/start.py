@@ -33,6 +33,8 @@ _SHARED = 0.5
 _MEETING = 0.02
 # Half the sides of the squares of a spot that tell a lens's type, pixels, and how often types are chosen again.
 _SQUARES, _ROUNDS = (1, 5), 10
+# Least share of a point's light in a square, whose logarithm is finite.
+_LEAST_SHARE = 1e-12
 
 
 class Start(NamedTuple):
@@ -224,7 +226,7 @@ def lens_types(
     for number, (image, places, point) in enumerate(zip(images, spots, points, strict=True)):
         views = host.views_of_all(point[None])
         field = np.linalg.norm(views.offset[:, 0], axis=1)
-        distance, nearest = KDTree(places).query(views.spot[:, 0])
+        distance, nearest = map(np.asarray, KDTree(places).query(views.spot[:, 0]))
         seen = np.flatnonzero((distance < near) & (field < host.field_radius))
         light, middle = signal(image).light, np.rint(host.sensor.to_pixels(places[nearest[seen]])).astype(int)
         for square, half in enumerate(_SQUARES):
@@ -233,18 +235,15 @@ def lens_types(
             total = light[at[0][:, :, None], at[1][:, None]].sum((1, 2))
             table = tables[:, square, np.searchsorted(depths, point[2])]
             expected = np.stack([np.interp(field[seen], fields, row) for row in table])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                off[:, number, square, seen] = np.log(total) - np.log(expected)
-    off[~np.isfinite(off)] = np.nan
+            logs = np.log(np.where(total > 0, total, np.nan)) - np.log(np.maximum(expected, _LEAST_SHARE))
+            off[:, number, square, seen] = logs
     off = off[:, np.isfinite(off).any((0, 2, 3))]
-    least, best = np.inf, np.zeros(count, int)
-    # From the brightnesses of the sources by which some lens is of some type, the median over all lenses is found.
+    total = lambda gain: np.nansum(np.abs(off - gain[..., None]), (1, 2))
+    solutions = []
+    # Alternate from the factors by which some lens is of some type.
     for number, lens in np.ndindex(len(imagers), count):
         gain = off[number, :, :, lens]
         for _ in range(_ROUNDS):
-            cost = np.nansum(np.abs(off - gain[..., None]), (1, 2))
-            of_lens = cost.argmin(0)
-            gain = np.nanmedian(off[of_lens, :, :, np.arange(count)], 0)
-        if (total := cost.min(0).sum()) < least and np.isfinite(gain).all():
-            least, best = total, of_lens
-    return best
+            gain = np.nanmedian(off[total(gain).argmin(0), :, :, np.arange(count)], 0)
+        solutions.append(total(gain))
+    return min(solutions, key=lambda cost: cost.min(0).sum()).argmin(0)
