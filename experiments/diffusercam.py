@@ -106,7 +106,7 @@ def run(
                 spent, found = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
             scene = np.asarray(found["gs_jax"][0])
             common = {"factor": factor, "pixels": image.size, "steps": some, "method": method}
-            place = Convolution.of(psf[None], image.shape).place
+            window = Convolution.of(psf[None], image.shape).window
             for name, seconds in spent.items():
                 x = scene if name == "gs_jax" else found[name]
                 cost = float(objective(*map(jnp.asarray, (psf, image, x)))) if method != "Richardson-Lucy" else None
@@ -115,7 +115,7 @@ def run(
                 if name == "gs_jax":
                     rows[-1]["compile_s"] = compile_s
                 size = "full size" if factor == 1 else f"1/{factor}"
-                pictures[f"{method}, {name}, {size}"] = x[place]
+                pictures[f"{method}, {name}, {size}"] = x[window]
     return {"machine": describe(), "tv": TV, "rows": rows}, pictures
 
 

@@ -8,7 +8,7 @@ lenses, layout and depths. Iterative methods take 20 steps with all of the light
 what follows it get the same voxels, four pixels wide. The truth of the points, and the points that a method finds, are
 as wide as the microscope resolves (Eq. 5: a voxel); zeros are the floor, the truth itself is the ceiling. F1 is that of
 as many of the brightest peaks of a volume, or points found, as scores best: a threshold that no user has, and that
-favours the volumes. "Imaged again" is how far the volume's image is from the capture (`gs_jax.reproject`).
+favours the volumes. "Imaged again" is how far the volume's image is from the capture (`gs_jax.forward_residual`).
 
     python -m experiments.fig9_benchmark DATA [--out DIR] [--scenes letters,points] [--weights FILE]
 
@@ -31,7 +31,7 @@ from experiments.common import Report, main, points_of
 from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
-from gs_jax import Grid, Imager, Unrolled, reproject
+from gs_jax import Grid, Imager, Unrolled, forward_residual
 from gs_jax.apps.benchmark_measure import timed
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.benchmark_scenes import spots
@@ -46,7 +46,7 @@ from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
 from gs_jax.pictures.style import draw_image, label_of
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import COARSE, reconstruct, voxel_grid
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, reconstruct, voxel_grid
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake
 from gs_jax.simulation.synthetic import Camera, expose
 from gs_jax.solvers.unrolled import read_unrolled
@@ -71,7 +71,7 @@ def _captured(data: Path, name: str, depths: np.ndarray, emitters: np.ndarray | 
     """A capture of another group's, on the voxels that iterative methods have by default."""
     imager = read_design(data / "P1.toml").imager()
     image = read_capture(data / f"P1_{name}.tif", imager.sensor.shape)
-    grid = voxel_grid(imager, list(depths), pixels=COARSE)
+    grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
     if emitters is None:
         points = points_of(data, name)
         return Scene(image, imager, grid, spots(points, grid, grid.pitch / FWHM), points)
@@ -79,7 +79,7 @@ def _captured(data: Path, name: str, depths: np.ndarray, emitters: np.ndarray | 
 
 
 def _traced(imager: Imager, depths: np.ndarray, emitters: np.ndarray) -> Scene:
-    grid = voxel_grid(imager, list(depths), pixels=COARSE)
+    grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
     light = traced(emitters, imager, _RAYS)
     image = np.asarray(expose(light, Camera(), jax.random.key(0), peak_electrons=10_000))
     return Scene(image, imager, grid, np.asarray(rasterize(emitters, grid), np.float32))
@@ -179,7 +179,7 @@ def run(
             seconds, result = timed(call)
             q = quality(result.volume, s.truth)
             scores = {"psnr_db": q.psnr_db, "ssim": q.ssim, "mse": q.mse, "f1": best_f1(result, s)}
-            again = reproject(result.volume, s.image, s.imager, s.grid, progress=progress).error
+            again = forward_residual(result.volume, s.image, s.imager, s.grid, progress=progress).error
             rows.append({"scene": name, "method": method, "seconds": seconds} | scores | {"reprojection": again})
             pictures[name, method] = View(result.volume.max(0), s.grid.extent)
     return {"rows": rows}, pictures

@@ -19,8 +19,8 @@ from gs_jax import (
     Camera,
     Grid,
     Imager,
-    ListRichardsonLucy,
     MicrolensArray,
+    PinholeRichardsonLucy,
     Sensor,
     expose,
     forward,
@@ -87,7 +87,7 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
         camera = Camera(gain=10.0 * KIND.binning**2, read_noise=2.0 * KIND.binning)
         counts = expose(image, camera, jax.random.key(number), peak_electrons=_ELECTRONS)
         light = np.asarray(electrons(counts, camera), np.float32)
-        volume = reconstruct(light, single, grid, ListRichardsonLucy(steps, accelerate=True), optics=of_volume)
+        volume = reconstruct(light, single, grid, PinholeRichardsonLucy(steps, accelerate=True), optics=of_volume)
         truth = shared_out(scene, between, DEPTHS)
         found.append(quality(volume, truth).psnr_db - quality(np.zeros_like(truth), truth).psnr_db)
     return found

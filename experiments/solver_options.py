@@ -1,7 +1,8 @@
 """What the solvers' defaults are for: three words of a ray-traced capture, with and without each of them.
 
 - Three planes, 30 plain steps of Richardson-Lucy: what the full model alone makes of it.
-- Background: the capture as it is, and under a wide glow that no voxel emits, by list-RL with and without tents.
+- Background: the capture as it is, and under a wide glow that no voxel emits, by list-RL with and without
+  a fitted background.
 - Rims: the near model, whose light is a sixth of the capture's, with and without holding back what few lenses see.
 - Unrolled: with and without its conjugate gradients.
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from experiments.common import Report, main, table
 from experiments.fig9_benchmark import SCENES, Scene
-from gs_jax import ListRichardsonLucy, RichardsonLucy, Unrolled, quality, reconstruct
+from gs_jax import PinholeRichardsonLucy, RichardsonLucy, Unrolled, quality, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS, Method
@@ -45,14 +46,18 @@ def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
     found: dict[str, tuple[Scene, Method, str]] = {
         "three planes, Richardson-Lucy, 30 plain steps": (few, RichardsonLucy(steps=30), "full")
     }
-    default: ListRichardsonLucy = METHODS["list-rl"](25)  # pyright: ignore[reportAssignmentType]
+    default: PinholeRichardsonLucy = METHODS["list-rl"](25)  # pyright: ignore[reportAssignmentType]
     for name, scene in (("as it is", s), ("under a glow", bright)):
         found[f"{name}, list-RL, 25 steps"] = scene, default, "full"
-        found[f"{name}, list-RL, 25 steps, no tents"] = scene, dataclasses.replace(default, tents=0), "full"
+        found[f"{name}, list-RL, 25 steps, no fitted background"] = (
+            scene,
+            dataclasses.replace(default, background_knots=0),
+            "full",
+        )
     for name in ("list-rl", "richardson-lucy"):
         method = METHODS[name](STEPS)
         found[f"near, {name}"] = s, method, "near"
-        found[f"near, {name}, rims not held back"] = s, dataclasses.replace(method, least_seen=0.0), "near"  # pyright: ignore[reportArgumentType]
+        found[f"near, {name}, rims not held back"] = s, dataclasses.replace(method, min_sensitivity=0.0), "near"  # pyright: ignore[reportArgumentType]
     networks = Unrolled.pretrained()
     found["unrolled"] = s, networks, "full"
     without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)

@@ -22,7 +22,7 @@ From a capture to a volume:
     read_capture         A capture `(row, column)` in the file's own type: uint8, uint16 or float32
     reconstruct          The volume that an image shows
     BackProjection       `backproject`, the paper's reconstruction: one step, no PSF
-    ListRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection
+    PinholeRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
     FISTA                FISTA: least squares with sparsity, not negative, for any operator
     Unrolled             Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package
@@ -68,7 +68,7 @@ Better designs, and their molds:
 
 How good it is:
 
-    reproject            Image a volume again, and compare with the capture that it was reconstructed from
+    forward_residual            Image a volume again, and compare with the capture that it was reconstructed from
     quality              PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best
     localization         Match found points with true ones, each at most once, and score them
 

@@ -28,9 +28,9 @@ from .projection.operators import (
     ImagingOperator as ImagingOperator,
 )
 from .reconstruction.deconvolution import deconvolve as deconvolve
-from .reconstruction.methods import BackProjection as BackProjection, ListRichardsonLucy as ListRichardsonLucy
+from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
-from .reconstruction.residual import reproject as reproject
+from .reconstruction.residual import forward_residual as forward_residual
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
 from .solvers.admm import ADMM as ADMM

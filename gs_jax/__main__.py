@@ -16,7 +16,7 @@ from ._version import __version__
 from .base.errors import InputError, InputWarning
 from .base.progress import QUIET, VERBOSE, shown
 from .cli.files import ARGUMENTS
-from .cli.interrupt import end, ending_soon, kept, message, status_of
+from .cli.interrupt import exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
 
 # Of a message; what is at its end is the least.
 _LONGEST = 380
@@ -45,7 +45,7 @@ COMMANDS = {
 
 def main(leave: Callable[[int], object] = sys.exit) -> None:
     """Run the command line, and exit; `leave` is how, after an interrupt."""
-    kept.clear()
+    partial_outputs.clear()
     try:
         status = commands.main(standalone_mode=False, prog_name="gs-jax")
     except InputError as error:
@@ -53,8 +53,8 @@ def main(leave: Callable[[int], object] = sys.exit) -> None:
     except click.ClickException as error:
         _fail(" ".join(error.format_message().split()), 2)
     except (click.Abort, KeyboardInterrupt) as error:
-        click.echo(message(), err=True)
-        leave(status_of(error.__cause__ or error))
+        click.echo(interrupt_message(), err=True)
+        leave(exit_status(error.__cause__ or error))
     except OSError as error:
         # A full disk or a vanished folder is nobody's wrong input; what has no number is a fault of ours.
         if error.errno is None:
@@ -67,8 +67,8 @@ def main(leave: Callable[[int], object] = sys.exit) -> None:
 
 def script() -> None:
     """`main` as a process of its own, which signals end soon."""
-    with ending_soon():
-        main(end)
+    with exit_on_signal():
+        main(exit_now)
 
 
 def _fail(message: str, status: int) -> None:

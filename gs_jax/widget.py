@@ -68,7 +68,7 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
     from .cli.options import CaptureOptions
     from .design.design import read_design
     from .io.napari import points_layer, step_of, volume_layer
-    from .reconstruction.workflow import plan
+    from .reconstruction.plan import Plan
 
     try:
         depths = Depths().convert(asked.depths, None, None)
@@ -81,11 +81,11 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
             image, warnings = camera.read(asked.capture), list(camera.warnings)
         else:
             image, warnings = _corrected(asked.name, asked.capture, imager.sensor)
-    pitch = asked.voxel_um / _UM or None
-    grid, making = plan(imager, depths, pitch, method=asked.method, suppress=asked.suppress, points=asked.points)
-    made = making(progress)
+    options = {"method": asked.method, "suppress": asked.suppress, "points": asked.points}
+    plan = Plan.of(imager, depths, asked.voxel_um / _UM or None, **options)
+    grid, volume_of = plan.grid, plan.prepare(progress)
     with progress.step("Reconstructing"):
-        volume, points, _, warning = made(image, progress)
+        volume, points, _, warning = volume_of(image, progress)
     progress.go_on()
     how = asked.method if asked.suppress == "none" else asked.suppress
     layers = [volume_layer(volume, grid, f"{asked.name}, {how}")]

@@ -431,7 +431,7 @@ def test_the_command(tmp_path):
     (tmp_path / "p.csv").write_text("x_mm,y_mm,z_mm\n0,0,20\n")
     for more, message in (
         ([], "p.csv: positions: found 1 sources for 3 captures, none in capture 2, allowed: one or more in each"),
-        (["--from-scene"], "--positions, --from-scene: found both, allowed: --positions"),
+        (["--from-scene"], "calibrate needs --positions"),
         (["--fit", "focus"], "found 'focus', allowed: sensor-distance, rotation"),
     ):
         wrong = CliRunner().invoke(commands, [*arguments, str(tmp_path / "other.toml"), *more])

@@ -31,7 +31,7 @@ def test_it_is_the_middle_of_scipys_convolution(sizes):
     for kernel, plane in zip(np.asarray(psf), np.asarray(scene), strict=True):
         whole = convolve2d(plane, kernel)
         middle = [slice(k // 2, k // 2 + n) for k, n in zip(kernel.shape, plane.shape, strict=True)]
-        expected = expected + whole[*middle][convolution.place]
+        expected = expected + whole[*middle][convolution.window]
     np.testing.assert_allclose(convolution(scene), expected, atol=1e-12)
 
 

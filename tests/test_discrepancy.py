@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, forward, reconstruct
-from gs_jax.reconstruction.residual import misfit_of_noise, noise_variance
+from gs_jax.reconstruction.residual import discrepancy_target, noise_variance
 from gs_jax.solvers.fista import FISTA
-from gs_jax.solvers.richardson_lucy import RichardsonLucy, divergence
+from gs_jax.solvers.richardson_lucy import RichardsonLucy, kl_divergence
 
 from .helpers import scene
 from .test_reconstruction import Log
@@ -26,7 +26,7 @@ def test_variance_of_noise_on_a_slope_with_sharp_spots():
 
 def test_an_image_without_noise_or_pixels_has_none():
     assert noise_variance(SLOPE).max() < 1e-18 and noise_variance(np.ones((2, 5))).max() == 0
-    assert misfit_of_noise(np.zeros((40, 40)), np.zeros((10, 10)), counts=True) == 0
+    assert discrepancy_target(np.zeros((40, 40)), np.zeros((10, 10)), counts=True) == 0
 
 
 @pytest.mark.parametrize("side", [1, 2])
@@ -34,10 +34,10 @@ def test_it_is_what_the_truth_has_left(side):
     summed = lambda image: image.reshape(200 // side, side, 150 // side, side).sum((1, 3))
     image, truth = RNG.poisson(SLOPE).astype(float), summed(SLOPE)
     light = summed(image)
-    left = float(divergence(jnp.asarray(light), jnp.asarray(truth)))
-    assert misfit_of_noise(image, light, counts=True) == pytest.approx(left, rel=0.05)
+    left = float(kl_divergence(jnp.asarray(light), jnp.asarray(truth)))
+    assert discrepancy_target(image, light, counts=True) == pytest.approx(left, rel=0.05)
     squares = float(np.sum((light - truth) ** 2) / 2)
-    assert misfit_of_noise(image, light, counts=False) == pytest.approx(squares, rel=0.05)
+    assert discrepancy_target(image, light, counts=False) == pytest.approx(squares, rel=0.05)
 
 
 @pytest.mark.integration
@@ -50,6 +50,6 @@ def test_solvers_end_where_noise_is_left(solver):
     steps = {}
     for name, capture in (("clean", image), ("noisy", noisy)):
         log = Log()
-        reconstruct(capture, imager, grid, solver, optics=None, stop_at_noise=True, progress=log)
+        reconstruct(capture, imager, grid, solver, optics=None, stop_at_discrepancy=True, progress=log)
         steps[name] = len(log.parts)
     assert steps["noisy"] < 60 < steps["clean"] == 100

@@ -26,7 +26,7 @@ from gs_jax.detection.type_views import LensType, readings_of
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type, type_weights
 from gs_jax.projection.backprojection import backproject
-from gs_jax.reconstruction.methods import BackProjection, ListRichardsonLucy
+from gs_jax.reconstruction.methods import BackProjection, PinholeRichardsonLucy
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import simulate
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
@@ -105,7 +105,7 @@ def test_back_projection_adds_kinds_by_weight():
     found = reconstruct(image, scope, voxels, RichardsonLucy(steps=2), optics="near")
     assert np.isfinite(found).all() and found.max() > 0
     # On the pixels of each type's own cores, as back-projection.
-    for method in (ListRichardsonLucy(steps=2), Unrolled.pretrained()):
+    for method in (PinholeRichardsonLucy(steps=2), Unrolled.pretrained()):
         found = reconstruct(image, scope, voxels, method)
         assert np.isfinite(found).all() and found.max() > 0
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.cli import options
 from gs_jax.cli.deconvolve import deconvolve_command
-from gs_jax.cli.interrupt import RESUMABLE, message
+from gs_jax.cli.interrupt import RESUMABLE, interrupt_message
 from gs_jax.design.design import read_design, write_design
 from gs_jax.detection.unet import pretrained, write_weights
 from gs_jax.grid import Grid
@@ -91,7 +91,7 @@ def test_an_output_that_is_an_input_is_refused(folder, monkeypatch, capsys):
             (folder / name).touch()
         before = {path: path.read_bytes() for path in folder.iterdir()}
         status, _, err = run(monkeypatch, capsys, *arguments)
-        assert status == 2 and "found an input of this command in the place of its output" in err, arguments
+        assert status == 2 and "the output must be another file than the inputs" in err, arguments
         assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -99,7 +99,7 @@ def test_what_people_write_is_replaced_by_force_alone(folder, monkeypatch, capsy
     layout = ("layout", "--count", 200, "--size-mm", 20, 20, "--pitch-mm", 1.23, "-o", "c.csv")
     (folder / "c.csv").write_text("mine")
     status, _, err = run(monkeypatch, capsys, *layout)
-    assert status == 2 and "c.csv: found a file that is there already" in err and "--force" in err
+    assert status == 2 and "c.csv: the output must be a new file" in err and "--force" in err
     assert (folder / "c.csv").read_text() == "mine"
     status, _, err = run(monkeypatch, capsys, *layout, "--force")
     assert status == 0 and "replaced c.csv" in err and "x_mm" in (folder / "c.csv").read_text()
@@ -179,14 +179,18 @@ def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
     optimize = ("optimize", "design.toml", "--study", "study.toml", "-o", "new.toml")
     for arguments in (optimize, ("train", "-o", "w.npz")):
         status, _, err = run(monkeypatch, capsys, *arguments, "--resume")
-        assert status == 2 and "--resume: found no checkpoint" in err and "study" not in err
+        assert (
+            status == 2
+            and "--resume must be used after an interrupted run, got no checkpoint" in err
+            and "study" not in err
+        )
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr("gs_jax.cli.interrupt.kept", {tmp_path / "w.checkpoint": RESUMABLE})
-    assert message() == "gs-jax: interrupted"
+    monkeypatch.setattr("gs_jax.cli.interrupt.partial_outputs", {tmp_path / "w.checkpoint": RESUMABLE})
+    assert interrupt_message() == "gs-jax: interrupted"
     (tmp_path / "w.checkpoint").touch()
-    assert message().endswith("w.checkpoint has what is done, and --resume goes on from it")
+    assert interrupt_message().endswith("w.checkpoint has what is done, and --resume goes on from it")
 
 
 # A job that a shell starts in the background ignores Ctrl-C, and so would its children.
@@ -289,8 +293,8 @@ def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
 
 IMPORTING = f"""
 {HEARD}
-from gs_jax.cli.interrupt import ending_soon
-with ending_soon():
+from gs_jax.cli.interrupt import exit_on_signal
+with exit_on_signal():
     try:
         import slow_extension
     except BaseException as error:
@@ -354,4 +358,4 @@ def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
     # 900 electrons of 20 a count, on an offset of 7.
     assert counts.dtype == np.uint8 and counts.min() == 7 and counts.max() == 52
     status, _, err = run(monkeypatch, capsys, "simulate", "scene.csv", "design.toml", "--gain", "0", "-o", "c.tif")
-    assert status == 2 and "found '0', allowed: 0.001 to 1e+06 electrons" in err
+    assert status == 2 and "must be 0.001 to 1e+06 electrons, got '0'" in err

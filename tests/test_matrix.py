@@ -23,7 +23,7 @@ from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import COARSE, voxel_grid
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").glob("*.toml"))
 LENSES, PIXELS = 24, 600
@@ -89,7 +89,7 @@ class Case:
         middle = 20.0 if far > 10 else (near + far) / 2
         self.depths = [0.9 * middle, middle, 1.1 * middle]
         self.sheet = datasheet(self.design, self.depths)
-        self.grid = voxel_grid(self.imager, self.depths, pixels=COARSE)
+        self.grid = voxel_grid(self.imager, self.depths, pixels=PIXELS_PER_VOXEL)
 
     @cached_property
     def points(self) -> np.ndarray:

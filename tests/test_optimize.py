@@ -52,7 +52,7 @@ def test_optimize(folder):
 
 def test_nothing_is_written_on_wrong_input(folder):
     before = set(folder.iterdir())
-    with pytest.raises(InputError, match="found no checkpoint new.checkpoint"):
+    with pytest.raises(InputError, match="got no checkpoint new.checkpoint"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
     with pytest.raises(InputError, match="found the suffix '.json'"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")

@@ -24,7 +24,7 @@ from gs_jax.io.recordings import opened_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halved
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import reconstruct
-from gs_jax.reconstruction.recording import AHEAD, reconstruct_frames
+from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
 
 from .test_cli import folder, run
 
@@ -284,12 +284,12 @@ def test_it_is_compiled_once(folder, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "name, options, words",
     [
-        ("rec.tif", ("-o", "v.ome.tif"), "rec.tif: found 5 pages, allowed: one (choose by --page 1 to 5"),
-        ("frames", ("-o", "v.ome.tif"), "v.ome.tif: found a recording of 5 frames, allowed: VOLUME.zarr"),
+        ("rec.tif", ("-o", "v.ome.tif"), "rec.tif must be one image, got 5 pages: choose one by --page 1 to 5"),
+        ("frames", ("-o", "v.ome.tif"), "-o must be VOLUME.zarr, which has a time axis, for 5 frames, got v.ome.tif"),
         ("empty", (), "empty: found no captures, allowed: files that end in .tif"),
         ("no*.tif", (), "no*.tif: found no captures"),
-        ("capture.tif", ("--resume",), "--resume: found a single capture capture.tif, allowed: a recording"),
-        ("capture.tif", ("--frame-interval", "1"), "--frame-interval: found a single capture"),
+        ("capture.tif", ("--resume",), "--resume must be used with a recording, got a single capture capture.tif"),
+        ("capture.tif", ("--frame-interval", "1"), "--frame-interval must be used with a recording"),
         ("flat.zarr", (), "flat.zarr: found an array of 96 x 80, allowed: (t, y, x)"),
         ("deep.zarr", (), "deep.zarr: found an array of 5 x 3 x 96 x 80, allowed: (t, y, x)"),
         ("double.zarr", (), "found pixels of type float64"),
@@ -343,7 +343,7 @@ def test_memory_is_bounded_and_work_overlaps(tmp_path):
     reconstruct_frames(series, read, lambda frame: (np.full((1, 4, 4), frame + 1, np.float32), {}))
     assert volumes(tmp_path / "v.zarr")[:, 0, 0, 0].tolist() == list(range(1, 31))
     # Those being read ahead, one more to be asked for, one made and one being written.
-    assert most <= AHEAD + 3
+    assert most <= PREFETCH + 3
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])

@@ -18,7 +18,7 @@ _CODE = """
 import sys
 import numpy as np, jax
 from gs_jax import Grid, read_design, reconstruct
-from gs_jax.reconstruction.pipeline import backproject_by_all
+from gs_jax.reconstruction.pipeline import backproject_on_all_devices
 from gs_jax.reconstruction.methods import BackProjection
 
 imager = read_design("design.toml").imager()
@@ -28,7 +28,8 @@ for count, method in ((1, methods[0]), (7, methods[1]), (50, methods[0])):
     grid = Grid.over(imager.sensor, depths=np.linspace(18, 22, count), pitch=0.05)
     np.save(f"{sys.argv[1]}-{count}.npy", reconstruct(image, imager, grid, method))
 if jax.device_count() > 1:
-    assert len(backproject_by_all(image, imager, grid.at(grid.depths[:7])).sharding.device_set) == jax.device_count()
+    volume = backproject_on_all_devices(image, imager, grid.at(grid.depths[:7]))
+    assert len(volume.sharding.device_set) == jax.device_count()
 print(jax.device_count())
 """
 

@@ -14,10 +14,10 @@ from skimage.restoration import richardson_lucy as of_skimage
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.solvers.admm import ADMM
-from gs_jax.solvers.base import least_weight_of_darkness, solve
+from gs_jax.solvers.base import lambda_max, solve
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
-from gs_jax.solvers.richardson_lucy import RichardsonLucy, tent_background, tent_step
+from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
 
 from .helpers import scene
 
@@ -222,7 +222,7 @@ def test_the_unit_of_sparsity_leaves_nothing_but_darkness(solver):
     np.testing.assert_allclose(run(image, 1.01), 0, atol=1e-9)
     assert run(image, 0.99).max() > 1e-3
     # Of a negative image there is nothing to be seen, and no negative weight.
-    assert least_weight_of_darkness(-image) == 0 and not np.any(run(-image, 0.5))
+    assert lambda_max(-image) == 0 and not np.any(run(-image, 0.5))
 
 
 def test_a_weight_that_changes_compiles_nothing(caplog):
@@ -246,13 +246,13 @@ def test_richardson_lucy_is_scikit_images():
     truth = np.zeros((40, 42))
     truth[12:28, 14:28] = rng.random((16, 14))
     system = Convolution.of(psf[None], truth.shape)
-    embedded = jnp.zeros(system.scene_shape).at[(0, *system.place)].set(truth)
+    embedded = jnp.zeros(system.scene_shape).at[(0, *system.window)].set(truth)
     image = np.maximum(np.asarray(system(embedded)), 0)
     image[image < 1e-12] = 0  # an FFT's rounding
     expected = of_skimage(image, psf, num_iter=25, clip=False)
     found = jax.jit(lambda b: solve(system.operator, b, RichardsonLucy(steps=25)))(jnp.asarray(image))
     # The same iteration in exact arithmetic; 25 divisions amplify the rounding of the FFTs.
-    np.testing.assert_allclose(found.x[0][system.place], expected, atol=1e-8)
+    np.testing.assert_allclose(found.x[0][system.window], expected, atol=1e-8)
 
 
 @pytest.mark.integration
@@ -278,8 +278,10 @@ def test_richardson_lucy_fits_a_slow_background():
     truth = light(A)
     shape = A.out_structure().shape
     slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
-    jitted = cache(lambda tents: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, tents=tents))))
-    error = lambda image, tents: float(jnp.linalg.norm(jitted(tents)(image).x - truth) / jnp.linalg.norm(truth))
+    jitted = cache(lambda knots: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, background_knots=knots))))
+    error = lambda image, background_knots: float(
+        jnp.linalg.norm(jitted(background_knots)(image).x - truth) / jnp.linalg.norm(truth)
+    )
     assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
     assert error(A.mv(truth), 3) < 0.1
     assert not jitted(3)(jnp.zeros(shape)).x.any()
@@ -291,16 +293,16 @@ def test_light_that_no_voxel_explains_does_not_go_to_those_that_few_pixels_see()
     image = jnp.ones(16)
     run = lambda **options: solve(A, image, RichardsonLucy(steps=10, **options)).x
     assert run()[-1] == pytest.approx(200)
-    held = run(least_seen=0.3)
+    held = run(min_sensitivity=0.3)
     np.testing.assert_allclose(held[:-1], 1)
     assert held[-1] < 4
 
 
 def test_tents_are_climbed_where_there_are_fewer_pixels():
     image = jnp.ones((3, 40))
-    tents = jnp.ones((8, 8))
-    np.testing.assert_allclose(tent_background(tents, image), 1, rtol=1e-12)
-    found = np.asarray(tent_step(tents, 2 * image))
+    background_knots = jnp.ones((8, 8))
+    np.testing.assert_allclose(bilinear_background(background_knots, image), 1, rtol=1e-12)
+    found = np.asarray(background_step(background_knots, 2 * image))
     assert np.isfinite(found).all() and set(np.round(np.unique(found), 9)) == {0.0, 2.0}
 
 
@@ -322,15 +324,15 @@ def test_largest_eigenvalue():
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_wrong_arguments_are_named(solver):
-    with pytest.raises(InputError, match=r"image: found \(4,\), allowed: the operator's output shape, \(30,\)"):
+    with pytest.raises(InputError, match=r"image must have the operator's output shape \(30,\), got \(4,\)"):
         solve(dense(), jnp.zeros(4), SOLVERS[solver](steps=1))
-    with pytest.raises(InputError, match="steps: found 0, allowed: 1 or more"):
+    with pytest.raises(InputError, match="steps must be 1 or more, got 0"):
         SOLVERS[solver](steps=0)
-    with pytest.raises(InputError, match="tolerance: found -1.0, allowed: 0 or more"):
+    with pytest.raises(InputError, match="tolerance must be 0 or more, got -1.0"):
         SOLVERS[solver](tolerance=-1.0)
-    with pytest.raises(InputError, match="sparsity: found nan, allowed: 0 or more"):
+    with pytest.raises(InputError, match="sparsity must be 0 or more, got nan"):
         ADMM(sparsity=float("nan"))
-    with pytest.raises(InputError, match="tents: found 1, allowed: 0, or 2 and more"):
-        RichardsonLucy(tents=1)
-    with pytest.raises(InputError, match="tents: found 2 and an image of 1 dimensions, allowed: of 2"):
-        solve(dense(), jnp.zeros(30), RichardsonLucy(tents=2))
+    with pytest.raises(InputError, match="background_knots must be 0, or 2 or more, got 1"):
+        RichardsonLucy(background_knots=1)
+    with pytest.raises(InputError, match="image must be 2-D .*, got 1-D"):
+        solve(dense(), jnp.zeros(30), RichardsonLucy(background_knots=2))

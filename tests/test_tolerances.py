@@ -319,7 +319,7 @@ def test_the_command(folder, monkeypatch, capsys):
         (("--tolerances", "wrong.toml"), "`possition_um`: found a key that does not exist, allowed: `position_um`"),
         (("-o", "t.txt"), "found the suffix '.txt', allowed: .json"),
         (("--draws", "0"), "0 is not in the range"),
-        (("--positions", "places.csv"), "places.csv: found a source whose place is not known"),
+        (("--positions", "places.csv"), "places.csv: every source must have x, y and z"),
         (("--min-strehl", "2"), "found '2', allowed: 0.001 to 1"),
     ],
 )

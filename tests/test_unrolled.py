@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gs_jax.projection.points import full_image_of_points
 from jax.test_util import check_grads
 from scipy.ndimage import convolve1d
 from scipy.sparse.linalg import LinearOperator, cg
@@ -14,12 +15,11 @@ from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_case
 from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
 from gs_jax.apps.training.training_loop import start, train
 from gs_jax.base.progress import Progress
-from gs_jax.projection.point_sources import full_image_of_points
-from gs_jax.reconstruction.inverse_problem import Sight, System
-from gs_jax.reconstruction.residual import reproject
+from gs_jax.reconstruction.inverse_problem import InverseProblem, LensTypeGeometry
+from gs_jax.reconstruction.residual import forward_residual
 from gs_jax.solvers import unrolled
-from gs_jax.solvers.richardson_lucy import tent_background
-from gs_jax.solvers.unrolled import read_unrolled, untrained, write_unrolled
+from gs_jax.solvers.richardson_lucy import bilinear_background
+from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
 
 KEY = jax.random.key(0)
 TINY = Kind(64, 0.06, 0.25, 3, binning=4)
@@ -34,10 +34,10 @@ def imager(pixels=(160, 160), pitch=0.03) -> Imager:
 def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     """Chief rays through nine lenses, and the exact image of random voxels."""
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
-    system = System(scope, grid, None, (Sight(scope, grid),))
+    system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope, grid),))
     truth = jax.random.uniform(KEY, grid.volume_shape)
     light = system.operator.mv(truth)
-    networks = networks or untrained(1, 2, 3, 4, key=KEY)
+    networks = networks or initialize_unrolled(1, 2, 3, 4, key=KEY)
     start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
     return networks, Case(np.asarray(light), system, np.asarray(truth), start)
 
@@ -47,7 +47,7 @@ def test_a_bright_voxel_is_the_brightest():
     scope, voxels = imager(), Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
     place = voxels.to_mm(np.array([[1, 8, 13]]))
     image = full_image_of_points(np.column_stack([place, [1e6]]), scope)
-    found = reconstruct(image, scope, voxels, untrained(key=KEY))
+    found = reconstruct(image, scope, voxels, initialize_unrolled(key=KEY))
     assert np.unravel_index(found.argmax(), found.shape) == (1, 8, 13)
     assert np.isfinite(found).all() and found.min() >= 0
 
@@ -55,7 +55,7 @@ def test_a_bright_voxel_is_the_brightest():
 @pytest.fixture(scope="module")
 def differentiable():
     """Networks of float64, a case of theirs, and what training lowers, by the networks and another image and truth."""
-    networks, case = small(untrained(1, 1, 2, 4, key=KEY))
+    networks, case = small(initialize_unrolled(1, 1, 2, 4, key=KEY))
     networks = jax.tree.map(lambda leaf: leaf.astype(float), networks)
     of = lambda networks, light, truth: unrolled_loss(networks, case._replace(light=light, truth=truth))
     return networks, case, jax.jit(of)
@@ -87,18 +87,18 @@ def test_gradients_by_the_image(differentiable):
 @pytest.mark.integration
 def test_the_last_steps_are_conjugate_gradients():
     """SciPy's, with the same preconditioner and as many, where slow waves are left out of account."""
-    networks, case = small(untrained(1, 1, 4, 4, key=KEY))
+    networks, case = small(initialize_unrolled(1, 1, 4, 4, key=KEY))
     scope, grid = case.system.imager, case.system.grid
-    A = System(scope, grid, None, case.system.seen, slow=2).operator
+    A = InverseProblem(scope, grid, None, case.system.back_projections, detrend_modes=2).operator
     state = networks.init(A, case.light)
     for _ in range(networks.steps):
         state = networks.step(A, case.light, state)[0]
-    exact, shape, size = System(scope, grid, None, slow=2).operator, case.truth.shape, case.truth.size
+    exact, shape, size = InverseProblem(scope, grid, None, detrend_modes=2).operator, case.truth.shape, case.truth.size
     back = lambda image: np.asarray(exact.T.mv(jnp.asarray(image))).ravel()
     x = np.asarray(state.lucy.x)
     variance = blurred(x).ravel() * (x**2).sum() / x.sum()
     light = jnp.asarray(case.light)
-    left = np.asarray(light - A.mv(state.lucy.x) - tent_background(state.lucy.tents, light))
+    left = np.asarray(light - A.mv(state.lucy.x) - bilinear_background(state.lucy.knots, light))
     normal = lambda x: back(exact.mv(jnp.asarray(x, float).reshape(shape))) + np.mean(left**2) * x / variance
     square, prior = (LinearOperator((size, size), product) for product in (normal, lambda x: variance * x))
     found, _ = cg(square, back(case.light), maxiter=4, rtol=0, M=prior)
@@ -113,24 +113,24 @@ def blurred(volume: np.ndarray) -> np.ndarray:
 
 
 def test_bands_leave_no_seams(monkeypatch):
-    layers = jax.tree.map(lambda part: part[0], untrained(key=KEY).layers)
+    layers = jax.tree.map(lambda part: part[0], initialize_unrolled(key=KEY).layers)
     seen = jax.random.normal(KEY, (3, 23, 17, 7))
-    whole = unrolled._weighed(layers, seen)
+    whole = unrolled._apply_network(layers, seen)
     monkeypatch.setattr(unrolled, "_ROWS", 5)
-    np.testing.assert_allclose(unrolled._weighed(layers, seen), whole, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(unrolled._apply_network(layers, seen), whole, rtol=1e-5, atol=1e-6)
 
 
 def test_no_more_steps_than_networks():
-    networks = untrained(1, 3, 2, key=KEY)
+    networks = initialize_unrolled(1, 3, 2, key=KEY)
     assert networks.steps == 6
-    with pytest.raises(InputError, match="steps: found 7, allowed: 1 to 6"):
+    with pytest.raises(InputError, match="steps must be 1 to 6, .* got 7"):
         Unrolled(networks.layers, networks.power, 1, 2, 7)
-    with pytest.raises(InputError, match="steps: found 0"):
+    with pytest.raises(InputError, match="steps must be 1 or more, got 0"):
         Unrolled(networks.layers, networks.power, 1, 2, 0)
 
 
 def test_weights_come_back(tmp_path):
-    made = untrained(3, 2, 1, 4, key=KEY)
+    made = initialize_unrolled(3, 2, 1, 4, key=KEY)
     write_unrolled(tmp_path / "w.npz", made)
     found = read_unrolled(tmp_path / "w.npz")
     assert (found.first, found.last, found.steps) == (3, 1, 6)
@@ -138,7 +138,7 @@ def test_weights_come_back(tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
     np.savez(tmp_path / "other.npz", about=np.array('{"first": 1, "networks": 100000, "squares": 1, "width": 4}'))
     np.savez(tmp_path / "old.npz", about=np.array('{"first": 1, "networks": 1, "last": 2, "width": 4}'))
-    with pytest.raises(InputError, match="found 2 last steps of Richardson-Lucy, allowed: conjugate gradients"):
+    with pytest.raises(InputError, match="must be conjugate gradients, got 2 of Richardson-Lucy"):
         read_unrolled(tmp_path / "old.npz")
     np.savez(tmp_path / "slices.npz", about=np.array('{"offsets": [0], "widths": [2], "standardized": true}'))
     with pytest.raises(InputError, match="another kind.*'widths'.*allowed: one with first, networks, width, squares"):
@@ -171,19 +171,19 @@ def test_training_makes_it_better():
 def test_a_volume_imaged_again():
     _, case = small()
     scope, grid, light = case.system.imager, case.system.grid, case.light
-    same = reproject(3 * case.truth, light, scope, grid, optics=None)
+    same = forward_residual(3 * case.truth, light, scope, grid, optics=None)
     # The image's darkest percent counts as the camera's offset.
     assert same.error < 0.05 and same.correlation == pytest.approx(1, abs=1e-6)
     assert same.regions.shape == (16, 16) and (same.regions >= 0).all()
-    nothing = reproject(0 * case.truth, light, scope, grid, optics=None)
+    nothing = forward_residual(0 * case.truth, light, scope, grid, optics=None)
     assert nothing.error == pytest.approx(1) and nothing.correlation == 0
-    wrong = reproject(case.truth[::-1], light, scope, grid, optics=None)
+    wrong = forward_residual(case.truth[::-1], light, scope, grid, optics=None)
     assert same.error < wrong.error < nothing.error
 
 
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
-    found, made = Unrolled.pretrained(), finished(untrained(key=KEY))
+    found, made = Unrolled.pretrained(), finished(initialize_unrolled(key=KEY))
     assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 33
 
 

@@ -83,14 +83,14 @@ planes({"network": clean, "Richardson-Lucy": fitted})
 # %% [markdown]
 # ## Quality
 #
-# An empty volume scores well if most of the scene is dark, so the table includes it. `reproject` needs no
+# An empty volume scores well if most of the scene is dark, so the table includes it. `forward_residual` needs no
 # truth: it images the volume again and compares the image with the capture.
 
 # %%
 print(f"{'':18} PSNR, dB")
 for name, volume in {"empty": 0 * plain, "back-projection": plain, "network": clean, "Richardson-Lucy": fitted}.items():
     print(f"{name:18} {gs.quality(volume, truth).psnr_db:8.1f}")
-again = gs.reproject(fitted, capture, scope, grid)
+again = gs.forward_residual(fitted, capture, scope, grid)
 print(f"unexplained: {100 * again.error:.0f} %, correlation {again.correlation:.3f}")
 
 # %% [markdown]

@@ -30,11 +30,11 @@ from ..detection.clustering import find_clusters
 from ..detection.locate import find_points
 from ..detection.unet import pretrained, suppress
 from ..projection.operators import ImagingOperator
-from ..reconstruction.inverse_problem import above_offset
-from ..reconstruction.methods import BackProjection, ListRichardsonLucy
+from ..reconstruction.inverse_problem import subtract_offset
+from ..reconstruction.methods import BackProjection, PinholeRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
 from ..solvers.admm import ADMM
-from ..solvers.base import least_weight_of_darkness, solve
+from ..solvers.base import lambda_max, solve
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from .benchmark_measure import peak_mib, timed
@@ -64,7 +64,7 @@ class Method(NamedTuple):
 # Every step as the paper's comparison has it, without acceleration.
 _PLAIN = {
     "backproject": BackProjection(),
-    "list-rl": ListRichardsonLucy(STEPS),
+    "list-rl": PinholeRichardsonLucy(STEPS),
     "richardson-lucy": RichardsonLucy(STEPS),
     "fista": FISTA(STEPS),
     "admm": ADMM(STEPS),
@@ -74,7 +74,7 @@ _PLAIN = {
 def _reconstructed(name: str):
     method = _PLAIN[name]
     # Pixel-voxel lists have no PSF.
-    of = lambda bench: None if isinstance(method, ListRichardsonLucy) else bench.psf
+    of = lambda bench: None if isinstance(method, PinholeRichardsonLucy) else bench.psf
     return lambda bench: lambda image: reconstruct(image, bench.imager, bench.grid, method, optics=of(bench))
 
 
@@ -144,12 +144,12 @@ METHODS = {
 def objective(volume, image, bench: Bench, solver: FISTA | ADMM) -> float:
     """What a solver without total variation minimises, over that of an empty volume."""
     A = ImagingOperator(bench.imager, bench.grid, jnp.asarray(bench.psf))
-    light = jnp.asarray(above_offset(image))
+    light = jnp.asarray(subtract_offset(image))
 
     @jax.jit
     def part(volume):
         residual = A.mv(volume) - light
-        weight = solver.sparsity * least_weight_of_darkness(A.T.mv(light))
+        weight = solver.sparsity * lambda_max(A.T.mv(light))
         return (jnp.vdot(residual, residual) / 2 + weight * jnp.sum(volume)) / (jnp.vdot(light, light) / 2)
 
     return float(part(jnp.asarray(volume)))

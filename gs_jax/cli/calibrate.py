@@ -1,4 +1,4 @@
-"""`gs-jax calibrate`: the geometry of a real microscope."""
+"""`gs-jax calibrate`: the geometry of a real microscope, from captures of point sources."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ _NAMES = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset
 
 
 class _Names(click.ParamType):
-    """Names of what is fitted, with commas between them."""
+    """Names of quantities, separated by commas."""
 
     name = "NAMES"
 
@@ -23,7 +23,7 @@ class _Names(click.ParamType):
             return value
         names = tuple(name.strip() for name in value.split(","))
         if wrong := [name for name in names if name not in _NAMES]:
-            self.fail(f"found {wrong[0]!r}, allowed: {', '.join(_NAMES)}.", param, ctx)
+            self.fail(f"must be some of {', '.join(_NAMES)}, got {wrong[0]!r}.", param, ctx)
         return tuple(name.replace("-", "_") for name in names)
 
 
@@ -33,21 +33,23 @@ class _Names(click.ParamType):
 @click.option(
     "--positions",
     type=Path,
-    help="POINTS.csv: x_mm,y_mm,z_mm of the source, a line for each capture; with a first column `capture` (number or "
-    "file name), of several sources. Empty cells are not known and are fitted.",
+    help="POINTS.csv: x_mm,y_mm,z_mm of the source in each capture, one line each; with several sources per capture, "
+    "a first column `capture` (number or file name). Empty cells are unknown and are fitted.",
 )
 @click.option(
     "--fit",
     type=_Names(),
     default=(),
-    help=f"Fit these, too: {', '.join(_NAMES[4:])}. {', '.join(_NAMES[:4])} are anyway.",
+    help=f"Also fit these: {', '.join(_NAMES[4:])}. {', '.join(_NAMES[:4])} are always fitted.",
 )
-@click.option("--hold", type=_Names(), default=(), help="Take these from the design.")
-@click.option("--find-lenses", is_flag=True, help="Find the lenses, whatever centres DESIGN lists; needs positions.")
+@click.option("--hold", type=_Names(), default=(), help="Take these from the design and do not fit them.")
+@click.option("--find-lenses", is_flag=True, help="Find the lenses instead of using DESIGN's; needs --positions.")
 @click.option(
-    "--from-scene", is_flag=True, help="One capture of any sparse scene, without positions: finds rotation and tilt."
+    "--from-scene", is_flag=True, help="Fit rotation and tilt to one capture of any sparse scene, without positions."
 )
-@click.option("-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of residuals beside it.")
+@click.option(
+    "-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of the residuals is written beside it."
+)
 @capture_options
 @force_option
 def calibrate_command(
@@ -62,11 +64,11 @@ def calibrate_command(
     force: bool,
     camera: CaptureOptions,
 ):
-    """Find the geometry of a real microscope, from CAPTURES of point sources: a pinhole or a bead at known places.
+    """Find the geometry of a real microscope, from CAPTURES of a pinhole or bead at known positions.
 
     Sensor distance, rotation, shift and tilt are fitted. DESIGN has the lens centres; its sensor distance may be off by
-    a fifth, its rotation and shift by anything, and the array may be mirrored. Positions are in the sensor's frame, z
-    from the plate. One capture does; several depths and places are better.
+    a fifth, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
+    with z from the plate. One capture suffices; several depths and positions are better.
     """
     from rich.console import Console
 
@@ -81,9 +83,9 @@ def calibrate_command(
     from ..reconstruction.pipeline import voxel_grid
 
     if from_scene == (positions is not None) or (from_scene and (find_lenses or len(captures) > 1)):
-        found = "both" if from_scene and positions else "several captures" if len(captures) > 1 else "neither"
-        allowed = "--positions POINTS.csv, or --from-scene with one capture and without --find-lenses"
-        raise InputError(f"--positions, --from-scene: found {found}, allowed: {allowed}.")
+        raise InputError(
+            "calibrate needs --positions POINTS.csv, or --from-scene with one capture and without --find-lenses."
+        )
     check_output(output, [".toml"])
     drawing = check_output(output.with_suffix(".png"), [".png"])
     inputs = (design, *captures, *([positions] if positions else []), *camera.files)
@@ -97,7 +99,7 @@ def calibrate_command(
             image = camera.read(capture)
             grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
             with errors_name_file(capture):
-                found = calibrate_by_scene(image, imager, grid, fit=names, progress=progress)
+                outcome = calibrate_by_scene(image, imager, grid, fit=names, progress=progress)
         else:
             points, of = read_positions(positions, captures)
             sources = Sources(points, of)
@@ -105,14 +107,12 @@ def calibrate_command(
                 sources.check(len(captures))
                 sources.check_fit(names)
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
-            found = calibrate(
-                images, points, imager, captures=of, fit=names, find_lenses=find_lenses, progress=progress
-            )
-    new = calibrated(microscope, found, camera.recorded(provenance_of(*inputs)))
-    write_design(output, new)
-    write_figure(drawing, picture(found))
-    camera.say()
-    Console().print(table(microscope, found))
-    mirrored = ", the array mirrored (y against -y) and turned" if found.mirrored else ""
-    lenses = f", {len(found.imager.array.centers)} lenses found" if find_lenses else ""
-    click.echo(f"{output}: {len(found.residuals)} spots, {found.rms:.3f} pixels RMS{mirrored}{lenses}")
+            options = {"captures": of, "fit": names, "find_lenses": find_lenses}
+            outcome = calibrate(images, points, imager, **options, progress=progress)
+    write_design(output, calibrated(microscope, outcome, camera.recorded(provenance_of(*inputs))))
+    write_figure(drawing, picture(outcome))
+    camera.print_corrections()
+    Console().print(table(microscope, outcome))
+    mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
+    lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
+    click.echo(f"{output}: {len(outcome.residuals)} spots, {outcome.rms:.3f} pixels RMS{mirrored}{lenses}")

@@ -1,4 +1,4 @@
-"""`gs-jax deconvolve`: a capture and a point spread function to a picture."""
+"""`gs-jax deconvolve`: a plane, from a capture and a measured PSF."""
 
 from pathlib import Path
 
@@ -16,18 +16,16 @@ from .options import CaptureOptions, Number, picture_options
 @click.argument("psf", type=Path)
 @click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True)
-@click.option(
-    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation.  [default: 0.001 of admm]"
-)
+@click.option("--tv", type=Number(least=0.0, most=10.0), help="Weight of total variation.  [default: 0.001 of admm]")
 @click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
 @picture_options
 def deconvolve_command(
     capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path, camera: CaptureOptions
 ):
-    """Reconstruct the plane that CAPTURE shows, through a diffuser or another mask whose PSF is the file PSF.
+    """Reconstruct the plane in CAPTURE, taken through a diffuser or another mask whose PSF is the file PSF.
 
-    PSF is the image of a point on the axis, of any size, the mean of its pages; both may be TIFF, PNG or .npy, and are
-    read and corrected in the same way.
+    PSF is the image of a point on the axis, of any size; several pages are averaged. Both files may be TIFF, PNG or
+    .npy, and are read and corrected in the same way.
     """
     from ..io.captures import write_capture
     from ..reconstruction.deconvolution import TV, deconvolve
@@ -37,18 +35,18 @@ def deconvolve_command(
 
     check_output(output, [".tif", ".tiff", ".npy"])
     check_may_write(output, inputs=(capture, psf, *camera.files))
-    if tv is not None and method == "fista":
-        raise InputError("--tv: found --method fista, allowed: admm, richardson-lucy.")
-    solver = {
-        "admm": lambda: ConvolutionADMM(steps, sparsity=0.0, tv=TV if tv is None else tv),
-        "fista": lambda: FISTA(steps),
-        "richardson-lucy": lambda: RichardsonLucy(steps, accelerate=True, tv=tv or 0.0),
-    }[method]()
+    if method == "admm":
+        solver = ConvolutionADMM(steps, sparsity=0.0, tv=TV if tv is None else tv)
+    elif method == "richardson-lucy":
+        solver = RichardsonLucy(steps, accelerate=True, tv=tv or 0.0)
+    elif tv is None:
+        solver = FISTA(steps)
+    else:
+        raise InputError("--tv must be used with --method admm or richardson-lucy, got fista.")
     image, spot = camera.read(capture), camera.read(psf, is_spot=True)
     with Progress() as progress:
         scene = deconvolve(image, spot, solver, progress=progress)
         with progress.step("Writing"):
             write_capture(output, scene, camera.recorded(provenance_of(capture, psf, *camera.files)))
-    camera.say()
-    size = " x ".join(map(str, scene.shape))
-    click.echo(f"{output}: {size} pixels, {method}, {steps} steps")
+    camera.print_corrections()
+    click.echo(f"{output}: {scene.shape[0]} x {scene.shape[1]} pixels, {method}, {steps} steps")

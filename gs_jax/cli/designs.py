@@ -1,4 +1,4 @@
-"""`gs-jax layout`: random lens centres."""
+"""`gs-jax layout`, `metrics` and `info`: random lens centres, the datasheet of a design, the machine and files."""
 
 from pathlib import Path
 
@@ -13,7 +13,9 @@ from .options import DESIGN, MM, UM, Depths, shipped_designs
 @click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
 @click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
 @click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
-@click.option("--diameter-mm", type=MM, default=2.0, show_default=True, help="Of the lenses; they leave no hole.")
+@click.option(
+    "--diameter-mm", type=MM, default=2.0, show_default=True, help="Lens diameter; the lenses cover the plate."
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
 @force_option
@@ -36,11 +38,11 @@ def layout_command(
 
 @click.command("metrics", epilog="Example: gs-jax metrics design/geomscope.toml --depths 18:22:1")
 @click.argument("design", type=DESIGN)
-@click.option("--json", "output", type=Path, help="Write the numbers to this file too.")
-@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven over the working distance]")
+@click.option("--json", "output", type=Path, help="Also write the numbers to this file.")
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven in the working distance]")
 @click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
 def metrics_command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
-    """Show what the microscope of DESIGN promises (the paper's Eqs. 1-11), and what becomes of it.
+    """Show the datasheet of the microscope of DESIGN (the paper's Eqs. 1-11), and its problems.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
@@ -70,7 +72,7 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
 
 
 def _calibration(provenance) -> str:
-    """What `gs-jax calibrate` wrote into the file."""
+    """The line about what `gs-jax calibrate` wrote into the file."""
     if "calibrated_spots" not in provenance:
         return "  not calibrated: the geometry is that of the design"
     spots, captures = provenance["calibrated_spots"], provenance["calibrated_captures"]
@@ -81,23 +83,23 @@ def _calibration(provenance) -> str:
 
 @click.command("info", epilog="Examples: gs-jax info volume.ome.tif, gs-jax info --designs")
 @click.argument("file", type=Path, required=False)
-@click.option("--designs", is_flag=True, help="List the designs that come with the package, to be used by their names.")
+@click.option("--designs", is_flag=True, help="List the names of the designs that come with the package.")
 def info_command(file: Path | None, designs: bool):
-    """Show versions, devices and memory; or of a FILE that gs-jax wrote, which command made it and of what."""
+    """Show versions, devices and memory; with FILE, which gs-jax command made this file, and from what."""
     if designs:
         from ..design.design import read_design
 
-        # The name of the file is what a command takes; the second line of a design says what its array is.
-        found = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}
+        # The second line of a design describes its array.
+        lines = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}
     elif file:
         from ..io.provenance import read_provenance
 
-        found = read_provenance(file) or {"provenance": f"{file} says nothing of where it comes from."}
+        lines = read_provenance(file) or {"provenance": f"{file} has no provenance."}
     else:
         from ..base.machine import describe
 
-        found = describe()
-    width = max(map(len, found))
-    for name, value in found.items():
+        lines = describe()
+    width = max(map(len, lines))
+    for name, value in lines.items():
         # The text of a design has many lines.
         click.echo(f"{name:<{width}} {value}" if "\n" not in value else f"{name}\n\n{value}")

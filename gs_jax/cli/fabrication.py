@@ -1,4 +1,4 @@
-"""`gs-jax mold`: a design to a part."""
+"""`gs-jax mold`, `mask` and `tolerance`: fabrication of a design, and its errors."""
 
 import math
 from pathlib import Path
@@ -17,44 +17,44 @@ from .options import DESIGN, UM, Depths, Number
 @click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
 @click.argument("design", type=DESIGN)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
-@click.option("--positive", is_flag=True, help="The array itself, rather than its mold.")
+@click.option("--positive", is_flag=True, help="Make the array itself instead of its mold.")
 @click.option(
     "--chord-um",
     type=Number(least=1e-3, most=1e3, unit="um"),
     default=0.4,
     show_default=True,
-    help="Largest distance between a facet and its lens.",
+    help="Largest distance between a facet and the lens surface.",
 )
 @click.option(
     "--shrinkage-percent",
     type=Number(least=0.0, most=20.0, unit="%"),
     default=0.0,
     show_default=True,
-    help="Of the cast material; the part is made larger by as much.",
+    help="Shrinkage of the cast material; the part is made larger by it.",
 )
 @click.option(
     "--draft-deg",
     type=Number(least=0.0, most=30.0, unit="degrees"),
     default=0.0,
     show_default=True,
-    help="Of the walls' inner faces. Silicone needs none.",
+    help="Draft angle of the walls' inner faces. Silicone needs none.",
 )
 @click.option(
     "--headroom-mm",
     type=Number(least=0.0, most=100.0, unit="mm"),
     default=0.0,
     show_default=True,
-    help="How much higher the walls are than the array is thick; 0 to cast flush under a glass plate.",
+    help="Height of the walls above the array; 0 to cast flush under a glass plate.",
 )
 @click.option(
     "--resolution-um",
     type=Number(least=1e-2, most=1e3, unit="um"),
     default=25.0,
     show_default=True,
-    help="Smallest feature that the printer makes.",
+    help="Smallest feature of the printer.",
 )
 @click.option(
-    "--layer-um", type=Number(least=1e-2, most=1e3, unit="um"), help="Thickness of the printer's layers, if it has any."
+    "--layer-um", type=Number(least=1e-2, most=1e3, unit="um"), help="Thickness of the printer's layers, if any."
 )
 @click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
 def mold_command(
@@ -69,11 +69,11 @@ def mold_command(
     layer_um: float | None,
     label: bool,
 ):
-    """Make the negative mold of the array of the file DESIGN, to print and to cast the array in.
+    """Make the negative mold of the array of the file DESIGN, to print and cast the array in.
 
-    Units are mm. Lenses look toward -z. If the plano side faces the object, x and y are the design's; if the curved
-    side does, the array lies turned over about x, with its y against the design's. A picture (.png) and a report
-    (.json, .txt) of the same name are written beside it; what was written is read back and measured.
+    Units are mm. The lenses face -z. If the plano side faces the object, x and y are the design's; if the curved side
+    does, the array is turned over about x, and y is reversed. A picture (.png) and a report (.json, .txt) of the same
+    name are written beside it; the mold is read back and measured.
     """
     from ..design.design import design_text, read_design
     from ..mold.make import make_mold, report_text
@@ -109,9 +109,9 @@ def mold_command(
 def mask_command(design: Path, output: Path):
     """Draw the opaque mask between the lenses of the file DESIGN, to have it made.
 
-    Openings are the lenses' clear discs; the sheet is as large as the mold, with its alignment marks, and seen as the
-    mold from above: from the plano side of the lenses. DXF and SVG are
-    in mm, GDSII in um (it needs `pip install 'gs-jax[gds]'`). Beside the drawing, .json says where it comes from.
+    Openings are the lenses' clear apertures. The sheet has the size and alignment marks of the mold, and is seen from
+    above, from the plano side of the lenses. DXF and SVG are in mm, GDSII in um (needs `pip install 'gs-jax[gds]'`). A
+    .json of the same name has the provenance.
     """
     from ..design.design import design_text, read_design
     from ..io.files import check_output
@@ -129,7 +129,7 @@ def mask_command(design: Path, output: Path):
 
 
 def _options(command):
-    """An option for each tolerance."""
+    """Add an option for each tolerance."""
     for name, field in reversed(ToleranceSpec.model_fields.items()):
         least, most = (getattr(bound, side) for bound, side in zip(field.metadata, ("ge", "le"), strict=True))
         unit = name.rpartition("_")[2] if "_" in name else ""
@@ -141,24 +141,22 @@ def _options(command):
 
 @click.command("tolerance", epilog="Example: gs-jax tolerance geomscope --sensor-distance-um 20 -o tolerance.json")
 @click.argument("design", type=DESIGN)
-@click.option("-o", "--output", type=Path, help="TOLERANCE.json: write the numbers too, and a picture (.png) beside.")
+@click.option("-o", "--output", type=Path, help="TOLERANCE.json: write the numbers, and a picture (.png) beside it.")
 @click.option("--tolerances", "file", type=Path, help="TOML file of tolerances: position_um = 3.0 and so on.")
 @_options
-@click.option("--max-width-um", type=UM, help="Target: width of spots, in the object.  [default: 1.2 of the design's]")
+@click.option("--max-width-um", type=UM, help="Target: width of spots in the object.  [default: 1.2 of the design's]")
 @click.option(
     "--min-strehl",
     type=Number(least=1e-3, most=1.0, unit=""),
-    help="Target: Strehl ratio on the axis.  [default: 0.8 of the design's, where that is 0.1 or more]",
+    help="Target: Strehl ratio on the axis.  [default: 0.8 times the design's, if that is 0.1 or more]",
 )
 @click.option(
     "--max-depth-error-um", type=UM, help="Target: error of calibrated depths.  [default: the axial resolution, Eq. 6]"
 )
-@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: five over the working distance]")
-@click.option(
-    "--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of the sources to calibrate by.  [default: four]"
-)
-@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, show_default=True, help="Devices to draw.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Which devices.")
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: five in the working distance]")
+@click.option("--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of calibration sources.  [default: four]")
+@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, show_default=True, help="Random devices.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of the devices.")
 def tolerance_command(
     design: Path,
     output: Path | None,
@@ -172,10 +170,10 @@ def tolerance_command(
     seed: int,
     **tolerances: Any,
 ):
-    """Show how well the microscope of DESIGN must be made: what tolerances do to spots and depths, and the yield.
+    """Show the effect of tolerances on the spots and depths of the microscope of DESIGN, and the yield.
 
-    Tolerances are standard deviations; roughness and printed layers are what every device has. Depth errors are those
-    of points that are found with the design's geometry, and with one that is calibrated first.
+    ToleranceSpec are standard deviations; roughness and printed layers are the same in every device. Depth errors are
+    those of points located with the design's geometry, and with a calibrated one.
     """
     import jax
     import numpy as np
@@ -189,7 +187,7 @@ def tolerance_command(
     from ..io.point_tables import read_positions
     from ..io.provenance import KEY
 
-    # Least squares of a few numbers in many steps: single precision leaves micrometres.
+    # Single precision would leave errors of micrometres.
     jax.config.update("jax_enable_x64", True)
     drawing = output and output.with_suffix(".png")
     if output and drawing:
@@ -202,7 +200,7 @@ def tolerance_command(
     if positions:
         sources, _ = read_positions(positions, [])
         if not len(sources) or np.isnan(sources).any() or not (sources[:, 2] > 0).all():
-            raise InputError(f"{positions}: found a source whose place is not known, allowed: x, y and z > 0 of each.")
+            raise InputError(f"{positions}: every source must have x, y and z > 0, got one without.")
     microscope = read_design(design)
     um = lambda value: value and value / 1000
     targets = {"max_width": um(max_width_um), "min_strehl": min_strehl, "max_depth_error": um(max_depth_error_um)}

@@ -1,4 +1,4 @@
-"""What a command may write: nothing over what it reads, and over what a person may have made only if told to."""
+"""Checks of a command's outputs before it starts, and the provenance that it writes into them."""
 
 import os
 import shlex
@@ -11,38 +11,36 @@ import click
 from ..base.errors import InputError
 from ..base.progress import QUIET, shown
 
-# Designs, studies, points and centres: what people write by hand.
-_BY_HAND = (".toml", ".csv")
+# Files that people write by hand: designs, studies, points and centres.
+_WRITTEN_BY_HAND = (".toml", ".csv")
+# Key of the command line in click's `meta`.
+ARGUMENTS = "gs_jax.arguments"
 
-force_option = click.option("--force", is_flag=True, help="Replace .toml and .csv files that are there already.")
+force_option = click.option("--force", is_flag=True, help="Replace existing .toml and .csv files.")
 
 
 def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force: bool = False) -> None:
-    """To be asked before any work; in the end it says on standard error which results were replaced.
+    """Check the outputs before any work; when the command succeeds, report on standard error what was replaced.
 
     Raises
     ------
     InputError
-        If an output is an input, or a file as people write by hand, and `force` is not given.
+        If an output is an input, or an existing .toml or .csv file without `force`.
     """
-    read = [path for path in inputs if path is not None]
-    there = [path for path in outputs if path is not None and os.path.exists(path)]
-    for path in there:
-        if any(os.path.exists(other) and os.path.samefile(path, other) for other in read):
-            raise InputError(f"{path}: found an input of this command in the place of its output, allowed: another.")
-        if path.suffix.lower() in _BY_HAND and not force:
-            raise InputError(f"{path}: found a file that is there already, allowed: another, or --force to replace it.")
-    # Said when it has happened: a command that fails leaves them as they are.
-    if there:
-        names, quiet = ", ".join(map(str, there)), shown.get() == QUIET
-        click.get_current_context().call_on_close(lambda: _say_replaced(names, quiet))
-
-
-ARGUMENTS = "gs_jax.arguments"
+    existing_inputs = [path for path in inputs if path is not None and os.path.exists(path)]
+    existing = [path for path in outputs if path is not None and os.path.exists(path)]
+    for path in existing:
+        if any(os.path.samefile(path, other) for other in existing_inputs):
+            raise InputError(f"{path}: the output must be another file than the inputs, got an input.")
+        if path.suffix.lower() in _WRITTEN_BY_HAND and not force:
+            raise InputError(f"{path}: the output must be a new file, got an existing one; --force replaces it.")
+    if existing:
+        names, quiet = ", ".join(map(str, existing)), shown.get() == QUIET
+        click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
 
 
 def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
-    """What the running command writes into its files: itself, what it read, and the text of the design."""
+    """Provenance of the running command's outputs: command line, inputs, and the text of the design."""
     from ..io.provenance import made_by
 
     context = click.get_current_context()
@@ -50,6 +48,6 @@ def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:
     return made_by(command, [path for path in inputs if path is not None], design)
 
 
-def _say_replaced(names, quiet):
+def _report_replaced(names, quiet):
     if sys.exc_info()[0] is None and not quiet:
         click.echo(f"gs-jax: replaced {names}", err=True)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a command soon, whatever compiled code it is in, and leave nothing half-written."""
+"""SIGINT and SIGTERM: end a command soon, even within compiled code, and leave no half-written file."""
 
 import multiprocessing
 import os
@@ -12,43 +12,43 @@ from pathlib import Path
 
 from ..io.files import remove_temporaries
 
-# Seconds that Python has to end by itself: to close files, and to say what it wants to say.
+# Seconds that Python has to end by itself, to close files and print its last lines.
 PATIENCE = 1.0
-# Exit status of a command that a signal ended, as shells have it.
+# Exit statuses of commands that a signal ended begin here, as in shells.
 _BY_SIGNAL = 128
-# Files to be named after an interrupt, and what to say of them.
-kept: dict[Path, str] = {}
+# Files to name after an interrupt, with a text about each.
+partial_outputs: dict[Path, str] = {}
 RESUMABLE, PARTIAL = "has what is done, and --resume goes on from it", "has what is done"
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as an exception like that of Ctrl-C."""
+    """Raised by SIGTERM, as `KeyboardInterrupt` by Ctrl-C."""
 
 
-def status_of(interrupt: BaseException | None) -> int:
+def exit_status(interrupt: BaseException | None) -> int:
     """130 for Ctrl-C, 143 for SIGTERM."""
     return _BY_SIGNAL + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
 
 
-def message() -> str:
-    """The line that an interrupted command ends with."""
-    there = [f"{path} {text}" for path, text in kept.items() if path.exists()]
-    return f"gs-jax: {'; '.join(['interrupted', *there])}"
+def interrupt_message() -> str:
+    """The last line of an interrupted command."""
+    existing = [f"{path} {text}" for path, text in partial_outputs.items() if path.exists()]
+    return f"gs-jax: {'; '.join(['interrupted', *existing])}"
 
 
 @contextmanager
-def ending_soon() -> Iterator[None]:
-    """Within it, a signal raises an exception, as always, and if that has not ended the process soon, ends it.
+def exit_on_signal() -> Iterator[None]:
+    """Within it, a signal raises an exception, and ends the process if that has not done so within `PATIENCE`.
 
-    Compiled code returns to Python when it is done, minutes later at full scale; until then there is no exception.
-    Only the main thread may call it.
+    Compiled code may return to Python only minutes later, and no exception is raised before. Only the main thread may
+    enter it.
     """
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     wakeup = signal.set_wakeup_fd(theirs.fileno())
-    # A process in the background may ignore Ctrl-C, and goes on to.
-    heard = {number: own for number, own in _HANDLERS.items() if signal.getsignal(number) != signal.SIG_IGN}
-    handlers = {number: signal.signal(number, own) for number, own in heard.items()}
+    # A background process may ignore Ctrl-C, and continues to.
+    replaced = {number: own for number, own in _HANDLERS.items() if signal.getsignal(number) != signal.SIG_IGN}
+    handlers = {number: signal.signal(number, own) for number, own in replaced.items()}
     hook, sys.unraisablehook = sys.unraisablehook, _unraisable
     threading.Thread(target=_watch, args=(ours,), daemon=True).start()
     try:
@@ -61,8 +61,8 @@ def ending_soon() -> Iterator[None]:
         theirs.close()
 
 
-def end(status: int) -> None:
-    """Ends the process here and now. An interpreter that shuts down under running compiled code may crash."""
+def exit_now(status: int) -> None:
+    """End the process without shutting the interpreter down, which may crash under running compiled code."""
     remove_temporaries()
     for child in multiprocessing.active_children():
         child.terminate()
@@ -72,31 +72,31 @@ def end(status: int) -> None:
 
 
 def _interrupt(number, frame):
-    _end_while_importing(number, frame)
+    _exit_if_importing(number, frame)
     raise KeyboardInterrupt
 
 
 def _terminate(number, frame):
-    _end_while_importing(number, frame)
+    _exit_if_importing(number, frame)
     raise Terminated
 
 
 _HANDLERS = {signal.SIGINT: _interrupt, signal.SIGTERM: _terminate}
 
 
-def _end_while_importing(number, frame):
-    """An exception within an extension's initialisation may crash it; nothing has been written that early."""
+def _exit_if_importing(number, frame):
+    # An exception within the initialisation of an extension may crash it; nothing has been written that early.
     while frame:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            print(message(), file=sys.stderr)
-            end(_BY_SIGNAL + number)
+            print(interrupt_message(), file=sys.stderr)
+            exit_now(_BY_SIGNAL + number)
         frame = frame.f_back
 
 
-def _unraisable(found):
-    """An interrupt within a garbage collector's callback goes no farther; the watch ends the process."""
-    if not (found.exc_type and issubclass(found.exc_type, KeyboardInterrupt)):
-        sys.__unraisablehook__(found)
+def _unraisable(unraisable):
+    # An interrupt within a garbage collector's callback is lost; `_watch` ends the process.
+    if not (unraisable.exc_type and issubclass(unraisable.exc_type, KeyboardInterrupt)):
+        sys.__unraisablehook__(unraisable)
 
 
 def _watch(ours):
@@ -107,5 +107,5 @@ def _watch(ours):
         else:
             return
     threading.Event().wait(PATIENCE)
-    print(f"\n{message()}", file=sys.stderr)
-    end(_BY_SIGNAL + number[0])
+    print(f"\n{interrupt_message()}", file=sys.stderr)
+    exit_now(_BY_SIGNAL + number[0])

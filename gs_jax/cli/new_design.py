@@ -138,12 +138,12 @@ def new_design_command(output: Path, centers: Path | None, name: str | None, for
 def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -> None:
     """Options that exclude each other, and those that nobody is there to be asked for."""
     if {"focal_length_mm", "radius_of_curvature_mm"} <= known.keys():
-        raise InputError("--radius-of-curvature-mm: found --focal-length-mm too, allowed: one of them.")
+        raise InputError("--radius-of-curvature-mm must be used without --focal-length-mm.")
     if centers and "count" in known:
-        raise InputError("--count: found --centers too, allowed: one of them.")
+        raise InputError("--count must be used without --centers.")
     about = [key for key in ("centers_unit", "centers_columns", "centers_origin", "mirror") if known.get(key)]
     if about and not centers and not (asking and "count" not in known):
-        raise InputError(f"{_option(about[0])}: found no --centers, allowed: with it alone.")
+        raise InputError(f"{_option(about[0])} must be used with --centers.")
     if asking:
         return
     missing = [_option(key) for key in ("pixel_pitch_um", "shape") if key not in known]
@@ -154,9 +154,7 @@ def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -
     if "working_distance_mm" not in known:
         missing.append("--working-distance-mm")
     if missing:
-        raise InputError(
-            f"found no {', '.join(missing)}, allowed: all of them, or a terminal, where they are asked for."
-        )
+        raise InputError(f"{', '.join(missing)} must be given where no terminal can ask for them.")
 
 
 def _lenses(known: dict[str, Any], asking: bool) -> None:
@@ -214,7 +212,7 @@ def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
     shape, pitch = tuple(map(float, known["shape"])), known["pixel_pitch_um"] / 1000
     found = unit_of_file(file, columns)
     if own := next(iter(lens_columns(file, columns)), None):
-        raise InputError(f"{file}: found a column {own}, allowed: in the `centers_file` of a design alone.")
+        raise InputError(f"{file}: a column {own} must be in the `centers_file` of a design, got it in --centers.")
     if unit is None and found is None and asking:
         unit = click.prompt("unit of the file's numbers", "mm", type=click.Choice(["mm", "um", "px"]))
     place = {"columns": columns, "unit": unit, "size": size, "shape": shape, "pixel_pitch": pitch}
@@ -244,9 +242,7 @@ def _crop(known: dict[str, Any], asking: bool) -> int:
         return 0
     found = f"{beyond} of {len(kept)} lenses are beyond the sensor's reach"
     if not kept.any() or not (known["crop"] or (asking and click.confirm(f"{found}: leave them out?", default=True))):
-        raise InputError(
-            f"{known.get('file', 'layout')}: found that {found}, allowed: none, or --crop to leave them out."
-        )
+        raise InputError(f"{known.get('file', 'layout')}: {found}; --crop leaves them out.")
     known["centers"] = known["centers"][kept]
     known["size_mm"] = tuple(map(min, known["size_mm"], plate_of(known["centers"])))
     return beyond
@@ -262,7 +258,7 @@ def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
     if asking:
         known[key] = _ask(known, f"{_PLACES[key]}.{key}", default or _OFFERED.get(key))
     elif default is None:
-        raise InputError(f"{_option(key)}: found nothing, and nothing follows from the others, allowed: a value.")
+        raise InputError(f"{_option(key)} must be given: it does not follow from other options.")
     else:
         known[key] = default
 

@@ -1,4 +1,4 @@
-"""`gs-jax optimize`: a better design."""
+"""`gs-jax optimize` and `gs-jax pareto`: searches for better designs."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, make_folder, write_json
 from .files import check_may_write, force_option, provenance_of
-from .interrupt import PARTIAL, RESUMABLE, kept
+from .interrupt import PARTIAL, RESUMABLE, partial_outputs
 from .options import DESIGN, worker_options
 
 
@@ -18,15 +18,15 @@ from .options import DESIGN, worker_options
     epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml",
 )
 @click.argument("design", type=DESIGN)
-@click.option("--study", type=Path, required=True, help="STUDY.toml: what is free, what is wanted, which solvers.")
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint that an interrupted run left beside NEW.toml.")
-@click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture go beside it.")
+@click.option("--study", type=Path, required=True, help="STUDY.toml: free parameters, goals and solvers.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint of an interrupted run beside NEW.toml.")
+@click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture are written beside it.")
 @worker_options
 @force_option
 def optimize_command(design: Path, study: Path, resume: bool, output: Path, force: bool, workers: Workers):
-    """Search for a better microscope than that of the file DESIGN, and show before and after.
+    """Search for a better microscope than that of the file DESIGN, and compare both.
 
-    Beside NEW.toml are written NEW.json (the terms, every start and step) and NEW.png (layout and history). Workers run
+    NEW.json (the terms, every start and step) and NEW.png (layout and history) are written beside NEW.toml. Workers run
     the starts of the study's first stage.
     """
     import jax
@@ -39,12 +39,12 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
     check_outputs(output)
     beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))
     check_may_write(output, *beside, inputs=(design, study), force=force)
-    # Searches end within a billionth of the minimum; single precision stops far from it.
+    # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output)
     if resume and not checkpoint.exists():
-        raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
-    kept[checkpoint] = RESUMABLE
+        raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
+    partial_outputs[checkpoint] = RESUMABLE
     with Progress() as progress, workers:
         how = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
         outcome = search.run_study(design, study, **how)
@@ -61,9 +61,9 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
 @click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
 @worker_options
 def pareto_command(study: Path, out: Path, workers: Workers):
-    """Show the trade-off that the file STUDY asks for: its one goal against one or two moving limits.
+    """Compute the trade-off of the file STUDY: its one goal against one or two moving limits.
 
-    The folder gets pareto.json, the designs' numbers, which grows as they are found, and pareto.png.
+    The folder gets pareto.json, to which each design is added when it is found, and pareto.png.
     """
     import jax
     from rich.console import Console
@@ -76,7 +76,7 @@ def pareto_command(study: Path, out: Path, workers: Workers):
     from ..io.files import write_figure
     from ..io.provenance import KEY
 
-    # Searches end within a billionth of the minimum; single precision stops far from it.
+    # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     question = read_study(study)
     start = parent_path(study, question)
@@ -90,7 +90,7 @@ def pareto_command(study: Path, out: Path, workers: Workers):
 
     def each(front):
         write_json(numbers, {KEY: provenance} | as_json(front))
-        kept[numbers] = PARTIAL
+        partial_outputs[numbers] = PARTIAL
 
     with Progress() as progress, workers, errors_name_file(study):
         front = trade_off(parent, question, each=each, progress=progress, workers=workers)

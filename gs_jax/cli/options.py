@@ -1,7 +1,7 @@
-"""Arguments that several commands take, and names that one has.
+"""Parameter types and options that several commands share, and the reading of captures with them.
 
-Commands import what they run when they run: their help needs none of it. So the names of methods and models are here
-again.
+Commands import what they run only when they run, so that their help is quick. So the names of methods and models are
+repeated here.
 """
 
 import functools
@@ -14,22 +14,23 @@ import click
 from ..base.workers import Workers
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
-_MOST_DEPTHS = 10_000
-# The nearest depth that a volume on disk may have, mm.
+_MAX_DEPTHS = 10_000
+# Nearest depth that a file of volumes may have, mm.
 _NEAREST = 1e-6
-
 
 METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
 SUPPRESSIONS = ("none", "points", "clusters", "unet")
 LEVELS = ("full", "near", "pinhole")
 SIMULATED = ("full", "near")
 PSFS = ("diffraction", "geometric", "gaussian")
+CHANNELS = ("red", "green", "blue")
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
 class Number(click.ParamType):
     """A number within bounds."""
 
-    def __init__(self, *, least: float, most: float, unit: str):
+    def __init__(self, *, least: float, most: float, unit: str = ""):
         self.least, self.most, self.unit, self.name = least, most, unit, unit or "number"
 
     def convert(self, value, param, ctx):
@@ -38,7 +39,8 @@ class Number(click.ParamType):
         except ValueError:
             number = math.nan
         if not self.least <= number <= self.most:
-            self.fail(f"found {value!r}, allowed: {self.least:g} to {self.most:g} {self.unit}.", param, ctx)
+            unit = f" {self.unit}" if self.unit else ""
+            self.fail(f"must be {self.least:g} to {self.most:g}{unit}, got {value!r}.", param, ctx)
         return number
 
 
@@ -53,13 +55,13 @@ class Depths(click.ParamType):
         try:
             start, stop, step = map(float, value.split(":") if ":" in value else (value, value, 1))
         except ValueError:
-            self.fail(f"found {value!r}, allowed: START:STOP:STEP, mm, such as 18:22:0.25, or one depth.", param, ctx)
+            self.fail(f"must be START:STOP:STEP in mm, such as 18:22:0.25, or one depth, got {value!r}.", param, ctx)
         if not all(map(math.isfinite, (start, stop, step))) or not _NEAREST <= start <= stop or not step > 0:
-            self.fail(f"found {value!r}, allowed: {_NEAREST:g} <= START <= STOP and STEP > 0, in mm.", param, ctx)
+            self.fail(f"must have {_NEAREST:g} <= START <= STOP and STEP > 0, in mm, got {value!r}.", param, ctx)
         # A step that misses STOP by rounding alone falls on it.
         count = (stop - start) / step + 1 + 1e-6
-        if count > _MOST_DEPTHS + 1:
-            self.fail(f"found {value!r}, {count:.3g} depths, allowed: at most {_MOST_DEPTHS}.", param, ctx)
+        if count > _MAX_DEPTHS + 1:
+            self.fail(f"must have at most {_MAX_DEPTHS} depths, got {value!r}, {count:.3g} depths.", param, ctx)
         return [round(start + i * step, 9) for i in range(int(count))]
 
 
@@ -71,48 +73,8 @@ class DesignFile(click.ParamType):
     def convert(self, value, param, ctx):
         path = Path(value)
         if path.parent == Path() and not path.suffix and not path.exists():
-            return next((each for each in shipped_designs() if each.stem == value), path)
+            return next((shipped for shipped in shipped_designs() if shipped.stem == value), path)
         return path
-
-
-def shipped_designs() -> list[Path]:
-    """The designs that come with the package; of a checkout, those in its folder."""
-    inside = Path(__file__).parents[1] / "design" / "shipped"
-    return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
-
-
-DESIGN = DesignFile()
-MM = Number(least=1e-3, most=1e4, unit="mm")
-UM = Number(least=1e-2, most=1e6, unit="um")
-
-
-def worker_options(command):
-    """Who does the work; the command takes it as `workers`, and enters it when there is work."""
-
-    @functools.wraps(command)
-    def taking(*arguments, workers, scheduler, **given):
-        return command(*arguments, workers=Workers(workers, scheduler), **given)
-
-    count = click.option(
-        "--workers",
-        type=click.IntRange(1, 1000),
-        help="Processes of this machine that share the work. Needs pip install 'gs-jax[cluster]'.  [default: this one]",
-    )
-    address = click.option(
-        "--scheduler", help="Address of a Dask scheduler whose workers do the work: tcp://HOST:8786."
-    )
-    return count(address(taking))
-
-
-def depth_range(depths: list[float]) -> str:
-    """The depths in words."""
-    if len(depths) == 1:
-        return f"at {depths[0]:g} mm"
-    return f"{len(depths)} depths from {depths[0]:g} to {depths[-1]:g} mm"
-
-
-CHANNELS = ("red", "green", "blue")
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
 class Page(click.ParamType):
@@ -125,7 +87,7 @@ class Page(click.ParamType):
             return value
         if value.isdecimal() and int(value) > 0:
             return int(value)
-        self.fail(f"found {value!r}, allowed: a page, 1 or more, or mean.", param, ctx)
+        self.fail(f"must be a page, 1 or more, or mean, got {value!r}.", param, ctx)
 
 
 class Region(click.ParamType):
@@ -138,41 +100,71 @@ class Region(click.ParamType):
             return value
         numbers = value.split(",")
         if len(numbers) != 4 or not all(number.strip().isdecimal() for number in numbers):
-            self.fail(f"found {value!r}, allowed: ROW,COLUMN,ROWS,COLUMNS in pixels, from 0.", param, ctx)
+            self.fail(f"must be ROW,COLUMN,ROWS,COLUMNS in pixels, from 0, got {value!r}.", param, ctx)
         return tuple(map(int, numbers))
 
 
-_READOUT = (
+def shipped_designs() -> list[Path]:
+    """The designs that come with the package; in a checkout, those in its folder."""
+    inside = Path(__file__).parents[1] / "design" / "shipped"
+    return sorted((inside if inside.is_dir() else Path(__file__).parents[2] / "design").glob("*.toml"))
+
+
+DESIGN = DesignFile()
+MM = Number(least=1e-3, most=1e4, unit="mm")
+UM = Number(least=1e-2, most=1e6, unit="um")
+
+
+def worker_options(command):
+    """Add `--workers` and `--scheduler`; the command receives `workers`, which it enters when there is work."""
+
+    @functools.wraps(command)
+    def wrapper(*args, workers, scheduler, **kwargs):
+        return command(*args, workers=Workers(workers, scheduler), **kwargs)
+
+    count = click.option(
+        "--workers",
+        type=click.IntRange(1, 1000),
+        help="Number of processes on this machine that share the work. Needs pip install 'gs-jax[cluster]'.  "
+        "[default: this process]",
+    )
+    address = click.option("--scheduler", help="Dask scheduler whose workers do the work: tcp://HOST:8786.")
+    return count(address(wrapper))
+
+
+_FORMAT_OPTIONS = (
     click.option(
-        "--page", type=Page(), help="Of a capture of several pages: one, from 1; or mean, of repeated frames."
+        "--page", type=Page(), help="Page of a capture of several, from 1; or mean, to average repeated frames."
     ),
-    click.option("--channel", type=click.Choice(CHANNELS), help="Of a colour capture, or of the mosaic of --bayer."),
+    click.option("--channel", type=click.Choice(CHANNELS), help="Channel of a colour capture or of a --bayer mosaic."),
     click.option(
         "--bayer",
         type=click.Choice(PATTERNS),
-        help="The capture is a raw mosaic, whose first pixels these are. Nothing is interpolated.",
+        help="The capture is a raw mosaic whose first pixels are these. Nothing is interpolated.",
     ),
 )
-_REGION = (
-    click.option(
-        "--roi", type=Region(), help="The part of the sensor that the capture is, in pixels of the whole; first row 0."
-    ),
+_REGION_OPTIONS = (
+    click.option("--roi", type=Region(), help="Region of the sensor that the capture covers, in unbinned pixels."),
     click.option(
         "--binning",
         type=click.IntRange(1, 64),
         default=1,
         show_default=True,
-        help="Pixels each way that the camera made one.",
+        help="Side of the squares of pixels that the camera combined.",
     ),
 )
-_CORRECTION = (
-    click.option("--dark", type=Path, help="DARK.tif: as exposed, without light; several pages are averaged."),
-    click.option("--flat", type=Path, help="FLAT.tif: even light on the sensor, without the array; likewise."),
+_CORRECTION_OPTIONS = (
+    click.option(
+        "--dark", type=Path, help="DARK.tif: dark frame of the capture's exposure; several pages are averaged."
+    ),
+    click.option(
+        "--flat", type=Path, help="FLAT.tif: even light on the sensor without the array; several pages are averaged."
+    ),
     click.option(
         "--bad-pixels",
         default="auto",
         show_default=True,
-        help="MASK.png, in which all but 0 is bad; none; or auto: the hot ones of DARK, or single ones of the capture.",
+        help="MASK.png, nonzero at bad pixels; none; or auto: hot pixels of DARK, or isolated ones of the capture.",
     ),
     click.option(
         "--offset",
@@ -184,7 +176,7 @@ _CORRECTION = (
 
 
 class CaptureOptions:
-    """What the options say, and what was done to the captures that were read with them."""
+    """Reads captures with the capture options, and collects what was corrected in them."""
 
     def __init__(self, page=None, channel=None, bayer=None, roi=None, binning=1, *, dark, flat, bad_pixels, offset):
         from ..io.camera import Correction, Readout
@@ -193,42 +185,40 @@ class CaptureOptions:
         mask = bad_pixels if bad_pixels in ("auto", "none") else Path(bad_pixels)
         self.correction = Correction(dark, flat, mask, offset)
         self.sensor: Any = None
+        # Lines to print, with the captures that each is about.
         self.done, self.warnings = {}, {}
 
     @property
     def files(self) -> list[Path]:
-        """Files beside the captures."""
-        return [
-            each
-            for each in (self.correction.dark, self.correction.flat, self.correction.bad_pixels)
-            if isinstance(each, Path)
-        ]
+        """Files that correct the captures."""
+        candidates = (self.correction.dark, self.correction.flat, self.correction.bad_pixels)
+        return [path for path in candidates if isinstance(path, Path)]
 
     def imager(self, imager):
-        """The microscope with the pixels that its captures have."""
+        """The microscope with the pixels of its captures."""
         import equinox as eqx
 
         self.sensor = imager.sensor
         return eqx.tree_at(lambda i: i.sensor, imager, self.readout.sensor(imager.sensor))
 
     def read(self, path: Path, *, is_spot: bool = False):
-        """The image of a capture, corrected; of one spot, the mean of all pages, and no pixel of it is too sharp."""
+        """Read and correct a capture; of a single spot, average all pages and keep sharp pixels."""
         from ..io.camera import read_corrected
 
         page, correction = self.page, self.correction
         if is_spot:
             page = "mean"
             correction = correction._replace(bad_pixels="none") if correction.bad_pixels == "auto" else correction
-        found = read_corrected(path, self.sensor, page=page, readout=self.readout, correction=correction)
-        for line in found.done:
+        capture = read_corrected(path, self.sensor, page=page, readout=self.readout, correction=correction)
+        for line in capture.done:
             self.done.setdefault(line, []).append(path)
-        self.warnings |= dict.fromkeys(found.warnings)
-        return found.image
+        self.warnings |= dict.fromkeys(capture.warnings)
+        return capture.image
 
     def frames(self, recording):
-        """From a frame of a recording to its image, corrected, float32, what was done to it alone, and what is wrong.
+        """Read the correction of a recording; return the function that reads a frame.
 
-        What corrects all frames is read here.
+        It returns the frame's image, float32, and lines about corrections and warnings of this frame alone.
         """
         import numpy as np
 
@@ -243,46 +233,55 @@ class CaptureOptions:
         self.warnings |= dict.fromkeys(prepared.warnings)
 
         def read(frame):
-            found = read_frame(recording.names[frame], recording.images(frame, wanted), prepared, readout)
-            # One type for all frames: nothing is compiled for another.
-            done, warnings = ([line for line in lines if line not in shared] for lines in (found.done, found.warnings))
-            return np.asarray(found.image, np.float32), done, warnings
+            capture = read_frame(recording.names[frame], recording.images(frame, wanted), prepared, readout)
+            done, warnings = (
+                [line for line in lines if line not in shared] for lines in (capture.done, capture.warnings)
+            )
+            # One type for all frames, so that nothing is compiled twice.
+            return np.asarray(capture.image, np.float32), done, warnings
 
         return read
 
     def recorded(self, provenance: dict[str, str]) -> dict[str, str]:
-        """A provenance that says what was done, too."""
+        """Add the corrections to a provenance."""
         return provenance | ({"correction": "; ".join(self._lines())} if self.done else {})
 
-    def say(self) -> None:
-        """Prints what was done to the captures, a line each, and on standard error what is wrong with them."""
+    def print_corrections(self) -> None:
+        """Print what was corrected, a line each, and warnings on standard error."""
         for line in self._lines():
             click.echo(line)
         for line in self.warnings:
             click.echo(f"gs-jax: warning: {line}", err=True)
 
     def _lines(self):
-        named = lambda paths: paths[0].name if len(paths) == 1 else f"{len(paths)} captures"
-        return [f"{named(paths)}: {line}" for line, paths in self.done.items()]
+        names = lambda paths: paths[0].name if len(paths) == 1 else f"{len(paths)} captures"
+        return [f"{names(paths)}: {line}" for line, paths in self.done.items()]
 
 
 def capture_options(command):
-    """The options; the command takes them as `camera`, a `CaptureOptions`."""
-    return _with(command, (*_READOUT, *_REGION, *_CORRECTION))
+    """Add the options of captures; the command receives them as `camera`, a `CaptureOptions`."""
+    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS))
 
 
 def picture_options(command):
-    """As `capture_options`, of captures without a design: their part of a sensor is all that there is."""
-    return _with(command, (*_READOUT, *_CORRECTION))
+    """As `capture_options`, without those that place the capture on a sensor."""
+    return _with_camera(command, (*_FORMAT_OPTIONS, *_CORRECTION_OPTIONS))
 
 
-def _with(command, options):
+def _with_camera(command, options):
     @functools.wraps(command)
-    def taking(*arguments, **given):
+    def wrapper(*args, **kwargs):
         names = ("page", "channel", "bayer", "roi", "binning", "dark", "flat", "bad_pixels", "offset")
-        mine = {name: given.pop(name) for name in names if name in given}
-        return command(*arguments, camera=CaptureOptions(**mine), **given)
+        camera = CaptureOptions(**{name: kwargs.pop(name) for name in names if name in kwargs})
+        return command(*args, camera=camera, **kwargs)
 
     for option in reversed(options):
-        taking = option(taking)
-    return taking
+        wrapper = option(wrapper)
+    return wrapper
+
+
+def depth_range(depths: list[float]) -> str:
+    """The depths in words."""
+    if len(depths) == 1:
+        return f"at {depths[0]:g} mm"
+    return f"{len(depths)} depths from {depths[0]:g} to {depths[-1]:g} mm"

@@ -1,4 +1,4 @@
-"""`gs-jax report`: a design and what it showed, as a page."""
+"""`gs-jax report`, `explore`, `demo` and `benchmark`: pages and figures of designs and methods."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
 from .files import check_may_write, provenance_of
-from .interrupt import PARTIAL, kept
+from .interrupt import PARTIAL, partial_outputs
 from .options import DESIGN, CaptureOptions, capture_options
 
 
@@ -19,8 +19,8 @@ from .options import DESIGN, CaptureOptions, capture_options
 @click.argument("design", type=DESIGN)
 @click.argument("volume", type=Path, required=False)
 @click.option("-o", "--output", type=Path, required=True, help="REPORT.html.")
-@click.option("--points", type=Path, help="POINTS.csv: found points, for a table and a view in space.")
-@click.option("--capture", type=Path, help="CAPTURE.tif: what it was reconstructed from.")
+@click.option("--points", type=Path, help="POINTS.csv: points for a table and a 3-D view.")
+@click.option("--capture", type=Path, help="CAPTURE.tif: the capture of VOLUME.")
 @click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
 @capture_options
 def report_command(
@@ -32,18 +32,18 @@ def report_command(
     tolerance: Path | None,
     camera: CaptureOptions,
 ):
-    """Show the microscope of DESIGN, and what it showed, as one page that any browser opens, without a network.
+    """Write one page, for any browser and without a network, about the microscope of DESIGN and a reconstruction.
 
-    VOLUME is what `gs-jax reconstruct` wrote. The page has the device to scale, the datasheet and what violates what,
-    spots and contrast through depth and field, the layout, the mold; the capture, the volume and the points where they
-    are given; what calibration and tolerances say; and which files all came from. It is less than 15 MB.
+    VOLUME is an output of `gs-jax reconstruct`. The page has the device to scale, the datasheet and violated
+    assumptions, spots and contrast over depth and field, the layout and the mold; the capture, volume and points that
+    are given; the results of calibration and tolerances; and the files that it was made from. It is below 15 MB.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
     check_output(output, [".html"])
     check_may_write(output, inputs=(design, volume, points, capture, tolerance, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
-        raise InputError(f"{volume}: found it in the place of VOLUME, allowed: .ome.tif or .zarr; points by --points.")
+        raise InputError(f"{volume}: VOLUME must be .ome.tif or .zarr; points are given by --points.")
     from ..apps.report.page import write_report
     from ..apps.report.report_tables import read_tolerance
     from ..design.design import design_text, read_design
@@ -72,27 +72,26 @@ def report_command(
         write_report(
             output, microscope, **given, origins=origins, provenance=camera.recorded(provenance), progress=progress
         )
-    camera.say()
+    camera.print_corrections()
     click.echo(f"{output}: {output.stat().st_size / 1e6:.1f} MB, opens in any browser")
 
 
 @click.command("explore", epilog="Example: gs-jax explore geomscope --study targets.toml -o mine.toml")
 @click.argument("design", type=DESIGN)
-@click.option("--study", type=Path, help="STUDY.toml, whose targets are judged, as in `gs-jax optimize`.")
+@click.option("--study", type=Path, help="STUDY.toml whose targets are evaluated, as in `gs-jax optimize`.")
 @click.option(
     "-o",
     "--output",
     type=Path,
-    help="NEW.toml to save to; a number is added where it is there.  [default: NAME-new.toml]",
+    help="NEW.toml to save to; a number is added if it exists.  [default: NAME-new.toml]",
 )
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of the page.  [default: one that is free]")
-@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page.  [default: a free one]")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in a browser.")
 def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool):
-    """Move sensor distance, curvature, aperture, pitch, depths and field of DESIGN in a browser, and see what it does.
+    """Change sensor distance, curvature, aperture, pitch, depths and field of DESIGN by sliders in a browser.
 
-    The page shows what violates a target, in words; spots, the layout with ghosts, the datasheet, a small simulated
-    reconstruction; keeps designs to compare with, and saves them. It is on this machine alone: nobody else can open it.
-    Ctrl-C ends it.
+    The page shows violated targets, spots, the layout with ghosts, the datasheet and a small simulated reconstruction.
+    It compares and saves designs. Only this machine can open it; Ctrl-C ends it.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
@@ -119,13 +118,13 @@ def explore_command(design: Path, study: Path | None, output: Path | None, port:
 @click.command("demo", epilog="Example: gs-jax demo --out demo")
 @click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
 def demo_command(out: Path):
-    """Run the pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
+    """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
     from ..apps.example_pipeline import run
 
     with Progress() as progress:
         report = run(out, progress)
-    click.echo(f"{report}: what was made, and what it shows")
-    click.echo(f"{report.with_suffix('.html')}: the microscope and what it showed, in a browser")
+    click.echo(f"{report}: the files, and their results")
+    click.echo(f"{report.with_suffix('.html')}: the microscope and its results, in a browser")
 
 
 @click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
@@ -140,7 +139,7 @@ def benchmark_command(out: Path):
 
     def each(records):
         write_records(numbers, records, provenance)
-        kept[numbers] = PARTIAL
+        partial_outputs[numbers] = PARTIAL
 
     with Progress() as progress:
         records, left_out = run(each=each, progress=progress)

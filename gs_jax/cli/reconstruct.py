@@ -1,8 +1,8 @@
-"""`gs-jax reconstruct`: a capture to a volume, or to points; a recording to volumes in time."""
+"""`gs-jax reconstruct`: a volume, and points, from a capture or from each frame of a recording."""
 
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -24,7 +24,7 @@ from .options import (
     depth_range,
     worker_options,
 )
-from .recording_command import check_recording, in_words, reconstruct_recording, recording_options
+from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
 
 
 @click.command(
@@ -34,13 +34,13 @@ from .recording_command import check_recording, in_words, reconstruct_recording,
 @click.argument("capture", type=Path)
 @click.argument("design", type=DESIGN)
 @click.option(
-    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included; or one."
+    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included; or one depth."
 )
 @click.option(
     "--voxel-um",
     type=UM,
-    help="Lateral voxel pitch; twice as wide takes about a quarter of the time.  "
-    "[default: a pixel, seen at the middle depth; 4 pixels for iterative methods]",
+    help="Lateral voxel pitch; doubling it takes about a quarter of the time.  [default: one pixel as seen at the "
+    "middle depth; 4 pixels for iterative methods]",
 )
 @click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
 @click.option(
@@ -48,30 +48,26 @@ from .recording_command import check_recording, in_words, reconstruct_recording,
     type=click.IntRange(1, 100_000),
     default=20,
     show_default=True,
-    help="Of list-rl to admm; unrolled has its own.",
+    help="Steps of list-rl, richardson-lucy, fista and admm; unrolled has its own.",
 )
 @click.option(
     "--optics",
     type=click.Choice(LEVELS),
     default="full",
     show_default=True,
-    help="What the method knows of the light: all, one PSF for all lenses near a point, or chief rays alone.",
+    help="Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.",
 )
+@click.option("--tv", type=Number(least=0.0, most=10.0), help="Weight of total variation (richardson-lucy, admm).")
+@click.option("--sparsity", type=Number(least=0.0, most=1.0), help="Weight of the sum of voxels (fista, admm).")
 @click.option(
-    "--tv", type=Number(least=0.0, most=10.0, unit=""), help="Weight of total variation (richardson-lucy, admm)."
-)
-@click.option(
-    "--sparsity", type=Number(least=0.0, most=1.0, unit=""), help="Weight of the sum of voxels (fista, admm)."
-)
-@click.option(
-    "--stop-at-noise", is_flag=True, help="End before the last step where all but noise is explained (list-rl to admm)."
+    "--stop-at-noise", is_flag=True, help="Stop early when all but noise is explained (list-rl to admm in --method)."
 )
 @click.option(
     "--suppress",
     type=click.Choice(SUPPRESSIONS),
     default="none",
     show_default=True,
-    help="Background suppression: points that their lenses agree on, the paper's clusters, or a network for anything.",
+    help="Background suppression: points on which their lenses agree, the paper's clusters, or a network.",
 )
 @click.option(
     "--weights",
@@ -82,9 +78,7 @@ from .recording_command import check_recording, in_words, reconstruct_recording,
     "-o", "--output", type=Path, required=True, help="VOLUME.ome.tif, or VOLUME.zarr for OME-Zarr and for recordings."
 )
 @click.option(
-    "--points",
-    type=Path,
-    help="POINTS.csv: write the points that the capture shows, too; of a recording with their frame, from 0.",
+    "--points", type=Path, help="POINTS.csv: also write the points in the capture; of a recording with their frame."
 )
 @recording_options
 @worker_options
@@ -95,33 +89,28 @@ def reconstruct_command(
     design: Path,
     depths: list[float],
     voxel_um: float | None,
-    method: str,
-    steps: int,
-    optics: str,
-    tv: float | None,
-    sparsity: float | None,
-    stop_at_noise: bool,
-    suppress: str,
-    weights: Path | None,
     output: Path,
     points: Path | None,
+    weights: Path | None,
     force: bool,
     frame_interval: float | None,
     track: float | None,
     resume: bool,
     camera: CaptureOptions,
     workers: Workers,
+    **method_options: Any,
 ):
-    """Reconstruct the volume that CAPTURE shows, taken with the microscope of the file DESIGN.
+    """Reconstruct the volume in CAPTURE, an image by the microscope of the file DESIGN.
 
-    CAPTURE is a grey TIFF, PNG or .npy of the sensor's size, or what --page, --channel, --bayer, --roi, --binning say
-    of it; --dark, --flat, --bad-pixels and --offset correct it. The volume is written to scale, for Fiji and napari.
+    CAPTURE is a grey TIFF, PNG or .npy of the sensor's size; other files need --page, --channel, --bayer, --roi or
+    --binning. --dark, --flat, --bad-pixels and --offset correct it. The volume opens to scale in Fiji and napari.
 
     CAPTURE may be a recording: a TIFF or .npy of several pages, a folder of captures, a pattern in quotes, or a Zarr
-    array (t, y, x). All frames go to one VOLUME.zarr (t, z, y, x); a bad one is named and left empty (exit status 1).
+    array (t, y, x). All frames go to one VOLUME.zarr (t, z, y, x); a frame that fails is named and left empty (exit
+    status 1).
 
     \b
-    A recording of 20 frames a second, and on after an interrupt:
+    A recording of 20 frames a second, to be continued after an interrupt:
     gs-jax reconstruct "run7/*.tif" my.toml --depths 18:22:0.25 --frame-interval 0.05 -o run7.zarr --resume
 
     \b
@@ -130,10 +119,11 @@ def reconstruct_command(
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..design.design import design_text, read_design
+    from ..io.point_tables import write_points
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.cpu.dispatch import once
-    from ..reconstruction.workflow import imaged_again, plan
+    from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
     if points:
@@ -142,71 +132,46 @@ def reconstruct_command(
         from ..detection.tracking import linker
 
         if not points:
-            raise InputError("--track: found no --points, allowed: with POINTS.csv, which has the particles.")
+            raise InputError("--track must be used with --points POINTS.csv, which has the particles.")
         linker()
     check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
-        raise InputError(f"{capture}: found a design in the place of CAPTURE, allowed: CAPTURE first, then DESIGN.")
+        raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
-    imager = camera.imager(microscope.imager())
-    grid, making = plan(
-        imager,
-        depths,
-        voxel_um and voxel_um / 1000,
-        method=method,
-        steps=steps,
-        optics=optics,
-        tv=tv,
-        sparsity=sparsity,
-        stop_at_noise=stop_at_noise,
-        suppress=suppress,
-        points=points is not None,
-        weights=weights,
-    )
-    again = partial(imaged_again, imager, grid, optics) if method == "unrolled" or suppress == "unet" else None
+    text, imager = design_text(microscope), camera.imager(microscope.imager())
+    method_options |= {"points": points is not None, "weights": weights}
+    plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
         given["--workers or --scheduler"] = workers.elsewhere
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
+            files = {"design_text": text, "capture": capture, "camera": camera, "points": points}
+            how = {"track": track, "interval": frame_interval, "resume": resume}
             with workers:
                 return reconstruct_recording(
-                    recording,
-                    design_text(microscope),
-                    grid,
-                    making,
-                    output,
-                    capture=capture,
-                    camera=camera,
-                    progress=progress,
-                    points=points,
-                    track=track,
-                    weights=weights,
-                    interval=frame_interval,
-                    resume=resume,
-                    workers=workers,
-                    again=again,
+                    recording, plan, output, **files, **how, workers=workers, progress=progress
                 )
         image = camera.read(capture)
-        made = making(progress)
-        # The paper's method is a single pass. All others, and points, are many.
-        with once() if method == "backproject" and suppress != "points" and not points else nullcontext():
-            volume, found, evidence, warning = made(image, progress)
-        check = again(volume, image, progress) if again else None
+        reconstruct = plan.prepare(progress)
+        # Back-projection alone runs its kernels once; iterative methods and points run them many times.
+        is_single_pass = method_options["method"] == "backproject" and plan.suppress != "points" and not points
+        with once() if is_single_pass else nullcontext():
+            result = reconstruct(image, progress)
+        residual = plan.check(result.volume, image, progress) if plan.is_learned else None
         with progress.step("Writing"):
-            provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=design_text(microscope)))
-            write_volume(output, volume, grid, provenance)
-            if points and found is not None:
-                from ..io.point_tables import write_points
-
-                write_points(points, found, evidence, provenance=provenance)
-    camera.say()
-    z, y, x = volume.shape
-    size = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * 1000:.4g} um laterally"
+            provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=text))
+            write_volume(output, result.volume, plan.grid, provenance)
+            if points and result.points is not None:
+                write_points(points, result.points, result.statistics, provenance=provenance)
+    camera.print_corrections()
+    z, y, x = result.volume.shape
+    size = f"{z} x {y} x {x} voxels (z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(depths)}")
-    if check:
-        click.echo(f"{output}: imaged again it is {in_words(check)}")
-    if found is not None:
-        click.echo(f"{points or output}: {len(found)} point{'s' * (len(found) != 1)}")
-    if warning:
-        click.echo(f"gs-jax: warning: {warning}", err=True)
+    if residual:
+        click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
+    if result.points is not None:
+        count = len(result.points)
+        click.echo(f"{points or output}: {count} point{'s' * (count != 1)}")
+    if result.warning:
+        click.echo(f"gs-jax: warning: {result.warning}", err=True)

@@ -1,4 +1,4 @@
-"""`gs-jax simulate`: a scene to a capture."""
+"""`gs-jax simulate`: a capture of a scene."""
 
 import math
 from pathlib import Path
@@ -11,6 +11,7 @@ from ..io.files import check_output
 from .files import check_may_write, provenance_of
 from .options import DESIGN, PSFS, SIMULATED, Number
 
+PEAK = Number(least=1.0, most=1e6, unit="electrons")
 ELECTRONS = Number(least=0.0, most=1e9, unit="electrons")
 GAIN = Number(least=1e-3, most=1e6, unit="electrons")
 WELL = Number(least=1.0, most=1e9, unit="electrons")
@@ -25,17 +26,17 @@ COUNTS = Number(least=0.0, most=65535.0, unit="counts")
     type=click.Choice(SIMULATED),
     default="full",
     show_default=True,
-    help="All of the light, where it lands; or Eq. (2), with one PSF for all lenses near a point.",
+    help="full: all of the light, by ray tracing; near: Eq. (2), with one PSF for all lenses near a point.",
 )
-@click.option("--psf", type=click.Choice(PSFS), help="Of --optics near.  [default: diffraction]")
-@click.option("--peak-electrons", type=Number(least=1.0, most=1e6, unit="electrons"), default=1e4, show_default=True)
-@click.option("--noise/--no-noise", default=True, show_default=True, help="Without, the capture is float32.")
-@click.option("--gain", type=GAIN, default=10.0, show_default=True, help="Electrons a count.")
-@click.option("--offset", type=COUNTS, default=16.0, show_default=True, help="Of dark pixels.")
-@click.option("--read-noise", type=ELECTRONS, default=2.0, show_default=True, help="Standard deviation.")
-@click.option("--full-well", type=WELL, help="The most that a pixel holds.  [default: no limit]")
-@click.option("--bits", type=click.IntRange(1, 16), default=16, show_default=True, help="Of the converter.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the noise.")
+@click.option("--psf", type=click.Choice(PSFS), help="PSF of --optics near.  [default: diffraction]")
+@click.option("--peak-electrons", type=PEAK, default=1e4, show_default=True, help="Electrons in the brightest pixel.")
+@click.option("--noise/--no-noise", default=True, show_default=True, help="Without noise the capture is float32.")
+@click.option("--gain", type=GAIN, default=10.0, show_default=True, help="Electrons per count.")
+@click.option("--offset", type=COUNTS, default=16.0, show_default=True, help="Counts of a dark pixel.")
+@click.option("--read-noise", type=ELECTRONS, default=2.0, show_default=True, help="Standard deviation, electrons.")
+@click.option("--full-well", type=WELL, help="Largest number of electrons in a pixel.  [default: no limit]")
+@click.option("--bits", type=click.IntRange(1, 16), default=16, show_default=True, help="Bits of the converter.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
 def simulate_command(
     scene: Path,
@@ -54,8 +55,7 @@ def simulate_command(
 ):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
-    SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr), whose voxels are evenly
-    lit boxes.
+    SCENE is a CSV of points, x_mm,y_mm,z_mm,intensity, or a volume (OME-TIFF or OME-Zarr) of uniformly lit voxels.
     """
     import jax
     import numpy as np
@@ -67,11 +67,11 @@ def simulate_command(
     check_output(output, CAPTURE_SUFFIXES)
     check_may_write(output, inputs=(scene, design))
     if not noise and output.suffix.lower() == ".png":
-        raise InputError(f"{output}: found .png for --no-noise, allowed: .tif, .tiff, .npy, which hold float32.")
+        raise InputError(f"{output}: the suffix must be .tif, .tiff or .npy with --no-noise: PNG holds no float32.")
     if scene.suffix.lower() == ".toml":
-        raise InputError(f"{scene}: found a design in the place of SCENE, allowed: SCENE first, then DESIGN.")
+        raise InputError(f"{scene}: SCENE must be points or a volume, got a design: SCENE comes first, then DESIGN.")
     if psf and optics == "full":
-        raise InputError(f"--psf {psf}: found --optics full, allowed: --optics near, which has one PSF for all lenses.")
+        raise InputError(f"--psf {psf} must be used with --optics near, which has one PSF for all lenses.")
     microscope = read_design(design)
     with Progress() as progress:
         light, grid = read_scene(scene)

@@ -1,4 +1,4 @@
-"""`gs-jax train`: the weights of a network."""
+"""`gs-jax train`: weights of the networks."""
 
 from functools import partial
 from pathlib import Path
@@ -10,10 +10,10 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
-from .interrupt import RESUMABLE, kept
+from .interrupt import RESUMABLE, partial_outputs
 from .options import worker_options
 
-# Those of the weights that come with the package.
+# Steps of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
 _EVERY = 50
 _STACKS, _CASES = 96, 112
@@ -24,16 +24,15 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 @click.option("--network", type=click.Choice(list(STEPS)), default="multislice", show_default=True)
 @click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint beside WEIGHTS, with the same steps and seed.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint beside WEIGHTS; same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
 @worker_options
 def train_command(network: str, steps: int | None, seed: int, resume: bool, output: Path, workers: Workers):
-    """Train networks: for background suppression the paper's, or ours, which looks at seven slices; or for the unrolled
-    inversion. Workers simulate the captures that networks are trained on.
+    """Train a network: for background suppression the paper's, or ours of seven slices; or for the unrolled inversion.
 
-    Beside WEIGHTS.npz it keeps WEIGHTS.checkpoint, which an interrupt leaves there, and WEIGHTS.json, the losses; for
-    seven slices also the folder WEIGHTS-stacks, the simulated captures that they are trained on (0.4 GB; it may be
-    deleted).
+    Workers simulate the captures for training. Beside WEIGHTS.npz are written WEIGHTS.json, the losses,
+    WEIGHTS.checkpoint, which remains after an interrupt, and for multislice the folder WEIGHTS-stacks of simulated
+    captures (0.4 GB), which may be deleted.
     """
     import numpy as np
 
@@ -48,9 +47,9 @@ def train_command(network: str, steps: int | None, seed: int, resume: bool, outp
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
     check_may_write(output, history, inputs=())
-    kept[checkpoint] = RESUMABLE
+    partial_outputs[checkpoint] = RESUMABLE
     if resume and not checkpoint.exists():
-        raise InputError(f"--resume: found no checkpoint {checkpoint}, allowed: after an interrupted run alone.")
+        raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
     with Progress() as progress:
         if network == "paper":
             recipe = paper_recipe()

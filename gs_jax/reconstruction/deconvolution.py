@@ -1,6 +1,5 @@
-"""Deconvolution of a capture by a measured point spread function, of a diffuser or any other mask before a camera."""
+"""Deconvolution of a capture with a measured PSF, of a diffuser or any other mask in front of a camera."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float32, Num
 
@@ -11,8 +10,8 @@ from ..solvers.convolution import Convolution, ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import Image
-from .inverse_problem import above_offset
-from .pipeline import iterated
+from .inverse_problem import subtract_offset
+from .pipeline import run_solver
 
 # Default weight of ADMM's total variation.
 TV = 1e-3
@@ -27,33 +26,33 @@ def deconvolve(
     *,
     progress: Progress | None = None,
 ) -> Float32[np.ndarray, "row column"]:
-    """The scene that an image shows, seen through a system that is everywhere alike.
+    """Reconstruct a plane from its image through a shift-invariant system.
 
     *Host.*
 
-    Points beside the sensor whose light falls on it are reconstructed, too, and then cut off (Antipa et al., Optica 5,
-    1, 2018). Both the image and the PSF are taken above their darkest percent, the camera's offset.
+    Points beside the sensor whose light reaches it are reconstructed, too, and then cropped (Antipa et al., Optica 5,
+    1, 2018). The camera's offset, the first percentile, is subtracted from image and PSF.
 
     Parameters
     ----------
     image
         Linear, in any unit.
     psf
-        The image of a point on the axis, its place in the middle; any unit.
+        Image of a point on the axis, which is at the middle; any unit.
     solver
-        What inverts the convolution.
+        Solver that inverts the convolution.
     progress
-        Shows how far it is.
+        Shows progress.
 
     Returns
     -------
     ndarray
-        `image.shape`, in the image's unit: its sum is about that of the light that reaches the sensor.
+        The scene, `image.shape`, in the image's unit: its sum is about that of the light that reaches the sensor.
 
     Raises
     ------
     InputError
-        If `solver` is none of these, a pixel is not finite, or the PSF is dark.
+        If `solver` is no such solver, a pixel is not finite, or the PSF is dark.
 
     Examples
     --------
@@ -67,23 +66,14 @@ def deconvolve(
     30 30
     """
     if not isinstance(solver, Deconvolver):
-        allowed = "an object such as ConvolutionADMM() or FISTA()"
-        raise InputError(f"solver: found {short_repr(solver)}, allowed: {allowed}.")
-    progress = progress or Progress()
+        raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")
     check_finite("image", image)
     check_finite("psf", psf)
-    light, spot = (above_offset(np.asarray(part, np.float32)) for part in (image, psf))
+    light, spot = (subtract_offset(np.asarray(part, np.float32)) for part in (image, psf))
     if not spot.sum() > 0:
-        raise InputError("psf: found no light above the darkest percent, allowed: the image of a point.")
+        raise InputError("psf must be the image of a point, got no light above the darkest percent.")
     system = Convolution.of(spot[None] / spot.sum(), light.shape)
-    # Solvers weigh their priors against an image of the order of 1.
+    # Weights of priors suit images of the order of 1.
     unit = float(np.abs(light).max()) or 1.0
-    inverted = _Itself(system) if isinstance(solver, ConvolutionADMM) else system
-    scene = iterated(solver, progress, light / np.float32(unit), inverted)
-    return np.float32(unit) * scene[0][system.place]
-
-
-class _Itself(eqx.Module):
-    """A convolution for the solver that needs more of it than its operator."""
-
-    operator: Convolution
+    scene = run_solver(solver, light / np.float32(unit), system, progress or Progress())
+    return np.float32(unit) * scene[0][system.window]

@@ -1,4 +1,4 @@
-"""What iterative methods invert: the microscope in pixels that suit the voxels, and the light that it is to explain."""
+"""The inverse problem of iterative methods: pixels binned to the size of voxels, the data to explain, the operator."""
 
 from typing import NamedTuple
 
@@ -21,65 +21,70 @@ from ..optics.psf_core import apparent_depths
 from ..projection.forward_model import Optics
 from ..projection.levels import optics_of
 from ..projection.operators import BackprojectionOperator, ImagingOperator
-from ..solvers.base import Unmatched
+from ..solvers.base import Operator, UnmatchedAdjointOperator
 from ..typing import Image
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
-_DARKEST = 1
-# Half a wave of background is this many of the halo's pixels at least: as wide as the halo of a spot.
-_SLOW = 6.5
+_DARK_PERCENTILE = 1
+# Minimum half wavelength of a background mode, in pixels of the halo's grid: the width of a spot's halo.
+_HALF_WAVE = 6.5
 _ROUNDING = 0.02
 
 
-class Model(NamedTuple):
-    """What iterative methods explain an image by.
+class ImageModel(NamedTuple):
+    """Forward model of iterative methods.
 
     Parameters
     ----------
     imager, optics
-        With optics by name, pixels are as wide as voxels.
-    side
-        So many of the camera's pixels each way are one of these.
-    hazy
-        The optics does not hold all of the light; what it does not is background.
+        With optics by name, pixels are binned to the width of voxels.
+    binning
+        Number of the camera's pixels along a side of one of these.
+    is_partial
+        Whether the optics lack some of the light, which is then background.
     """
 
     imager: Imager
     optics: Optics
-    side: int = 1
-    hazy: bool = False
+    binning: int = 1
+    is_partial: bool = False
 
 
-def model_of(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> Model:
-    """The model of a microscope for voxels; optics as for `reconstruct`."""
+def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> ImageModel:
+    """Make the forward model of a microscope for a grid; `optics` as for `reconstruct`."""
     if not isinstance(optics, str):
-        return Model(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
-    imager, side = _coarser(imager, grid)
-    return Model(imager, optics_of(imager, grid.depths, optics, progress=progress), side, optics != "full")
+        return ImageModel(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
+    # At least two binned pixels must remain along each side; what fills no square is left out.
+    voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
+    binning = max(1, min(int(voxel + _ROUNDING), min(imager.sensor.shape) // 2))
+    imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
+    return ImageModel(imager, optics_of(imager, grid.depths, optics, progress=progress), binning, optics != "full")
 
 
-def explainable(image: Image, model: Model) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
-    """What iterative methods are to explain: light above the offset, in the model's pixels, and background in it.
+def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
+    """Bin an image to the model's pixels, above the camera's offset; return it and the background in it.
 
-    It raises `InputError` if a pixel is not finite.
+    Raises
+    ------
+    InputError
+        If a pixel is not finite.
     """
     check_finite("image", image)
-    rows, columns = model.imager.sensor.shape
-    light = above_offset(np.asarray(image, model.imager.sensor_distance.dtype))
-    light = light[: rows * model.side, : columns * model.side]
-    light = light.reshape(rows, model.side, columns, model.side).sum((1, 3))
-    return light, np.maximum(between(square_levels(light)[0], light.shape), 0) if model.hazy else 0.0
+    (rows, columns), side = model.imager.sensor.shape, model.binning
+    light = subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype))
+    light = light[: rows * side, : columns * side].reshape(rows, side, columns, side).sum((1, 3))
+    return light, np.maximum(between(square_levels(light)[0], light.shape), 0) if model.is_partial else 0.0
 
 
-def above_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
-    """An image less its darkest percent, or as it is if that is negative."""
-    return image - np.asarray(max(float(np.percentile(image, _DARKEST)), 0.0), image.dtype)
+def subtract_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+    """Subtract the first percentile of an image, unless it is negative because the offset was subtracted before."""
+    return image - np.asarray(max(float(np.percentile(image, _DARK_PERCENTILE)), 0.0), image.dtype)
 
 
-class Sight(NamedTuple):
-    """How lenses of one type are read: the voxels of which chief rays land where their cores do.
+class LensTypeGeometry(NamedTuple):
+    """Geometry that back-projects the lenses of one type: chief rays of `grid` land on the cores of their spots.
 
-    `weight`: how much they count at each depth, `(depth, 1, 1)`; None if there is one type.
+    `weight` is the weight of this type at each depth, `(depth, 1, 1)`, or None if there is only one.
     """
 
     imager: Imager
@@ -87,86 +92,72 @@ class Sight(NamedTuple):
     weight: Float[Array | np.ndarray, "depth 1 1"] | None = None
 
 
-def sights_of(imager: Imager, grid: Grid) -> tuple[Sight, ...]:
-    """Where the cores of each type of lens lie, and how much a type counts by how bright and sharp it is there."""
+def lens_type_geometries(imager: Imager, grid: Grid) -> tuple[LensTypeGeometry, ...]:
+    """Geometry of each type of lens, weighted by how bright and sharp its spots are at each depth."""
     depths = np.asarray(grid.depths, np.float64)
     if imager.array.alike:
-        return (Sight(imager, grid.at(apparent_depths(imager, depths))),)
-    each = split_by_type(imager, lenses_by_type(imager.array))
+        return (LensTypeGeometry(imager, grid.at(apparent_depths(imager, depths))),)
+    imagers = split_by_type(imager, lenses_by_type(imager.array))
     side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
-    weights = type_weights(each, depths, side)[..., None, None].astype(np.float32)
-    pairs = zip(each, weights, strict=True)
-    return tuple(Sight(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in pairs)
+    weights = type_weights(imagers, depths, side)[..., None, None].astype(np.float32)
+    pairs = zip(imagers, weights, strict=True)
+    return tuple(LensTypeGeometry(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in pairs)
 
 
-class System(eqx.Module):
-    """What a solver inverts: the microscope, and how.
+class InverseProblem(eqx.Module):
+    """What a solver inverts: a microscope, a grid, and how back-projection and background are treated.
 
     Parameters
     ----------
     imager, grid, optics
         As for `forward`.
-    seen
-        If given, back-projection of these stands for the adjoint.
-    slow
-        So many of the image's longest cosine waves each way are left out of account, with `seen` by least squares
-        alone.
+    back_projections
+        If given, back-projection with these geometries replaces the adjoint.
+    detrend_modes
+        Number of low cosine modes per axis that least squares leave out of the image.
     """
 
     imager: Imager
     grid: Grid
     optics: Optics
-    seen: tuple[Sight, ...] | None = None
-    slow: int = eqx.field(static=True, default=0)
+    back_projections: tuple[LensTypeGeometry, ...] | None = None
+    detrend_modes: int = eqx.field(static=True, default=0)
 
     @property
-    def operator(self) -> lx.AbstractLinearOperator | Unmatched:
+    def operator(self) -> Operator:
         A = ImagingOperator(self.imager, self.grid, self.optics)
-        squares = lx.FunctionLinearOperator(lambda x: self.fast(A.mv(x)), A.in_structure()) if self.slow else A
-        if self.seen is not None:
-            return Unmatched(A, self._back(A, self.seen), squares)
-        return squares
+        least_squares = A
+        if self.detrend_modes:
+            least_squares = lx.FunctionLinearOperator(lambda x: self.detrend(A.mv(x)), A.in_structure())
+        if self.back_projections is None:
+            return least_squares
+        # With the pixels of this problem, which may be binned.
+        binned = lambda view: eqx.tree_at(lambda i: i.sensor, view.imager, self.imager.sensor)
+        pairs = [(BackprojectionOperator(binned(v), v.grid), v.weight) for v in self.back_projections]
+        if len(pairs) == 1:
+            return UnmatchedAdjointOperator(A, pairs[0][0], least_squares)
+        total = lambda image: sum(jnp.asarray(weight, image.dtype) * B.mv(image) for B, weight in pairs)
+        return UnmatchedAdjointOperator(A, lx.FunctionLinearOperator(total, A.out_structure()), least_squares)
 
-    def _back(self, A: ImagingOperator, seen: tuple[Sight, ...]) -> lx.AbstractLinearOperator:
-        # In the pixels of this system.
-        sensor = lambda one: eqx.tree_at(lambda i: i.sensor, one.imager, self.imager.sensor)
-        each = [(BackprojectionOperator(sensor(one), one.grid), one.weight) for one in seen]
-        if len(each) == 1:
-            return each[0][0]
-        total = lambda image: sum(jnp.asarray(weight, image.dtype) * B.mv(image) for B, weight in each)
-        return lx.FunctionLinearOperator(total, A.out_structure())
-
-    def fast(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
-        """The image without its slow waves, an orthogonal projection: least squares then fit these waves, too."""
+    def detrend(self, image: Float[Array | np.ndarray, "row column"]) -> Float[Array, "row column"]:
+        """Project the low cosine modes out of the image, so that least squares fit a smooth background, too."""
         image = jnp.asarray(image)
-        if not self.slow:
+        if not self.detrend_modes:
             return image
-        rows, columns = (_waves(n, self.slow, image.dtype) for n in image.shape)
+        rows, columns = (_cosine_modes(n, self.detrend_modes, image.dtype) for n in image.shape)
         return image - rows @ (rows.T @ image @ columns) @ columns.T
 
 
-def _waves(size, count, dtype):
-    """The longest waves of the discrete cosine transform, orthonormal: `(size, count)`."""
-    waves = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
-    return jnp.asarray(waves / np.linalg.norm(waves, axis=0), dtype)
+def _cosine_modes(size, count, dtype):
+    """Lowest modes of the discrete cosine transform, orthonormal: `(size, count)`."""
+    modes = np.cos(np.pi * (np.arange(size)[:, None] + 0.5) * np.arange(min(count, size)) / size)
+    return jnp.asarray(modes / np.linalg.norm(modes, axis=0), dtype)
 
 
-def _coarser(imager, grid):
-    """Sum squares of pixels that are at most as wide as a voxel's image; returns how many each way, too.
-
-    The last rows and columns, which fill no square, are left out.
-    """
-    sensor = imager.sensor
-    wanted = float(imager.magnification(grid.depths).mean()) * grid.pitch / sensor.pixel_pitch
-    # Two pixels each way must be left.
-    side = max(1, min(int(wanted + _ROUNDING), min(sensor.shape) // 2))
-    return eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=side).sensor(sensor)), side
-
-
-def slow_waves(imager: Imager, optics: Optics) -> int:
-    """Of the image's longest cosine waves each way, those that a background makes which `optics` holds all of."""
+def num_detrend_modes(imager: Imager, optics: Optics) -> int:
+    """Number of cosine modes per axis that are smoother than a spot's halo; 0 for optics without a halo."""
     if isinstance(optics, PerTypePsf):
         optics = optics.optics[0]
     if not isinstance(optics, FieldVaryingPsf):
         return 0
-    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_SLOW * optics.stray_light.grid.pixel))
+    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_HALF_WAVE * optics.halo.grid.pixel))

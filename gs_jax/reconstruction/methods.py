@@ -1,4 +1,4 @@
-"""Every way from an image to a volume, as an object that holds its options, and by name."""
+"""Reconstruction methods that are no solvers of `gs_jax.solvers`, and the table of all methods by name."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,12 @@ from ..base.errors import InputError
 from ..solvers.admm import ADMM
 from ..solvers.base import Solver
 from ..solvers.fista import FISTA
-from ..solvers.richardson_lucy import TENTS, RichardsonLucy
+from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy
 from ..solvers.unrolled import Unrolled
 
 
 class BackProjection(eqx.Module):
-    """`backproject`, the paper's reconstruction: one step, no PSF.
+    """Back-projection, the paper's reconstruction: one pass, no PSF.
 
     *Host.*
 
@@ -29,7 +29,7 @@ class BackProjection(eqx.Module):
     Raises
     ------
     InputError
-        If there is no such interpolation.
+        If `interpolation` is neither.
 
     Examples
     --------
@@ -48,18 +48,18 @@ class BackProjection(eqx.Module):
 
     def __check_init__(self):
         if self.interpolation not in ("linear", "nearest"):
-            raise InputError(f"interpolation: found {self.interpolation!r}, allowed: linear, nearest.")
+            raise InputError(f"interpolation must be 'linear' or 'nearest', got {self.interpolation!r}.")
 
 
-class ListRichardsonLucy(eqx.Module):
-    """Richardson-Lucy on the pixel-voxel lists of back-projection.
+class PinholeRichardsonLucy(eqx.Module):
+    """Richardson-Lucy with the pinhole back-projection in place of the adjoint.
 
     *Host.*
 
-    Each voxel is multiplied by the mean ratio of what was seen to what is expected, weighted by the envelope, over the
-    pixels that back-projection would read: `backproject(ratio, ..., normalize=True)`. What is expected is the
-    forward model's image. Without a PSF this is `RichardsonLucy` with the ray operator; with one, what goes back is
-    sharper than the adjoint, and takes fewer steps. Parameters and errors as there.
+    Each voxel is multiplied by the mean ratio of the measured to the expected image over the pixels that
+    back-projection reads: `backproject(ratio, ..., normalize=True)`. The expected image is the forward model's. Without
+    a PSF this is `RichardsonLucy` with the ray operator; with one, the back-projection is sharper than the adjoint, and
+    fewer steps suffice. Parameters and errors are those of `RichardsonLucy`.
 
     Examples
     --------
@@ -70,7 +70,7 @@ class ListRichardsonLucy(eqx.Module):
     >>> import numpy as np
     >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
     >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
-    >>> volume = gs.reconstruct(image, scope, grid, gs.ListRichardsonLucy(steps=3), optics="near")
+    >>> volume = gs.reconstruct(image, scope, grid, gs.PinholeRichardsonLucy(steps=3), optics="near")
     >>> print(volume.argmax() == np.ravel_multi_index((1, 19, 22), volume.shape))
     True
     """
@@ -78,28 +78,28 @@ class ListRichardsonLucy(eqx.Module):
     steps: int = eqx.field(static=True, default=20)
     tolerance: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
-    tents: int = eqx.field(static=True, default=0)
-    least_seen: float = eqx.field(static=True, default=0.0)
+    background_knots: int = eqx.field(static=True, default=0)
+    min_sensitivity: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         self.solver()
 
     def solver(self, background: Float[np.ndarray, "row column"] | float = 0.0) -> RichardsonLucy:
-        """The solver that does it, with a known background."""
-        options = {"accelerate": self.accelerate, "tents": self.tents, "least_seen": self.least_seen}
-        return RichardsonLucy(self.steps, self.tolerance, background, **options)
+        """The `RichardsonLucy` that runs on an `UnmatchedAdjointOperator`."""
+        options = {"accelerate": self.accelerate, "background_knots": self.background_knots}
+        return RichardsonLucy(self.steps, self.tolerance, background, min_sensitivity=self.min_sensitivity, **options)
 
 
-# What both kinds of Richardson-Lucy have. Near the field's edge one lens sees a voxel, in its middle a dozen.
-_LUCY = {"accelerate": True, "tents": TENTS, "least_seen": 0.3}
+# Near the edge of the field one lens sees a voxel, in its middle a dozen.
+_LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitivity": 0.3}
 
-Method = BackProjection | ListRichardsonLucy | Solver
+Method = BackProjection | PinholeRichardsonLucy | Solver
 
-# By the name that the command line and the benchmark know it by: from the number of steps to the method. Unrolled
-# steps are as many as were trained.
+# Methods by the names of the command line and the benchmark, as functions of the number of steps; the unrolled solver
+# has as many as were trained.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
-    "list-rl": lambda steps: ListRichardsonLucy(steps, **_LUCY),
+    "list-rl": lambda steps: PinholeRichardsonLucy(steps, **_LUCY),
     "richardson-lucy": lambda steps: RichardsonLucy(steps, **_LUCY),
     "fista": FISTA,
     "admm": ADMM,

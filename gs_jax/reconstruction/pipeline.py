@@ -1,4 +1,4 @@
-"""From a capture to a volume, whatever the method."""
+"""Reconstruction of a volume from a capture, by any method."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,39 +22,47 @@ from ..projection.backprojection import backproject
 from ..projection.forward_model import Optics
 from ..projection.levels import LEVELS
 from ..solvers.base import Solver
+from ..solvers.convolution import ConvolutionADMM
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
-from .inverse_problem import Sight, System, explainable, model_of, sights_of, slow_waves
-from .methods import BackProjection, ListRichardsonLucy, Method
-from .residual import misfit_of_noise
+from .inverse_problem import (
+    InverseProblem,
+    LensTypeGeometry,
+    lens_type_geometries,
+    num_detrend_modes,
+    prepare_data,
+    prepare_model,
+)
+from .methods import BackProjection, Method, PinholeRichardsonLucy
+from .residual import discrepancy_target
 
-# Planes of a device between two steps of the progress bar; a plane more or less changes neither speed nor memory.
+# Planes that each device back-projects between two updates of the progress bar.
 _PLANES = 16
-# Of the default voxel of an iterative method, which is as wide as so many pixels.
-COARSE = 4
-# In units of the misfit of noise, which is known to a few percent.
-_ENOUGH = 1.1
+# Default voxel of an iterative method, in pixels seen at the middle depth.
+PIXELS_PER_VOXEL = 4
+# The noise's share of the cost is known to a few percent.
+_DISCREPANCY_FACTOR = 1.1
 
 
 def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:
-    """The voxels to reconstruct: the field of view, as large as the sensor.
+    """Grid of the field of view, as large as the sensor.
 
     Parameters
     ----------
     imager
-        What took the capture.
+        Microscope that took the capture.
     depths
         In mm.
     pitch
-        Of the voxels laterally, mm. By default `pixels` as seen at the middle depth, rounded to 0.1 um, and no less.
+        Lateral voxel pitch, mm; by default `pixels` as seen at the middle depth, rounded to 0.1 um, at least 0.1 um.
     pixels
-        Of the default.
+        Pixels per voxel of the default pitch.
 
     Raises
     ------
     InputError
-        If the volume would not fit into the memory.
+        If the volume would not fit into memory.
     """
     if pitch is None:
         middle = float(imager.magnification(np.median(depths)))
@@ -65,8 +73,8 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
     if 2.5 * size > (memory := available_memory()):
         shape = " x ".join(map(str, (len(depths), *grid.shape)))
         raise InputError(
-            f"--voxel-um, --depths: found {pitch * 1000:g} um and {len(depths)} depths, a volume of {shape} voxels or "
-            f"{size / 2**30:.3g} GiB, allowed: {memory / 2.5 / 2**30:.3g} GiB of the memory that is free."
+            f"--voxel-um, --depths: the volume must take at most {memory / 2.5 / 2**30:.3g} GiB of the free memory, "
+            f"got {shape} voxels of {pitch * 1000:g} um, {size / 2**30:.3g} GiB."
         )
     return grid
 
@@ -78,45 +86,43 @@ def reconstruct(
     method: Method = BackProjection(),
     *,
     optics: Optics | str = "full",
-    stop_at_noise: bool = False,
+    stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
-    """The volume that an image shows.
+    """Reconstruct the volume that an image shows.
 
     *Host.*
 
-    Back-projection takes the image as it is, some planes at a time, on all devices there are. The other methods explain
-    the light above the camera's offset: the image's darkest percent, or nothing if that is negative, as it was taken
-    off already. They run step by step, and can be interrupted after each; the second call with the same shapes compiles
-    nothing.
+    Back-projection uses the image as it is, some planes at a time, on all devices. The other methods subtract the
+    camera's offset, the image's first percentile (unless it is negative, because it was subtracted before). They run
+    step by step and can be interrupted after each; a second call with the same shapes compiles nothing.
 
-    With optics by name, iterative methods sum as many pixels as the voxels are wide. Light that the optics does not
-    hold is background, and is fitted by no voxel. With "full" that varies slowly: FISTA and ADMM leave the image's
-    longest waves out of account. With "near" and "pinhole" it is most of the light: what is everywhere within squares
-    of 32 pixels.
+    With optics by name, iterative methods bin pixels to the width of voxels, and light that the optics lack is fitted
+    as background, not by voxels. With "full" that is smooth: FISTA and ADMM leave out the image's lowest cosine modes.
+    With "near" and "pinhole" it is most of the light: the level of squares of 32 pixels.
 
     Parameters
     ----------
     image, imager, grid
         As for `backproject`.
     method
-        `BackProjection()`, `ListRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
+        `BackProjection()`, `PinholeRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
         `Unrolled.pretrained()`.
     optics
-        As for `forward`, or its name for `optics_of`. By name, "full" or "near", back-projection reads the bright cores
+        As for `forward`, or a name as for `optics_of`. With "full" and "near", back-projection reads the bright cores
         of the spots; otherwise it follows the chief rays, as the paper does.
-    stop_at_noise
-        End before the last step where no more is left to explain than the image's own noise, by the discrepancy
-        principle; `BackProjection` and `Unrolled` do not.
+    stop_at_discrepancy
+        Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle).
+        `BackProjection` and `Unrolled` ignore it.
     progress
-        Shows how far it is; by default nothing does.
+        Shows progress; by default nothing is shown.
 
     Raises
     ------
     InputError
-        If `method` is no method, the image is not `sensor.shape` or not finite, there is no such optics, a depth of the
-        grid is blurred over more than 128 pixels ("near"), or JAX traces a value: `solve` is what can be differentiated
-        and compiled.
+        If `method` is no method, the image is not `sensor.shape` or not finite, the optics do not exist, a depth of the
+        grid is blurred over more than 128 pixels ("near"), or JAX traces a value: `solve` can be differentiated and
+        compiled.
 
     Examples
     --------
@@ -132,15 +138,15 @@ def reconstruct(
     >>> volume.shape
     (3, 41, 41)
     >>> peak = np.array(np.unravel_index(better.argmax(), better.shape))
-    >>> print(grid.to_mm(peak).round(6))  # the point's place, mm
+    >>> print(grid.to_mm(peak).round(6))  # the point's position, mm
     [ 0.2 -0.1 20. ]
     """
     if image.shape != imager.sensor.shape:
-        raise InputError(f"image: found the shape {image.shape}, allowed: the sensor's shape {imager.sensor.shape}.")
+        raise InputError(f"image must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
     _check(method, optics, imager, grid, image)
     progress = progress or Progress()
-    volume_of = reconstructor(imager, grid, method, optics=optics, stop_at_noise=stop_at_noise, progress=progress)
-    return volume_of(image, progress)
+    options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
+    return reconstructor(imager, grid, method, **options)(image, progress)
 
 
 def reconstructor(
@@ -149,155 +155,140 @@ def reconstructor(
     method: Method = BackProjection(),
     *,
     optics: Optics | str = "full",
-    stop_at_noise: bool = False,
+    stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Callable[[Image, Progress], Volume]:
-    """`reconstruct` for many images: what is the same for all is computed here, once.
-
-    Parameters
-    ----------
-    imager, grid, method, optics, stop_at_noise, progress
-        As for `reconstruct`.
+    """Prepare `reconstruct` for many images of one type; parameters and errors as there.
 
     Returns
     -------
     Callable
-        From an image of `sensor.shape`, and what shows how far it is, to the volume. Images of one type: of another
-        it compiles again.
-
-    Raises
-    ------
-    InputError
-        If `method` is no method, there is no such optics, or a depth is blurred over more than 128 pixels ("near").
+        Maps an image of `sensor.shape` and a progress display to the volume.
 
     Warns
     -----
     InputWarning
-        If `ListRichardsonLucy` or `Unrolled` is asked for where the microscope is out of focus.
+        If `PinholeRichardsonLucy` or `Unrolled` is used where the microscope is out of focus.
     """
     by_name = isinstance(optics, str)
     _check(method, optics, imager, grid)
     on_cores = by_name and optics != "pinhole"
-    # Of these, back-projection stands for the adjoint.
-    unmatched = isinstance(method, ListRichardsonLucy | Unrolled)
+    views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager, grid),)
     if isinstance(method, BackProjection):
-        return _back_projector(sights_of(imager, grid) if on_cores else (Sight(imager, grid),), method)
-    model = model_of(imager, grid, optics, progress or Progress())
-    if unmatched and by_name:
+        return partial(_backproject_views, views(), method)
+    model = prepare_model(imager, grid, optics, progress or Progress())
+    replaces_adjoint = isinstance(method, PinholeRichardsonLucy | Unrolled)
+    if replaces_adjoint and by_name:
         what = "the pixels that back-projection reads"
         warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
-    least_squares = not isinstance(method, ListRichardsonLucy | RichardsonLucy)
-    slow = slow_waves(model.imager, model.optics) if by_name and least_squares else 0
-    seen = None
-    if unmatched:
-        seen = sights_of(imager, grid) if on_cores else (Sight(imager, grid),)
-    system = System(model.imager, grid, model.optics, seen, slow)
-    return lambda image, progress: _explained(image, model, system, method, stop_at_noise, progress)
-
-
-def _check(method, optics, *given):
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((method, optics, given))):
-        allowed = "numbers; `solve` and `backproject` can be compiled and differentiated"
-        raise InputError(f"reconstruct: found a value that JAX traces (jit, grad or vmap), allowed: {allowed}.")
-    # A class has what the protocol asks for, too.
-    if isinstance(method, type) or not isinstance(method, BackProjection | ListRichardsonLucy | Solver):
-        raise InputError(f"method: found {short_repr(method)}, allowed: an object such as BackProjection() or FISTA().")
-    if isinstance(optics, str) and optics not in LEVELS:
-        raise InputError(f"optics: found {short_repr(optics)}, allowed: {', '.join(LEVELS)}.")
-
-
-def _explained(image, model, system, method, stop_at_noise, progress):
-    light, background = explainable(image, model)
-    counts = isinstance(method, ListRichardsonLucy | RichardsonLucy)
-    enough = _ENOUGH * misfit_of_noise(np.asarray(image), light, counts=counts) if stop_at_noise else 0.0
-    if isinstance(method, ListRichardsonLucy):
-        return iterated(method.solver(background), progress, light, system, enough)
-    if isinstance(method, RichardsonLucy):
-        method = dataclasses.replace(method, background=method.background + jnp.asarray(background))
-        return iterated(method, progress, light, system, enough)
-    light = light - background
-    if isinstance(method, Unrolled):
-        # Its steps were trained together.
-        return iterated(method, progress, light, system)
-    return iterated(method, progress, np.asarray(system.fast(light), light.dtype), system, enough)
-
-
-def _back_projector(seen, method):
-    """Each type of lens is read where its own cores land."""
-    if len(seen) == 1:
-        return lambda image, progress: _back_projected(image, seen[0].imager, seen[0].grid, method, progress)
-    plain = dataclasses.replace(method, normalize=False)
+    is_poisson = isinstance(method, PinholeRichardsonLucy | RichardsonLucy)
+    modes = num_detrend_modes(model.imager, model.optics) if by_name and not is_poisson else 0
+    problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
     def volume_of(image, progress):
-        each = lambda image, one: one.weight * _back_projected(image, one.imager, one.grid, plain, progress)
-        total = lambda image: sum(each(image, one) for one in seen)
-        volume = np.asarray(total(image), np.float32)
-        if not method.normalize:
-            return volume
-        light = total(np.ones_like(image, np.float32))
-        return np.divide(volume, light, out=np.zeros_like(volume), where=light > 0)
+        light, background = prepare_data(image, model)
+        target = 0.0
+        # The steps of `Unrolled` were trained together.
+        if stop_at_discrepancy and not isinstance(method, Unrolled):
+            target = _DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
+        if isinstance(method, PinholeRichardsonLucy):
+            return run_solver(method.solver(background), light, problem, progress, target)
+        if isinstance(method, RichardsonLucy):
+            solver = dataclasses.replace(method, background=method.background + jnp.asarray(background))
+            return run_solver(solver, light, problem, progress, target)
+        light = light - background
+        if not isinstance(method, Unrolled):
+            light = np.asarray(problem.detrend(light), light.dtype)
+        return run_solver(method, light, problem, progress, target)
 
     return volume_of
 
 
-def _back_projected(image, imager, grid, method, progress):
+def _check(method, optics, *arguments):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((method, optics, arguments))):
+        raise InputError("reconstruct cannot be traced by jit, grad or vmap; use `solve` or `backproject`.")
+    # A class has the attributes of the protocol, too.
+    if isinstance(method, type) or not isinstance(method, BackProjection | PinholeRichardsonLucy | Solver):
+        raise InputError(f"method must be an object such as BackProjection() or FISTA(), got {short_repr(method)}.")
+    if isinstance(optics, str) and optics not in LEVELS:
+        raise InputError(f"optics must be one of {', '.join(LEVELS)}, got {short_repr(optics)}.")
+
+
+def _backproject_views(views, method, image, progress):
+    """Sum the back-projections of all types of lenses, weighted."""
+    if len(views) == 1:
+        return _backproject(image, views[0].imager, views[0].grid, method, progress)
+    plain = dataclasses.replace(method, normalize=False)
+    weighted = lambda image, view: view.weight * _backproject(image, view.imager, view.grid, plain, progress)
+    total = lambda image: sum(weighted(image, view) for view in views)
+    volume = np.asarray(total(image), np.float32)
+    if not method.normalize:
+        return volume
+    weights = total(np.ones_like(image, np.float32))
+    return np.divide(volume, weights, out=np.zeros_like(volume), where=weights > 0)
+
+
+def _backproject(image, imager, grid, method, progress):
     check_finite("image", image)
     options = {"method": method.interpolation, "normalize": method.normalize}
     planes = _PLANES * (devices := jax.local_device_count())
-    project = backproject if devices == 1 else backproject_by_all
+    project = backproject if devices == 1 else backproject_on_all_devices
     if grid.depths.size <= planes:
         return np.asarray(project(image, imager, grid, **options), np.float32)
     image, depths = jnp.asarray(image), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
-    for first in progress.track(range(0, depths.size, planes), "Back-projecting", quarter=_wider(grid)):
-        some = slice(first, first + planes)
-        volume[some] = project(image, imager, grid.at(depths[some]), **options)
+    for first in progress.track(range(0, depths.size, planes), "Back-projecting", quarter=_wider_voxels(grid)):
+        part = slice(first, first + planes)
+        volume[part] = project(image, imager, grid.at(depths[part]), **options)
     return volume
 
 
-def _wider(grid):
-    """Voxels that there are a fourth of: so are the pixels that iterative methods look at, and the time."""
+def backproject_on_all_devices(image: Image, imager: Imager, grid: Grid, **options) -> Float[Array, "depth y x"]:
+    """`backproject` with the depths divided evenly among the devices of this process."""
+    count = grid.depths.size
+    padding = jnp.full(-count % jax.local_device_count(), grid.depths[-1])
+    return _backproject_sharded(image, imager, grid, jnp.concatenate([grid.depths, padding]), **options)[:count]
+
+
+@partial(jax.jit, static_argnames=("method", "normalize"))
+def _backproject_sharded(image, imager, grid, depths, **options):
+    mesh, replicated, sharded = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec(), PartitionSpec("depth")
+    project = lambda image, imager, grid, depths: backproject(image, imager, grid.at(depths), **options)
+    # The kernels do not declare which results vary between devices.
+    specs = {"in_specs": (replicated, replicated, replicated, sharded), "out_specs": sharded}
+    return jax.shard_map(project, mesh=mesh, **specs, check_vma=False)(image, imager, grid, depths)
+
+
+def _wider_voxels(grid):
+    """The option that takes a quarter of the time: a fourth of the voxels, and of the pixels of iterative methods."""
     return f"--voxel-um {2000 * grid.pitch:.4g}"
 
 
-def iterated(solver, progress, light, system, enough=0.0):
-    """What a solver makes of an image, step by step; `system` is a module whose `operator` it inverts."""
-    # How many steps and until when is decided here: other numbers need no other code.
+def run_solver(solver, light, problem, progress, target_cost=0.0):
+    """Run a solver on an `InverseProblem` or a `Convolution`, step by step, until it converges or meets the target."""
+    # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
-    state = _start(compiled, light, system)
-    quarter = _wider(system.grid) if isinstance(system, System) else ""
+    state = _start(compiled, light, problem)
+    quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else ""
     with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):
-            state, cost, residual = _step(state, compiled, light, system)
-            # To read the numbers waits for the step: what is shown has been done, and Ctrl-C ends it here.
-            if float(residual) < solver.tolerance or float(cost) < enough:
+            state, cost, residual = _step(state, compiled, light, problem)
+            # Reading the numbers waits for the step: progress is true, and Ctrl-C ends it here.
+            if float(residual) < solver.tolerance or float(cost) < target_cost:
                 break
             advance()
     return np.asarray(solver.estimate(state), np.float32)
 
 
 @jax.jit
-def _start(solver, light, system):
-    return solver.init(system.operator, light)
+def _start(solver, light, problem):
+    return solver.init(_operator(solver, problem), light)
 
 
 @partial(jax.jit, donate_argnums=0)
-def _step(state, solver, light, system):
-    return solver.step(system.operator, light, state)
+def _step(state, solver, light, problem):
+    return solver.step(_operator(solver, problem), light, state)
 
 
-def backproject_by_all(image: Image, imager: Imager, grid: Grid, **options) -> Float[Array, "depth y x"]:
-    """As `backproject`, whose arguments it takes; no device does more than one depth more than another."""
-    count = grid.depths.size
-    last = jnp.full(-count % jax.local_device_count(), grid.depths[-1])
-    return _shared(image, imager, grid, jnp.concatenate([grid.depths, last]), **options)[:count]
-
-
-@partial(jax.jit, static_argnames=("method", "normalize"))
-def _shared(image, imager, grid, depths, **options):
-    mesh, alike = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec()
-    some = PartitionSpec("depth")
-    part = lambda image, imager, grid, depths: backproject(image, imager, grid.at(depths), **options)
-    # The kernels do not say which of their results differ from device to device.
-    shared = jax.shard_map(part, mesh=mesh, in_specs=(alike, alike, alike, some), out_specs=some, check_vma=False)
-    return shared(image, imager, grid, depths)
+def _operator(solver, problem):
+    return problem if isinstance(solver, ConvolutionADMM) else problem.operator

@@ -1,5 +1,7 @@
-"""From a recording to volumes in time: frames are read ahead and written behind while one is computed, or are shared
-out to workers."""
+"""Reconstruction of a recording frame by frame, in this process or by workers.
+
+In this process frames are read ahead and written behind while one is computed.
+"""
 
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -20,8 +22,8 @@ from ..typing import Volume
 
 Frame = TypeVar("Frame")
 
-# Frames that are read before they are asked for. One volume is written while the next is computed.
-AHEAD = 2
+# Frames that are read before they are needed. One volume is written while the next is computed.
+PREFETCH = 2
 
 
 def reconstruct_frames(
@@ -29,26 +31,26 @@ def reconstruct_frames(
     read: Callable[[int], Frame],
     make: Callable[[Frame], tuple[Volume, Note]],
     *,
-    failed: Callable[[int, str], object] = lambda frame, reason: None,
+    on_failure: Callable[[int, str], object] = lambda frame, reason: None,
     progress: Progress | None = None,
 ) -> None:
-    """Makes and writes the volumes that a series lacks.
+    """Make and write the volumes that a series lacks.
 
-    At most four frames are in memory: `AHEAD` that are read, one that is computed and one that is written. Whatever
-    ends it, the volumes that were written are kept.
+    At most four frames are in memory: `PREFETCH` that are read, one that is computed and one that is written. Volumes
+    that were written are kept whatever ends the run.
 
     Parameters
     ----------
     series
-        Where volumes go.
+        Destination of the volumes.
     read
-        From a frame, counted from 0, to what `make` takes; runs in a thread of its own.
+        Maps a frame's number, from 0, to the argument of `make`; runs in another thread.
     make
-        To a volume, and what is to be noted of it.
-    failed
-        Told of a frame whose `read` or `make` raised `InputError`, and why; the others go on.
+        Maps it to a volume and a note.
+    on_failure
+        Called with the number of a frame whose `read` or `make` raised `InputError`, and the reason.
     progress
-        Shows how far it is.
+        Shows progress.
 
     Raises
     ------
@@ -56,109 +58,104 @@ def reconstruct_frames(
         If every frame failed: the first one's.
     """
     frames = series.unfinished
-    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as done:
+    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
         pending: Future[Any] | None = None
         reader, writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         try:
-            for frame, found in _ahead(reader, frames, read):
+            for frame, image in _read_ahead(reader, frames, read):
                 try:
-                    volume, note = _finite(*make(found.result()))
+                    volume, note = _check_finite(*make(image.result()))
                     job = partial(series.write, frame, volume, note)
                 except InputError as error:
                     job = partial(series.fail, frame, str(error))
-                    failed(frame, str(error))
+                    on_failure(frame, str(error))
                 if pending:
                     pending.result()
                 pending = writer.submit(job)
-                # The writer holds the volume until it is written; here it would be there while the next is computed.
+                # Only the writer may hold the volume while the next is computed.
                 volume = job = None
-                done()
+                advance()
             if pending:
                 pending.result()
         finally:
             reader.shutdown(cancel_futures=True)
             writer.shutdown()
-    _check_some(series)
+    _check_any_finished(series)
 
 
 def reconstruct_frames_by(
     workers: Workers,
     series: VolumeSeries,
-    opened: Callable[[], tuple[Callable[[int], Frame], Callable[[Frame], tuple[Volume, Note]]]],
+    open_frames: Callable[[], tuple[Callable[[int], Frame], Callable[[Frame], tuple[Volume, Note]]]],
     *,
-    failed: Callable[[int, str], object] = lambda frame, reason: None,
+    on_failure: Callable[[int, str], object] = lambda frame, reason: None,
     progress: Progress | None = None,
 ) -> None:
-    """As `reconstruct_frames`, by other processes, which write the volumes where the store is; this one says which.
+    """Let other processes make and write the volumes that a series lacks; parameters and errors as above.
 
-    A frame whose worker died is made again: the same files hold the same. The first few volumes come here, where the
-    first makes the store.
+    A frame whose worker died is made again, with the same result. The first few volumes are written here, where the
+    first one creates the store.
 
     Parameters
     ----------
     workers
         Other processes, entered.
-    series, failed, progress
+    series, on_failure, progress
         As for `reconstruct_frames`.
-    opened
-        Gives `read` and `make`, once in each worker; can be pickled.
-
-    Raises
-    ------
-    InputError
-        As `reconstruct_frames`.
+    open_frames
+        Returns `read` and `make`, once in each worker; must be picklable.
     """
     frames = series.unfinished
     items = ((frame, series.exists) for frame in frames)
-    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as done:
-        for (frame, _), result in workers.stream_of(partial(_writer, opened, series.path, series.grid))(items):
+    with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
+        stream = workers.stream_of(partial(_frame_maker, open_frames, series.path, series.grid))
+        for (frame, _), result in stream(items):
             try:
                 volume, note = result()
             except InputError as error:
                 series.fail(frame, str(error))
-                failed(frame, str(error))
+                on_failure(frame, str(error))
             else:
                 series.write(frame, volume, note)
-            done()
-    _check_some(series)
+            advance()
+    _check_any_finished(series)
 
 
-def _writer(opened, path: Path, grid: Grid):
-    """From a frame and whether the store is there to its volume, or None if it is written there; and the note."""
-    read, make = opened()
+def _frame_maker(open_frames, path: Path, grid: Grid):
+    """In a worker: the function that makes a frame, and writes it if the store exists."""
+    read, make = open_frames()
     levels = cache(partial(opened_levels, path, grid))
-    reading = Lock()
+    # Threads of a worker share one open file.
+    lock = Lock()
 
-    def written(item):
+    def make_frame(item):
         frame, exists = item
-        # A worker of several threads has one file open for all of them.
-        with reading:
-            found = read(frame)
-        volume, note = _finite(*make(found))
+        with lock:
+            image = read(frame)
+        volume, note = _check_finite(*make(image))
         if not exists:
             return volume, note
         write_frame(path, levels(), frame, volume)
         return None, note
 
-    return written
+    return make_frame
 
 
-def _finite(volume, note):
+def _check_finite(volume, note):
     if not np.isfinite(volume).all():
-        raise InputError("found a NaN or an infinity in the volume, allowed: finite numbers.")
+        raise InputError("the volume must be finite, got a NaN or an infinity.")
     return volume, note
 
 
-def _check_some(series):
+def _check_any_finished(series):
     if series.failed and not series.finished:
         raise InputError(series.failed[min(series.failed)])
 
 
-def _ahead(reader: ThreadPoolExecutor, frames: Iterable[int], read: Callable[[int], Frame]):
-    """Frames and what is read of them, some of which is being read before it is asked for."""
+def _read_ahead(reader: ThreadPoolExecutor, frames: Iterable[int], read: Callable[[int], Frame]):
     waiting: deque[tuple[int, Future[Frame]]] = deque()
     for frame in frames:
         waiting.append((frame, reader.submit(read, frame)))
-        if len(waiting) > AHEAD:
+        if len(waiting) > PREFETCH:
             yield waiting.popleft()
     yield from waiting

@@ -1,4 +1,4 @@
-"""What of a capture a volume explains: the check on any reconstruction, and on a learned one above all."""
+"""Residual between a capture and the image of its reconstruction: forward residual, and level that noise explains."""
 
 from typing import NamedTuple
 
@@ -12,24 +12,28 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics, forward
 from ..typing import Image
-from .inverse_problem import explainable, model_of
+from .inverse_problem import prepare_data, prepare_model
 
-# Squares along a side of the sensor, unless it has fewer pixels.
-REGIONS = 16
+# Regions along a side of the sensor, unless it has fewer pixels.
+_REGIONS = 16
+# Side of the squares in which noise is estimated, pixels.
+_SQUARE = 32
+# Median absolute value of a standard normal variable.
+_NORMAL_MEDIAN = 0.6745
 
 
-class Reprojection(NamedTuple):
-    """How far the image of a volume is from the capture, after the one gain that fits it best.
+class ForwardResidual(NamedTuple):
+    """Difference between the image of a volume, scaled to fit best, and the capture.
 
     Parameters
     ----------
     error
-        RMS of the difference over that of the capture above its offset: 0 if all is explained, 1 if nothing is.
+        RMS of the difference relative to that of the capture above its offset: 0 if all is explained, 1 if nothing is.
     correlation
-        Pearson's, of the pixels.
+        Pearson's correlation of the pixels.
     regions
-        The error in squares of the sensor, relative to the whole capture's RMS: where it is large, do not trust what
-        is reconstructed from there.
+        The error in squares of the sensor, relative to the whole capture's RMS: do not trust what is reconstructed from
+        squares where it is large.
     """
 
     error: float
@@ -37,7 +41,7 @@ class Reprojection(NamedTuple):
     regions: Float[np.ndarray, "row column"]
 
 
-def reproject(
+def forward_residual(
     volume: Float[Array | np.ndarray, "depth y x"],
     image: Image,
     imager: Imager,
@@ -45,25 +49,25 @@ def reproject(
     *,
     optics: Optics | str = "full",
     progress: Progress | None = None,
-) -> Reprojection:
-    """Image a volume again, and compare with the capture that it was reconstructed from.
+) -> ForwardResidual:
+    """Image a volume again, and compare the image with the capture.
 
     *Host.*
 
-    It is compared as `reconstruct` sees it: above the camera's offset, pixels as wide as voxels, and without what the
-    optics takes for background.
+    The images are compared as iterative methods see them: above the camera's offset, with pixels as wide as voxels, and
+    without the background that the optics lack.
 
     Parameters
     ----------
     volume
-        `grid.volume_shape`, of any method.
+        Volume of `grid.volume_shape`, by any method.
     image, imager, grid, optics, progress
         As for `reconstruct`.
 
     Raises
     ------
     InputError
-        If a voxel or a pixel is not finite, or there is no such optics.
+        If a voxel or a pixel is not finite, or the optics do not exist.
 
     Examples
     --------
@@ -75,79 +79,72 @@ def reproject(
     >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
     >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
     >>> volume = gs.reconstruct(image, scope, grid, gs.RichardsonLucy(steps=10), optics="near")
-    >>> found = gs.reproject(volume, image, scope, grid, optics="near")
-    >>> print(found.error < 0.5, found.correlation > 0.9, found.regions.shape)
+    >>> check = gs.forward_residual(volume, image, scope, grid, optics="near")
+    >>> print(check.error < 0.5, check.correlation > 0.9, check.regions.shape)
     True True (16, 16)
     """
     check_finite("volume", volume, "voxels")
-    model = model_of(imager, grid, optics, progress or Progress())
-    light, background = explainable(image, model)
+    model = prepare_model(imager, grid, optics, progress or Progress())
+    light, background = prepare_data(image, model)
     again = forward(jnp.asarray(volume, light.dtype), model.imager, grid, model.optics)
-    return _compared(np.asarray(again, np.float64), np.asarray(light - background, np.float64))
+    return _compare(np.asarray(again, np.float64), np.asarray(light - background, np.float64))
 
 
-def _compared(model, light):
-    energy, whole = np.vdot(model, model), np.sqrt(np.mean(light**2))
-    left = light - (np.vdot(model, light) / energy if energy > 0 else 0) * model
+def _compare(model, light):
+    energy, rms = np.vdot(model, model), np.sqrt(np.mean(light**2))
+    residual = light - (np.vdot(model, light) / energy if energy > 0 else 0) * model
     spread = model.std() * light.std()
     correlation = np.mean((model - model.mean()) * (light - light.mean())) / spread if spread > 0 else 0.0
-    # A dark capture is explained by anything.
-    regions = _rms_of_regions(left) / (whole if whole > 0 else 1)
-    error = np.sqrt(np.mean(left**2)) / whole if whole > 0 else 0.0
-    return Reprojection(float(error), float(correlation), regions)
+    # Any volume explains a dark capture.
+    regions = _rms_of_regions(residual) / (rms if rms > 0 else 1)
+    error = np.sqrt(np.mean(residual**2)) / rms if rms > 0 else 0.0
+    return ForwardResidual(float(error), float(correlation), regions)
 
 
 def _rms_of_regions(image):
-    first = [np.unique(np.linspace(0, n, REGIONS, endpoint=False).astype(int)) for n in image.shape]
+    first = [np.unique(np.linspace(0, n, _REGIONS, endpoint=False).astype(int)) for n in image.shape]
     sums = lambda part: np.add.reduceat(np.add.reduceat(part, first[0], 0), first[1], 1)
     return np.sqrt(sums(image**2) / sums(np.ones_like(image)))
 
 
-# Side of the squares that have one noise each, pixels.
-_SQUARE = 32
-# Median of the absolute value of normal noise, in standard deviations.
-_MEDIAN = 0.6745
-
-
 def noise_variance(image: Shaped[np.ndarray, "row column"]) -> Float64[np.ndarray, "square_row square_column"]:
-    """Variance of a capture's noise in each square of 32 pixels (the last may be smaller), in the square of its unit.
+    """Variance of a capture's noise in each square of 32 pixels (the last may be smaller); 0 below 3 pixels a side.
 
     From second differences along rows and columns, in which smooth light cancels (Immerkaer, Comput. Vis. Image
-    Underst. 64, 300, 1996), and their median, which sharp spots hardly move. Images of fewer than three pixels a side
-    have none.
+    Underst. 64, 300, 1996), and their median, which sharp spots hardly change.
     """
     image = np.asarray(image, np.float64)
     if min(image.shape) < 3:
         return np.zeros((1, 1))
-    # The variance of independent noise grows by 6 with each.
+    # Each second difference multiplies the variance of independent noise by 6.
     difference = np.abs(np.diff(np.diff(image, 2, axis=0), 2, axis=1)) / 6
-    ends = [range(0, n, _SQUARE) for n in difference.shape]
-    median = [[np.median(difference[r : r + _SQUARE, c : c + _SQUARE]) for c in ends[1]] for r in ends[0]]
-    return (np.array(median) / _MEDIAN) ** 2
+    starts = [range(0, n, _SQUARE) for n in difference.shape]
+    median = [[np.median(difference[r : r + _SQUARE, c : c + _SQUARE]) for c in starts[1]] for r in starts[0]]
+    return (np.array(median) / _NORMAL_MEDIAN) ** 2
 
 
-def misfit_of_noise(
+def discrepancy_target(
     image: Shaped[np.ndarray, "row column"], light: Float[np.ndarray, "binned_row binned_column"], *, counts: bool
 ) -> float:
-    """The cost that a solver has left where nothing but noise is (the discrepancy principle of Morozov, 1966).
+    """Cost that noise alone leaves a solver, by the discrepancy principle (Morozov, 1966).
 
     Parameters
     ----------
     image
         The capture.
     light
-        What is to be explained: pixels of the capture summed to larger ones, above the offset.
+        Data to explain: the capture in binned pixels, above the offset.
     counts
-        If true, of the Kullback-Leibler divergence, `sum(variance / (2 mean))`; else of half the squares.
+        Whether the cost is the Kullback-Leibler divergence, `sum(variance / (2 mean))`, or half the squares.
     """
-    from scipy.ndimage import uniform_filter  # here, so that back-projection, which asks no noise, does without SciPy
+    from scipy.ndimage import uniform_filter  # imported here: back-projection does without SciPy
 
     side = image.shape[0] // light.shape[0]
     variance = noise_variance(image)
     squares = (np.arange(n) * side // _SQUARE for n in light.shape)
     variance = side**2 * variance[np.ix_(*(np.minimum(s, n - 1) for s, n in zip(squares, variance.shape, strict=True)))]
     if counts:
-        # In the dark, where negative pixels count as 0, a divergence is of the order of the noise.
+        # In the dark, where negative pixels count as 0, the divergence is of the order of the noise.
         mean = np.maximum(uniform_filter(np.asarray(light, np.float64), max(_SQUARE // side, 1)), np.sqrt(variance))
         variance = np.divide(variance, mean, out=np.zeros_like(variance), where=mean > 0)
     return float(variance.sum() / 2)

@@ -1,13 +1,13 @@
-"""ADMM: least squares with total variation and sparsity, not negative, for any operator.
+"""ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator.
 
 It minimises
 
     |A x - image|^2 / 2 + tv TV(x) + l1 sum(x)    over x >= 0
 
-by the alternating direction method of multipliers (Boyd et al., Found. Trends Mach. Learn. 3, 1, 2011). `x` is split
-from its differences `D x` and from its copy that is not negative; the x-step is a linear system, `A'A + rho (D'D + 1)`,
-solved by a few conjugate gradients. Without total variation there is no split of the differences, which would only
-hold the steps back. `convolution_admm` has the version for convolutions, by FFTs.
+by the alternating direction method of multipliers (Boyd et al., Found. Trends Mach. Learn. 3, 1, 2011). The split
+variables are the differences `D x` and a non-negative copy of `x`. The x-step is the linear system
+`A'A + rho (D'D + 1)`, solved by a few conjugate gradients. Without total variation the differences are not split, which
+would slow convergence.
 """
 
 from typing import Any, NamedTuple
@@ -27,22 +27,22 @@ from .base import (
     check_options,
     differences,
     differences_adjoint,
-    least_weight_of_darkness,
+    lambda_max,
     norm,
     shrink,
     total_variation,
 )
 
-# The penalty is doubled or halved where one residual is this many times the other (Boyd, section 3.4.1), and so often
-# at most: a penalty that stays the same from some step on is what convergence is proven for.
-_BALANCE, _FACTOR, _CHANGES = 10.0, 2.0, 50
-# Over-relaxation (Boyd, section 3.4.3) with conjugate gradients. Measured on images of particles and of letters: with
-# 1.8 the cost after as many steps is below that with 1, and about that with 1.6.
+# The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
+# many times: convergence is proven for a penalty that is constant from some step on.
+_BALANCE, _FACTOR, _MAX_CHANGES = 10.0, 2.0, 50
+# Over-relaxation (Boyd, section 3.4.3) with conjugate gradients. On images of particles and of letters, 1.8 gives a
+# lower cost than 1 after as many steps, and about the same as 1.6.
 _RELAXATION = 1.8
 
 
-class Prior(eqx.Module):
-    """What is added to the squares; `wrap` takes the last and the first voxel of a line for neighbours."""
+class Regularizer(eqx.Module):
+    """Total variation, L1 norm and non-negativity of the split variables; `wrap` makes differences periodic."""
 
     tv: Float[Array, ""]
     l1: Float[Array, ""]
@@ -50,19 +50,19 @@ class Prior(eqx.Module):
     wrap: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, solver: Any, back: Float[Array, "*shape"], *, wrap: bool) -> "Prior":
-        """With the weights of a solver, which are in parts of the largest voxel of `back = A' image`."""
-        unit = least_weight_of_darkness(back)
+    def of(cls, solver: Any, back: Float[Array, "*shape"], *, wrap: bool) -> "Regularizer":
+        """The weights of a solver, which are relative to `lambda_max(back)` of `back = A' image`."""
+        unit = lambda_max(back)
         tv, l1 = (jnp.asarray(weight, back.dtype) * unit for weight in (solver.tv, solver.sparsity))
         return cls(tv, l1, solver.isotropic, wrap)
 
     @property
-    def varies(self) -> Float[Array, ""]:
+    def splits_differences(self) -> Float[Array, ""]:
         """1 with total variation, 0 without: the weight of the differences in the split."""
         return (self.tv > 0).astype(self.tv.dtype)
 
     def split(self, x):
-        return self.varies * differences(x, wrap=self.wrap), x
+        return self.splits_differences * differences(x, wrap=self.wrap), x
 
     def adjoint(self, split):
         u, w = split
@@ -78,7 +78,7 @@ class Prior(eqx.Module):
 
 
 class Splitting(NamedTuple):
-    """Scaled ADMM's `x`, its split `z`, the multipliers `u`, the penalty `rho` and how often that may still change."""
+    """Variables of scaled ADMM: `x`, its split `z`, the multipliers `u`, the penalty `rho`, and its changes left."""
 
     x: PyTree
     z: PyTree
@@ -89,58 +89,52 @@ class Splitting(NamedTuple):
     @classmethod
     def start(cls, x: PyTree, split: PyTree, rho: Array) -> "Splitting":
         """From `x = 0` and its split."""
-        return cls(x, split, split, rho, jnp.array(_CHANGES))
+        return cls(x, split, split, rho, jnp.array(_MAX_CHANGES))
 
 
-class Point(NamedTuple):
-    """A volume `x`, `A x` and `A'A x`: kept together, a step of conjugate gradients applies `A` and `A'` once."""
+class Iterate(NamedTuple):
+    """A volume `x` with `A x` and `A'A x`, so that a step of conjugate gradients applies `A` and `A'` once."""
 
     x: Array
     image: Array
     back: Array
 
-    @classmethod
-    def of(cls, A: lx.AbstractLinearOperator, x: Array) -> "Point":
-        image = A.mv(x)
-        return cls(x, image, A.T.mv(image))
-
 
 class State(NamedTuple):
-    """Of `ADMM`: the splitting, what is known of the volume, and `A' image`."""
+    """State of `ADMM`: the splitting, the regularizer, and `A' image`."""
 
     splitting: Splitting
-    prior: Prior
+    regularizer: Regularizer
     back: Array
 
 
 class ADMM(eqx.Module):
-    """ADMM: least squares with total variation and sparsity, not negative, for any operator.
+    """ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator.
 
     *Differentiable.*
 
-    The x-step is done by conjugate gradients that start from the last x; each applies the operator and its adjoint
-    once, and nothing else does. The steps are over-relaxed, and the penalty adapts: it starts at the mean of the
-    diagonal of `A'A` and is doubled or halved, a bounded number of times, where the primal residual is ten times the
-    dual one or the reverse (Boyd, sections 3.4.1 and 3.4.3). The residual is the larger of the two, each relative
-    (Boyd, section 3.3). The costs are of the unconstrained part of the split, which may be slightly negative before it
-    has converged; the estimate is not.
+    Conjugate gradients solve the x-step from the last `x`; each applies the operator and its adjoint once. The steps
+    are over-relaxed, and the penalty starts at the mean diagonal entry of `A'A` and adapts to the primal and dual
+    residuals (Boyd, sections 3.4.1 and 3.4.3). The residual is the larger of these two, each relative (Boyd, section
+    3.3). Costs are those of the unconstrained `x`, which may be slightly negative before convergence; the estimate is
+    not.
 
     Parameters
     ----------
     steps, tolerance
         As for `Solver`.
     sparsity, tv
-        Weights of the sum of `x` and of its total variation, both in parts of `max(A' image)`: the least weight of the
-        sum that leaves nothing but darkness. At `tv=0` the derivative with respect to `tv` is 0.
+        Weights of the sum and of the total variation of `x`, relative to `max(A' image)`, the smallest L1 weight for
+        which `x = 0` is optimal. At `tv=0` the derivative with respect to `tv` is 0.
     isotropic
-        Total variation of vectors rather than of each axis.
+        Total variation of gradient vectors rather than of each axis.
     cg_steps
-        Of each x-step. Three give the lowest cost for the same number of applications of the operator, or nearly so.
+        Conjugate gradients of each x-step. Three give about the lowest cost per application of the operator.
 
     Raises
     ------
     InputError
-        If an option is negative, or a number of steps 0.
+        If an option is negative or a number of steps is 0.
 
     Examples
     --------
@@ -152,8 +146,8 @@ class ADMM(eqx.Module):
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 19:23, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
-    >>> found = gs.solve(gs.ImagingOperator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
-    >>> print(bool(found.x.min() >= 0))
+    >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
+    >>> print(bool(solution.x.min() >= 0))
     True
     """
 
@@ -170,28 +164,29 @@ class ADMM(eqx.Module):
     def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = as_image(A, image)
         back = A.T.mv(image)
-        prior = Prior.of(self, back, wrap=False)
+        regularizer = Regularizer.of(self, back, wrap=False)
         x = jnp.zeros_like(back)
-        dark = Point(x, jnp.zeros_like(image), x)
-        return State(Splitting.start(dark, prior.split(x), _mean_gain(A)), prior, back)
+        start = Iterate(x, jnp.zeros_like(image), x)
+        return State(Splitting.start(start, regularizer.split(x), _mean_gain(A)), regularizer, back)
 
     def step(
         self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = as_image(A, image)
-        splitting, prior, back = state
+        splitting, regularizer, back = state
 
-        def update(point, target, rho):
-            smooth = lambda x: rho * prior.adjoint(prior.split(x))
-            point = _conjugate_gradients(A, smooth, back + rho * prior.adjoint(target), point, self.cg_steps)
-            return point, prior.split(point.x)
+        def update(iterate, target, rho):
+            smooth = lambda x: rho * regularizer.adjoint(regularizer.split(x))
+            right_side = back + rho * regularizer.adjoint(target)
+            iterate = _conjugate_gradients(A, smooth, right_side, iterate, self.cg_steps)
+            return iterate, regularizer.split(iterate.x)
 
-        def cost(point, split):
-            residual = point.image - image
-            return jnp.vdot(residual, residual) / 2 + prior.cost(split)
+        def cost(iterate, split):
+            residual = iterate.image - image
+            return jnp.vdot(residual, residual) / 2 + regularizer.cost(split)
 
-        splitting, now, residual = advance(splitting, update, prior.prox, cost, _RELAXATION)
-        return State(splitting, prior, back), now, residual
+        splitting, now, residual = advance(splitting, update, regularizer.prox, cost, _RELAXATION)
+        return State(splitting, regularizer, back), now, residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.splitting.z[-1]
@@ -200,18 +195,18 @@ class ADMM(eqx.Module):
 def advance(
     splitting: Splitting, update, prox, cost, relaxation: float = 1.0
 ) -> tuple[Splitting, Float[Array, ""], Float[Array, ""]]:
-    """One step of scaled ADMM, its cost and its residual.
+    """Take one step of scaled ADMM; return the splitting, the cost and the residual.
 
     Parameters
     ----------
     update
-        From `x`, the target of its split and `rho` to the next `x` and its split.
+        Maps `x`, the target of its split, and `rho` to the next `x` and its split.
     prox
-        The proximal map of the split, with `rho`.
+        Proximal map of the split, with `rho`.
     cost
-        Of `x` and its split.
+        Cost of `x` and its split.
     relaxation
-        Between 1 and 2: more than 1 over-relaxes.
+        Between 1 (none) and 2 (over-relaxation).
     """
     add = lambda a, b: jax.tree.map(jnp.add, a, b)
     subtract = lambda a, b: jax.tree.map(jnp.subtract, a, b)
@@ -220,8 +215,8 @@ def advance(
     relaxed = jax.tree.map(lambda a, b: relaxation * a + (1 - relaxation) * b, split, z)
     new = prox(add(relaxed, u), rho)
     u = add(u, subtract(relaxed, new))
-    # Before the adjoint of the split, not after as Boyd has it: where the image is split off too, the adjoint of
-    # the multipliers is 0 at the solution, and nothing would be left to compare with.
+    # Residuals of the split itself, not of its adjoint as in Boyd: where the image is split too, the adjoint of the
+    # multipliers is 0 at the solution, and a relative residual would have no scale.
     primal = divide(norm(subtract(split, new)), jnp.maximum(norm(split), norm(new)))
     dual = divide(norm(subtract(new, z)), jnp.maximum(norm(u), norm(new)))
     factor = jnp.where(primal > _BALANCE * dual, _FACTOR, jnp.where(dual > _BALANCE * primal, 1 / _FACTOR, 1))
@@ -231,37 +226,38 @@ def advance(
     return splitting, cost(x, split), jnp.maximum(primal, dual)
 
 
-def _conjugate_gradients(A, smooth, vector, point, steps):
-    """So many steps toward the solution of `A'A x + smooth(x) = vector`, from a `Point`.
+def _conjugate_gradients(A, smooth, right_side, iterate, steps):
+    """Take `steps` conjugate gradients toward the solution of `A'A x + smooth(x) = right_side`.
 
-    Not `lineax.CG`: `linear_solve` is differentiated as the exact solution is, which so few steps do not reach. The
-    derivative here is that of what was computed.
+    Not `lineax.CG`: `linear_solve` has the derivative of the exact solution, which so few steps do not reach. This has
+    the derivative of what was computed.
     """
 
     def step(state, _):
-        point, residual, direction, square = state
-        moved = Point.of(A, direction)
-        product = moved.back + smooth(direction)
+        iterate, residual, direction, square = state
+        image = A.mv(direction)
+        change = Iterate(direction, image, A.T.mv(image))
+        product = change.back + smooth(direction)
         length = divide(square, jnp.vdot(direction, product))
-        point = jax.tree.map(lambda a, b: a + length * b, point, moved)
+        iterate = jax.tree.map(lambda a, b: a + length * b, iterate, change)
         residual = residual - length * product
         new = jnp.vdot(residual, residual)
-        return (point, residual, residual + divide(new, square) * direction, new), None
+        return (iterate, residual, residual + divide(new, square) * direction, new), None
 
-    residual = vector - point.back - smooth(point.x)
-    return lax.scan(step, (point, residual, residual, jnp.vdot(residual, residual)), length=steps)[0][0]
+    residual = right_side - iterate.back - smooth(iterate.x)
+    return lax.scan(step, (iterate, residual, residual, jnp.vdot(residual, residual)), length=steps)[0][0]
 
 
 def _mean_gain(A):
-    """The mean of `A'A`'s diagonal: a penalty of this size weighs the split like the image (Hutchinson's estimate).
+    """Mean diagonal entry of `A'A` by Hutchinson's estimate, or 1 for a zero operator.
 
-    1 for an operator that is zero.
+    A penalty of this size weighs the split like the image.
     """
     structure = A.in_structure()
     signs = jax.random.rademacher(jax.random.key(0), structure.shape, structure.dtype)
     image = A.mv(signs)
-    return or_one(jnp.vdot(image, image) / signs.size)
+    return positive_or_one(jnp.vdot(image, image) / signs.size)
 
 
-def or_one(penalty):
+def positive_or_one(penalty):
     return jnp.where(penalty > 0, penalty, 1)

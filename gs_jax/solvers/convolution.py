@@ -1,7 +1,7 @@
-"""A shift-invariant imaging system from a measured point spread function: convolution by FFT, and cropping.
+"""Shift-invariant imaging by a measured PSF, as convolution and crop, and its ADMM solver with an exact x-step.
 
-A sensor sees only a part of what a diffuser or lens array casts, also from beyond its own edges. So the scene is
-larger than the image: it holds every point whose PSF reaches the sensor, and the image is the middle of its
+A sensor sees only a part of the light that a diffuser or lens array casts, also from points beyond its edges. So the
+scene is larger than the image: it holds every point whose PSF reaches the sensor, and the image is the middle of its
 convolution (Antipa et al., DiffuserCam, Optica 5, 1, 2018).
 """
 
@@ -17,12 +17,16 @@ from jaxtyping import Array, Complex, Float
 
 from ..base.arrays import divide, safe_sqrt
 from ..typing import Image, Real
-from .admm import Prior, Splitting, advance, or_one
+from .admm import Regularizer, Splitting, advance, positive_or_one
 from .base import as_image, check_options
+
+# Initial penalty of the convolved scene, relative to the image's weight. With 1 or 0.01 the cost falls more slowly, on
+# DiffuserCam's image and on random ones.
+_INITIAL_PENALTY = 0.1
 
 
 class Convolution(eqx.Module):
-    """A PSF for each depth, as spectra on the scene's grid. Make it with `of`."""
+    """Convolution with a PSF for each depth, stored as spectra on the scene's grid. Make it with `of`."""
 
     spectra: Complex[Array, "depth tall half"]
     image_shape: tuple[int, int] = eqx.field(static=True)
@@ -30,23 +34,23 @@ class Convolution(eqx.Module):
 
     @classmethod
     def of(cls, psf: Float[Array | np.ndarray, "depth high wide"], image_shape: tuple[int, int]) -> "Convolution":
-        """The system of a measured PSF.
+        """Convolution with a measured PSF.
 
         Parameters
         ----------
         psf
-            The image of a point on the axis at each depth, with the point's place at `(high // 2, wide // 2)`.
+            Image of a point on the axis at each depth, the point being at `(high // 2, wide // 2)`.
         image_shape
             `(rows, columns)` of the images.
 
         Raises
         ------
         ValueError
-            If `psf` is not `(depth, row, column)`, or empty.
+            If `psf` is empty or not `(depth, row, column)`.
         """
         if psf.ndim != 3 or min(psf.shape) < 1:
-            raise ValueError(f"`psf` must be (depth, row, column) with a pixel at least, got {psf.shape}.")
-        from scipy.fft import next_fast_len  # here, so that solvers that transform nothing do without SciPy
+            raise ValueError(f"`psf` must be (depth, row, column) and not empty, got {psf.shape}.")
+        from scipy.fft import next_fast_len  # imported here: solvers without FFTs do not need SciPy
 
         size = [int(next_fast_len(n + k - 1, real=True) or 0) for n, k in zip(image_shape, psf.shape[1:], strict=True)]
         padded = jnp.pad(jnp.asarray(psf), [(0, 0), *((0, n - k) for n, k in zip(size, psf.shape[1:], strict=True))])
@@ -55,56 +59,51 @@ class Convolution(eqx.Module):
         return cls(jnp.fft.rfft2(centred), (rows, columns), (len(psf), size[0], size[1]))
 
     @property
-    def place(self) -> tuple[slice, slice]:
-        """Where the image lies within a plane of the scene."""
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the image within a plane of the scene."""
         corner = [(n - m) // 2 for n, m in zip(self.scene_shape[1:], self.image_shape, strict=True)]
         rows, columns = (slice(a, a + m) for a, m in zip(corner, self.image_shape, strict=True))
         return rows, columns
 
     def __call__(self, scene: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
-        """The image of a scene of `scene_shape`."""
+        """Image of a scene of `scene_shape`."""
         spectrum = jnp.sum(jnp.fft.rfft2(scene) * self.spectra, axis=0)
-        return jnp.fft.irfft2(spectrum, s=self.scene_shape[1:])[self.place]
+        return jnp.fft.irfft2(spectrum, s=self.scene_shape[1:])[self.window]
 
     @property
     def operator(self) -> lx.AbstractLinearOperator:
-        """The same as a `lineax` operator, for any solver; its transpose is exact."""
+        """`lineax` operator for any solver; its transpose is exact."""
         scene = jax.ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
         return lx.FunctionLinearOperator(eqx.Partial(type(self).__call__, self), scene)
 
 
-# The first penalty of the convolved scene, in parts of the image's weight. Measured: with 1 or 0.01 the cost falls more
-# slowly, on DiffuserCam's image and on random ones.
-_START = 0.1
-
-
 class State(NamedTuple):
-    """Of `ConvolutionADMM`: the splitting, what is known of the scene, and the system divided by its gain.
+    """State of `ConvolutionADMM`.
 
-    `spectrum` is the divided system's, `solvent` the inverse of the x-step's matrix, both in Fourier space.
+    `gain` is the scale by which the system is divided, `spectrum` the spectrum of the divided system, and
+    `inverse_spectrum` that of the inverse of the x-step's matrix.
     """
 
     splitting: Splitting
-    prior: Prior
+    regularizer: Regularizer
     gain: Array
     spectrum: Array
-    solvent: Array
+    inverse_spectrum: Array
 
 
 class ConvolutionADMM(eqx.Module):
-    """What `ADMM` minimises, for a `Convolution`; parameters and errors as there.
+    """ADMM for a `Convolution`, with an exact x-step by four FFTs; cost, parameters and errors as for `ADMM`.
 
-    The x-step is exact and the steps are not over-relaxed: with 1.6 or 1.8 the cost of DiffuserCam's image falls more
-    slowly.
+    As in DiffuserCam (Antipa et al., Optica 5, 1, 2018) the convolved scene is split too, which separates the crop to
+    the sensor from the convolution. The steps are not over-relaxed: with 1.6 or 1.8 the cost of DiffuserCam's image
+    falls more slowly. Differences are periodic, in depth too. The estimate has `system.scene_shape`;
+    `system.window` is the image's place in it.
 
-    Differences wrap round the edge of the scene, in depth too. The estimate is of `system.scene_shape`;
-    `system.place` says where the image is in it.
-
-    The convolved scene has a penalty of its own, `rho / gain^2`: `gain^2` is the geometric mean of the largest and the
+    The convolved scene has its own penalty `rho / gain^2`, where `gain^2` is the geometric mean of the largest and the
     mean eigenvalue of `A'A`. For one split the best penalty is the geometric mean of the extreme eigenvalues (Ghadimi
-    et al., IEEE Trans. Autom. Control 60, 644, 2015); a diffuser's smallest is 0, hence the mean. With the mean alone
-    low spatial frequencies, up to `max / mean` (4e5 for 2 million pixels) times as strong, outweigh what is known of
-    the scene, which then comes in slowly.
+    et al., IEEE Trans. Autom. Control 60, 644, 2015); the smallest of a diffuser is 0, hence the mean. With the mean
+    alone, low spatial frequencies, up to `max / mean` times as strong (4e5 for 2 million pixels), outweigh the
+    regularizer, which then acts slowly.
     """
 
     steps: int = eqx.field(static=True, default=20)
@@ -118,43 +117,44 @@ class ConvolutionADMM(eqx.Module):
 
     def init(self, system: Convolution, image: Image) -> State:
         A = system.operator
-        prior = Prior.of(self, A.T.mv(as_image(A, image)), wrap=True)
+        regularizer = Regularizer.of(self, A.T.mv(as_image(A, image)), wrap=True)
         shape, axes = system.scene_shape, _axes(system)
-        # The sum of 2-D convolutions is plane 0 of a 3-D convolution, with the depths of the PSF in reverse.
+        # The sum of 2-D convolutions is plane 0 of a 3-D convolution with the PSF's depths reversed.
         backwards = jnp.roll(system.spectra[::-1], 1, axis=0)
         spectrum = jnp.fft.fft(backwards, axis=0) if shape[0] > 1 else backwards
         power = jnp.abs(spectrum) ** 2
         gain = safe_sqrt(safe_sqrt(jnp.mean(power) * jnp.max(power)))
-        spectrum = _times(divide(jnp.ones_like(gain), gain), spectrum)
-        curvature = _curvature(shape, axes, gain.dtype)[..., : spectrum.shape[-1]]
-        solvent = 1 / (jnp.abs(spectrum) ** 2 + prior.varies * curvature + 1)
+        spectrum = _scale(divide(jnp.ones_like(gain), gain), spectrum)
+        laplacian = _laplacian_spectrum(shape, axes, gain.dtype)[..., : spectrum.shape[-1]]
+        inverse_spectrum = 1 / (jnp.abs(spectrum) ** 2 + regularizer.splits_differences * laplacian + 1)
         x = jnp.zeros(shape, gain.dtype)
-        split = (x, *prior.split(x))
-        return State(Splitting.start(x, split, or_one(_START * gain**2)), prior, gain, spectrum, solvent)
+        splitting = Splitting.start(x, (x, *regularizer.split(x)), positive_or_one(_INITIAL_PENALTY * gain**2))
+        return State(splitting, regularizer, gain, spectrum, inverse_spectrum)
 
     def step(self, system: Convolution, image: Image, state: State) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = as_image(system.operator, image)
-        splitting, prior, gain, spectrum, solvent = state
+        splitting, regularizer, gain, spectrum, inverse_spectrum = state
         shape, axes = system.scene_shape, _axes(system)
         transform = lambda x: jnp.fft.rfftn(x, axes=axes)
         inverse = lambda f: jnp.fft.irfftn(f, s=[shape[axis] for axis in axes], axes=axes)
-        seen = (0, *system.place)
+        window = (0, *system.window)
 
         def update(x, target, rho):
             v, *rest = target
-            found = _times(solvent, spectrum.conj() * transform(v) + transform(prior.adjoint(rest)))
-            x = inverse(found)
-            return x, (inverse(spectrum * found), *prior.split(x))
+            right_side = spectrum.conj() * transform(v) + transform(regularizer.adjoint(rest))
+            solution = _scale(inverse_spectrum, right_side)
+            x = inverse(solution)
+            return x, (inverse(spectrum * solution), *regularizer.split(x))
 
         def prox(split, rho):
             v, *rest = split
-            measured = (rho * v[seen] + gain * image) / (rho + gain**2)
-            return v.at[seen].set(measured), *prior.prox(rest, rho)
+            measured = (rho * v[window] + gain * image) / (rho + gain**2)
+            return v.at[window].set(measured), *regularizer.prox(rest, rho)
 
         def cost(x, split):
             v, *rest = split
-            residual = gain * v[seen] - image
-            return jnp.vdot(residual, residual) / 2 + prior.cost(rest)
+            residual = gain * v[window] - image
+            return jnp.vdot(residual, residual) / 2 + regularizer.cost(rest)
 
         splitting, now, residual = advance(splitting, update, prox, cost)
         return state._replace(splitting=splitting), now, residual
@@ -164,17 +164,16 @@ class ConvolutionADMM(eqx.Module):
 
 
 def _axes(system):
-    """Those that are transformed."""
     return (0, 1, 2) if system.scene_shape[0] > 1 else (1, 2)
 
 
-def _times(factor, spectrum):
-    """A real factor times complex numbers, without making the factor complex."""
+def _scale(factor, spectrum):
+    # Complex times real would convert the factor to a complex number.
     return lax.complex(factor * spectrum.real, factor * spectrum.imag)
 
 
-def _curvature(shape, axes, dtype):
-    """Eigenvalues of `D'D` with differences that wrap: `2 - 2 cos(2 pi k / n)`, summed over the axes."""
+def _laplacian_spectrum(shape, axes, dtype):
+    """Eigenvalues of `D'D` with periodic differences: `2 - 2 cos(2 pi k / n)`, summed over the axes."""
     total = jnp.zeros((1, 1, 1), dtype)
     for axis in axes:
         angle = 2 * jnp.pi * jnp.arange(shape[axis], dtype=dtype) / shape[axis]

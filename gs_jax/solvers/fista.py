@@ -1,4 +1,4 @@
-"""FISTA: least squares with sparsity, not negative, for any operator.
+"""FISTA: non-negative least squares with an L1 penalty, for any linear operator.
 
 It minimises `|A x - image|^2 / 2 + l1 sum(x)` over `x >= 0` (Beck and Teboulle, SIAM J. Imaging Sci. 2, 183, 2009).
 """
@@ -15,15 +15,15 @@ from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
 from ..typing import Real
-from .base import as_image, check_options, least_weight_of_darkness, norm
+from .base import as_image, check_options, lambda_max, norm
 
-# Steps of the power method, and what it may fall short by: for operators without negative entries the largest
-# eigenvalue stands alone, and this many steps find it to about a percent.
+# Without negative entries the largest eigenvalue is isolated, and this many steps find it to about a percent; the
+# margin covers the rest.
 _POWER_STEPS, _MARGIN = 20, 1.05
 
 
 class State(NamedTuple):
-    """Of `FISTA`: the estimate, the point ahead of it, the momentum's `t`; the step length and the weight `l1`."""
+    """State of `FISTA`: estimate, extrapolated point, momentum `t`, step length and L1 weight."""
 
     x: Array
     point: Array
@@ -33,11 +33,11 @@ class State(NamedTuple):
 
 
 class FISTA(eqx.Module):
-    """FISTA: least squares with sparsity, not negative, for any operator.
+    """FISTA: non-negative least squares with an L1 penalty, for any linear operator.
 
     *Differentiable.*
 
-    It restarts whenever the momentum points uphill (O'Donoghue and Candes, Found. Comput. Math. 15, 715, 2015). A dark
+    It restarts when the momentum points uphill (O'Donoghue and Candes, Found. Comput. Math. 15, 715, 2015). A dark
     image gives zeros.
 
     Parameters
@@ -45,12 +45,12 @@ class FISTA(eqx.Module):
     steps, tolerance
         As for `Solver`; the residual is the relative change of `x`.
     sparsity
-        Weight of the sum of `x`, in parts of `max(A' image)`: the least that leaves nothing but darkness.
+        L1 weight, relative to `max(A' image)`, the smallest weight for which `x = 0` is optimal.
 
     Raises
     ------
     InputError
-        If an option is negative, or a number of steps 0.
+        If an option is negative or `steps` is 0.
 
     Examples
     --------
@@ -62,8 +62,8 @@ class FISTA(eqx.Module):
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 19, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
-    >>> found = gs.solve(gs.ImagingOperator(scope, grid), image, gs.FISTA(steps=30, sparsity=0.01))
-    >>> print(bool(found.costs[-1] < found.costs[0]), bool(found.x.min() >= 0))
+    >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.FISTA(steps=30, sparsity=0.01))
+    >>> print(bool(solution.costs[-1] < solution.costs[0]), bool(solution.x.min() >= 0))
     True True
     """
 
@@ -77,7 +77,7 @@ class FISTA(eqx.Module):
     def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = as_image(A, image)
         back = A.T.mv(image)
-        weight = jnp.asarray(self.sparsity, image.dtype) * least_weight_of_darkness(back)
+        weight = jnp.asarray(self.sparsity, image.dtype) * lambda_max(back)
         one, zeros = jnp.ones((), back.dtype), jnp.zeros_like(back)
         return State(zeros, zeros, one, divide(one, _MARGIN * largest_eigenvalue(A)), weight)
 
@@ -92,24 +92,20 @@ class FISTA(eqx.Module):
         t_old = jnp.where(uphill, 1.0, t).astype(t.dtype)
         t_new = (1 + jnp.sqrt(1 + 4 * t_old**2)) / 2
         momentum = jnp.where(uphill, 0, (t_old - 1) / t_new)
-        return (
-            State(new, new + momentum * (new - x), t_new, rate, weight),
-            cost,
-            divide(norm(new - x), norm(new)),
-        )
+        state = State(new, new + momentum * (new - x), t_new, rate, weight)
+        return state, cost, divide(norm(new - x), norm(new))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
 
 
-def largest_eigenvalue(A: lx.AbstractLinearOperator, steps: int = _POWER_STEPS) -> Float[Array, ""]:
-    """Of `A' A`, by the power method from a positive start: from below."""
+def largest_eigenvalue(A: lx.AbstractLinearOperator) -> Float[Array, ""]:
+    """Largest eigenvalue of `A' A`, approached from below by the power method."""
 
     def power(x, _):
-        y = A.T.mv(A.mv(divide(x, jnp.broadcast_to(norm(x), x.shape))))
-        return y, None
+        return A.T.mv(A.mv(divide(x, jnp.broadcast_to(norm(x), x.shape)))), None
 
     structure = A.in_structure()
-    # Positive, as the eigenvector is where no entry is negative, and not symmetric in case some are.
+    # Positive, as is the eigenvector if no entry is negative; random, in case an entry is and the vector is asymmetric.
     start = 1 + jax.random.uniform(jax.random.key(0), structure.shape, structure.dtype)
-    return norm(lax.scan(power, start, length=steps)[0])
+    return norm(lax.scan(power, start, length=_POWER_STEPS)[0])

@@ -1,9 +1,9 @@
-"""Unrolled inversion: an iterative solver, whose last steps have small networks between them, trained together.
+"""Unrolled inversion: an iterative solver with small trained networks between its steps.
 
-What a capture says of a volume is in the operators of its own microscope, which the networks do not hold: they are the
-same for every layout of lenses. The first steps are those of accelerated list-Richardson-Lucy. In each of the next its
-step is taken to a power that was learned, and a network then weighs each voxel by what it and its neighbours look like.
-The last have no networks again: where light may be is known then, and least squares say how much of it there is.
+The operators of the microscope hold all that is known of its lenses, so the same networks serve every lens layout. The
+first steps are accelerated Richardson-Lucy with back-projection in place of the adjoint. In each of the next, the
+Richardson-Lucy factor is raised to a trained power, and a network weighs each voxel by its neighbourhood. The last
+steps are conjugate gradients of least squares, weighted by the brightness found so far.
 """
 
 from typing import NamedTuple
@@ -21,37 +21,44 @@ from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
 from ..typing import PathLike
-from .base import Unmatched, as_image, check_options, norm
-from .richardson_lucy import TENTS, RichardsonLucy, State as LucyState, divergence, tent_background, tent_step
+from .base import Operator, UnmatchedAdjointOperator, as_image, check_options, norm
+from .richardson_lucy import (
+    BACKGROUND_KNOTS,
+    RichardsonLucy,
+    State as LucyState,
+    background_step,
+    bilinear_background,
+    kl_divergence,
+)
 
-# Channels that a network sees: the voxel after the step and before it, the largest and the mean over its column, how
-# far its lenses agree, what the step asked for, and how many lenses see it.
-_SEEN = 7
-# Voxels along a side of each layer's convolution, and how far a network sees laterally.
+# Input channels of a network: the voxel after and before the step, the maximum and the mean over its column, the
+# agreement of its lenses, the factor of the step, and the voxel's sensitivity.
+_CHANNELS = 7
+# Kernel sizes of the layers, and a network's lateral reach.
 _SIDES = (3, 3, 1)
 _MARGIN = sum(side // 2 for side in _SIDES)
-# Light that counts as none, in parts of the image's mean: where lenses are asked whether they agree, and in ratios.
+# Light that counts as dark, relative to the mean pixel: in the agreement of lenses, and in ratios.
 _DARK, _FAINT = 1e-2, 1e-3
-# What a step may ask for at most, and at least, as the network sees it.
-_MOST = 20.0
-# Rows of voxels at a time, which bounds the memory: what a network sees does not depend on them.
+_MAX_FACTOR = 20.0
+# Rows of voxels that a network processes at once, which bounds the memory.
 _ROWS = 128
-# Binomial weights, whose standard deviation is one voxel: where light is likely, it is so beside it, too.
-_BESIDE = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-_MOST_STEPS, _MOST_WIDTH = 64, 1024
-_LUCY = RichardsonLucy(accelerate=True, tents=TENTS)
+# Binomial weights with a standard deviation of one voxel: where light is likely, it is likely in neighbours, too.
+_BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+_MAX_STEPS, _MAX_WIDTH = 64, 1024
+_LUCY = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS)
 
 
 class Layer(eqx.Module):
-    """A convolution, one for each step: over rows and columns, with neighbouring planes among the channels seen."""
+    """Convolution over rows and columns, one for each step; neighbouring planes are additional input channels."""
 
-    weight: Float[Array, "*step side side seen made"]
-    bias: Float[Array, "*step made"]
+    weight: Float[Array, "*step side side inputs outputs"]
+    bias: Float[Array, "*step outputs"]
 
 
-class Squares(NamedTuple):
-    """Of conjugate gradients: the estimate over the variance that each voxel is expected to have, the negative
-    gradient, the next direction, that variance, the variance of noise, the gradient's square in its unit, and the cost.
+class ConjugateGradients(NamedTuple):
+    """State of conjugate gradients on `weights`, the estimate divided by the prior `variance` of each voxel.
+
+    `residual` is the negative gradient, `product` its preconditioned square, `noise` the variance of the noise.
     """
 
     weights: Array
@@ -64,46 +71,44 @@ class Squares(NamedTuple):
 
 
 class State(NamedTuple):
-    """Of `Unrolled`: the state of Richardson-Lucy, how far the lenses agree, that of conjugate gradients, and the steps
-    that are done.
-    """
+    """State of `Unrolled`: those of its parts, the agreement of the lenses at each voxel, and the steps taken."""
 
     lucy: LucyState
     agreement: Array
-    squares: Squares
+    gradients: ConjugateGradients
     number: Int[Array, ""]
 
 
 class Unrolled(eqx.Module):
-    """Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package.
+    """Unrolled inversion by trained networks; `Unrolled.pretrained()` has those that come with the package.
 
     *Differentiable.*
 
-    `x <- w x (B(image / A x) / B 1)^p`, with the forward model `A`, back-projection `B` in the place of its adjoint, a
-    power `p` of each step, and weights `w` between 0 and 2 that a network gives. Before that come the first steps of
-    accelerated Richardson-Lucy with `A` and `B`. Both fit a slow background, too. After that come conjugate gradients
-    from darkness towards the least `|A x - image|^2 / noise + |x|^2 / variance`, with the exact adjoint. The variance
-    that each voxel is expected to have is the `x` before them, blurred by a voxel, times its mean brightness; they are
-    preconditioned by it, and end early (Calvetti et al., "Bayes meets Krylov", arXiv:1503.06844). The noise is what
-    that `x` leaves of the image, so that nothing is made of noise alone. A dark image gives zeros.
+    The steps are of three kinds, with the forward model `A` and back-projection `B`:
+
+    1. Accelerated Richardson-Lucy with `B` in place of the adjoint.
+    2. `x <- w x (B(image / A x) / B 1)^p` with a power `p` for each step and weights `w` in (0, 2) from a network.
+       Steps of kinds 1 and 2 also fit a smooth background.
+    3. Conjugate gradients, from zero, on `|A x - image|^2 / noise + |x|^2 / variance` with the exact adjoint. The
+       variance is the `x` of step 2, blurred by a voxel, times its mean brightness; it preconditions the gradients,
+       which stop early (Calvetti et al., "Bayes meets Krylov", arXiv:1503.06844). The noise is the mean square of the
+       residual at that `x`. A dark image gives zeros.
 
     Parameters
     ----------
     layers
-        Of the networks.
+        Layers of the networks.
     power
-        One for each step with a network.
-    first
-        Steps before those with networks.
-    last
-        Conjugate gradients after them.
+        Power `p` of each step of kind 2.
+    first, last
+        Numbers of steps of kind 1 and kind 3.
     steps, tolerance
-        As for `Solver`; `first`, one for each network, and `last`, or fewer. The cost of the last is half the squares.
+        As for `Solver`; at most the sum of all three kinds. The cost of kind 3 is half the squares.
 
     Raises
     ------
     InputError
-        If an option is negative, or there are no steps or too many.
+        If an option is negative, or `steps` is 0 or too many.
 
     Examples
     --------
@@ -129,144 +134,147 @@ class Unrolled(eqx.Module):
 
     def __check_init__(self):
         check_options(self)
-        # Where modules are made of shapes or of nothing, there is nothing to check.
+        # `power` is not an array where JAX builds the module of shapes or placeholders.
         if isinstance(self.power, jax.Array) and self.steps > (most := self.first + self.power.size + self.last):
-            raise InputError(
-                f"steps: found {self.steps}, allowed: 1 to {most}, {self.power.size} of them with networks."
-            )
+            raise InputError(f"steps must be 1 to {most}, the number that was trained, got {self.steps}.")
 
-    def init(self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."]) -> State:
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
         lucy = _LUCY.init(A, image)
         dark = _DARK * jnp.mean(image)
         inverse = divide(jnp.ones_like(image), image + dark)
-        # The harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
+        # Harmonic mean of the pixels under a voxel's lenses: bright where all of them are.
         agreement = jnp.maximum(divide(lucy.sensitivity, A.T.mv(inverse)) - dark, 0)
         zeros, zero = jnp.zeros_like(lucy.x), jnp.zeros((), lucy.x.dtype)
-        return State(lucy, agreement, Squares(zeros, zeros, zeros, zeros, zero, zero, zero), jnp.zeros((), jnp.int32))
+        gradients = ConjugateGradients(zeros, zeros, zeros, zeros, zero, zero, zero)
+        return State(lucy, agreement, gradients, jnp.zeros((), jnp.int32))
 
     def step(
-        self, A: lx.AbstractLinearOperator | Unmatched, image: Num[Array | np.ndarray, "..."], state: State
+        self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         light = as_image(A, image)
         image = jnp.maximum(light, 0)
 
-        def lucy(state):
-            lucy, *told = _LUCY.step(A, image, state.lucy)
-            return state._replace(lucy=lucy), *told
+        def lucy_step(state):
+            lucy, cost, residual = _LUCY.step(A, image, state.lucy)
+            return state._replace(lucy=lucy), cost, residual
 
-        def learned(state):
-            lucy, *told = self.learned(A, image, state)
-            return state._replace(lucy=lucy), *told
+        def network_step(state):
+            lucy, cost, residual = self.network_step(A, image, state)
+            return state._replace(lucy=lucy), cost, residual
 
-        def squares(state):
-            begin = lambda: _squares(A, light, state.lucy)
-            squares, *told = _conjugate(A, lax.cond(state.number == ended[1], begin, lambda: state.squares))
-            return state._replace(squares=squares), *told
+        def gradient_step(state):
+            start = lambda: _start_gradients(A, light, state.lucy)
+            gradients = lax.cond(state.number == ends[1], start, lambda: state.gradients)
+            gradients, cost, residual = _gradient_step(A, gradients)
+            return state._replace(gradients=gradients), cost, residual
 
-        ended = jnp.array([self.first, self.first + self.power.size], jnp.int32)
-        state, cost, residual = lax.switch(jnp.sum(state.number >= ended), (lucy, learned, squares), state)
+        ends = jnp.array([self.first, self.first + self.power.size], jnp.int32)
+        kind = jnp.sum(state.number >= ends)
+        state, cost, residual = lax.switch(kind, (lucy_step, network_step, gradient_step), state)
         return state._replace(number=state.number + 1), cost, residual
 
-    def learned(
-        self, A: lx.AbstractLinearOperator | Unmatched, image: Float[Array, "..."], state: State
+    def network_step(
+        self, A: Operator, image: Float[Array, "..."], state: State
     ) -> tuple[LucyState, Float[Array, ""], Float[Array, ""]]:
-        """A step with a network: the new estimate, the cost of the old one, and the relative change."""
-        (x, sensitivity, momentum, _), number = state.lucy, state.number - self.first
-        expected, tents, asked = _asked(A, image, state.lucy)
-        ahead = x * asked ** self.power[number].astype(x.dtype)
+        """Take a step with a network; return the new estimate, the cost of the old one, and the relative change."""
+        (x, sensitivity, momentum, knots), number = state.lucy, state.number - self.first
+        expected = jnp.maximum(A.mv(x) + bilinear_background(knots, image), 0)
+        ratio = divide(image, expected + _FAINT * jnp.mean(image))
+        factor = jnp.clip(divide(A.T.mv(ratio), sensitivity), 1 / _MAX_FACTOR, _MAX_FACTOR)
+        ahead = x * factor ** self.power[number].astype(x.dtype)
         unit = _rms(ahead)
         in_unit = lambda volume, unit: jnp.arcsinh(divide(volume, jnp.broadcast_to(unit, volume.shape)))
-        column = lambda part: in_unit(jnp.broadcast_to(part(ahead, axis=0, keepdims=True), x.shape), unit)
-        seen = [
+        column = lambda reduce: in_unit(jnp.broadcast_to(reduce(ahead, axis=0, keepdims=True), x.shape), unit)
+        channels = [
             in_unit(ahead, unit),
             in_unit(x, unit),
             column(jnp.max),
             column(jnp.mean),
             in_unit(state.agreement, _rms(state.agreement)),
-            jnp.log(asked),
+            jnp.log(factor),
             divide(sensitivity, jnp.broadcast_to(jnp.max(sensitivity), x.shape)),
         ]
-        layers = jax.tree.map(lambda part: part[number], self.layers)
-        new = ahead * 2 * jax.nn.sigmoid(_weighed(layers, jnp.stack(seen, -1)))
-        lucy = LucyState(new, sensitivity, momentum, tents)
-        return lucy, divergence(image, expected), divide(norm(new - x), norm(new))
+        layers = jax.tree.map(lambda leaf: leaf[number], self.layers)
+        new = ahead * 2 * jax.nn.sigmoid(_apply_network(layers, jnp.stack(channels, -1)))
+        lucy = LucyState(new, sensitivity, momentum, background_step(knots, ratio))
+        return lucy, kl_divergence(image, expected), divide(norm(new - x), norm(new))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
-        squares = state.number > self.first + self.power.size
-        return jnp.where(squares, jnp.maximum(state.squares.variance * state.squares.weights, 0), state.lucy.x)
+        gradients = state.gradients
+        is_last = state.number > self.first + self.power.size
+        return jnp.where(is_last, jnp.maximum(gradients.variance * gradients.weights, 0), state.lucy.x)
 
     @staticmethod
     def pretrained() -> "Unrolled":
-        """The networks that come with the package; their model card says how they were made."""
+        """The networks that come with the package; the model card describes their training."""
         return weights.shipped("unrolled", _skeleton)
 
 
 def write_unrolled(path: PathLike, networks: Unrolled, provenance: Provenance | None = None) -> None:
-    """Writes the networks as `.npz`; see `gs_jax.io.weights`."""
+    """Write the networks as `.npz`; see `gs_jax.io.weights`."""
     width = networks.layers[0].bias.shape[-1]
     about = {"first": networks.first, "networks": networks.power.size, "squares": networks.last, "width": width}
     weights.write_weights(path, networks, about, provenance)
 
 
 def read_unrolled(path: PathLike) -> Unrolled:
-    """The networks in a file of `write_unrolled`, in float32. Nothing in the file is ever executed.
+    """Read networks written by `write_unrolled`, in float32, without executing anything from the file.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or holds no such networks, or not their arrays, finite.
+        If the file cannot be read, or does not hold finite arrays of such networks.
     """
     return weights.read_weights(path, _skeleton)
 
 
 def _skeleton(first: int, networks: int, width: int, squares: int | None = None, last: int = 0) -> Unrolled:
-    """The shapes of the networks, checked: what a file says decides how much memory is asked for."""
+    """Shapes of the networks. The numbers are checked: they decide how much memory is allocated.
+
+    Older files have `last` steps of Richardson-Lucy in place of conjugate gradients (`squares`).
+    """
     if squares is None:
-        raise ValueError(f"found {last} last steps of Richardson-Lucy, allowed: conjugate gradients, by training again")
-    whole = lambda n, least, most: type(n) is int and least <= n <= most
-    steps = whole(first, 0, _MOST_STEPS) and whole(networks, 1, _MOST_STEPS) and whole(squares, 0, _MOST_STEPS)
-    if not (steps and whole(width, 1, _MOST_WIDTH)):
+        raise ValueError(f"the last steps must be conjugate gradients, got {last} of Richardson-Lucy: train again")
+    is_count = lambda n, least, most: type(n) is int and least <= n <= most
+    steps = is_count(first, 0, _MAX_STEPS) and is_count(networks, 1, _MAX_STEPS) and is_count(squares, 0, _MAX_STEPS)
+    if not (steps and is_count(width, 1, _MAX_WIDTH)):
         raise ValueError("its number of steps or its width is out of range")
-    return eqx.filter_eval_shape(lambda key: untrained(first, networks, squares, width, key=key), jax.random.key(0))
+    make = lambda key: initialize_unrolled(first, networks, squares, width, key=key)
+    return eqx.filter_eval_shape(make, jax.random.key(0))
 
 
-def untrained(first: int = 15, networks: int = 3, last: int = 0, width: int = 16, *, key: PRNGKeyArray) -> Unrolled:
-    """Networks before their training: they leave nearly every voxel as it is."""
-    widths = (_SEEN, *(len(_SIDES) - 1) * (width,), 1)
+def initialize_unrolled(
+    first: int = 15, networks: int = 3, last: int = 0, width: int = 16, *, key: PRNGKeyArray
+) -> Unrolled:
+    """Random networks to train, which change voxels little; `networks` steps have one."""
+    widths = (_CHANNELS, *(len(_SIDES) - 1) * (width,), 1)
     layers = []
-    for one, side, seen, made in zip(jax.random.split(key, len(_SIDES)), _SIDES, widths[:-1], widths[1:], strict=True):
-        # He's normal distribution. As many planes are seen as rows.
-        weight = jax.random.normal(one, (networks, side, side, side * seen, made)) * (2 / (side**3 * seen)) ** 0.5
-        layers.append(Layer(weight.astype(jnp.float32), jnp.zeros((networks, made), jnp.float32)))
+    for layer_key, side, inputs, outputs in zip(
+        jax.random.split(key, len(_SIDES)), _SIDES, widths[:-1], widths[1:], strict=True
+    ):
+        # He's normal distribution; as many planes are inputs as rows.
+        shape = (networks, side, side, side * inputs, outputs)
+        weight = jax.random.normal(layer_key, shape) * (2 / (side**3 * inputs)) ** 0.5
+        layers.append(Layer(weight.astype(jnp.float32), jnp.zeros((networks, outputs), jnp.float32)))
     layers[-1] = eqx.tree_at(lambda layer: layer.weight, layers[-1], 0.1 * layers[-1].weight)
     return Unrolled(tuple(layers), jnp.full(networks, 1.3, jnp.float32), first, last, first + networks + last)
 
 
-def _asked(A, image, lucy: LucyState):
-    """The image of an estimate and its background, the next background, and the factors of Richardson-Lucy's step."""
-    expected = jnp.maximum(A.mv(lucy.x) + tent_background(lucy.tents, image), 0)
-    ratio = divide(image, expected + _FAINT * jnp.mean(image))
-    asked = jnp.clip(divide(A.T.mv(ratio), lucy.sensitivity), 1 / _MOST, _MOST)
-    return expected, tent_step(lucy.tents, ratio), asked
-
-
-def _squares(A, image, lucy: LucyState) -> Squares:
-    """Before the first of the conjugate gradients, with the volume that says where light may be."""
-    x, forward = lucy.x, A.forward if isinstance(A, Unmatched) else A
-    left = image - forward.mv(x) - tent_background(lucy.tents, image)
-    # As bright as light is on average, where there is as much of it as there is.
-    variance = _blurred(_blurred(x, 1), 2) * divide(jnp.vdot(x, x), jnp.sum(x))
-    residual = _exact(A).T.mv(image)
+def _start_gradients(A, image, lucy: LucyState) -> ConjugateGradients:
+    x, forward = lucy.x, A.forward if isinstance(A, UnmatchedAdjointOperator) else A
+    residual_image = image - forward.mv(x) - bilinear_background(lucy.knots, image)
+    variance = _blur(_blur(x, 1), 2) * divide(jnp.vdot(x, x), jnp.sum(x))
+    residual = _least_squares_operator(A).T.mv(image)
     product = jnp.vdot(residual, variance * residual)
-    cost = jnp.vdot(image, image) / 2
-    return Squares(jnp.zeros_like(x), residual, residual, variance, jnp.mean(left**2), product, cost)
+    noise, cost = jnp.mean(residual_image**2), jnp.vdot(image, image) / 2
+    return ConjugateGradients(jnp.zeros_like(x), residual, residual, variance, noise, product, cost)
 
 
-def _conjugate(A, squares: Squares):
-    """One of them: the next state, the cost of the last, and the relative change."""
-    A = _exact(A)
-    weights, residual, direction, variance, noise, product, cost = squares
+def _gradient_step(A, state: ConjugateGradients):
+    """Take one conjugate gradient; return the next state, the cost before it, and the relative change."""
+    A = _least_squares_operator(A)
+    weights, residual, direction, variance, noise, product, cost = state
     step = variance * direction
     image = A.mv(step)
     length = divide(product, jnp.vdot(image, image) + noise * jnp.vdot(direction, step))
@@ -274,53 +282,53 @@ def _conjugate(A, squares: Squares):
     residual = residual - length * (A.T.mv(image) + noise * direction)
     new = jnp.vdot(residual, variance * residual)
     direction = residual + divide(new, product) * direction
-    after = Squares(weights, residual, direction, variance, noise, new, cost - length * product / 2)
+    after = ConjugateGradients(weights, residual, direction, variance, noise, new, cost - length * product / 2)
     return after, cost, divide(norm(length * step), norm(variance * weights))
 
 
-def _exact(A: lx.AbstractLinearOperator | Unmatched) -> lx.AbstractLinearOperator:
-    return (A.squares or A.forward) if isinstance(A, Unmatched) else A
+def _least_squares_operator(A: Operator) -> lx.AbstractLinearOperator:
+    return (A.least_squares or A.forward) if isinstance(A, UnmatchedAdjointOperator) else A
 
 
-def _blurred(x, axis):
-    """By `_BESIDE`; beyond the volume it is dark."""
-    reach, size = len(_BESIDE) // 2, x.shape[axis]
-    wide = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
-    return sum(w * lax.slice_in_dim(wide, i, i + size, axis=axis) for i, w in enumerate(_BESIDE))
+def _blur(x, axis):
+    reach, size = len(_BLUR) // 2, x.shape[axis]
+    padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
+    return sum(w * lax.slice_in_dim(padded, i, i + size, axis=axis) for i, w in enumerate(_BLUR))
 
 
 def _rms(x):
     return norm(x) / x.size**0.5
 
 
-def _weighed(layers, seen: Float[Array, "depth y x channel"]) -> Float[Array, "depth y x"]:
-    """What the network of one step says of each voxel; beyond the volume it sees zeros."""
-    depths, rows, columns, channels = seen.shape
+def _apply_network(layers, channels: Float[Array, "depth y x channel"]) -> Float[Array, "depth y x"]:
+    """Apply the network of one step, in bands of rows, with zeros beyond the volume."""
+    depths, rows, columns, count = channels.shape
     bands = -(-rows // _ROWS)
     tall = -(-rows // bands)
-    wide = jnp.pad(seen, [(0, 0), (_MARGIN, bands * tall - rows + _MARGIN), (_MARGIN, _MARGIN), (0, 0)])
-    shape = (depths, tall + 2 * _MARGIN, columns + 2 * _MARGIN, channels)
-    network = lambda first: _network(layers, lax.dynamic_slice(wide, (0, first, 0, 0), shape))
-    found = lax.map(network, jnp.arange(bands) * tall)
-    return jnp.moveaxis(found, 0, 1).reshape(depths, bands * tall, columns)[:, :rows]
+    padded = jnp.pad(channels, [(0, 0), (_MARGIN, bands * tall - rows + _MARGIN), (_MARGIN, _MARGIN), (0, 0)])
+    shape = (depths, tall + 2 * _MARGIN, columns + 2 * _MARGIN, count)
+
+    def network(first):
+        x = lax.dynamic_slice(padded, (0, first, 0, 0), shape)
+        for layer in layers:
+            if layer is not layers[0]:
+                x = jax.nn.relu(x)
+            x = _convolve(x, layer.weight.astype(x.dtype)) + layer.bias.astype(x.dtype)[None, None, None]
+        return x[..., 0]
+
+    outputs = lax.map(network, jnp.arange(bands) * tall)
+    return jnp.moveaxis(outputs, 0, 1).reshape(depths, bands * tall, columns)[:, :rows]
 
 
-def _network(layers, x):
-    for layer in layers:
-        if layer is not layers[0]:
-            x = jax.nn.relu(x)
-        x = _convolved(x, layer.weight.astype(x.dtype)) + layer.bias.astype(x.dtype)[None, None, None]
-    return x[..., 0]
-
-
-def _convolved(x, weight):
-    """Sums of products of matrices: within loops XLA's convolutions take five times as long on processors."""
-    side, _, seen, made = weight.shape
-    ends = side // 2
-    depths, rows, columns = x.shape[0], x.shape[1] - 2 * ends, x.shape[2] - 2 * ends
-    planes = jnp.pad(x, [(ends, ends), (0, 0), (0, 0), (0, 0)])
-    beside = jnp.concatenate([planes[first : first + depths] for first in range(side)], -1)
-    total = jnp.zeros((depths * rows * columns, made), x.dtype)
+def _convolve(x, weight):
+    """Convolution as a sum of matrix products: XLA's convolutions take five times as long within loops on CPUs."""
+    side, _, inputs, outputs = weight.shape
+    reach = side // 2
+    depths, rows, columns = x.shape[0], x.shape[1] - 2 * reach, x.shape[2] - 2 * reach
+    planes = jnp.pad(x, [(reach, reach), (0, 0), (0, 0), (0, 0)])
+    stacked = jnp.concatenate([planes[first : first + depths] for first in range(side)], -1)
+    total = jnp.zeros((depths * rows * columns, outputs), x.dtype)
     for row, column in np.ndindex(side, side):
-        total = total + beside[:, row : row + rows, column : column + columns].reshape(-1, seen) @ weight[row, column]
-    return total.reshape(depths, rows, columns, made)
+        window = stacked[:, row : row + rows, column : column + columns].reshape(-1, inputs)
+        total = total + window @ weight[row, column]
+    return total.reshape(depths, rows, columns, outputs)

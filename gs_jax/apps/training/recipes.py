@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Float32
 from ...base.progress import Progress
 from ...base.workers import Workers
 from ...detection.unet import UNet, multislice_network, paper_network
-from ...reconstruction.inverse_problem import System, above_offset, sights_of
-from ...solvers.unrolled import State, Unrolled, untrained
+from ...reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset
+from ...solvers.unrolled import State, Unrolled, initialize_unrolled
 from ...typing import Volume
 from .simulated_captures import SCENES, Kind, example, tables
 from .training_loop import Recipe
@@ -34,7 +34,7 @@ class Case(NamedTuple):
     """A capture above its offset, with the mean 1, what inverts it, what it shows, and where the networks begin."""
 
     light: Float32[np.ndarray, "row column"]
-    system: System
+    system: InverseProblem
     truth: Volume
     start: State
 
@@ -53,7 +53,7 @@ def multislice_recipe(stacks: list[Stack]) -> Recipe:
 def unrolled_recipe(cases: list[Case]) -> Recipe:
     """Adam and relative squared error through all steps, and so through the operators and their exact adjoints."""
     batch = lambda rng: cases[rng.integers(len(cases))]
-    return Recipe(lambda key: untrained(key=key), partial(_adam, 2e-3), batch, unrolled_loss)
+    return Recipe(lambda key: initialize_unrolled(key=key), partial(_adam, 2e-3), batch, unrolled_loss)
 
 
 def slices_loss(network: UNet, batch: Batch) -> Float[Array, ""]:
@@ -67,11 +67,11 @@ def unrolled_loss(network: Unrolled, case: Case) -> Float[Array, ""]:
     truth, light, operator = jnp.asarray(case.truth), jnp.asarray(case.light), case.system.operator
 
     # Not `step`, which would keep what the gradient needs of its other kinds of step, too.
-    def learned(state, _):
-        lucy, cost, _ = network.learned(operator, light, state)
+    def network_step(state, _):
+        lucy, cost, _ = network.network_step(operator, light, state)
         return state._replace(lucy=lucy, number=state.number + 1), cost
 
-    found = network.estimate(lax.scan(learned, case.start, length=network.power.size)[0])
+    found = network.estimate(lax.scan(network_step, case.start, length=network.power.size)[0])
     start = network.estimate(case.start)
     return jnp.mean((found - truth) ** 2) / (jnp.mean(truth**2) + _OF_THE_START * jnp.mean(start**2))
 
@@ -100,16 +100,16 @@ def unrolled_cases(
 
 def _simulator(seed: int, kind: Kind):
     """From the numbers of what one microscope images to its cases."""
-    networks = untrained(key=jax.random.key(0))
+    networks = initialize_unrolled(key=jax.random.key(0))
 
     def simulate(numbers):
         cases, optics = [], None
         for number in numbers:
             image, imager, grid, truth = example(seed, number, kind)
             optics = optics or tables(imager, np.asarray(grid.depths, np.float64), kind)
-            light = above_offset(image)
+            light = subtract_offset(image)
             unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
-            system = System(imager, grid, optics, sights_of(imager, grid))
+            system = InverseProblem(imager, grid, optics, lens_type_geometries(imager, grid))
             cases.append(Case(light / unit, system, truth / unit, _started(networks, system, light / unit)))
         return cases
 

@@ -1,0 +1,145 @@
+"""Reconstruction as asked for by the options of `gs-jax reconstruct` and napari's widget: volume, and points."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..detection.clustering import find_clusters
+from ..detection.consistency import signal
+from ..detection.evidence import point_evidence
+from ..detection.locate import NOT_TRUSTED, find_points
+from ..detection.unet import read_weights, suppress
+from ..geometry import Imager
+from ..grid import Grid
+from ..optics.lens_types import blur_warning, sharpness
+from ..simulation.phantoms import rasterize
+from ..solvers.unrolled import Unrolled, read_unrolled
+from ..typing import Image, Volume
+from .methods import METHODS, Method
+from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
+from .residual import ForwardResidual, forward_residual
+
+
+class Result(NamedTuple):
+    """Reconstruction of an image: volume, points if asked for, their statistics as columns of a table, a warning."""
+
+    volume: Any
+    points: Any = None
+    statistics: Any = None
+    warning: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Everything that a reconstruction depends on but the image; workers receive it pickled."""
+
+    imager: Imager
+    grid: Grid
+    method: Method
+    optics: str
+    stop_at_discrepancy: bool
+    suppress: str
+    points: bool
+    weights: Path | None
+
+    @classmethod
+    def of(
+        cls,
+        imager: Imager,
+        depths: list[float],
+        pitch: float | None = None,
+        *,
+        method: str,
+        steps: int = 20,
+        optics: str = "full",
+        stop_at_noise: bool = False,
+        suppress: str = "none",
+        points: bool = False,
+        weights: Path | None = None,
+        **method_options: float | None,
+    ) -> "Plan":
+        """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
+
+        Raises
+        ------
+        InputError
+            If options exclude each other, or the volume would not fit into memory.
+        """
+        if suppress != "none" and method != "backproject":
+            raise InputError(f"--suppress {suppress} must be used with --method backproject, got {method}.")
+        if suppress == "points" and optics != "full":
+            raise InputError(f"--optics must be full with --suppress points, got {optics}.")
+        if weights and suppress != "unet" and method != "unrolled":
+            raise InputError(
+                "--weights must be used with --method unrolled or --suppress unet, "
+                f"got --method {method} and --suppress {suppress}."
+            )
+        if stop_at_noise and method in ("backproject", "unrolled"):
+            raise InputError(
+                f"--stop-at-noise must be used with list-rl, richardson-lucy, fista or admm, got --method {method}."
+            )
+        solver = _method(method, steps, weights, method_options)
+        grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
+        return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights)
+
+    def prepare(self, progress: Progress) -> Callable[[Image, Progress], Result]:
+        """Compute what all images share; return the function that reconstructs one."""
+        clean = volume_of = None
+        if self.suppress == "unet":
+            clean = partial(suppress, network=read_weights(self.weights) if self.weights else None)
+        if self.suppress != "points":
+            options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
+            volume_of = reconstructor(self.imager, self.grid, self.method, **options, progress=progress)
+        # Computed once, and only if points are asked for.
+        sharp = cache(partial(sharpness, self.imager, self.grid))
+
+        def reconstruct(image: Image, progress: Progress) -> Result:
+            points = statistics = warning = None
+            if self.suppress == "points" or (self.points and self.suppress != "clusters"):
+                light = signal(image)
+                points = find_points(light, self.imager, self.grid, progress=progress)
+                warning = blur_warning(sharp(), "points", NOT_TRUSTED)
+                statistics = point_evidence(points, light, self.imager, self.grid)._asdict()
+                statistics |= {"confident": np.full(len(points), int(warning is None))}
+            volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
+            if self.suppress == "clusters":
+                with progress.step("Clustering"):
+                    points = find_clusters(volume, self.grid)
+                    volume = self._volume_of_points(points)
+            if clean:
+                with progress.step("Suppressing the background"):
+                    volume = clean(volume)
+            return Result(volume, points, statistics, warning)
+
+        return reconstruct
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether a network made the volume, which `check` compares with the capture."""
+        return self.suppress == "unet" or isinstance(self.method, Unrolled)
+
+    def check(self, volume: Volume, image: Image, progress: Progress) -> ForwardResidual:
+        return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
+
+    def _volume_of_points(self, points: Any) -> Volume:
+        # Dark points up to a power of two: other numbers of points compile nothing.
+        padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
+        padded[: len(points)] = points
+        return np.asarray(rasterize(padded, self.grid), np.float32)
+
+
+def _method(name: str, steps: int, weights: Path | None, options: dict[str, float | None]) -> Any:
+    """The method of a name with the options that are given; `InputError` if it lacks one."""
+    method: Any = read_unrolled(weights) if weights and name == "unrolled" else METHODS[name](steps)
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given:
+        if not hasattr(method, option):
+            names = [other for other, make in METHODS.items() if hasattr(make(1), option)]
+            raise InputError(f"--{option} must be used with {', '.join(names)}, got --method {name}.")
+    return dataclasses.replace(method, **given)
