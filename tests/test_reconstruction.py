@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gs_jax.optics.window import psf_of_depth
-from gs_jax.simulation.scene import simulate_volume
 
 from gs_jax import Grid, ImagingOperator, backproject, optics_of
 from gs_jax.apps.method_benchmark import obstacle
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
+from gs_jax.optics.psf import psf_of_depth
 from gs_jax.reconstruction.inverse_problem import prepare_data, prepare_model
 from gs_jax.reconstruction.methods import METHODS, BackProjection, PinholeRichardsonLucy
 from gs_jax.reconstruction.pipeline import reconstruct, voxel_grid
 from gs_jax.reconstruction.residual import forward_residual
+from gs_jax.simulation.synthetic import simulate_volume
 from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gs_jax.projection.points import full_image_of_points
 from jax.test_util import check_grads
 from scipy.ndimage import convolve1d
 from scipy.sparse.linalg import LinearOperator, cg
@@ -15,6 +14,7 @@ from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_case
 from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
 from gs_jax.apps.training.training_loop import start, train
 from gs_jax.base.progress import Progress
+from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.inverse_problem import InverseProblem, LensTypeGeometry
 from gs_jax.reconstruction.residual import forward_residual
 from gs_jax.solvers import unrolled
