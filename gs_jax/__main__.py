@@ -128,7 +128,11 @@ def _questions_in_one_line() -> Iterator[None]:
         yield
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+    invoke_without_command=True,
+)
 @click.version_option(__version__, prog_name="gs-jax")
 def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""

@@ -14,9 +14,9 @@ from .options import CaptureOptions, Number, picture_options
 @click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf.tif --tv 1e-3 -o scene.tif")
 @click.argument("capture", type=Path)
 @click.argument("psf", type=Path)
-@click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm", show_default=True)
-@click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True)
-@click.option("--tv", type=Number(least=0.0, most=10.0), help="Weight of total variation.  [default: 0.001 of admm]")
+@click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm")
+@click.option("--steps", type=click.IntRange(1, 100_000), default=100)
+@click.option("--tv", type=Number(0.0, 10.0), help="Weight of total variation.  [default: 0.001 of admm]")
 @click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
 @picture_options
 def deconvolve_command(

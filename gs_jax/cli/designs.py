@@ -13,10 +13,8 @@ from .options import DESIGN, MM, UM, Depths, shipped_designs
 @click.option("--count", type=click.IntRange(1, 100_000), required=True, help="Number of lenses.")
 @click.option("--size-mm", type=MM, nargs=2, required=True, help="Size of the plate, X Y.")
 @click.option("--pitch-mm", type=MM, required=True, help="Mean distance of a lens from its nearest neighbour.")
-@click.option(
-    "--diameter-mm", type=MM, default=2.0, show_default=True, help="Lens diameter; the lenses cover the plate."
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--diameter-mm", type=MM, default=2.0, help="Lens diameter; the lenses cover the plate.")
+@click.option("--seed", type=click.IntRange(0), default=0)
 @click.option("-o", "--output", type=Path, required=True, help="CENTERS.csv, with the header x_mm,y_mm.")
 @force_option
 def layout_command(

@@ -13,62 +13,22 @@ from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
 from .options import DESIGN, UM, Depths, Number
 
+SMALL_UM, FEATURE_UM = Number(1e-3, 1e3, "um"), Number(1e-2, 1e3, "um")
+PERCENT, DRAFT, HEADROOM = Number(0.0, 20.0, "%"), Number(0.0, 30.0, "degrees"), Number(0.0, 100.0, "mm")
+
 
 @click.command("mold", epilog="Example: gs-jax mold design/geomscope.toml -o mold.stl")
 @click.argument("design", type=DESIGN)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
 @click.option("--positive", is_flag=True, help="Make the array itself instead of its mold.")
-@click.option(
-    "--chord-um",
-    type=Number(least=1e-3, most=1e3, unit="um"),
-    default=0.4,
-    show_default=True,
-    help="Largest distance between a facet and the lens surface.",
-)
-@click.option(
-    "--shrinkage-percent",
-    type=Number(least=0.0, most=20.0, unit="%"),
-    default=0.0,
-    show_default=True,
-    help="Shrinkage of the cast material; the part is made larger by it.",
-)
-@click.option(
-    "--draft-deg",
-    type=Number(least=0.0, most=30.0, unit="degrees"),
-    default=0.0,
-    show_default=True,
-    help="Draft angle of the walls' inner faces. Silicone needs none.",
-)
-@click.option(
-    "--headroom-mm",
-    type=Number(least=0.0, most=100.0, unit="mm"),
-    default=0.0,
-    show_default=True,
-    help="Height of the walls above the array; 0 to cast flush under a glass plate.",
-)
-@click.option(
-    "--resolution-um",
-    type=Number(least=1e-2, most=1e3, unit="um"),
-    default=25.0,
-    show_default=True,
-    help="Smallest feature of the printer.",
-)
-@click.option(
-    "--layer-um", type=Number(least=1e-2, most=1e3, unit="um"), help="Thickness of the printer's layers, if any."
-)
-@click.option("--label/--no-label", default=True, show_default=True, help="Engrave the design's name in the rim.")
-def mold_command(
-    design: Path,
-    output: Path,
-    positive: bool,
-    chord_um: float,
-    shrinkage_percent: float,
-    draft_deg: float,
-    headroom_mm: float,
-    resolution_um: float,
-    layer_um: float | None,
-    label: bool,
-):
+@click.option("--chord-um", type=SMALL_UM, default=0.4, help="Largest distance between a facet and the lens surface.")
+@click.option("--shrinkage-percent", type=PERCENT, default=0.0, help="Of the cast material; the part is made larger.")
+@click.option("--draft-deg", type=DRAFT, default=0.0, help="Of the walls' inner faces. Silicone needs none.")
+@click.option("--headroom-mm", type=HEADROOM, default=0.0, help="Walls above the array; 0 to cast under a glass plate.")
+@click.option("--resolution-um", type=FEATURE_UM, default=25.0, help="Smallest feature of the printer.")
+@click.option("--layer-um", type=FEATURE_UM, help="Thickness of the printer's layers, if any.")
+@click.option("--label/--no-label", default=True, help="Engrave the design's name in the rim.")
+def mold_command(design: Path, output: Path, positive: bool, label: bool, layer_um: float | None, **sizes: float):
     """Make the negative mold of the array of the file DESIGN, to print and cast the array in.
 
     Units are mm. The lenses face -z. If the plano side faces the object, x and y are the design's; if the curved side
@@ -83,23 +43,16 @@ def mold_command(
     check_may_write(output, *beside, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
-        draft=math.radians(draft_deg),
-        headroom=headroom_mm,
-        shrinkage=shrinkage_percent / 100,
+        draft=math.radians(sizes["draft_deg"]),
+        headroom=sizes["headroom_mm"],
+        shrinkage=sizes["shrinkage_percent"] / 100,
         label=microscope.name if label else "",
     )
+    accuracy = {"chord": sizes["chord_um"] / 1000, "resolution": sizes["resolution_um"] / 1000}
+    provenance = provenance_of(design, design=design_text(microscope))
     with Progress() as progress, errors_name_file(design):
-        report = make_mold(
-            microscope,
-            output,
-            positive=positive,
-            shape=shape,
-            chord=chord_um / 1000,
-            resolution=resolution_um / 1000,
-            layer=layer_um and layer_um / 1000,
-            provenance=provenance_of(design, design=design_text(microscope)),
-            progress=progress,
-        )
+        options = {"positive": positive, "shape": shape, "layer": layer_um and layer_um / 1000, **accuracy}
+        report = make_mold(microscope, output, **options, provenance=provenance, progress=progress)
     click.echo(report_text(report), nl=False)
 
 
@@ -147,7 +100,7 @@ def _options(command):
 @click.option("--max-width-um", type=UM, help="Target: width of spots in the object.  [default: 1.2 of the design's]")
 @click.option(
     "--min-strehl",
-    type=Number(least=1e-3, most=1.0, unit=""),
+    type=Number(1e-3, 1.0),
     help="Target: Strehl ratio on the axis.  [default: 0.8 times the design's, if that is 0.1 or more]",
 )
 @click.option(
@@ -155,8 +108,8 @@ def _options(command):
 )
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: five in the working distance]")
 @click.option("--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of calibration sources.  [default: four]")
-@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, show_default=True, help="Random devices.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of the devices.")
+@click.option("--draws", type=click.IntRange(1, 10**6), default=1000, help="Random devices.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the devices.")
 def tolerance_command(
     design: Path,
     output: Path | None,

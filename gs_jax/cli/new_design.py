@@ -1,4 +1,4 @@
-"""`gs-jax new-design`: a design file of one's own."""
+"""`gs-jax new-design`: a design file from options, and from questions at a terminal."""
 
 import json
 import re
@@ -12,8 +12,8 @@ from ..base.errors import InputError, errors_name_file
 from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
 
-# Options that are keys of the file, by the place of the key. In the order in which they are asked for.
-_PLACES = {
+# Table of each option that is a key of the file, in the order of the questions.
+_TABLES = {
     "pixel_pitch_um": "sensor",
     "shape": "sensor",
     "refractive_index": "lens",
@@ -26,13 +26,13 @@ _PLACES = {
     "wavelength_nm": "imaging",
     "field_radius_mm": "imaging",
 }
-# What a terminal offers where there is no default: the paper's.
+# Answers that a terminal suggests where there is no default: the paper's.
 _OFFERED = {"pixel_pitch_um": 4.5, "shape": (5120, 5120), "working_distance_mm": (18.0, 30.0)}
 _FOCAL_LENGTH_MM, _COUNT = 4.65, 200
 
 
 def at_terminal() -> bool:
-    """Whether somebody is there to answer."""
+    """Whether questions can be answered."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
@@ -49,38 +49,44 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
     epilog="Example: gs-jax new-design --pixel-pitch-um 3.45 --shape 3000 4096 --focal-length-mm 4.6 "
     "--centers vendor.csv --working-distance-mm 18 23 -o my.toml",
 )
-@click.option("--pixel-pitch-um", type=float, help="Distance of the camera's pixels.")
-@click.option("--shape", type=int, nargs=2, help="Rows and columns of the camera's image.")
-@click.option("--focal-length-mm", "--focal-length", type=float, help="Of one lens, in air; R = f (n - 1) is written.")
-@click.option("--radius-of-curvature-mm", type=float, help="R of one lens, in place of its focal length.")
-@click.option("--refractive-index", type=float, help="Of lenses and plate.  [default: 1.43, PDMS]")
-@click.option("--aperture-diameter-mm", type=float, help="Of one lens.  [default: mean distance of nearest lenses]")
-@click.option("--centers", type=Path, help="Lens centres: a table of text, x and y in a line, with any header.")
-@click.option("--centers-unit", type=click.Choice(["mm", "um", "px"]), help="[default: the header's, or else mm]")
-@click.option("--centers-columns", nargs=2, help="The header's names of x and y, where they are not clear.")
+@click.option("--pixel-pitch-um", type=float, help="Pixel pitch of the camera.")
+@click.option("--shape", type=int, nargs=2, help="Rows and columns of the camera.")
+@click.option(
+    "--focal-length-mm", "--focal-length", type=float, help="Focal length of a lens in air; R = f (n - 1) is written."
+)
+@click.option(
+    "--radius-of-curvature-mm", type=float, help="Radius of curvature of a lens, instead of --focal-length-mm."
+)
+@click.option("--refractive-index", type=float, help="Index of lenses and plate.  [default: 1.43, PDMS]")
+@click.option(
+    "--aperture-diameter-mm", type=float, help="Diameter of a lens.  [default: mean nearest-neighbour distance]"
+)
+@click.option("--centers", type=Path, help="Lens centres: a text table with x and y in each line and any header.")
+@click.option(
+    "--centers-unit", type=click.Choice(["mm", "um", "px"]), help="Unit of --centers.  [default: the header's, else mm]"
+)
+@click.option("--centers-columns", nargs=2, help="Names of the columns of x and y, if they are ambiguous.")
 @click.option(
     "--centers-origin",
     type=click.Choice(["center", "corner"]),
-    help="Where they are counted from: the plate's middle or its corner; px: the sensor's first pixel is the corner.",
+    help="Origin of --centers: the plate's middle or corner. In px the corner is the sensor's first pixel.",
 )
-@click.option("--mirror", is_flag=True, help="Take x for -x: the list shows the plate from its other side.")
-@click.option("--rotation-deg", type=float, help="About how the array is turned, from +x toward +y.  [default: 0]")
-@click.option("--crop", is_flag=True, help="Leave out lenses beyond the sensor's reach, where the array is larger.")
-@click.option(
-    "--count", type=click.IntRange(1, 100_000), help="Make a random layout of so many lenses, without a list."
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random layout.")
-@click.option("--size-mm", type=float, nargs=2, help="X Y of the plate.  [default: around the lenses, or the sensor's]")
-@click.option("--substrate-thickness-mm", type=float, help="Of the plate, lenses included.  [default: 1]")
-@click.option("--working-distance-mm", type=float, nargs=2, help="NEAR FAR of the object, from the plate's front.")
-@click.option("--sensor-distance-mm", type=float, help="From lenses to sensor.  [default: in focus, of a thin lens]")
-@click.option("--wavelength-nm", type=float, help="Of the light.  [default: 520]")
+@click.option("--mirror", is_flag=True, help="Reverse x: the list shows the plate from its other side.")
+@click.option("--rotation-deg", type=float, help="Approximate rotation of the array, +x toward +y.  [default: 0]")
+@click.option("--crop", is_flag=True, help="Leave out lenses without an image on the sensor.")
+@click.option("--count", type=click.IntRange(1, 100_000), help="Make a random layout of this many lenses.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the random layout.")
+@click.option("--size-mm", type=float, nargs=2, help="Plate, X Y.  [default: around the lenses, or the sensor's]")
+@click.option("--substrate-thickness-mm", type=float, help="Thickness of the plate with lenses.  [default: 1]")
+@click.option("--working-distance-mm", type=float, nargs=2, help="NEAR FAR of the object from the plate.")
+@click.option("--sensor-distance-mm", type=float, help="Lenses to sensor.  [default: thin-lens focus]")
+@click.option("--wavelength-nm", type=float, help="Wavelength.  [default: 520]")
 @click.option(
     "--field-radius-mm",
     type=float,
-    help="How far beside its axis a lens sees.  [default: 14 lenses see a point, at most a quarter of NEAR]",
+    help="Field of a lens about its axis.  [default: 14 lenses see a point, at most NEAR / 4]",
 )
-@click.option("--name", help="What reports call it.  [default: the file's]")
+@click.option("--name", help="Name in reports.  [default: the file's]")
 @click.option("-o", "--output", type=Path, required=True, help="MY.toml, with a comment for each key.")
 @click.option(
     "--schema",
@@ -88,14 +94,14 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
     is_eager=True,
     expose_value=False,
     callback=_print_schema,
-    help=("Print the JSON schema of design files, for editors, and exit."),
+    help="Print the JSON schema of design files, for editors, and exit.",
 )
 @force_option
-def new_design_command(output: Path, centers: Path | None, name: str | None, force: bool, **given: Any):
+def new_design_command(output: Path, centers: Path | None, name: str | None, force: bool, **options: Any):
     """Write the design file of your own microlens array and camera.
 
-    At a terminal it asks for what the options do not say. Elsewhere nothing is asked: what has no default must be
-    given. Lens centres are read from a file (--centers) or made (--count).
+    At a terminal it asks for options that are not given. Elsewhere those without a default are required. Lens centres
+    are read from a file (--centers) or random (--count).
     """
     from ..design.design import checked_design
     from ..design.keys import commented
@@ -103,17 +109,17 @@ def new_design_command(output: Path, centers: Path | None, name: str | None, for
 
     check_output(output, [".toml"])
     check_may_write(output, inputs=(centers,), force=force)
-    known = {key: value for key, value in given.items() if value is not None}
+    known = {key: value for key, value in options.items() if value is not None}
     asking = at_terminal()
     _check_together(known, centers, asking)
-    said = set(known)
+    given = set(known)
     _lenses(known, asking)
     _centers(known, centers, asking)
-    for key in list(_PLACES)[list(_PLACES).index("aperture_diameter_mm") :]:
+    for key in list(_TABLES)[list(_TABLES).index("aperture_diameter_mm") :]:
         _fill(known, key, asking)
     left_out = _crop(known, asking)
     tables: dict[str, Any] = {"name": name or output.stem, "sensor": {}, "lens": {}, "array": {}, "imaging": {}}
-    for key, table in _PLACES.items():
+    for key, table in _TABLES.items():
         tables[table][key] = list(known[key]) if isinstance(known[key], tuple) else known[key]
     tables["array"]["centers_mm"] = known["centers"].round(6).tolist()
     if "rotation_deg" in known:
@@ -121,22 +127,21 @@ def new_design_command(output: Path, centers: Path | None, name: str | None, for
     tables["provenance"] = provenance_of(known.get("file"))
     design = checked_design(output, tables)
     write_text(output, commented(design), [".toml"])
-    taken = [f"{key} = {_shown(known[key])}" for key in _PLACES if key not in said | {"radius_of_curvature_mm"}]
-    if taken and not asking:
-        click.echo(f"by default: {', '.join(taken)}")
+    defaults = [f"{key} = {_format(known[key])}" for key in _TABLES if key not in given | {"radius_of_curvature_mm"}]
+    if defaults and not asking:
+        click.echo(f"by default: {', '.join(defaults)}")
     if left_out:
-        click.echo(f"left out: {left_out} lenses beyond the sensor's reach; the plate is {_shown(known['size_mm'])} mm")
-    radius = known["radius_of_curvature_mm"]
-    f = radius / (design.lens.refractive_index - 1)
-    click.echo(
-        f"{output}: {len(design.array.centers_mm)} lenses of f = {f:.4g} mm (R = "
-        f"{radius:.4g} mm), sensor at {design.imaging.sensor_distance_mm:g} mm; "
-        f"see gs-jax metrics {output}"
-    )
+        click.echo(
+            f"left out: {left_out} lenses beyond the sensor's reach; the plate is {_format(known['size_mm'])} mm"
+        )
+    radius, lenses = known["radius_of_curvature_mm"], len(design.array.centers_mm)
+    lens = f"f = {radius / (design.lens.refractive_index - 1):.4g} mm (R = {radius:.4g} mm)"
+    sensor = f"sensor at {design.imaging.sensor_distance_mm:g} mm"
+    click.echo(f"{output}: {lenses} lenses of {lens}, {sensor}; see gs-jax metrics {output}")
 
 
 def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -> None:
-    """Options that exclude each other, and those that nobody is there to be asked for."""
+    """Raise `InputError` for options that exclude each other, or are missing without a terminal."""
     if {"focal_length_mm", "radius_of_curvature_mm"} <= known.keys():
         raise InputError("--radius-of-curvature-mm must be used without --focal-length-mm.")
     if centers and "count" in known:
@@ -158,7 +163,7 @@ def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -
 
 
 def _lenses(known: dict[str, Any], asking: bool) -> None:
-    """Camera and lens."""
+    """Add camera and lens."""
     from ..design.start import radius_of
 
     for key in ("pixel_pitch_um", "shape", "refractive_index"):
@@ -179,7 +184,7 @@ def _lenses(known: dict[str, Any], asking: bool) -> None:
 
 
 def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
-    """Lens centres and the plate's size: of a file, or made."""
+    """Add lens centres and the plate's size, from a file or random."""
     from ..design.start import generated_centers
 
     while asking and file is None and "count" not in known:
@@ -203,7 +208,7 @@ def _centers(known: dict[str, Any], file: Path | None, asking: bool) -> None:
 
 
 def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
-    """The file's centres, once it is known how it is meant."""
+    """Read the file's centres, when unit and origin are known."""
     from ..design.centers import lens_columns, read_centers, unit_of_file
     from ..design.start import check_origin_said, check_unit_said
 
@@ -233,7 +238,7 @@ def _read(known: dict[str, Any], file: Path, asking: bool) -> None:
 
 
 def _crop(known: dict[str, Any], asking: bool) -> int:
-    """Leaves out lenses without an image on the sensor, if that is wanted, and the plate about them; how many."""
+    """Leave out lenses without an image on the sensor, if wanted, and fit the plate; return their number."""
     from ..design.start import plate_of, within_reach
 
     kept = within_reach(known)
@@ -249,14 +254,14 @@ def _crop(known: dict[str, Any], asking: bool) -> int:
 
 
 def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
-    """Adds what is not known yet: asked for, or the default."""
+    """Add a missing value: the answer to a question, or the default."""
     from ..design.start import DEFAULTS
 
     if key in known:
         return
     default = DEFAULTS[key](known) if key in DEFAULTS else None
     if asking:
-        known[key] = _ask(known, f"{_PLACES[key]}.{key}", default or _OFFERED.get(key))
+        known[key] = _ask(known, f"{_TABLES[key]}.{key}", default or _OFFERED.get(key))
     elif default is None:
         raise InputError(f"{_option(key)} must be given: it does not follow from other options.")
     else:
@@ -264,7 +269,7 @@ def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
 
 
 def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> Any:
-    """An answer that is allowed; what looks like a slip of a unit is asked about."""
+    """Ask until the answer is allowed; confirm values that look like a wrong unit."""
     from ..design.keys import design_keys, problem
     from ..design.plausible import USUAL, meant, slip
     from ..design.start import clash
@@ -273,7 +278,7 @@ def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> A
     hint = f"usually {key.usual}" if key.usual else key.allowed
     text = f"{meaning or key.meaning} ({hint})"
     while True:
-        answer = click.prompt(text, None if default is None else _shown(default))
+        answer = click.prompt(text, None if default is None else _format(default))
         value = _number(answer, whole=path == "sensor.shape", pair=key.allowed.startswith("["))
         if path in USUAL and (question := slip(path, value)):
             other = meant(path, value)
@@ -287,7 +292,7 @@ def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> A
 
 
 def _number(answer: str, *, whole: bool, pair: bool) -> Any:
-    """What an answer says: a number, or two of them; of what is none, the text itself, which is then refused."""
+    """Parse an answer as a number, or two of them; other text is returned, to be refused."""
     try:
         numbers = [int(part) if whole else float(part) for part in re.split(r"[\s,x]+", answer.strip("[] "))]
     except ValueError:
@@ -295,7 +300,7 @@ def _number(answer: str, *, whole: bool, pair: bool) -> Any:
     return numbers if pair else numbers[0] if len(numbers) == 1 else answer
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return " ".join(f"{each:g}" for each in value) if isinstance(value, list | tuple) else f"{value:g}"
 
 

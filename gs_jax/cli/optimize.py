@@ -14,8 +14,7 @@ from .options import DESIGN, worker_options
 
 
 @click.command(
-    "optimize",
-    epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml",
+    "optimize", epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml"
 )
 @click.argument("design", type=DESIGN)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: free parameters, goals and solvers.")
@@ -58,7 +57,7 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
 
 @click.command("pareto", epilog="Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
 @click.argument("study", type=Path)
-@click.option("--out", type=Path, default=Path("gs-jax-pareto"), show_default=True, help="Folder to write to.")
+@click.option("--out", type=Path, default=Path("gs-jax-pareto"), help="Folder to write to.")
 @worker_options
 def pareto_command(study: Path, out: Path, workers: Workers):
     """Compute the trade-off of the file STUDY: its one goal against one or two moving limits.

@@ -30,7 +30,7 @@ PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 class Number(click.ParamType):
     """A number within bounds."""
 
-    def __init__(self, *, least: float, most: float, unit: str = ""):
+    def __init__(self, least: float, most: float, unit: str = ""):
         self.least, self.most, self.unit, self.name = least, most, unit, unit or "number"
 
     def convert(self, value, param, ctx):
@@ -111,8 +111,8 @@ def shipped_designs() -> list[Path]:
 
 
 DESIGN = DesignFile()
-MM = Number(least=1e-3, most=1e4, unit="mm")
-UM = Number(least=1e-2, most=1e6, unit="um")
+MM = Number(1e-3, 1e4, "mm")
+UM = Number(1e-2, 1e6, "um")
 
 
 def worker_options(command):
@@ -149,7 +149,6 @@ _REGION_OPTIONS = (
         "--binning",
         type=click.IntRange(1, 64),
         default=1,
-        show_default=True,
         help="Side of the squares of pixels that the camera combined.",
     ),
 )
@@ -163,12 +162,11 @@ _CORRECTION_OPTIONS = (
     click.option(
         "--bad-pixels",
         default="auto",
-        show_default=True,
         help="MASK.png, nonzero at bad pixels; none; or auto: hot pixels of DARK, or isolated ones of the capture.",
     ),
     click.option(
         "--offset",
-        type=Number(least=0.0, most=65535.0, unit="counts"),
+        type=Number(0.0, 65535.0, "counts"),
         default=0.0,
         help="Counts of a dark pixel, if there is no --dark.",
     ),

@@ -80,13 +80,10 @@ def report_command(
 @click.argument("design", type=DESIGN)
 @click.option("--study", type=Path, help="STUDY.toml whose targets are evaluated, as in `gs-jax optimize`.")
 @click.option(
-    "-o",
-    "--output",
-    type=Path,
-    help="NEW.toml to save to; a number is added if it exists.  [default: NAME-new.toml]",
+    "-o", "--output", type=Path, help="NEW.toml to save to; a number is added if it exists.  [default: NAME-new.toml]"
 )
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page.  [default: a free one]")
-@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in a browser.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0 takes a free one.")
+@click.option("--browser/--no-browser", default=True, help="Open the page in a browser.")
 def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool):
     """Change sensor distance, curvature, aperture, pitch, depths and field of DESIGN by sliders in a browser.
 
@@ -116,7 +113,7 @@ def explore_command(design: Path, study: Path | None, output: Path | None, port:
 
 
 @click.command("demo", epilog="Example: gs-jax demo --out demo")
-@click.option("--out", type=Path, default=Path("gs-jax-demo"), show_default=True, help="Folder to write to.")
+@click.option("--out", type=Path, default=Path("gs-jax-demo"), help="Folder to write to.")
 def demo_command(out: Path):
     """Run the whole pipeline on the built-in design: image a scene, reconstruct it, write a folder with reports."""
     from ..apps.example_pipeline import run
@@ -128,7 +125,7 @@ def demo_command(out: Path):
 
 
 @click.command("benchmark", epilog="Example: gs-jax benchmark --out benchmark")
-@click.option("--out", type=Path, default=Path("gs-jax-benchmark"), show_default=True, help="Folder to write to.")
+@click.option("--out", type=Path, default=Path("gs-jax-benchmark"), help="Folder to write to.")
 def benchmark_command(out: Path):
     """Compare back-projection with ADMM, Richardson-Lucy and others: time, memory and quality (the paper's Fig. 9)."""
     from ..apps.benchmark_report import write, write_records

@@ -42,23 +42,21 @@ from .recording_command import check_recording, reconstruct_recording, recording
     help="Lateral voxel pitch; doubling it takes about a quarter of the time.  [default: one pixel as seen at the "
     "middle depth; 4 pixels for iterative methods]",
 )
-@click.option("--method", type=click.Choice(METHODS), default="backproject", show_default=True)
+@click.option("--method", type=click.Choice(METHODS), default="backproject")
 @click.option(
     "--steps",
     type=click.IntRange(1, 100_000),
     default=20,
-    show_default=True,
     help="Steps of list-rl, richardson-lucy, fista and admm; unrolled has its own.",
 )
 @click.option(
     "--optics",
     type=click.Choice(LEVELS),
     default="full",
-    show_default=True,
     help="Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.",
 )
-@click.option("--tv", type=Number(least=0.0, most=10.0), help="Weight of total variation (richardson-lucy, admm).")
-@click.option("--sparsity", type=Number(least=0.0, most=1.0), help="Weight of the sum of voxels (fista, admm).")
+@click.option("--tv", type=Number(0.0, 10.0), help="Weight of total variation (richardson-lucy, admm).")
+@click.option("--sparsity", type=Number(0.0, 1.0), help="Weight of the sum of voxels (fista, admm).")
 @click.option(
     "--stop-at-noise", is_flag=True, help="Stop early when all but noise is explained (list-rl to admm in --method)."
 )
@@ -66,7 +64,6 @@ from .recording_command import check_recording, reconstruct_recording, recording
     "--suppress",
     type=click.Choice(SUPPRESSIONS),
     default="none",
-    show_default=True,
     help="Background suppression: points on which their lenses agree, the paper's clusters, or a network.",
 )
 @click.option(

@@ -27,7 +27,7 @@ def recording_options(command):
     """Add the options of recordings."""
     interval = click.option(
         "--frame-interval",
-        type=Number(least=1e-9, most=1e9, unit="s"),
+        type=Number(1e-9, 1e9, "s"),
         help="Recordings: seconds between frames, the scale of the time axis.  [default: unknown]",
     )
     resume = click.option(

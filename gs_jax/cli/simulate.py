@@ -11,11 +11,11 @@ from ..io.files import check_output
 from .files import check_may_write, provenance_of
 from .options import DESIGN, PSFS, SIMULATED, Number
 
-PEAK = Number(least=1.0, most=1e6, unit="electrons")
-ELECTRONS = Number(least=0.0, most=1e9, unit="electrons")
-GAIN = Number(least=1e-3, most=1e6, unit="electrons")
-WELL = Number(least=1.0, most=1e9, unit="electrons")
-COUNTS = Number(least=0.0, most=65535.0, unit="counts")
+PEAK = Number(1.0, 1e6, "electrons")
+ELECTRONS = Number(0.0, 1e9, "electrons")
+GAIN = Number(1e-3, 1e6, "electrons")
+WELL = Number(1.0, 1e9, "electrons")
+COUNTS = Number(0.0, 65535.0, "counts")
 
 
 @click.command("simulate", epilog="Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
@@ -25,18 +25,17 @@ COUNTS = Number(least=0.0, most=65535.0, unit="counts")
     "--optics",
     type=click.Choice(SIMULATED),
     default="full",
-    show_default=True,
     help="full: all of the light, by ray tracing; near: Eq. (2), with one PSF for all lenses near a point.",
 )
 @click.option("--psf", type=click.Choice(PSFS), help="PSF of --optics near.  [default: diffraction]")
-@click.option("--peak-electrons", type=PEAK, default=1e4, show_default=True, help="Electrons in the brightest pixel.")
-@click.option("--noise/--no-noise", default=True, show_default=True, help="Without noise the capture is float32.")
-@click.option("--gain", type=GAIN, default=10.0, show_default=True, help="Electrons per count.")
-@click.option("--offset", type=COUNTS, default=16.0, show_default=True, help="Counts of a dark pixel.")
-@click.option("--read-noise", type=ELECTRONS, default=2.0, show_default=True, help="Standard deviation, electrons.")
+@click.option("--peak-electrons", type=PEAK, default=1e4, help="Electrons in the brightest pixel.")
+@click.option("--noise/--no-noise", default=True, help="Without noise the capture is float32.")
+@click.option("--gain", type=GAIN, default=10.0, help="Electrons per count.")
+@click.option("--offset", type=COUNTS, default=16.0, help="Counts of a dark pixel.")
+@click.option("--read-noise", type=ELECTRONS, default=2.0, help="Standard deviation, electrons.")
 @click.option("--full-well", type=WELL, help="Largest number of electrons in a pixel.  [default: no limit]")
-@click.option("--bits", type=click.IntRange(1, 16), default=16, show_default=True, help="Bits of the converter.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of the noise.")
+@click.option("--bits", type=click.IntRange(1, 16), default=16, help="Bits of the converter.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
 def simulate_command(
     scene: Path,

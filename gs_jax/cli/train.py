@@ -21,9 +21,9 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
 @click.command("train", epilog="Example: gs-jax train --network unrolled -o weights.npz")
-@click.option("--network", type=click.Choice(list(STEPS)), default="multislice", show_default=True)
+@click.option("--network", type=click.Choice(list(STEPS)), default="multislice")
 @click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0)
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint beside WEIGHTS; same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
 @worker_options

@@ -22,16 +22,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from ..base.arrays import divide
 from ..typing import Real
-from .base import (
-    as_image,
-    check_options,
-    differences,
-    differences_adjoint,
-    lambda_max,
-    norm,
-    shrink,
-    total_variation,
-)
+from .base import as_image, check_options, differences, differences_adjoint, lambda_max, norm, shrink, total_variation
 
 # The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
 # many times: convergence is proven for a penalty that is constant from some step on.
