@@ -122,7 +122,7 @@ def test_a_camera_s_offset(folder):
         (["--flat", "design.toml"], ["design.toml", "'.toml'"]),
         (["--bad-pixels", "design.toml"], ["design.toml", "'.toml'"]),
         (["--dark", "capture.tif", "--offset", "16"], ["--offset", "--dark"]),
-        (["--dark", "v.ome.tif"], ["v.ome.tif", "in the place of its output"]),
+        (["--dark", "v.ome.tif"], ["v.ome.tif", "must be another file than the inputs"]),
     ],
 )
 def test_wrong_options_are_one_line(folder, options, words):

@@ -17,8 +17,9 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from ..base.errors import InputError, short_repr
-from ..typing import PathLike
 
+# Not from `gs_jax.typing`, which imports JAX: the help of commands does without.
+PathLike = str | os.PathLike[str]
 AnyPath = TypeVar("AnyPath", bound=PurePath)
 
 MAX_TEXT_BYTES = 2**26

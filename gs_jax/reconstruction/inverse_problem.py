@@ -160,4 +160,4 @@ def num_detrend_modes(imager: Imager, optics: Optics) -> int:
         optics = optics.optics[0]
     if not isinstance(optics, FieldVaryingPsf):
         return 0
-    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_HALF_WAVE * optics.halo.grid.pixel))
+    return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_HALF_WAVE * optics.stray_light.grid.pixel))

@@ -10,15 +10,9 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..detection.clustering import find_clusters
-from ..detection.consistency import signal
-from ..detection.evidence import point_evidence
-from ..detection.locate import NOT_TRUSTED, find_points
-from ..detection.unet import read_weights, suppress
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import blur_warning, sharpness
-from ..simulation.phantoms import rasterize
 from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
 from .methods import METHODS, Method
@@ -92,6 +86,8 @@ class Plan:
         """Compute what all images share; return the function that reconstructs one."""
         clean = volume_of = None
         if self.suppress == "unet":
+            from ..detection.unet import read_weights, suppress
+
             clean = partial(suppress, network=read_weights(self.weights) if self.weights else None)
         if self.suppress != "points":
             options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
@@ -102,13 +98,11 @@ class Plan:
         def reconstruct(image: Image, progress: Progress) -> Result:
             points = statistics = warning = None
             if self.suppress == "points" or (self.points and self.suppress != "clusters"):
-                light = signal(image)
-                points = find_points(light, self.imager, self.grid, progress=progress)
-                warning = blur_warning(sharp(), "points", NOT_TRUSTED)
-                statistics = point_evidence(points, light, self.imager, self.grid)._asdict()
-                statistics |= {"confident": np.full(len(points), int(warning is None))}
+                points, statistics, warning = self._find_points(image, sharp(), progress)
             volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
             if self.suppress == "clusters":
+                from ..detection.clustering import find_clusters
+
                 with progress.step("Clustering"):
                     points = find_clusters(volume, self.grid)
                     volume = self._volume_of_points(points)
@@ -127,7 +121,20 @@ class Plan:
     def check(self, volume: Volume, image: Image, progress: Progress) -> ForwardResidual:
         return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
 
+    def _find_points(self, image: Image, sharp: Any, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
+        from ..detection.consistency import signal
+        from ..detection.evidence import point_evidence
+        from ..detection.locate import NOT_TRUSTED, find_points
+
+        light = signal(image)
+        points = find_points(light, self.imager, self.grid, progress=progress)
+        warning = blur_warning(sharp, "points", NOT_TRUSTED)
+        statistics = point_evidence(points, light, self.imager, self.grid)._asdict()
+        return points, statistics | {"confident": np.full(len(points), int(warning is None))}, warning
+
     def _volume_of_points(self, points: Any) -> Volume:
+        from ..simulation.phantoms import rasterize
+
         # Dark points up to a power of two: other numbers of points compile nothing.
         padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
         padded[: len(points)] = points
