@@ -63,5 +63,5 @@ def test_gradients():
 
 
 def test_a_wrong_psf_is_named():
-    with pytest.raises(ValueError, match=r"\(depth, row, column\) with a pixel at least, got \(0, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"\(depth, row, column\) and not empty, got \(0, 3, 3\)"):
         Convolution.of(jnp.zeros((0, 3, 3)), (5, 5))

@@ -187,7 +187,7 @@ def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
     taken = SimpleNamespace(total=2**50, available=2**20)
     monkeypatch.setattr("psutil.virtual_memory", lambda: taken)
     imager, grid, *_ = small()
-    with pytest.raises(InputError, match="GiB of the memory that is free"):
+    with pytest.raises(InputError, match="GiB of the free memory"):
         voxel_grid(imager, [18.0, 20.0], 0.001)
     with pytest.raises(InputError, match="GiB that are free"):
         simulate_volume(np.ones((1, 900, 900), np.float32), imager, Grid([20.0], (900, 900), 0.001))
