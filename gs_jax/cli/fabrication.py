@@ -125,7 +125,7 @@ def tolerance_command(
 ):
     """Show the effect of tolerances on the spots and depths of the microscope of DESIGN, and the yield.
 
-    ToleranceSpec are standard deviations; roughness and printed layers are the same in every device. Depth errors are
+    Tolerances are standard deviations; roughness and printed layers are the same in every device. Depth errors are
     those of points located with the design's geometry, and with a calibrated one.
     """
     import jax
