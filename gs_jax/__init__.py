@@ -20,14 +20,14 @@ The microscope:
 From a capture to a volume:
 
     read_capture         A capture `(row, column)` in the file's own type: uint8, uint16 or float32
-    reconstruct          The volume that an image shows
-    BackProjection       `backproject`, the paper's reconstruction: one step, no PSF
-    PinholeRichardsonLucy   Richardson-Lucy on the pixel-voxel lists of back-projection
+    reconstruct          Reconstruct the volume that an image shows
+    BackProjection       Back-projection, the paper's reconstruction: one pass, no PSF
+    PinholeRichardsonLucy  Richardson-Lucy with the pinhole back-projection in place of the adjoint
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
-    FISTA                FISTA: least squares with sparsity, not negative, for any operator
-    Unrolled             Unrolled inversion, by networks: `Unrolled.pretrained()` has those that come with the package
-    ADMM                 ADMM: least squares with total variation and sparsity, not negative, for any operator
-    deconvolve           The scene that an image shows, seen through a system that is everywhere alike
+    FISTA                FISTA: non-negative least squares with an L1 penalty, for any linear operator
+    Unrolled             Unrolled inversion by trained networks; `Unrolled.pretrained()` has those that come with the package
+    ADMM                 ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator
+    deconvolve           Reconstruct a plane from its image through a shift-invariant system
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
     write_volume         Writes a volume as float32, never rescaled or clipped, whole or not at all
     read_volume          A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths
@@ -55,7 +55,7 @@ The operators themselves, differentiable:
     ImagingOperator      The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
     BackprojectionOperator  The paper's back-projection as a `lineax` operator, image to volume
     optics_of            What `forward` takes to image planes at some depths, as true as is wanted
-    solve                Explain an image: all steps of a solver, or as many as its tolerance asks for
+    solve                Run a solver on an image, for all its steps or until its tolerance is met
 
 Better designs, and their molds:
 
@@ -68,7 +68,7 @@ Better designs, and their molds:
 
 How good it is:
 
-    forward_residual            Image a volume again, and compare with the capture that it was reconstructed from
+    forward_residual     Image a volume again, and compare the image with the capture
     quality              PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best
     localization         Match found points with true ones, each at most once, and score them
 
