@@ -24,9 +24,9 @@ From a capture to a volume:
     BackProjection       Back-projection, the paper's reconstruction: one pass, no PSF
     PinholeRichardsonLucy  Richardson-Lucy with the pinhole back-projection in place of the adjoint
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
-    FISTA                FISTA: non-negative least squares with an L1 penalty, for any linear operator
-    Unrolled             Unrolled inversion by trained networks; `Unrolled.pretrained()` has those that come with the package
-    ADMM                 ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator
+    FISTA                FISTA: non-negative least squares with an L1 penalty, for any operator
+    Unrolled             Unrolled inversion by trained networks; `Unrolled.pretrained()` loads those of the package
+    ADMM                 ADMM: non-negative least squares with total variation and an L1 penalty, for any operator
     deconvolve           Reconstruct a plane from its image through a shift-invariant system
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
     write_volume         Writes a volume as float32, never rescaled or clipped, whole or not at all

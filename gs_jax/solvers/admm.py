@@ -1,4 +1,4 @@
-"""ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator.
+"""ADMM: non-negative least squares with total variation and an L1 penalty, for any operator.
 
 It minimises
 
@@ -100,7 +100,7 @@ class State(NamedTuple):
 
 
 class ADMM(eqx.Module):
-    """ADMM: non-negative least squares with total variation and an L1 penalty, for any linear operator.
+    """ADMM: non-negative least squares with total variation and an L1 penalty, for any operator.
 
     *Differentiable.*
 

@@ -1,4 +1,4 @@
-"""FISTA: non-negative least squares with an L1 penalty, for any linear operator.
+"""FISTA: non-negative least squares with an L1 penalty, for any operator.
 
 It minimises `|A x - image|^2 / 2 + l1 sum(x)` over `x >= 0` (Beck and Teboulle, SIAM J. Imaging Sci. 2, 183, 2009).
 """
@@ -33,7 +33,7 @@ class State(NamedTuple):
 
 
 class FISTA(eqx.Module):
-    """FISTA: non-negative least squares with an L1 penalty, for any linear operator.
+    """FISTA: non-negative least squares with an L1 penalty, for any operator.
 
     *Differentiable.*
 

@@ -80,7 +80,7 @@ class State(NamedTuple):
 
 
 class Unrolled(eqx.Module):
-    """Unrolled inversion by trained networks; `Unrolled.pretrained()` has those that come with the package.
+    """Unrolled inversion by trained networks; `Unrolled.pretrained()` loads those of the package.
 
     *Differentiable.*
 
