@@ -28,7 +28,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.pareto import searcher, sweep_of
-from gs_jax.codesign.search import started
+from gs_jax.codesign.search import initial_design
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.checks import plate_as_air
@@ -112,7 +112,7 @@ def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, St
     """The design that a kind starts from, and its study."""
     design, study = read_design(FOLDER / f"{kind.design}.toml"), study_of(kind, span, steps)
     lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
-    return started(design.model_copy(update={"lens": lens}), study), study
+    return initial_design(design.model_copy(update={"lens": lens}), study), study
 
 
 def off_target(point, sweep, limits) -> float:

@@ -46,7 +46,7 @@ HEIGHTS = np.sqrt((np.arange(6) + 0.5) / 6)
 WINDOW = 0.6
 
 
-def started(kind: str, study: Study, design: Design) -> tuple[Design, Study]:
+def initial_design(kind: str, study: Study, design: Design) -> tuple[Design, Study]:
     """A design and a study of a kind of lens."""
     orientation, conic = KINDS[kind]
     lens = design.lens.model_copy(update={"orientation": orientation, "conic_constant": 0.0})
@@ -93,7 +93,7 @@ def run(study: Study, start: Design, kinds=tuple(KINDS), *, progress: Progress) 
     """For each kind a list with one record a share of the light; `design` is the design."""
     found = {}
     for kind in kinds:
-        design, question = started(kind, study, start)
+        design, question = initial_design(kind, study, start)
         front = trade_off(design, question, progress=progress)
         sweep = sweep_of(design, question)
         found[kind] = []

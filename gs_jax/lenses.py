@@ -121,7 +121,7 @@ class MicrolensArray(eqx.Module):
         """`InputError` unless all lenses are alike: what is computed for a lens unit has one for all of them."""
         if not self.alike:
             found = ", ".join(name for name in EACH if getattr(self, name).ndim)
-            raise InputError(f"Found lenses that differ ({found}), allowed: lenses that are alike; `lens(k)` is one.")
+            raise InputError(f"Lenses must be alike, got lenses that differ in {found}; `lens(k)` is one of them.")
 
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""

@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from gs_jax import objectives, random_layout
 from gs_jax.base.errors import InputError
 from gs_jax.codesign.parameters import candidate, evaluated, new_design, start_values
-from gs_jax.codesign.search import run_study, started
+from gs_jax.codesign.search import initial_design, run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS
@@ -51,13 +51,13 @@ def study(**changes):
 
 
 def two_kinds(**options):
-    design = started(conics(**options), study(kinds=2))
+    design = initial_design(conics(**options), study(kinds=2))
     return design, evaluated(design, depths_mm=(15.0, 30.0), depth_count=3)
 
 
 def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     """From 15 to 30 mm: paraxial foci are a third of the vergences apart, that of the middle kind in their middle."""
-    design = started(conics(), study(kinds=3))
+    design = initial_design(conics(), study(kinds=3))
     radii = np.array(design.lens.radius_of_curvature_mm)
     which = interleave(np.array(design.array.centers_mm), 3)
     np.testing.assert_array_equal(radii, np.unique(radii)[which])
@@ -67,23 +67,23 @@ def test_lenses_are_dealt_with_radii_spread_over_the_depths():
     vergence = (0.05 + behind) / focal - behind  # 1/f - 1/v', for the middle kind in focus at 1/20
     np.testing.assert_allclose(vergence, [11 / 180, 0.05, 7 / 180], rtol=1e-9)
     assert middle == pytest.approx(1.34)
-    assert started(design, study(kinds=3)) is design and started(design, study()) is design
-    assert started(conics(), study(kinds=1)) == conics()
+    assert initial_design(design, study(kinds=3)) is design and initial_design(design, study()) is design
+    assert initial_design(conics(), study(kinds=1)) == conics()
 
 
 def test_kinds_that_cannot_be():
-    three = started(conics(), study(kinds=3))
-    with pytest.raises(InputError, match="`kinds`: found 2 for a design of 3 types, allowed: 3, or none"):
-        started(three, study(kinds=2))
-    with pytest.raises(InputError, match="`kinds`: found 5 for a design of 4 lenses"):
-        started(conics(4, 2.4), study(kinds=5))
+    three = initial_design(conics(), study(kinds=3))
+    with pytest.raises(InputError, match="`kinds` must be 3, .*, got 2"):
+        initial_design(three, study(kinds=2))
+    with pytest.raises(InputError, match="`kinds` must be at most 4, .*, got 5"):
+        initial_design(conics(4, 2.4), study(kinds=5))
     thin = conics().model_copy(update={"lens": conics().lens.model_copy(update={"focal_length_mm": 4.65})})
-    with pytest.raises(InputError, match="`kinds`.*without it"):
-        started(thin, study(kinds=2))
-    with pytest.raises(InputError, match="`lens`: found lenses of 12 types, allowed: lenses of up to 8"):
+    with pytest.raises(InputError, match="`kinds` needs a design without"):
+        initial_design(thin, study(kinds=2))
+    with pytest.raises(InputError, match="up to 8 lens types, got 12"):
         problem_of(conics(radii=np.linspace(1.3, 1.4, 12).tolist()), study())
     for name in ("scene_error", "localization_um"):
-        with pytest.raises(InputError, match=f"`terms`: found {name} for lenses that differ, allowed"):
+        with pytest.raises(InputError, match=f"`terms`: {name} needs lenses that are alike"):
             problem_of(three, study(terms=[{"name": name, "minimise": 1.0}]))
     with pytest.raises(ValueError, match="less than or equal to 8"):
         study(kinds=9)

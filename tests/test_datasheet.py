@@ -255,7 +255,7 @@ def test_the_built_in_design_matches_its_file():
 def test_the_command(tmp_path, monkeypatch, capsys, table1):
     design = Path(__file__).parents[1] / "design" / "geomscope-table1.toml"
     output = tmp_path / "sheet.json"
-    options = ("--depths", "20:22:1", "--circle_of_confusion-um", "18", "--json", output)
+    options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
     status, out, err = run(monkeypatch, capsys, "metrics", design, *options)
     assert (status, err) == (0, "")
     assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], circle_of_confusion=0.018)
@@ -267,7 +267,7 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     [
         (["--json", "sheet.txt"], "sheet.txt"),
         (["--depths", "20:22"], "allowed: START:STOP:STEP"),
-        (["--circle_of_confusion-um", "0"], "allowed: 0.01 to 1e"),
+        (["--confusion-um", "0"], "allowed: 0.01 to 1e"),
     ],
 )
 def test_wrong_options_are_one_line(tmp_path, monkeypatch, capsys, options, words):

@@ -415,7 +415,7 @@ def test_the_written_file_is_the_contracts(tmp_path):
     ("lens", "said"),
     [
         ({"orientation": "front"}, "`lens.orientation`: found 'front', allowed: "),
-        ({"conic_constant": 3.0, "aperture_diameter_mm": 2.5}, "allowed: at most 2.0 mm, where the conic ends"),
+        ({"conic_constant": 3.0, "aperture_diameter_mm": 2.5}, "must be at most 2.0 mm, where the conic ends"),
         ({"aspheric_terms": [-1.0]}, "with which lenses rise at 0.3"),
         ({"aspheric_terms": [0.0] * 7}, "allowed: up to 6 numbers"),
     ],
@@ -476,12 +476,10 @@ def test_a_design_of_an_imager_says_what_is_sharp():
     in_focus = 1 / (0.43 / 2.0 - 1 / 5.8) - 1.0 / 1.43
     sheet = datasheet(design, [in_focus])
     assert found == pytest.approx((sheet["near_limit_mm"][0], sheet["far_limit_mm"][0]), abs=2e-3)
-    with pytest.raises(
-        InputError, match="working_distance_mm: found none, and no depth that is in focus, allowed: near"
-    ):
+    with pytest.raises(InputError, match="working_distance_mm must be given .*: no depth is in focus"):
         Design.from_imager(design.replace(sensor_distance_mm=4.0).imager(), name="mine")
     endless = dataclasses.replace(design.imager().array, size=(math.inf, math.inf))
-    with pytest.raises(InputError, match="`array.size`: found .*allowed: a plate of finite size"):
+    with pytest.raises(InputError, match="`array.size` must be finite"):
         Design.from_imager(dataclasses.replace(design.imager(), array=endless), name="mine")
 
 
@@ -490,9 +488,9 @@ def test_keys_are_replaced_and_checked():
     moved = design.replace(centers_mm=np.array([[0.0, 0.0], [1.5, 0.25]]), sensor_distance_mm=6.0, name="two")
     assert moved.array.centers_mm == ((0.0, 0.0), (1.5, 0.25)) and moved.imaging.sensor_distance_mm == 6.0
     assert moved.name == "two" and moved.lens == design.lens
-    with pytest.raises(InputError, match="found the key sensor_distance, allowed: sensor_distance_mm"):
+    with pytest.raises(InputError, match="such as sensor_distance_mm, .*got sensor_distance"):
         design.replace(sensor_distance=6.0)
     with pytest.raises(InputError, match="`imaging.sensor_distance_mm`: found -1, allowed: a number of mm"):
         design.replace(sensor_distance_mm=-1)
-    with pytest.raises(InputError, match="allowed: near below far"):
+    with pytest.raises(InputError, match="near below far"):
         design.replace(working_distance_mm=(30.0, 18.0))

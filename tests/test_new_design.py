@@ -140,10 +140,10 @@ WRONG = [
     (["must be used without --centers"], {"count": (5,)}),
     (["--centers-unit", "must be used with --centers"], {"centers": None, "count": (5,), "centers_unit": ("um",)}),
     (["none.csv", "No such file"], {"centers": ("none.csv",)}),
-    (["vendor.csv", "µm", "unit mm", "one unit"], {"centers_unit": ("mm",)}),
+    (["vendor.csv", "µm", "unit must be", "mm"], {"centers_unit": ("mm",)}),
     (["vendor.csv", "'Z'"], {"centers_columns": ("Pos X [µm]", "Z")}),
-    (["bare.csv", "up to 400 without a unit", "--centers-unit um"], {"centers": ("bare.csv",)}),
-    (["corner.csv", "no x or y below 0", "--centers-origin corner"], {"centers": ("corner.csv",)}),
+    (["bare.csv", "reach 400 without a unit", "--centers-unit um"], {"centers": ("bare.csv",)}),
+    (["corner.csv", "no x or y is below 0", "--centers-origin corner"], {"centers": ("corner.csv",)}),
     (["working_distance_mm", "near below far"], {"working_distance_mm": (23, 18)}),
     (["aperture_diameter_mm", "at most 3.956 mm"], {"aperture_diameter_mm": (5,)}),
     (["sensor.shape[0]", "found 1"], {"shape": (1, 400)}),
@@ -280,7 +280,7 @@ def test_every_key_is_described():
 )
 def test_problem_of_one_value(path, value, fine):
     found = problem(path, value)
-    assert found is None if fine else found and "allowed: " in found
+    assert found is None if fine else found and "must be " in found
 
 
 def is_kind(value: Any, kind: str) -> bool:

@@ -132,7 +132,7 @@ UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotat
         ),
         (
             lambda: gs.optimize(lambda s: s.wavelength, small(), free=FREE, solver=optx.LevenbergMarquardt(1e-3, 1e-3)),
-            "a loss that is one number for LevenbergMarquardt, allowed: residuals",
+            "LevenbergMarquardt needs residuals, an array, got a scalar",
         ),
     ],
 )

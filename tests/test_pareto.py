@@ -132,7 +132,7 @@ def test_every_stage_compiles_once(monkeypatch):
 
 
 def test_a_study_without_limits_that_move():
-    with pytest.raises(InputError, match="`pareto`: found nothing, allowed: one or two tables"):
+    with pytest.raises(InputError, match="`pareto` must be one or two tables"):
         trade_off(geomscope(), Study.model_validate(STUDY | {"pareto": []}))
 
 

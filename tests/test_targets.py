@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax.codesign.study import TermTable
-from gs_jax.codesign.targets import Row, assess, evaluate, residual, worst_of
+from gs_jax.codesign.targets import Row, assess, evaluate, residual, worst_entry
 from gs_jax.codesign.terms import TERMS, Term
 
 KEY = jax.random.key(0)
@@ -85,7 +85,7 @@ def test_an_infinite_depth_of_field_is_enough(entries):
 def test_assessment(kind, met, worst):
     row = assess(table({kind: 2.0}), np.asarray(X))
     assert row == Row(1.0, 4.0, met)
-    assert worst_of(table({kind: 2.0}), X) == worst
+    assert worst_entry(table({kind: 2.0}), X) == worst
     if met is not None:
         assert assess(table({kind: 2.0}), np.array([2.0])).met
 

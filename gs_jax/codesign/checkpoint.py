@@ -1,4 +1,4 @@
-"""The file that a search goes on from: its log as one line of JSON, then the solver's state as arrays."""
+"""Checkpoint of a search: its log as one line of JSON, then the solver's state as arrays."""
 
 import hashlib
 import io
@@ -21,7 +21,7 @@ _FORMAT = "gs-jax checkpoint 3"
 
 @dataclass
 class Log:
-    """What a search has done.
+    """Record of a search.
 
     `steps`: one record a step, with the worst entry of each term. `ends`: one record for each finished start of a
     stage, with the reason for stopping, whether all targets are met, and the free parameters.
@@ -32,7 +32,7 @@ class Log:
 
 
 def write_checkpoint(path: PathLike, log: Log, study: Study, design: Design, state: State | None) -> None:
-    """Write the file, whole or not at all; the state is None between two starts."""
+    """Write a checkpoint atomically; the state is None between two starts."""
     head = {"format": _FORMAT, "of": _digest(study, design), "log": asdict(log)}
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(json.dumps(head).encode() + b"\n")
@@ -40,12 +40,12 @@ def write_checkpoint(path: PathLike, log: Log, study: Study, design: Design, sta
 
 
 def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, bytes]:
-    """The log, and the state for `restored`, empty between two starts.
+    """Read the log, and the state for `restore_state`, empty between two starts.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is no checkpoint, or belongs to another study or design.
+        If the file cannot be read, is not a checkpoint, or belongs to another study or design.
     """
     head, _, state = check_input(path).read_bytes().partition(b"\n")
     try:
@@ -56,28 +56,26 @@ def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, 
         if not isinstance(log.steps, list) or not isinstance(log.ends, list):
             raise TypeError
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: found no checkpoint of a search, allowed: what `gs-jax optimize` wrote.") from error
+        raise InputError(f"{path}: not a checkpoint of `gs-jax optimize`.") from error
     if owner != _digest(study, design):
-        raise InputError(
-            f"{path}: found the checkpoint of another study or design, allowed: the ones it was made with."
-        )
+        raise InputError(f"{path}: the checkpoint is of another study or design.")
     return log, state
 
 
-def restored(path: Path, state: bytes, like: State) -> State:
-    """The state of a checkpoint; `like` is one of the same solver.
+def restore_state(path: Path, state: bytes, like: State) -> State:
+    """Restore the state of a checkpoint; `like` is a state of the same solver.
 
     Raises
     ------
     InputError
-        If it is not whole; it names `path`.
+        If the file is truncated.
     """
     with decoding(path, "checkpoint"):
         return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
 
 
 def checkpoint_path(output: Path) -> Path:
-    """Where the checkpoint of a search for this file lies."""
+    """Path of the checkpoint beside an output file."""
     return output.with_suffix(".checkpoint")
 
 

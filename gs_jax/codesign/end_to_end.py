@@ -1,12 +1,11 @@
-"""End to end: how well random scenes come back through the image, its noise and back-projection.
+"""End-to-end loss: how well random scenes are reconstructed from their noisy images by back-projection.
 
-`reconstruction_loss` is an estimate from a few random scenes, differentiable with respect to the whole imager: for
-stochastic optimisers. What it draws follows from its key alone, so one key gives one smooth function. A full field
-need not fit into memory: with `window` each scene lies at a random place of the sensor, and no more than the window
-around it is computed.
+`reconstruction_loss` is an estimate from a few random scenes, differentiable with respect to the imager, for stochastic
+optimisers. One key gives one smooth function. With `window` a scene lies at a random position of the sensor and only
+the window around it is computed, so the full field need not fit into memory.
 
-The reconstruction is `backproject`, normalised, less its local background: light from other depths makes a smooth
-haze whose low frequencies no layout can remove, because the lenses that see a point lie within one field radius.
+The reconstruction is normalised `backproject` minus its local background: light from other depths gives a smooth haze
+whose low frequencies no layout can remove, because the lenses that see a point lie within one field radius.
 """
 
 import jax
@@ -23,16 +22,16 @@ from ..projection.subfields import subfield
 from ..typing import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
-# Side of the PSF of a voxel where none is given, pixels: three standard deviations of voxels up to 5 pixels wide.
+# Default side of the PSF of a voxel, pixels: three standard deviations of voxels up to 5 pixels wide.
 _FOOTPRINT = 17
-# Summed weight under which a voxel is dimmed: half of a lens on its axis.
+# Summed weight below which a voxel is dimmed: half of a lens on its axis.
 _LEAST_WEIGHT = 0.5
 
 
 def random_scene(
     key: PRNGKeyArray, grid: Grid, *, density: Real = 0.02, width: Real = 0.04
 ) -> Float[Array, "depth y x"]:
-    """Soft round blobs at random voxels, each plane by itself.
+    """Gaussian blobs at random voxels, each in its own plane.
 
     Parameters
     ----------
@@ -41,7 +40,7 @@ def random_scene(
     grid
         The voxels.
     density
-        Blobs per voxel, each with a brightness between 0.5 and 1 at its middle.
+        Blobs per voxel, with peaks between 0.5 and 1.
     width
         Standard deviation of a blob, mm.
     """
@@ -54,9 +53,9 @@ def random_scene(
 
 
 def local_contrast(volume: Volume, grid: Grid, *, width: Real) -> Float[Array, "depth y x"]:
-    """What of a volume stands out: less its Gaussian mean over `width` (mm) in the plane, and zero where below.
+    """Subtract from each plane its Gaussian mean over `width` (mm), and clip at zero.
 
-    Means at the edges are over what is there.
+    Means at the edges are over existing voxels.
     """
     dtype = jnp.asarray(volume).dtype
     rows, columns = (_gaussian(n, width / grid.pitch, dtype) for n in grid.shape)
@@ -72,7 +71,7 @@ def reconstruct(
     background_width: Real,
     lit: Bool[Array, "row column"] | None = None,
 ) -> Float[Array, "depth y x"]:
-    """Back-projection by weight, and its local contrast.
+    """Local contrast of the back-projection, normalised by the sum of weights.
 
     Parameters
     ----------
@@ -81,13 +80,13 @@ def reconstruct(
     background_width
         Of `local_contrast`, mm.
     lit
-        The pixels that exist, all by default. Others count neither as light nor as weight.
+        Mask of the pixels that exist, all by default. Others have neither light nor weight.
 
     Returns
     -------
     Array
-        `grid.volume_shape`. A voxel that sums up less weight than half a lens on its axis is dimmed in
-        proportion, so that the edge of the field is neither divided by nothing nor abrupt.
+        `grid.volume_shape`. A voxel with less weight than half a lens on its axis is dimmed in proportion, so that
+        the edge of the field is smooth.
     """
     seen = jnp.ones(image.shape, image.dtype) if lit is None else lit.astype(image.dtype)
     weight = backproject(seen, imager, grid)
@@ -98,12 +97,11 @@ def reconstruct(
 def footprints(
     imager: Imager, grid: Grid, psf: Float[Array | np.ndarray, "plane tall wide"] | None = None
 ) -> Float[Array, "plane tall wide"]:
-    """PSFs of voxels instead of points: blurred by a Gaussian with a standard deviation of half a voxel's image.
+    """Blur PSFs of points to PSFs of voxels, by a Gaussian with a standard deviation of half a voxel's image.
 
-    `forward` images voxels as points. Where these are a pixel apart or more, and sharper than that, the image of a
-    smooth scene is a grid of dots, and what back-projection reads depends on how each lens's grid falls on the pixels:
-    a loss that changes by a tenth of a dB when a lens moves by 2 um, as no microscope's does. Of Gaussians this wide
-    the grid is below 1 %.
+    `forward` images voxels as points. Where these are a pixel apart or more, the image of a smooth scene is a grid of
+    dots, and the loss depends on how each lens's grid falls on the pixels: it changes by a tenth of a dB when a lens
+    moves by 2 um. With this blur the modulation is below 1 %.
 
     Parameters
     ----------
@@ -130,8 +128,8 @@ def footprints(
 def misfit_db(estimate: Volume, truth: Volume) -> Float[Array, ""]:
     """Squared error after the best gain, in dB of the truth's energy: `10 log10(1 - <a,b>^2 / (<a,a> <b,b>))`.
 
-    For one truth it is minus the PSNR of `gs_jax.metrics.quality`, up to a constant. 0 dB, without a derivative, where
-    either volume is all zero; at a perfect estimate it ends at ten times the rounding of the type.
+    For one truth it is minus the PSNR of `gs_jax.metrics.quality`, up to a constant. It is 0 dB, without a derivative,
+    where either volume is zero. Its minimum, at a perfect estimate, is ten times the rounding error.
     """
     estimate, truth = jnp.asarray(estimate), jnp.asarray(truth)
     energies = jnp.vdot(estimate, estimate) * jnp.vdot(truth, truth)
@@ -142,10 +140,10 @@ def misfit_db(estimate: Volume, truth: Volume) -> Float[Array, ""]:
 
 
 def noisy(key: PRNGKeyArray, image: Float[Array, "row column"], read_noise: Real) -> Float[Array, "row column"]:
-    """An image in electrons with shot and read noise, both Gaussian, so that it has a derivative by the image.
+    """Add Gaussian shot and read noise to an image in electrons, differentiably.
 
-    The standard deviation is `sqrt(image + read_noise^2)`: the draw from the key is scaled, not drawn anew. Pixels
-    below zero (an FFT's rounding) have no shot noise.
+    A standard normal draw is scaled by `sqrt(image + read_noise^2)`. Negative pixels, by rounding of an FFT, have no
+    shot noise.
     """
     variance = jnp.maximum(image, 0) + jnp.asarray(read_noise, image.dtype) ** 2
     some = variance > 0
@@ -169,36 +167,36 @@ def reconstruction_loss(
     window: tuple[int, int] | None = None,
     field: tuple[float, float] = (0.0, 0.0),
 ) -> Float[Array, ""]:
-    """Mean misfit of random scenes that are imaged, with noise, and reconstructed, dB; lower is better.
+    """Mean misfit of random scenes that are imaged with noise and reconstructed, dB; lower is better.
 
     Differentiable once, in both modes, with respect to the imager, the grid's depths and the PSF.
 
     Parameters
     ----------
     imager, key
-        What is judged, and what the scenes, their places and their noise are drawn from.
+        The microscope, and the key of scenes, positions and noise.
     grid
-        The voxels of a scene. They decide what is imaged, so a scene smaller than the field is darker at its edges.
+        The voxels of a scene. A scene smaller than the field is darker at its edges.
     psf
-        Of points, as for `forward`; voxels are imaged by `footprints`. It may be computed from the imager: its gradient
-        counts then.
+        PSF of points, as for `forward`; voxels are imaged by `footprints`. A PSF that is computed from the imager
+        contributes to the gradient.
     scenes
-        To average over, one after the other.
+        Number of scenes, computed one after the other.
     density, width
         Of `random_scene`.
     electrons
-        Brightness: mean electrons that a voxel of 1 adds to the sensor through a lens on its axis.
+        Mean electrons that a voxel of brightness 1 adds to the sensor through a lens on its axis.
     read_noise
         Standard deviation, electrons.
     background_width
         Of `local_contrast`, mm. A few times `width`.
     margin
-        Voxels along each side that are lit but not judged: as the neighbours of a random place are.
+        Voxels along each side that are lit but do not count.
     window
         `(rows, columns)` of the part of the sensor that is computed. By default the whole sensor, and the grid on the
         axis; for a smaller part, the grid's middle is uniform over `field`.
     field
-        `(x, y)` of the rectangle of these places, its middle the sensor's, mm.
+        `(x, y)` of the rectangle of these positions, centred on the sensor, mm.
 
     Returns
     -------
@@ -214,7 +212,7 @@ def reconstruction_loss(
         raise ValueError(f"`scenes` must be 1 or more, got {scenes}.")
     if not 0 <= 2 * margin < min(grid.shape):
         raise ValueError(f"`margin` must be 0 or more and leave voxels of {grid.shape}, got {margin}.")
-    judged = np.s_[:, margin : grid.shape[0] - margin, margin : grid.shape[1] - margin]
+    inner = np.s_[:, margin : grid.shape[0] - margin, margin : grid.shape[1] - margin]
     dtype = imager.sensor_distance.dtype
     images = footprints(imager, grid, psf)
 
@@ -226,12 +224,12 @@ def reconstruction_loss(
         truth = random_scene(scene_key, grid, density=density, width=width)
         image = noisy(noise_key, electrons * forward(truth, local, grid, images), read_noise)
         estimate = reconstruct(image, local, grid, background_width=background_width, lit=lit)
-        return misfit_db(estimate[judged], truth[judged])
+        return misfit_db(estimate[inner], truth[inner])
 
     return jnp.mean(lax.map(one, jax.random.split(key, scenes)))
 
 
 def _gaussian(size: int, deviation: Real, dtype) -> Float[Array, "size size"]:
-    """`exp(-(i - j)^2 / (2 deviation^2))`: a blur as a matrix, without wrap-around."""
+    """A blur as a matrix, `exp(-(i - j)^2 / (2 deviation^2))`, without wrap-around."""
     place = jnp.arange(size, dtype=dtype)
     return jnp.exp(-(((place[:, None] - place[None]) / deviation) ** 2) / 2)

@@ -1,14 +1,24 @@
-"""How precisely a point can be located: Fisher information of its image, and the Cramer-Rao bound.
+"""Cramer-Rao bounds: the least standard deviations with which the position of a point can be estimated.
 
-A point at `(x, y, z)` is imaged by every lens that sees it, each image moved by its own parallax. What the pixels tell
-together about the place is the Fisher information; its inverse bounds the covariance of any unbiased estimate, so it
-judges a layout without a reconstruction. Light on pixel `k` has mean `m_k` and variance `m_k + read_noise^2`
-(shot noise, background included in `m_k`, and read noise as the same variance of Poisson light), for which
+A point at `(x, y, z)` has an image under every lens that sees it, and each image moves by its own parallax. The Fisher
+information of all pixels gives the bound of any unbiased estimate, so it judges a layout without a reconstruction. A
+pixel `k` with mean `m_k` and variance `m_k + read_noise^2` (shot noise, with the background in `m_k`; read noise is
+treated as Poisson light of the same variance) contributes
 
     F = sum_k (d m_k) (d m_k)' / (m_k + read_noise^2)
 
-(Ober, Ram and Ward, Biophys. J. 86, 1185, 2004; read noise as in Huang et al., Nat. Methods 10, 653, 2013). The
-paper has no such bound. Images of one point by different lenses are taken as apart from each other.
+(Ober, Ram and Ward, Biophys. J. 86, 1185, 2004; read noise as in Huang et al., Nat. Methods 10, 653, 2013). The paper
+has no such bound. Images of one point by different lenses are assumed not to overlap.
+
+`crowded_bound` is the bound in a crowded scene, with the light of an exposure and the lenses' own spots. Its noise is
+white over an image, so a lens whose image of the point moves by `s` contributes the information of the matched filter
+
+    F = N^2 / n  integral |2 pi v . s|^2 |H(v)|^2 dv
+
+for `N` electrons, the transfer function `H` and noise of the density `n` (Kay, Fundamentals of Statistical Signal
+Processing I, 1993, section 3.5). A wide halo adds little at the frequencies that count; a Gaussian of its variance
+would not distinguish a sharp core in a halo from no core. The noise is that of a scene
+(`linear_error.noise_density`) plus the point's own.
 """
 
 from collections.abc import Sequence
@@ -25,7 +35,7 @@ from ..objectives.conditions import Conditions, field_radius
 from ..typing import Real
 from .linear_error import lens_electrons, noise_density, transfer_power
 
-# What is known before the image, standard deviations of x, y, z (mm) and of the logarithm of the brightness.
+# Prior standard deviations of x, y, z (mm) and of the logarithm of the brightness.
 PRIOR = (10.0, 10.0, 10.0, 10.0)
 
 
@@ -49,9 +59,10 @@ def mean_images(
     parameters
         `x, y, z` of the point, mm, and the logarithm of its brightness.
     imager
-        What sees it.
+        The lens array and the sensor.
     photons
-        Electrons that a lens on its axis gets of a point of brightness 1; other lenses get the envelope C of them.
+        Electrons that a lens on its axis collects from a point of brightness 1; other lenses collect the envelope C
+        of them.
     spot
         Standard deviation of a Gaussian image, mm, or a PSF on the sensor's pixels, as `diffraction_psf` makes it, of
         `size`. The PSF moves by cubic interpolation.
@@ -65,7 +76,7 @@ def mean_images(
     places, weights = imager.sensor.to_pixels(views.spot[:, 0]) - corners, imager.brightness(views)[:, 0]
     spot = jnp.asarray(spot, parameters.dtype)
     if spot.ndim:
-        light = jax.vmap(lambda place: _moved(spot, place - size // 2))(places)
+        light = jax.vmap(lambda place: _shifted(spot, place - size // 2))(places)
     else:
         light = jax.vmap(lambda place: _gaussian(spot / imager.sensor.pixel_pitch, place, size))(places)
     return jnp.asarray(photons * brightness * weights)[:, None, None] * light
@@ -74,7 +85,7 @@ def mean_images(
 def windows(
     point: Float[Array | np.ndarray, "3"], imager: Imager, size: int
 ) -> tuple[Float[Array, "lens 2"], Float[Array, "lens row column"]]:
-    """Windows around the images of a point: first `(row, column)` of each, and 1 on the sensor and 0 beside it."""
+    """Windows around the images of a point: first `(row, column)` of each, and a mask that is 1 on the sensor."""
     places = imager.sensor.to_pixels(imager.project(jnp.asarray(point)[None])[:, 0])
     corners = lax.stop_gradient(jnp.round(places)) - size // 2
     index = corners[:, :, None] + jnp.arange(size, dtype=corners.dtype)[None, None]
@@ -95,8 +106,7 @@ def fisher_information(
 ) -> Float[Array, "4 4"]:
     """Fisher information about `x, y, z` (mm) and the logarithm of the brightness of a point.
 
-    Differentiable in everything that is continuous. It is smooth but where a lens's image crosses a pixel: there the
-    window moves on, and what it loses at one side is not quite what it gains at the other.
+    Differentiable in all continuous arguments. It has small steps where an image crosses a pixel and its window moves.
 
     Parameters
     ----------
@@ -107,7 +117,7 @@ def fisher_information(
     background
         Mean electrons in each pixel beside the point's.
     read_noise
-        Standard deviation, electrons. If both are 0, pixels without light say nothing.
+        Standard deviation, electrons. If both are 0, pixels without light have no information.
     size
         Of the window around each image, pixels, odd; of the PSF if there is one. Wide enough for the spot.
 
@@ -127,9 +137,9 @@ def fisher_information(
     images = lambda parameters: mean_images(parameters, imager, photons=photons, spot=spot, corners=corners, size=size)
     mean, slopes = images(start), jax.jacfwd(images)(start)
     variance = mean + background + jnp.asarray(read_noise, dtype) ** 2
-    # An interpolated PSF may fall below zero; with enough background that does not matter.
-    known = variance > 0
-    weight = jnp.where(known, on_sensor / jnp.where(known, variance, 1), 0)
+    # An interpolated PSF may be negative where there is little background.
+    positive = variance > 0
+    weight = jnp.where(positive, on_sensor / jnp.where(positive, variance, 1), 0)
     return jnp.einsum("lrci,lrcj,lrc->ij", slopes, slopes, weight)
 
 
@@ -145,10 +155,10 @@ def cramer_rao(
     size: int = 15,
     prior: tuple[float, float, float, float] = PRIOR,
 ) -> Float[Array, "point 3"]:
-    """The least standard deviations of `x, y, z` of points, each alone and of unknown brightness, mm.
+    """Cramer-Rao bound of `x, y, z` of single points of unknown brightness, as standard deviations, mm.
 
-    `sqrt(diag((F + diag(1 / prior^2))^-1))`. The prior stands for what is known anyway; it is so wide that it does
-    not matter to a point that is seen, and it keeps the bound and its gradient finite where no lens sees one.
+    `sqrt(diag((F + diag(1 / prior^2))^-1))`. The prior is so wide that it does not change the bound of a point that is
+    seen. It keeps the bound and its gradient finite where no lens sees a point.
 
     Parameters
     ----------
@@ -165,7 +175,7 @@ def cramer_rao(
         information = fisher_information(
             point, imager, photons=photons, spot=spot, background=background, read_noise=read_noise, size=size
         )
-        # In units in which the diagonal is 1: lengths and brightness differ by many orders.
+        # Scaled to a unit diagonal: lengths and brightness differ by orders of magnitude.
         total = information + jnp.diag(scale**-2)
         unit = jnp.diag(total) ** -0.5
         inverse = jnp.linalg.inv(unit[:, None] * total * unit[None])
@@ -175,34 +185,34 @@ def cramer_rao(
 
 
 def localization_bound(imager: Imager, points: Float[Array | np.ndarray, "point 3"], **options) -> Float[Array, "3"]:
-    """Root mean square of `cramer_rao` over points, along x, y and z, mm: terms for co-design. Options are its."""
+    """Root mean square of `cramer_rao` over points, along x, y and z, mm, with its options."""
     return jnp.sqrt(jnp.mean(cramer_rao(points, imager, **options) ** 2, axis=0))
 
 
 def _gaussian(deviation, place, size):
-    """A Gaussian's share of each pixel; lengths in pixels, `place` from the middle of the first one."""
+    """Integral of a Gaussian over each pixel; lengths in pixels, `place` from the centre of the first one."""
     borders = jnp.arange(size + 1, dtype=place.dtype) - 0.5
     rows, columns = (jnp.diff(jax.scipy.stats.norm.cdf(borders, at, deviation)) for at in place)
     return rows[:, None] * columns[None]
 
 
-def _moved(psf, shift):
-    """A PSF moved by `(rows, columns)`, pixels; beyond its window it is dark."""
+def _shifted(psf, shift):
+    """Shift a PSF by `(rows, columns)`, pixels; it is zero beyond its window."""
     padded = jnp.pad(psf, 2)
-    moved = jax.image.scale_and_translate(
+    shifted = jax.image.scale_and_translate(
         padded, padded.shape, (0, 1), jnp.ones(2, psf.dtype), shift.astype(psf.dtype), "cubic", antialias=False
     )
-    return moved[2:-2, 2:-2]
+    return shifted[2:-2, 2:-2]
 
 
-# Frequencies, up to the pixels' own highest.
+# Nodes of the quadrature over frequencies up to Nyquist.
 _NODES = 24
 
 
 def crowded_bound(
     parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, "place 2"]
 ) -> Float[Array, "depth 3"]:
-    """The least standard deviations of x, y, z of points as bright as a lit place of 40 um x 40 um, mm.
+    """Cramer-Rao bound of x, y, z in a crowded scene, for points as bright as an emitter of 40 um x 40 um, mm.
 
     Parameters
     ----------
@@ -210,20 +220,20 @@ def crowded_bound(
         The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are
         those of the points.
     places
-        `(x, y)` of points, mm. Root mean squares over them are given.
+        `(x, y)` of points, mm. The result is the root mean square over them.
     """
     spots = [_spot(*part, parts) for part in parts]
     prior = jnp.asarray(PRIOR[:3], parts[0][1].depths.dtype)
 
     def at(place):
-        told = sum(_information(*part, spot, place) for part, spot in zip(parts, spots, strict=True))
-        return jnp.diagonal(jnp.linalg.inv(told + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
+        information = sum(_information(*part, spot, place) for part, spot in zip(parts, spots, strict=True))
+        return jnp.diagonal(jnp.linalg.inv(information + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
 
     return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
 
 
 def _spot(imager, at, parts):
-    """At each depth of the spot of a lens its squared light, 1/mm^2, and of its derivative by x or y; and its noise."""
+    """Integrals at each depth of a spot's square and of its squared derivative, 1/mm^2, and the noise density."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     dtype, highest = at.depths.dtype, 1 / (2 * imager.sensor.pixel_pitch)
     frequency = highest * jnp.asarray((nodes + 1) / 2, dtype)
@@ -235,18 +245,18 @@ def _spot(imager, at, parts):
 
 
 def _information(imager, at, spot, place) -> Float[Array, "depth 3 3"]:
-    """Information about `x, y, z` of a point at a place by these lenses."""
+    """Fisher information about `x, y, z` of a point by lenses of one type."""
     energy, slope, noise = spot
     beside = imager.array.centers - place[None]
     weight = envelope(jnp.sum(beside**2, 1)[None], imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
     light = lens_electrons(imager, at)[:, None] * weight
-    told = light**2 * slope[:, None] / (noise + light * energy[:, None])
-    # How far images move, over the magnification: with the point, and with its depth.
-    moved = jnp.concatenate(
+    per_shift = light**2 * slope[:, None] / (noise + light * energy[:, None])
+    # Derivative of image positions by x, y, z, divided by the magnification.
+    shift = jnp.concatenate(
         [
             jnp.broadcast_to(jnp.eye(2, dtype=at.depths.dtype), (at.depths.size, len(beside), 2, 2)),
             (beside[None] / imager.reduced_depth(at.depths)[:, None, None])[..., None],
         ],
         -1,
     )
-    return jnp.einsum("dl,dlai,dlaj->dij", told * imager.magnification(at.depths)[:, None] ** 2, moved, moved)
+    return jnp.einsum("dl,dlai,dlaj->dij", per_shift * imager.magnification(at.depths)[:, None] ** 2, shift, shift)

@@ -1,8 +1,7 @@
-"""What a layout of lenses does to the reconstruction, as terms of co-design.
+"""Terms of a study that judge the layout, and terms at equal exposure.
 
-The functions of `comb`, `fisher` and `end_to_end` want points, grids and windows; a study names a term and no more.
-What is chosen here follows from the candidate: places over the part of the plate whose points see a whole field of
-lenses, the depths that are judged, and blobs and spots of a few pixels. Random terms draw anew from their key.
+They apply `array_psf`, `fisher`, `linear_error` and `end_to_end` at points, depths and frequencies that follow from the
+imager and its conditions. Points lie where they see a whole field of lenses. Random terms draw new ones for each key.
 """
 
 import dataclasses
@@ -16,17 +15,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..geometry import Imager, field_limit
 from ..grid import Grid
 from ..objectives.conditions import Conditions, finite_plate, per_type
-from .array_psf import comb_spectrum, condition_number, lens_shortage, sidelobes, spectral_flatness
+from .array_psf import array_spectrum, condition_number, mean_inverse_views, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import crowded_bound, localization_bound
 from .linear_error import PLACE, lens_electrons, lost_power, spots
 
-# Points whose ghosts are looked for, and places where; points that are located or whose combs are looked at; light of
-# one, electrons a lens.
+# Numbers of sources and targets for sidelobes, of points that are located or whose spectrum is computed; and electrons
+# a lens of a point.
 _SOURCES, _TARGETS, _POINTS, _PHOTONS = 4, 256, 4, 1000.0
-# Spatial frequencies at which a point's comb is looked at.
+# Spatial frequencies of a spectrum.
 _FREQUENCIES = 256
-# Places along a side of the plate.
+# Points along a side of the plate.
 _RASTER = 15
 # Voxels along a side of a random scene, blobs per voxel, each as wide as a voxel; scenes of a draw.
 _VOXELS, _DENSITY, _SCENES = 99, 0.008, 2
@@ -37,7 +36,7 @@ _SPOT = 65
 
 
 def ghosts(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""]:
-    """RMS ghost of a point at random other places, over its own image; a pixel is the width of a tooth."""
+    """RMS sidelobe of random points at random targets, relative to the peak; spots are a pixel wide."""
     near, far = jax.random.split(key)
     sources, targets = _points(imager, at, near, _SOURCES), _points(imager, at, far, _TARGETS)
     pixel = imager.sensor.pixel_pitch
@@ -47,36 +46,36 @@ def ghosts(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""
 
 
 def shortage(imager: Imager, at: Conditions) -> Float[Array, ""]:
-    """`comb.lens_shortage` over the whole plate, at the middle depth."""
+    """`mean_inverse_views` over the whole plate, at the middle depth."""
     plate = finite_plate(imager)
     side = jnp.linspace(-0.5, 0.5, _RASTER, dtype=plate.dtype)
     places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
     depth = jnp.broadcast_to((at.depths[0] + at.depths[-1]) / 2, (len(places), 1))
-    return lens_shortage(imager, jnp.concatenate([places, depth], 1))
+    return mean_inverse_views(imager, jnp.concatenate([places, depth], 1))
 
 
 def flatness(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""]:
-    """`comb.spectral_flatness` of random points' combs, at random frequencies of `_spectrum`."""
+    """`spectral_flatness` of random points at random frequencies."""
     return spectral_flatness(_spectrum(imager, at, key))
 
 
 def conditioning(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""]:
-    """`comb.condition_number` of the same."""
+    """`condition_number` of the same spectrum."""
     return condition_number(_spectrum(imager, at, key))
 
 
 def _spectrum(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, "point frequency"]:
-    """Power from one over the field radius to the Nyquist frequency, evenly over its logarithm and all directions."""
+    """Power at frequencies between `1 / field_radius` and Nyquist, log-uniform, in all directions."""
     place, size, angle = jax.random.split(key, 3)
     low, high = 1 / imager.field_radius, 0.5 / imager.sensor.pixel_pitch
     draw = lambda key: jax.random.uniform(key, (_FREQUENCIES,), at.depths.dtype)
     frequency, turn = low * (high / low) ** draw(size), jnp.pi * draw(angle)
     frequencies = jnp.stack([frequency * jnp.cos(turn), frequency * jnp.sin(turn)], 1)
-    return comb_spectrum(imager, _points(imager, at, place, _POINTS), frequencies)
+    return array_spectrum(imager, _points(imager, at, place, _POINTS), frequencies)
 
 
 def localization(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, "3"]:
-    """Cramer-Rao bound of x, y, z at random points, um; a spot of one pixel's standard deviation."""
+    """Cramer-Rao bound of x, y, z at random points, um; the spot has a standard deviation of one pixel."""
     points, spot = _points(imager, at, key, _POINTS), imager.sensor.pixel_pitch
     return 1000 * localization_bound(imager, points, photons=_PHOTONS, spot=spot)
 
@@ -84,16 +83,17 @@ def localization(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Arr
 def log_error(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""]:
     """Logarithm of the relative error, `sqrt(1 - <a,b>^2 / (<a,a> <b,b>))`, of reconstructed random scenes.
 
-    Three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate: sub-images overlap
-    as much as those of an object that fills the field. Spots are points, and light is the same for all lenses.
+    Scenes have three depths of 99 x 99 voxels, as wide as the field of a lens, at a random place of the plate:
+    sub-images overlap as much as those of an object that fills the field. Spots are points, and all lenses have the
+    same light.
     """
     return _log_error(imager, at, key)
 
 
 def log_error_for_exposure(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""]:
-    """The same with the lens's own spots and the light of the exposure, from a blob's lit voxels."""
+    """`log_error` with the lenses' own spots and the light of the exposure."""
     at = dataclasses.replace(at, depths=_three(at))
-    # `forward` has no inverse square of the depth: the same light for all three, the mean.
+    # `forward` does not scale light with the depth: all three planes have the mean.
     electrons = jnp.mean(lens_electrons(imager, at)) * (_voxel_pitch(imager) / PLACE) ** 2
     return _log_error(imager, at, key, psf=spots(imager, at, _SPOT), electrons=electrons)
 
@@ -103,14 +103,14 @@ def _three(at: Conditions) -> Float[Array, "3"]:
 
 
 def _voxel_pitch(imager: Imager) -> float:
-    """Of the voxels of a random scene, mm."""
+    """Pitch of the voxels of a random scene, mm."""
     return 2 * imager.field_radius / _VOXELS
 
 
 def _log_error(imager: Imager, at: Conditions, key: PRNGKeyArray, **light) -> Float[Array, ""]:
     sensor, reach = imager.sensor, imager.field_radius
     depths, pitch = _three(at), _voxel_pitch(imager)
-    # A voxel is imaged up to this far beside it, by the lens that is as far away as one can be that sees it.
+    # Distance of a voxel from its image by the farthest lens that sees it.
     beside = (1 + at.largest_magnification) * field_limit(reach)
     rows, columns = (math.ceil(min(n, 2 * (reach + beside) / sensor.pixel_pitch)) for n in sensor.shape)
     height, width = (max(0.0, n * sensor.pixel_pitch - 4 * reach) for n in sensor.shape)
@@ -130,7 +130,7 @@ def _log_error(imager: Imager, at: Conditions, key: PRNGKeyArray, **light) -> Fl
 
 
 def _points(imager: Imager, at: Conditions, key: PRNGKeyArray, count: int) -> Float[Array, "point 3"]:
-    """Points evenly over the depths and the field, a field radius from the plate's edge where it is that large."""
+    """Random points over the depths and the field, a field radius from the plate's edge where it is that large."""
     plate = finite_plate(imager)
     inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
     middle = jnp.stack([0 * inner[0], 0 * inner[0], (at.depths[0] + at.depths[-1]) / 2])

@@ -1,23 +1,27 @@
-"""How well volumes can be estimated from a capture: defocus, aberrations, light, noise and parallax in one number.
+"""Error of the best linear estimate of volumes: defocus, aberrations, light, noise and parallax in one number.
 
-Scenes are planes of random objects with edges, stationary, independent of each other. Of such a scene, image and noise
-only second moments count for the best linear estimate (Wiener's), and each frequency `v` of the sensor counts for
-itself. Lens `j` sees plane `k` there through
+Scenes are planes of random objects with edges, stationary and independent of each other. The best linear estimate
+(Wiener's) depends on second moments of scene, image and noise only, and treats each frequency `v` of the sensor by
+itself. Lens `j` images plane `k` with
 
     A_jk = sqrt(w_jk) H_k(v) L_k M_k exp(2 pi i v . r_j M_k)
 
-with the envelope `w`, the transfer function `H`, a lit plane's light `L` on the sensor, the magnification `M` and the
-lens's place `r_j` beside the object. For planes of the spectrum `S_k` and noise of the density `n` what is not found
-of plane `k` is the diagonal of
+for the envelope `w`, the transfer function `H`, the light `L` of a lit plane on the sensor, the magnification `M` and
+the lens's position `r_j` beside the object. For planes with the spectrum `S_k` and noise of the density `n` the
+relative error of plane `k` is the diagonal of
 
     (1 + S^(1/2) A* A S^(1/2) / n)^-1
 
-(Kailath, Sayed and Hassibi, Linear Estimation, 2000, Theorem 3.2.1). Nothing is drawn at random.
+(Kailath, Sayed and Hassibi, Linear Estimation, 2000, Theorem 3.2.1). No random numbers are drawn.
 
-Left out: sub-images are taken as apart from each other (their light counts as noise where they overlap, what they show
-does not), a lens's transfer function is its mean over the field, and frequencies above the pixels' count as others do,
-since lenses see an object with different parts of a pixel. Where a scene is sparse, a solver that knows that light is
-positive does better than any linear one. The paper has no such measure.
+Approximations: sub-images do not overlap (their light counts as noise where they do), the transfer function is its mean
+over a lens's field, and frequencies above Nyquist count as others do, since lenses sample an object with different
+parts of a pixel. For sparse scenes, solvers with a positivity constraint do better than any linear estimate. The paper
+has no such measure.
+
+An exposure is a time and a brightness, the same for all candidates: the electrons that each mm^2 of clear aperture at a
+distance of 20 mm collects from an emitter of 40 um x 40 um. So a smaller aperture pays for its sharpness with light,
+and a magnification for its detail.
 """
 
 from collections.abc import Sequence
@@ -33,11 +37,11 @@ from ..objectives.conditions import Conditions, clear_diameter, field_heights, f
 from ..objectives.paraxial import occupancy
 from ..optics.raytrace import pupil_quadrature, trace_lenslet
 
-# Of a scene: lit part of a plane, and the distance over which its correlation falls to 1/e, mm.
+# Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
 FILL, LENGTH = 0.03, 0.05
-# Electrons of read noise.
+# Read noise, electrons.
 READ_NOISE = 2.0
-# Frequencies, up to that of voxels as wide as `PLACE`.
+# Nodes of the quadrature over frequencies, up to Nyquist of voxels of 40 um.
 _NODES = 16
 
 
@@ -50,12 +54,12 @@ def lost_power(parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, 
         The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are the
         scene's planes.
     places
-        `(x, y)` of objects, mm: the lenses around each, where they are, give the parallax. They are averaged over.
+        `(x, y)` of objects, mm; the result is the mean over them. The lenses around each give its parallax.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     imager, at = parts[0]
     dtype, finest = at.depths.dtype, 1 / (2 * PLACE)
-    # In the object, 1/mm; over a plane's area. On the sensor they are those of a mean magnification.
+    # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
     frequency = object_frequency / jnp.mean(imager.magnification(at.depths))
@@ -76,8 +80,8 @@ def lost_power(parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, 
                 real = real + both * same
                 imaginary = imaginary + both * (other - jnp.swapaxes(other, 1, 2))
             # A complex matrix as a real one of twice the size.
-            known = jnp.block([[real, -imaginary], [imaginary, real]])
-            left = jnp.diagonal(jnp.linalg.inv(known), axis1=1, axis2=2)
+            normal = jnp.block([[real, -imaginary], [imaginary, real]])
+            left = jnp.diagonal(jnp.linalg.inv(normal), axis1=1, axis2=2)
             return jnp.mean(left[:, : len(planes)], 0)
 
         return jax.vmap(at_frequency, (0, 1), 1)(frequency, amplitudes)
@@ -88,13 +92,13 @@ def lost_power(parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, 
 
 
 def _amplitude(imager, at, parts, frequency, spectrum) -> Float[Array, "depth frequency"]:
-    """What a lens passes on of each plane, over the noise."""
+    """Amplitude with which a lens images each plane, relative to the noise."""
     amplitude = lit_density(imager, at) * imager.magnification(at.depths) / jnp.sqrt(noise_density(imager, at, parts))
     return amplitude[:, None] * safe_sqrt(transfer_power(imager, at, frequency) * spectrum)
 
 
 def _view(imager, at, place, ways):
-    """Weights of the lenses `(lens, depth)`, and the turns of their images over frequency `(way, lens, depth)`."""
+    """Weights of the lenses `(lens, depth)`, and their images' phase over frequency `(direction, lens, depth)`."""
     beside = imager.array.centers - place[None]
     squared = jnp.sum(beside**2, 1)[:, None]
     weight = safe_sqrt(envelope(squared, imager.reduced_depth(at.depths)[None], field_radius(imager, at)))
@@ -102,9 +106,9 @@ def _view(imager, at, place, ways):
 
 
 def noise_density(imager: Imager, at: Conditions, parts: Sequence[tuple[Imager, Conditions]]) -> Float[Array, ""]:
-    """Electrons^2 per mm^2 of a sub-image: shot noise of all planes and of the sub-images over it, and read noise.
+    """Noise density of a sub-image, electrons^2 per mm^2: shot noise of planes and overlapping sub-images, read noise.
 
-    `imager` has the type of lens whose sub-image it is, `parts` are all types: each as bright as its aperture is large.
+    `imager` has the lens type of the sub-image, `parts` are all types, whose light follows from their apertures.
     """
     over = sum(occupancy(*part) * lit_density(*part) for part in parts)
     shot = FILL * jnp.sum(lit_density(imager, at) + over)
@@ -112,22 +116,22 @@ def noise_density(imager: Imager, at: Conditions, parts: Sequence[tuple[Imager, 
 
 
 def _spectrum(frequency):
-    """Of random objects with edges: correlations that fall exponentially (Debye), in two dimensions, mm^2."""
+    """Power spectrum of random objects with edges, whose correlation falls exponentially (Debye), mm^2."""
     return FILL * (1 - FILL) * 2 * jnp.pi * LENGTH**2 / (1 + (2 * jnp.pi * LENGTH * frequency) ** 2) ** 1.5
 
 
-# What an exposure is counted for, mm.
+# Distance and side of the emitter that an exposure is defined by, mm.
 AWAY, PLACE = 20.0, 0.04
-# Rings of rays: enough for spots of some twenty periods across.
+# Rings of rays: enough for spots twenty periods wide.
 _RINGS = 16
-# Frequencies at which spots read it off.
+# Frequencies between which the transfer function of a spot is interpolated.
 _READ = 24
 # Directions of frequencies over half a turn.
 _DIRECTIONS = 4
 
 
 def directions(dtype) -> Float[Array, "2 direction"]:
-    """Unit vectors, evenly over half a turn: the other half says the same."""
+    """Unit vectors evenly over half a turn; the other half is equivalent."""
     angle = jnp.asarray((np.arange(_DIRECTIONS) + 0.5) * np.pi / _DIRECTIONS, dtype)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
@@ -135,11 +139,11 @@ def directions(dtype) -> Float[Array, "2 direction"]:
 def transfer_power(
     imager: Imager, at: Conditions, frequencies: Float[Array, " frequency"]
 ) -> Float[Array, "depth frequency"]:
-    """Squared modulus of the transfer function, mean over a lens's field and over directions.
+    """Squared modulus of the transfer function, averaged over a lens's field and over directions.
 
-    The Fourier transform of exact rays through the clear aperture, which has all of defocus and aberrations, times the
-    transfer functions of a perfect lens and of a pixel. That product is right in both limits, of a spot much wider
-    than the Airy disc and of one without aberrations; between them it is a little low.
+    It is the Fourier transform of exact rays through the clear aperture, with defocus and all aberrations, times the
+    transfer functions of a perfect lens and of a pixel. The product is exact for spots much wider than the Airy disc
+    and for those without aberrations; between these limits it is a little low.
 
     Parameters
     ----------
@@ -156,7 +160,7 @@ def transfer_power(
     def power(depth, height):
         rays = trace_lenslet(imager, depth, points, (height, jnp.zeros_like(height)))
         lit = jnp.where(rays.valid, weights, 0)
-        # What is reflected totally at the rim is missing. From the middle of the spot, for small phases.
+        # Rays with total reflection at the rim are missing. Phases are relative to the centroid.
         middle = jnp.sum(lit[:, None] * rays.landing, 0) / jnp.maximum(jnp.sum(lit), 1e-6)
         phase = 2 * jnp.pi * frequencies[:, None, None] * ((rays.landing - middle[None]) @ ways)[None]
         parts = (jnp.einsum("r,frw->fw", lit, wave(phase)) for wave in (jnp.cos, jnp.sin))
@@ -172,15 +176,15 @@ def transfer_power(
 def _perfect(imager: Imager, at: Conditions, frequencies):
     """Transfer function of a round aperture without aberrations."""
     share = frequencies * imager.wavelength * imager.reduced_sensor_distance / clear_diameter(imager, at)
-    share = jnp.minimum(share, 1 - 1e-6)  # where it ends its slope by the share is zero, and arccos has none
+    share = jnp.minimum(share, 1 - 1e-6)  # arccos has no derivative at 1
     return 2 / jnp.pi * (jnp.arccos(share) - share * safe_sqrt(1 - share**2))
 
 
 def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size size"]:
-    """Even spots with the transfer function's modulus, on the sensor's pixels, with the sum 1: PSFs for `forward`.
+    """Symmetric spots with the modulus of the transfer function, on the sensor's pixels, of sum 1: PSFs for `forward`.
 
-    What of a spot is not even, and where the transfer function is negative, is not in them; light beyond the window
-    is in it at the other side. The root of `transfer_power` is read off between 24 frequencies.
+    They lack the phase of the transfer function. Light beyond the window is folded back into it. The square root of
+    `transfer_power` is interpolated between 24 frequencies.
 
     Parameters
     ----------
@@ -198,11 +202,11 @@ def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size
 
 
 def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
-    """Electrons that a lens on its axis gets of a lit place of 40 um x 40 um, or of a point as bright as that."""
+    """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
     return at.exposure * area * (AWAY / imager.reduced_depth(at.depths)) ** 2
 
 
 def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
-    """Electrons per mm^2 of the sensor behind a lens that images a lit plane."""
+    """Electrons per mm^2 of the sensor in the image of a lit plane."""
     return lens_electrons(imager, at) / (PLACE * imager.magnification(at.depths)) ** 2

@@ -1,9 +1,9 @@
-"""Trade-offs between two or three things that are wanted: what one costs in the others.
+"""Pareto fronts of two or three objectives.
 
-The epsilon constraint (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971): one term is the goal,
-and limits on one or two others move from value to value. Each search is that of `gs_jax.codesign.search`: the first
-from the design, the others, which may run at once, from where the first ended. Every point is a design that a search
-found, so the true front may be better, not worse.
+By the epsilon-constraint method (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971) one term is
+minimised or maximised under limits on one or two others, which move from value to value. Each search is that of
+`gs_jax.codesign.search`. The first starts from the design; the others start from its result and may run in parallel.
+Every point is a design that a search found, so the true front may be better, not worse.
 """
 
 import contextlib
@@ -23,15 +23,15 @@ from ..base.workers import Workers
 from ..design.design import Design
 from .checkpoint import Log
 from .parameters import NAMES, Values, significant, start_values
-from .search import PathLike, opened
+from .search import PathLike, load
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
-from .targets import Row, worst_of
+from .targets import Row, worst_entry
 from .terms import unit_of, with_terms
 
 
 class Point(NamedTuple):
-    """A design on the way: its parameters, and what the terms (the limits last) say of it."""
+    """Parameters of a design, and its terms (the limits last)."""
 
     values: Values
     rows: list[Row]
@@ -56,7 +56,7 @@ class Front(NamedTuple):
 
 
 def non_dominated(losses: Float[np.ndarray, "point objective"]) -> Bool[np.ndarray, " point"]:
-    """Which points no other point beats: at least as good in every objective, and better in one. Less is better."""
+    """Mask of points that no other point dominates (no worse in any objective, better in one). Less is better."""
     no_worse = (losses[:, None] <= losses[None]).all(2)
     better = (losses[:, None] < losses[None]).any(2)
     return np.logical_not((no_worse & better).any(0))
@@ -70,26 +70,26 @@ def trade_off(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> Front:
-    """What a study's one goal costs in its one or two moving limits.
+    """The Pareto front of a study's goal and its one or two moving limits.
 
     Parameters
     ----------
     design
-        To start from, or its file.
+        The initial design, or its file.
     study
         With one term to minimise or maximise and one or two `[[pareto]]` tables, or its file. Its stages run one after
-        the other for each combination of limits. Its own `design` is not looked at.
+        the other for each combination of limits. Its own `design` is ignored.
     each
         Called with the front so far after each point.
     workers
-        Who runs the searches; this process by default. The result is the same.
+        Processes that run the searches; this one by default. The result is the same.
 
     Raises
     ------
     InputError
         If a file cannot be read, the study does not fit the design or moves no limit.
     """
-    with opened(design, study) as (parent, question):
+    with load(design, study) as (parent, question):
         return _trade_off(sweep_of(parent, question), each, progress or Progress(), workers or Workers())
 
 
@@ -102,9 +102,9 @@ class Sweep(NamedTuple):
 
 
 def sweep_of(design: Design, study: Study) -> Sweep:
-    """The sweep that a study poses for a design; `InputError` if it does not fit the design or moves no limit."""
+    """The sweep of a study for a design; `InputError` if it does not fit the design or moves no limit."""
     if not study.pareto:
-        raise InputError("`pareto`: found nothing, allowed: one or two tables.")
+        raise InputError("`pareto` must be one or two tables, got none.")
     moving = [_term(limit) for limit in study.pareto]
     kept = [term for term in study.terms if term.is_goal or all(not _same(term, limit) for limit in moving)]
     wider = study.model_copy(update={"terms": (*kept, *moving)})
@@ -163,7 +163,7 @@ def _with_targets(kept, moving, limits) -> list[TermTable]:
 def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Point]) -> Front:
     places = [terms.index(objective) for objective in objectives]
     ends = [[jnp.array(point.rows[place][:2]) for place in places] for point in points]
-    values = np.array([[float(worst_of(t, x)) for t, x in zip(objectives, row, strict=True)] for row in ends])
+    values = np.array([[float(worst_entry(t, x)) for t, x in zip(objectives, row, strict=True)] for row in ends])
     signs = np.array([-1.0 if t.kind in ("at_least", "maximise") else 1.0 for t in objectives])
     feasible = np.array([point.feasible for point in points])
     best = np.zeros(len(points), bool)

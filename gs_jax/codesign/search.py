@@ -1,8 +1,8 @@
-"""Co-design: from a design and a study to a better design.
+"""Run a study: from a design to a better design.
 
-The study says what is free, what is wanted and which solvers run, stage by stage (`gs_jax.codesign.study`). The first
-stage may start from several points; the best goes on to the next, which keeps what it found. What is done so far is in
-a log, and the log and the solver's state make a checkpoint.
+A study (`gs_jax.codesign.study`) has free parameters, terms with targets, and stages of solvers. The first stage may
+start from several points; the best goes on to the next stage. A log of all steps and the solver's state make a
+checkpoint.
 """
 
 import contextlib
@@ -36,9 +36,9 @@ PathLike = PathLike
 
 
 class Outcome(NamedTuple):
-    """What a search found.
+    """Result of a search.
 
-    `parent`, `study`: what it started from. `design`: new, with the study's name. `before`, `after`: one row for each
+    `parent`, `study`: its inputs. `design`: the new one, with the study's name. `before`, `after`: one row for each
     of the study's terms. `log`: of every start and step. `seconds`: of the search, compilation included.
     """
 
@@ -52,18 +52,18 @@ class Outcome(NamedTuple):
 
 
 @contextlib.contextmanager
-def opened(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[Design, Study]]:
-    """A design as the study wants it to start, and a study, read where they are files.
+def load(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[Design, Study]]:
+    """The initial design of a study and the study, read if they are files.
 
     An `InputError` within names the study's file.
     """
     found = design if isinstance(design, Design) else read_design(design)
     if isinstance(study, Study):
-        yield started(found, study), study
+        yield initial_design(found, study), study
         return
     question = read_study(study)
     with errors_name_file(study):
-        yield started(found, question), question
+        yield initial_design(found, question), question
 
 
 def run_study(
@@ -85,19 +85,19 @@ def run_study(
     Parameters
     ----------
     design
-        To start from, or its file.
+        The initial design, or its file.
     study
-        What is free and what is wanted, or its file. Its own `design` is not looked at.
+        The study, or its file. Its own `design` is ignored.
     progress
-        Shows how far it is; nothing by default.
+        Shows progress; silent by default.
     checkpoint
-        A file to keep the state in; none by default.
+        File for the state; none by default.
     resume
-        Go on from that file, with the same result as without the interruption.
+        Continue from that file, with the same result as without the interruption.
     every
         Seconds between two checkpoints.
     workers
-        Who runs the first stage's starts; this process by default. The result is the same.
+        Processes that run the first stage's starts; this one by default. The result is the same.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def run_study(
     >>> print(round(outcome.design.imaging.sensor_distance_mm, 1))  # where a thin lens images the middle
     6.0
     """
-    with opened(design, study) as (parent, question):
+    with load(design, study) as (parent, question):
         path = None if checkpoint is None else Path(checkpoint)
         return _run_study(parent, question, progress, path, resume, every, workers)
 
@@ -146,7 +146,7 @@ def _run_study(
     problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.imager, problem.at)
     before = rows_of(study.terms, entries_of(problem, study.terms), values)
-    # Made when they are needed: what compiles is seen in the progress.
+    # Built when they are needed, so that compilation shows in the progress.
     stages = (make_stage(problem, index) for index in range(len(study.stages)))
     how = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
     values = run_stages(problem, stages, study.terms, values, **how)
@@ -157,7 +157,7 @@ def _run_study(
 
 
 class _Saver:
-    """Writes a checkpoint after the first step and then now and then, and after each start that a worker ran."""
+    """Write a checkpoint after the first step, then at intervals, and after each start that a worker ran."""
 
     def __init__(self, path: Path | None, every: float, log: Log, study: Study, design: Design):
         self.path, self.every, self.last = path, every, -math.inf
@@ -169,13 +169,13 @@ class _Saver:
             self.last = time.monotonic()
 
 
-def started(design: Design, study: Study) -> Design:
-    """A design with the orientation and the types of lenses that a study asks for.
+def initial_design(design: Design, study: Study) -> Design:
+    """Apply the orientation and the lens types of a study to a design.
 
     Raises
     ------
     InputError
-        If its lenses differ and are not of so many types, or are ideal thin lenses, which have no radii to spread.
+        If its lenses have another number of types, or are ideal thin lenses, which have no radii.
     """
     if study.orientation is not None:
         design = _with(design, orientation=study.orientation)
@@ -185,18 +185,18 @@ def started(design: Design, study: Study) -> Design:
     if found == study.kinds:
         return design
     if found > 1:
-        raise InputError(f"`kinds`: found {study.kinds} for a design of {found} types, allowed: {found}, or none.")
+        raise InputError(f"`kinds` must be {found}, as the design's lens types, or be left out, got {study.kinds}.")
     if design.lens.focal_length_mm is not None:
-        raise InputError("`kinds`: found it for a design with `lens.focal_length_mm`, allowed: for one without it.")
+        raise InputError("`kinds` needs a design without `lens.focal_length_mm`.")
     if study.kinds > (count := len(design.array.centers_mm)):
-        raise InputError(f"`kinds`: found {study.kinds} for a design of {count} lenses, allowed: up to {count}.")
+        raise InputError(f"`kinds` must be at most {count}, the number of lenses, got {study.kinds}.")
     radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.kinds)
     which = interleave(np.array(design.array.centers_mm), study.kinds)
     return _with(design, radius_of_curvature_mm=tuple(radius[which].tolist()))
 
 
 def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
-    """Of thin lenses that image the middles of equal parts of the depths, in vergence, over that of their middle."""
+    """Focal lengths of thin lenses focused on equal parts of the depths, in vergence, relative to the middle's."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
     lens, array = design.lens, design.array
     front, back = plate_as_air(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)

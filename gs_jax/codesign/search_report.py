@@ -1,4 +1,4 @@
-"""What a search found, for people and for files: a table, a picture, JSON, and the design with its provenance."""
+"""Report of a search: a table, a figure, JSON, and the design with its provenance."""
 
 import datetime
 import math
@@ -26,15 +26,17 @@ from .terms import TERMS, unit_of
 
 
 def before_and_after(outcome: Outcome) -> Table:
-    """The study's terms before and after."""
+    """Table of the study's terms before and after."""
     table = Table("term", "target", "before", "after", "", box=None, pad_edge=False)
     for term, old, new in zip(outcome.study.terms, outcome.before, outcome.after, strict=True):
-        table.add_row(term.name, wanted(term), span(old), span(new), {True: "met", False: "MISSED", None: ""}[new.met])
+        table.add_row(
+            term.name, target_text(term), span(old), span(new), {True: "met", False: "MISSED", None: ""}[new.met]
+        )
     return table
 
 
-def wanted(term: TermTable) -> str:
-    """The target in short."""
+def target_text(term: TermTable) -> str:
+    """The target of a term as text."""
     return SIGNS[term.kind] if term.is_goal else f"{SIGNS[term.kind]} {term.target:g}"
 
 
@@ -47,7 +49,7 @@ def span(row: Row) -> str:
 def write_outcome(
     path: PathLike, outcome: Outcome, *, parent: PathLike, source: PathLike, provenance: Provenance | None = None
 ) -> list[Path]:
-    """Writes the design with its provenance, and beside it the numbers (.json) and a picture (.png).
+    """Write the design with its provenance, and beside it the numbers (.json) and a figure (.png).
 
     Parameters
     ----------
@@ -56,12 +58,12 @@ def write_outcome(
     parent, source
         The files of the old design and of the study, for the provenance.
     provenance
-        What else the provenance says.
+        Further entries of the provenance.
 
     Returns
     -------
     list
-        Of the files.
+        The files.
     """
     path, study, records = Path(path), outcome.study, as_records(outcome)
     paths = [path, path.with_suffix(".json"), path.with_suffix(".png")]
@@ -82,7 +84,7 @@ def write_outcome(
 
 
 def as_records(outcome: Outcome) -> list[dict[str, Any]]:
-    """Before and after for a JSON file; `None` stands for infinity."""
+    """Terms before and after as records for a JSON file; `None` stands for infinity."""
     ends = lambda row: [_finite(row.low), _finite(row.high)]
     return [
         {
@@ -109,7 +111,7 @@ def _plain(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def picture(outcome: Outcome) -> Figure:
-    """The layout with its clear apertures, the cost, and the terms on their way to the targets, of the best start."""
+    """Figure of the layout, and of cost and terms over the steps of the best start."""
     figure = Figure(figsize=(13.5, 4.6), dpi=110, layout="constrained")
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     _draw_layout(layout, outcome.design)
@@ -121,9 +123,9 @@ def picture(outcome: Outcome) -> Figure:
     for number, (term, label) in enumerate(zip(asked, labels(asked, outcome.study), strict=True)):
         values = np.array([step.get(label, np.nan) for step in steps], float)
         style = "-" if term.is_goal else ("--", ":")[number >= len(PALETTE)]
-        said = f"{TERMS[term.name].meaning}\n{wanted(term)} {unit_of(term.name)}"
+        text = f"{TERMS[term.name].meaning}\n{target_text(term)} {unit_of(term.name)}"
         color = PALETTE[number % len(PALETTE)]
-        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=color, label=said)
+        terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=color, label=text)
     terms.axhline(1, color="0.6", lw=0.8)
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
     terms.legend(fontsize=7.5, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -131,7 +133,7 @@ def picture(outcome: Outcome) -> Figure:
 
 
 def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
-    """Whether a step led to the design: the best start of each stage goes on."""
+    """Whether a step belongs to the best start of its stage."""
     return step["start"] == best_end(outcome.log, step["stage"])["start"]
 
 

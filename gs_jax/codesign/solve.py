@@ -1,8 +1,10 @@
-"""Solvers for co-design, step by step: what stops can go on later, exactly.
+"""Solvers of a search, step by step, and the changes of variables that keep bounds.
 
-Optimistix has the algorithms, and jaxopt the one that keeps bounds. They run here one step at a time from the host, so
-that progress can be shown and the state saved; a run that is interrupted and resumed takes the same steps, bit for bit,
-as one that is not.
+Optimistix has the algorithms, jaxopt the one that handles bounds itself. They run one step at a time from the host, so
+that progress can be shown and the state saved. A run that is interrupted and resumed takes the same steps, bit for bit.
+
+`Bounds` maps a value between bounds to an unbounded number of order one, and back; `Box` maps it to its fraction of the
+range, for the solver that handles bounds itself.
 """
 
 from collections.abc import Callable
@@ -21,8 +23,7 @@ from ..base.errors import InputError
 from .lbfgsb import LBFGSB
 from .study import StageTable
 
-# A residual of everything that is wanted: of the free parameters, of what does not change within a run (targets), and
-# of a key that is new in every step, for what is random.
+# Residuals of free parameters, of arguments that do not change within a run, and of a key that is new in every step.
 Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | optax.GradientTransformation | LBFGSB
@@ -34,7 +35,7 @@ NOT_FINITE = "stopped: the cost or a parameter is not finite"
 
 
 class State(NamedTuple):
-    """Where a solver is: everything that its next step depends on, and whether there is one, arrays only."""
+    """State of a solver: all that its next step depends on, arrays only."""
 
     free: PyTree[Array]
     solver: PyTree[Array]
@@ -44,7 +45,7 @@ class State(NamedTuple):
 
 
 class Stepper(NamedTuple):
-    """A solver as steps; both functions take what does not change within a run as their second argument.
+    """A solver as compiled steps. Both functions take the arguments of a run second.
 
     `begin`: the state at free parameters. `advance`: the state one step later.
     """
@@ -54,19 +55,19 @@ class Stepper(NamedTuple):
 
 
 def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solver, key: Key[Array, ""]) -> Stepper:
-    """A solver as steps, compiled once for any start.
+    """Compile the steps of a solver, once for all starts.
 
     Parameters
     ----------
     residual
-        One number for each thing that is wanted, of which the cost is `|residual|^2 / 2`; or the cost itself, a scalar.
+        Residuals, whose cost is `|residual|^2 / 2`; or the cost itself, a scalar.
     free, given
-        Examples of its arguments, for shapes. Free parameters are of order one and have no bounds; for `LBFGSB` they
-        are between 0 and 1.
+        Examples of its arguments, for shapes. Free parameters are of order one without bounds; for `LBFGSB` they lie
+        between 0 and 1.
     solver
-        Solvers of optax never converge: they are for what is random, which gets a new key in each step.
+        Solvers of optax never converge: they are for random residuals, which get a new key in each step.
     key
-        The steps' keys follow from it.
+        From which the keys of the steps follow.
     """
 
     def cost(free, args):
@@ -82,8 +83,8 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         isinstance(steps, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
     )
     if least_squares and jnp.ndim(jax.eval_shape(residual, free, given, key)) == 0:
-        found = f"found a loss that is one number for {type(steps).__name__}"
-        raise InputError(f"{found}, allowed: residuals, an array; or a minimiser such as optimistix.BFGS.")
+        name = type(steps).__name__
+        raise InputError(f"{name} needs residuals, an array, got a scalar loss; optimistix.BFGS takes a scalar.")
     target = (lambda free, args: residual(free, *args)) if least_squares else cost
     args = given, key
     function = eqx.filter_closure_convert(lambda free, args: (target(free, args), None), free, args)
@@ -140,16 +141,16 @@ def run(
     enough: float = 0.0,
     each: Callable[[State], None] = lambda state: None,
 ) -> tuple[State, str]:
-    """Steps until something says stop; the reason in words.
+    """Run steps until a stopping rule holds; return the state and the reason.
 
     Parameters
     ----------
     state
-        From `steps.begin`, or where it stopped before.
+        From `steps.begin`, or a saved one.
     limit
-        Steps, counted from the start.
+        Largest number of steps, counted from the start.
     enough
-        A cost that is low enough to stop.
+        Cost below which the run stops.
     each
         Called after every step.
     """
@@ -167,7 +168,7 @@ def run(
 
 
 def solver_of(stage: StageTable) -> Solver:
-    """The solver that a stage names. Adam's rate falls to zero by a cosine over the stage's steps."""
+    """The solver that a stage names. Adam's learning rate falls to zero by a cosine over the steps."""
     match stage.solver:
         case "levenberg-marquardt":
             return optx.LevenbergMarquardt(least_change(), least_change())
@@ -178,50 +179,49 @@ def solver_of(stage: StageTable) -> Solver:
         case "lbfgsb":
             return LBFGSB()
         case "adam":
-            # What is random is only found as well as the last steps are small.
+            # The precision of a stochastic search is that of its last steps.
             return optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps))
 
 
 def least_change() -> float:
-    """The change of costs and parameters at which a search ends, relative: what their type allows."""
+    """Relative change of costs and parameters at which a search ends, by precision."""
     return 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6
 
 
-# How near to a bound a start may be, as a fraction of the range: on the bound the map has no slope, and no way back.
+# Distance of a start from a bound at least, as a fraction of the range: at the bound the map has no slope.
 _NEAREST = 0.01
 
 
 class Bounds(eqx.Module):
-    """The values between two bounds as a smooth, invertible image of all numbers `x`: `(1 + x / sqrt(1 + x^2)) / 2` of
-    the way from the lowest to the highest.
+    """Map between values within bounds and all numbers `x`: the fraction `(1 + x / sqrt(1 + x^2)) / 2` of the range.
 
-    A logistic curve would do as well but for its ends, so flat that a search that comes there does not come back.
-    Bounds may be arrays that broadcast against the value, in its unit.
+    The ends of a logistic curve are so flat that a search that reaches them does not return. Bounds may be arrays that
+    broadcast against the value.
     """
 
     low: Float[Array, "..."] = eqx.field(converter=as_float)
     high: Float[Array, "..."] = eqx.field(converter=as_float)
 
     def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The value of a number of order one."""
+        """The value of a free number."""
         return self.low + (self.high - self.low) * (1 + free / jnp.sqrt(1 + free**2)) / 2
 
     def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The inverse of `value`. Values at a bound or beyond it are first taken within, by 1 % of the range."""
+        """The inverse of `value`. Values at a bound or beyond it are first moved inside by 1 % of the range."""
         share = jnp.clip((value - self.low) / (self.high - self.low), _NEAREST, 1 - _NEAREST)
         return (2 * share - 1) / (2 * jnp.sqrt(share * (1 - share)))
 
 
 class Box(eqx.Module):
-    """The values between two bounds by their share of the way from the lowest to the highest, 0 to 1."""
+    """Map between values within bounds and their fraction of the range, 0 to 1."""
 
     low: Float[Array, "..."] = eqx.field(converter=as_float)
     high: Float[Array, "..."] = eqx.field(converter=as_float)
 
     def value(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The value of a share."""
+        """The value of a fraction."""
         return self.low + (self.high - self.low) * free
 
     def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """The inverse of `value`. Values beyond a bound are first taken to it."""
+        """The inverse of `value`. Values beyond a bound are first clipped."""
         return jnp.clip((value - self.low) / (self.high - self.low), 0, 1)

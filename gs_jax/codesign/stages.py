@@ -1,4 +1,4 @@
-"""The stages of a search: solvers that run one after the other, each on some of what is free.
+"""Stages of a search: solvers that run one after the other, each on some of the free parameters.
 
 `gs_jax.codesign.search` runs them once, `gs_jax.codesign.pareto` once for each combination of limits.
 """
@@ -21,16 +21,16 @@ from ..design.design import Design
 from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
-from .checkpoint import Log, restored
+from .checkpoint import Log, restore_state
 from .parameters import Values, candidate, evaluated, start_values
 from .solve import NOT_FINITE, Bounds, Box, State, Stepper, run, solver_of, stepper
 from .study import MOST_TYPES, StageTable, Study, TermTable, labels
-from .targets import Row, assess, evaluate, residual, worst_of
+from .targets import Row, assess, evaluate, residual, worst_entry
 from .terms import TERMS, with_terms
 
 
 class Problem(NamedTuple):
-    """A design and a study as a solver sees them."""
+    """The imager of a design, the conditions of its evaluation, and the study."""
 
     imager: Imager
     at: Conditions
@@ -38,11 +38,10 @@ class Problem(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A stage that is ready to run, compiled once for all starts, targets and values of what it does not free.
+    """A stage that is ready to run, compiled once for all starts, targets and values of fixed parameters.
 
-    `labels`: of its terms, for the log. `free`: from parameters to what the solver moves. `values`: back, given the
-    parameters that it does not move. `watch`: the worst entry of each term, of the same arguments. `enough`: a cost at
-    which all targets are met.
+    `labels`: of its terms, for the log. `free`: from parameters to the solver's variables. `values`: from these and the
+    fixed parameters to parameters. `watch`: the worst entry of each term. `enough`: a cost at which all targets hold.
     """
 
     number: int
@@ -61,7 +60,7 @@ def problem_of(design: Design, study: Study) -> Problem:
     Raises
     ------
     InputError
-        If what is free does not exist in the design, or depths may come to lie behind the plate.
+        If a free parameter does not exist in the design, or depths may come to lie behind the plate.
     """
     _check_free(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
@@ -72,24 +71,22 @@ def problem_of(design: Design, study: Study) -> Problem:
 def _check_free(design: Design, study: Study) -> None:
     _check_types(len(lenses_by_type(design.imager().array)), study)
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
-        raise InputError("`free.pitch_mm`: found it free for a design of one lens, allowed: for two or more.")
+        raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
     twice = sum(study.depths_mm or design.imaging.working_distance_mm)
     if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
-        found = f"`free.depth_span_mm`: found {list(study.free['depth_span_mm'])}"
-        raise InputError(f"{found}, allowed: below {twice:g}, twice the middle of the depths.")
+        bounds = list(study.free["depth_span_mm"])
+        raise InputError(f"`free.depth_span_mm` must be below {twice:g}, twice the middle of the depths, got {bounds}.")
     of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant", "aspheric_terms"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
-        raise InputError(
-            f"`free.{min(of_lens)}`: found it free for a design with `lens.focal_length_mm`, allowed: one without it."
-        )
+        raise InputError(f"`free.{min(of_lens)}` needs a design without `lens.focal_length_mm`.")
 
 
 def _check_types(count: int, study: Study) -> None:
     if count > MOST_TYPES:
-        raise InputError(f"`lens`: found lenses of {count} types, allowed: lenses of up to {MOST_TYPES}.")
+        raise InputError(f"`lens`: a search takes up to {MOST_TYPES} lens types, got {count}.")
     named = [*(term.name for term in study.terms), *(limit.name for limit in study.pareto)]
     if alike := [name for name in named if count > 1 and not TERMS[name].types]:
-        raise InputError(f"`terms`: found {alike[0]} for lenses that differ, allowed: for lenses that are alike.")
+        raise InputError(f"`terms`: {alike[0]} needs lenses that are alike, got {count} lens types.")
 
 
 def make_stage(problem: Problem, index: int) -> Stage:
@@ -110,7 +107,7 @@ def make_stage(problem: Problem, index: int) -> Stage:
 
     def watch(free, values):
         found = candidate(imager, at, to_values(free, values))
-        return [worst_of(term, evaluate(term.name, *found, key)) for term in terms]
+        return [worst_entry(term, evaluate(term.name, *found, key)) for term in terms]
 
     key = jax.random.fold_in(jax.random.key(study.seed), index)
     values = start_values(imager, at)
@@ -137,7 +134,7 @@ def targets_of(terms: Sequence[TermTable]) -> Float[Array, " term"]:
 
 
 def _enough(problem: Problem, terms: Sequence[TermTable]) -> float:
-    """A cost at which all targets are met: half the margin is missing of one entry. Zero if there is a goal."""
+    """A cost at which all targets are met: one entry misses by half the margin. Zero if there is a goal."""
     if any(term.is_goal for term in terms):
         return 0.0
     sizes = jax.eval_shape(entries_of(problem, terms), start_values(problem.imager, problem.at))
@@ -146,7 +143,7 @@ def _enough(problem: Problem, terms: Sequence[TermTable]) -> float:
 
 
 def entries_of(problem: Problem, terms: Sequence[TermTable]) -> Callable[[Values], list[Float[Array, " entry"]]]:
-    """The function from parameters to the entries of each term, compiled. Of what is random it is one draw."""
+    """Compile the function from parameters to the entries of each term; random terms have one draw."""
 
     @jax.jit
     def entries(values: Values):
@@ -159,12 +156,12 @@ def entries_of(problem: Problem, terms: Sequence[TermTable]) -> Callable[[Values
 def rows_of(
     terms: Sequence[TermTable], entries: Callable[[Values], list[Float[Array, " entry"]]], values: Values
 ) -> list[Row]:
-    """What terms say of parameters; `entries` is of `entries_of`, for terms of the same names."""
+    """Assess terms at parameters; `entries` is of `entries_of`, for terms of the same names."""
     return [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
 
 
 def random_start(problem: Problem, values: Values, start: int) -> Values:
-    """Parameters drawn evenly between their bounds, others for each `start`; lens centres stay. 0 is the design."""
+    """Random parameters within their bounds for each `start`, the design's for 0; lens centres stay."""
     if start == 0:
         return values
     rng = np.random.default_rng([problem.study.seed, start])
@@ -185,27 +182,27 @@ def run_stages(
     saved: tuple[Path, bytes] | None = None,
     workers: Workers | None = None,
 ) -> Values:
-    """The parameters that the stages come to, one after the other; each keeps what the one before it found.
+    """Run stages one after the other and return the parameters; each starts from the result of the one before.
 
     Parameters
     ----------
     terms
         The study's, with the targets that count.
     values
-        To start from.
+        Initial parameters.
     log
-        Steps and ends are added to it; what already ended according to it is not run again.
+        Steps and ends are added to it. A start that it has the end of is not run again.
     each
         Called after every step with the state; with None after every start that a worker ran.
     saved
-        The state of the first start that has not ended, to go on from.
+        Saved state of the first start that has not ended.
     workers
-        Who runs the starts of the first stage, if there are several; this process by default.
+        Processes that run the starts of the first stage, if there are several; this one by default.
 
     Raises
     ------
     InputError
-        If no start of a stage comes to a finite cost.
+        If no start of a stage reaches a finite cost.
     """
     progress = progress or Progress()
     for stage in stages:
@@ -213,7 +210,7 @@ def run_stages(
         starts = [start for start in range(problem.study.starts if stage.number == 0 else 1) if start not in ended]
         with progress.counter(f"Stage {stage.number + 1}, {stage.table.solver}", len(starts)) as advance:
             if workers and workers.elsewhere and len(starts) > 1:
-                # What was saved within a start is left: a worker runs it from its beginning.
+                # A worker runs a start from its beginning, whatever was saved of it.
                 saved = None
                 log.steps[:] = [step for step in log.steps if step["start"] in ended]
                 build = with_terms(partial(_starts_of_worker, problem, terms, values), [term.name for term in terms])
@@ -226,12 +223,12 @@ def run_stages(
                     advance()
             else:
                 for start in starts:
-                    state = _begun(problem, stage, terms, values, start)
+                    state = _initial_state(problem, stage, terms, values, start)
                     if saved is not None:
-                        state, saved = restored(*saved, state), None
+                        state, saved = restore_state(*saved, state), None
                     log.ends.append(_run_start(stage, terms, values, start, state, log.steps, each))
                     advance()
-        # Workers end them in any order.
+        # Workers finish in any order.
         for records in (log.steps, log.ends):
             records.sort(key=lambda record: (record["stage"], record["start"]))
         free = best_end(log, stage.number)["free"]
@@ -240,24 +237,24 @@ def run_stages(
 
 
 def _starts_of_worker(problem, terms, values):
-    """From a start of the first stage to the records of its steps and of its end."""
+    """Build the function from a start of the first stage to the records of its steps and of its end."""
     stage = make_stage(problem, 0)
 
     def run_alone(start):
-        steps, state = [], _begun(problem, stage, terms, values, start)
+        steps, state = [], _initial_state(problem, stage, terms, values, start)
         end = _run_start(stage, terms, values, start, state, steps, lambda state: None)
         return steps, end
 
     return run_alone
 
 
-def _begun(problem, stage, terms, values, start) -> State:
+def _initial_state(problem, stage, terms, values, start) -> State:
     given = targets_of(terms_of(stage.table, terms)), values
     return stage.steps.begin(stage.free(random_start(problem, values, start)), given)
 
 
 def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any]:
-    """Runs a start from its state, adds a record for each step, and returns that of its end."""
+    """Run a start from its state, add a record for each step, and return that of its end."""
     wanted = terms_of(stage.table, terms)
 
     def after_step(state):
@@ -281,16 +278,16 @@ def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any
 
 
 def best_end(log: Log, stage: int) -> dict[str, Any]:
-    """The record of the start of a stage that came to the least cost; one that misses a target only if all do.
+    """The record of the start with the least cost; one that misses a target only if all do.
 
-    Of Adam's costs, which are random, there is only one: it runs from one start unless it is the first stage.
+    Costs of Adam are random, but it has a single start unless it is the first stage.
 
     Raises
     ------
     InputError
-        If none came to a finite one.
+        If none reached a finite cost.
     """
     ends = [end for end in log.ends if end["stage"] == stage and end["reason"] != NOT_FINITE]
     if not ends:
-        raise InputError(f"stage {stage + 1}: no start came to a finite cost, allowed: other bounds or terms.")
+        raise InputError(f"stage {stage + 1}: no start reached a finite cost; other bounds or terms are needed.")
     return min(ends, key=lambda end: (not end["met"], end["cost"]))

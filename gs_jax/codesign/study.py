@@ -34,12 +34,17 @@ from .parameters import NAMES
 from .terms import check_term
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
-# Of lenses: each is traced for itself.
+# Each lens type is traced separately.
 MOST_TYPES = 8
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
-# Of what may be free, but lengths.
-_LEAST = {"refractive_index": 1, "centers_mm": -math.inf, "conic_constant": -math.inf, "aspheric_terms": -math.inf}
+# Lower limits of free parameters that are not lengths.
+_LOWER_LIMITS = {
+    "refractive_index": 1,
+    "centers_mm": -math.inf,
+    "conic_constant": -math.inf,
+    "aspheric_terms": -math.inf,
+}
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 Range = Annotated[tuple[float, float], Field(strict=False)]
@@ -47,10 +52,10 @@ Depths = Annotated[tuple[Positive, Positive], Field(strict=False, description="[
 
 
 class TermTable(Table):
-    """`[[terms]]`: one of the kinds, and how much a miss counts beside the other terms.
+    """`[[terms]]`: a term, its target or direction, and its weight.
 
-    `at_most`, `at_least`, `equal`: a target, for every entry of the term. `minimise`, `maximise`: the size of a value
-    that is worth 1; of a term with several entries the worst counts.
+    `at_most`, `at_least`, `equal`: a target for every entry of the term. `minimise`, `maximise`: the value that counts
+    as 1; the worst entry of a term counts.
     """
 
     name: str = Field(description="the name of a term")
@@ -66,7 +71,9 @@ class TermTable(Table):
         check_term(self.name)
         found = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(found) != 1:
-            raise ValueError(f"{self.name}: found {found or 'no kind'}, allowed: one of {', '.join(KINDS)}")
+            raise ValueError(
+                f"{self.name}: one of {', '.join(KINDS)} must be given, got {' and '.join(found) or 'none'}"
+            )
         return self
 
     @property
@@ -79,12 +86,12 @@ class TermTable(Table):
 
     @property
     def is_goal(self) -> bool:
-        """Whether it is to be as small, or as large, as possible."""
+        """Whether the term is minimised or maximised."""
         return self.kind in ("minimise", "maximise")
 
 
 class StageTable(Table):
-    """`[[stages]]`: a solver on some of the parameters and terms, all by default. Stages follow each other.
+    """`[[stages]]`: a solver for some of the parameters and terms, all by default. Stages run one after the other.
 
     `learning_rate`: of Adam, at the start; it falls to zero over the steps.
     """
@@ -97,9 +104,9 @@ class StageTable(Table):
 
 
 class LimitTable(Table):
-    """`[[pareto]]`: a term whose limit is moved from value to value, each with a weight of 30.
+    """`[[pareto]]`: a term with a list of limits, each with a weight of 30.
 
-    It takes the place of the term of that name and kind, if there is one.
+    It replaces the term of that name and kind, if there is one.
     """
 
     name: str = Field(description="the name of a term")
@@ -111,7 +118,7 @@ class LimitTable(Table):
         check_term(self.name)
         if bool(self.at_most) == bool(self.at_least):
             found = "both" if self.at_most else "neither"
-            raise ValueError(f"{self.name}: found {found}, allowed: one of at_most, at_least")
+            raise ValueError(f"{self.name}: one of at_most and at_least must be given, got {found}")
         return self
 
     @property
@@ -124,15 +131,14 @@ class LimitTable(Table):
 
 
 class Study(Table):
-    """A study, with the tables and keys of its file; the module's docstring has one.
+    """A study; the module's docstring has an example of its file.
 
-    `margin`: by how much a target is tightened while searching, so that what is found meets it when rounded.
-    `exposure`: electrons that each mm^2 of clear aperture, 20 mm away, gets of a lit place of 40 um x 40 um, for the
-    terms that count light. `orientation`: the side of the lenses toward the object, if it is not to be the design's;
-    which is better, two studies tell. `kinds`: lenses that are alike are dealt to so many kinds, whose radii are spread
-    over the depths, if the design has not as many; then each kind has its own radius, aperture and conic constant.
-    `starts`: the first stage also starts from this many points at random between
-    the bounds less one, and the best goes on; `seed` says which.
+    `margin`: fraction by which targets are tightened during the search, so that the rounded result meets them.
+    `exposure`: electrons that each mm^2 of clear aperture at 20 mm collects from an emitter of 40 um x 40 um, for terms
+    that count light. `orientation`: side of the lenses toward the object, if it is not the design's. `kinds`: number of
+    lens types; lenses that are alike are divided into so many types, with radii spread over the depths, and each type
+    has its own radius, aperture and conic constant. `starts`: number of starts of the first stage; all but the first
+    are random within the bounds, and the best goes on. `seed`: of random numbers.
     """
 
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
@@ -159,7 +165,7 @@ class Study(Table):
 
 
 def labels(terms: Sequence[TermTable], study: Study) -> list[str]:
-    """Names of terms in records: with the kind where the study has a name twice."""
+    """Names of terms in records, with the kind where a study has a name twice."""
     names = [term.name for term in study.terms]
     return [term.name if names.count(term.name) == 1 else f"{term.name} {term.kind}" for term in terms]
 
@@ -204,7 +210,7 @@ def read_study(path: PathLike) -> Study:
 
 
 def parent_path(path: PathLike, study: Study) -> Path:
-    """The file of the design that a study starts from.
+    """Path of the initial design of a study.
 
     Raises
     ------
@@ -212,12 +218,12 @@ def parent_path(path: PathLike, study: Study) -> Path:
         If the study names none.
     """
     if study.design is None:
-        raise InputError(f"{path}: `design`: found nothing, allowed: the file of a design, relative to the study.")
+        raise InputError(f"{path}: `design` must be the file of a design, relative to the study, got nothing.")
     return Path(path).parent / study.design
 
 
 def _in_a_list(error: ValidationError) -> str | None:
-    """The first problem in one line if it is in one of several tables of a name: `one_line` sees single tables."""
+    """The first problem in one line if it is in an array of tables, which `one_line` does not handle."""
     problem = error.errors(include_url=False)[0]
     name, number, *keys = problem["loc"] if len(problem["loc"]) > 1 else ("", "")
     table = {"terms": TermTable, "stages": StageTable, "pareto": LimitTable}.get(str(name))
@@ -228,29 +234,29 @@ def _in_a_list(error: ValidationError) -> str | None:
         return f"{where}: {problem['msg'].removeprefix('Value error, ')}"
     field = table.model_fields.get(str(keys[0]))
     if field is None:
-        return f"{where}: found the key {short_repr(keys[0])}, allowed: {', '.join(table.model_fields)}"
+        return f"{where}: keys must be among {', '.join(table.model_fields)}, got {short_repr(keys[0])}"
     found = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
-    return f"{where}, {keys[0]}: found {found}, allowed: {field.description}"
+    return f"{where}, {keys[0]} must be {field.description}, got {found}"
 
 
 def _check_free(study: Study) -> None:
     if not study.free:
-        raise ValueError(f"`free`: found nothing, allowed: one or more of {', '.join(NAMES)}")
+        raise ValueError(f"`free` must have one or more of {', '.join(NAMES)}, got nothing")
     for name, (low, high) in study.free.items():
         if name not in NAMES:
-            raise ValueError(f"`free.{name}`: found a key that does not exist, allowed: {', '.join(NAMES)}")
+            raise ValueError(f"`free`: keys must be among {', '.join(NAMES)}, got {short_repr(name)}")
         if not low < high or not math.isfinite(high - low):
-            raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: [lowest, highest], lowest below")
-        if not low > (least := _LEAST.get(name, 0)):
-            raise ValueError(f"`free.{name}`: found [{low:g}, {high:g}], allowed: above {least}")
+            raise ValueError(f"`free.{name}` must be [lowest, highest], lowest below highest, got [{low:g}, {high:g}]")
+        if not low > (least := _LOWER_LIMITS.get(name, 0)):
+            raise ValueError(f"`free.{name}` must be above {least}, got [{low:g}, {high:g}]")
     if study.depths_mm is not None and not study.depths_mm[0] < study.depths_mm[1]:
-        raise ValueError(f"`depths_mm`: found {list(study.depths_mm)}, allowed: [near, far] in mm, near below far")
+        raise ValueError(f"`depths_mm` must be [near, far] in mm, near below far, got {list(study.depths_mm)}")
 
 
 def _check_terms(study: Study) -> None:
     pairs = [(term.name, term.kind) for term in study.terms]
     if twice := [name for name, kind in pairs if pairs.count((name, kind)) > 1]:
-        raise ValueError(f"`terms`: found {twice[0]} twice with the same kind, allowed: once")
+        raise ValueError(f"`terms`: {twice[0]} must be given once with the same kind, got it twice")
 
 
 def _check_stages(study: Study) -> None:
@@ -260,11 +266,11 @@ def _check_stages(study: Study) -> None:
             chosen = getattr(stage, key)
             wrong = [name for name in chosen or () if name not in names]
             if wrong or chosen == ():
-                found = short_repr(wrong[0]) if wrong else "nothing"
-                raise ValueError(f"`stages.{key}`: found {found}, allowed: one or more of {', '.join(sorted(names))}")
+                got = short_repr(wrong[0]) if wrong else "nothing"
+                raise ValueError(f"`stages.{key}` must be one or more of {', '.join(sorted(names))}, got {got}")
 
 
 def _check_pareto(study: Study) -> None:
     goals = [term.name for term in study.terms if term.is_goal]
     if study.pareto and len(goals) != 1:
-        raise ValueError(f"`terms`: found {len(goals)} to minimise or maximise, allowed: one beside `pareto`")
+        raise ValueError(f"`terms`: exactly one must be minimised or maximised beside `pareto`, got {len(goals)}")

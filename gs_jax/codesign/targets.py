@@ -1,4 +1,4 @@
-"""Terms against what is wanted of them: residuals for a solver, and rows of a table for people."""
+"""Terms compared with their targets: residuals for solvers, rows of a table for people."""
 
 import math
 from typing import NamedTuple
@@ -13,17 +13,17 @@ from ..objectives.conditions import Conditions
 from .study import TermTable
 from .terms import TERMS
 
-# The worst of a term's entries, smoothly: their mean's power.
+# Exponent of the power mean that stands for the worst entry.
 _POWER = 8
 _LEAST_TOLERANCE = 1e-3
-# Logarithm of a ratio; e^50 is far from where float32 overflows.
+# Largest logarithm of a ratio: e^50 does not overflow in float32.
 _LONGEST = 50.0
 
 SIGNS = {"at_most": "<=", "at_least": ">=", "equal": "=", "minimise": "min", "maximise": "max"}
 
 
 class Row(NamedTuple):
-    """A term of a design: its lowest and highest entry, and whether it meets its target (None without one)."""
+    """Lowest and highest entry of a term, and whether it meets its target (None without one)."""
 
     low: float
     high: float
@@ -31,7 +31,7 @@ class Row(NamedTuple):
 
 
 def evaluate(name: str, imager: Imager, at: Conditions, key: Key[Array, ""]) -> Float[Array, " entry"]:
-    """The entries of a term in its own unit."""
+    """Entries of a term, in its unit."""
     entries = _entries(name, imager, at, key)
     return jnp.exp(entries) if TERMS[name].log else entries
 
@@ -45,7 +45,7 @@ def residual(
     *,
     margin: float,
 ) -> Float[Array, " entry"]:
-    """What a term lacks, relative to its target: zero where a limit holds, so that its square is smooth.
+    """Residual of a term, relative to its target: zero where a limit holds, so that its square is smooth.
 
     `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal; times
     the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the place of
@@ -56,9 +56,9 @@ def residual(
     table
         Kind and weight.
     target
-        In the term's unit. It may be traced, unlike the table's own.
+        In the term's unit. Unlike the table's it may be traced.
     margin
-        By which a limit is tightened.
+        Fraction by which a limit is tightened.
     """
     entries = _entries(table.name, imager, at, key)
     missing = _missing(table.kind, _ratio(table, entries, target), margin)
@@ -69,7 +69,7 @@ def _ratio(table: TermTable, entries: Float[Array, " entry"], target: Float[Arra
     if not TERMS[table.name].log:
         return entries / target
     logarithm = entries - jnp.log(target)
-    # A goal needs a ratio that stays positive, however small.
+    # A goal needs a positive ratio.
     return jnp.exp(jnp.clip(logarithm, -_LONGEST, _LONGEST)) if table.is_goal else 1 + logarithm
 
 
@@ -89,7 +89,7 @@ def _missing(kind: str, ratio: Float[Array, " entry"], margin: float) -> Float[A
 
 
 def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
-    """Of numbers that are not negative; zero, without a slope, where all are zero."""
+    """Power mean of non-negative numbers; zero, with zero slope, where all are zero."""
     largest = jax.lax.stop_gradient(jnp.max(x))
     largest = jnp.where(largest > 0, largest, 1)
     mean = jnp.mean((x / largest) ** _POWER)
@@ -103,7 +103,7 @@ def _entries(name, imager, at, key):
 
 
 def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:
-    """What a term says of a design. An equality holds within 0.1 %."""
+    """Assess the entries of a term. An equality holds within 0.1 %."""
     low, high = float(np.min(entries)), float(np.max(entries))
     target = table.target
     off = max(abs(low - target), abs(high - target)) / target
@@ -111,8 +111,8 @@ def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:
     return Row(low, high, met)
 
 
-def worst_of(table: TermTable, entries: Float[Array, " entry"]) -> Float[Array, ""]:
-    """The entry that counts."""
+def worst_entry(table: TermTable, entries: Float[Array, " entry"]) -> Float[Array, ""]:
+    """The entry farthest from the target."""
     if table.kind == "equal":
         return entries[jnp.argmax(jnp.abs(entries - table.target))]
     return jnp.min(entries) if table.kind in ("at_least", "maximise") else jnp.max(entries)

@@ -99,9 +99,9 @@ TERMS: dict[str, Term] = {
     ),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage, types=True),
     "sag_mm": Term("height of a whole lens", objectives.sag, types=True),
-    "ghosts": Term("RMS ghost of a point over its image", ghosts, random=True, types=True),
+    "ghosts": Term("RMS sidelobe of the array PSF over its peak", ghosts, random=True, types=True),
     "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage, types=True),
-    "spectral_flatness": Term("flatness of a point's comb's spectrum, 1 if white", flatness, random=True, types=True),
+    "spectral_flatness": Term("flatness of the array PSF's spectrum, 1 if white", flatness, random=True, types=True),
     "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True, types=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
@@ -145,7 +145,7 @@ def check_term(name: str) -> None:
     if name not in TERMS:
         near = difflib.get_close_matches(name, TERMS, n=3) or list(TERMS)[:3]
         others = len(TERMS) - len(near)
-        raise ValueError(f"found the name {short_repr(name)}, allowed: {', '.join(near)} or {others} others")
+        raise ValueError(f"name must be {', '.join(near)} or one of {others} others, got {short_repr(name)}")
 
 
 def _imported(name: str) -> Term:

@@ -85,12 +85,12 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
         raise InputError(f"{path}: {one_line(error, _Centers, {})}.") from error
     if keys.centers_file is None:
         if rest := next((key for key in given if key not in ("mirror", "centers_file")), None):
-            raise InputError(f"{path}: `array.{rest}`: found no `array.centers_file`, allowed: beside it alone.")
+            raise InputError(f"{path}: `array.{rest}` needs `array.centers_file`.")
         if keys.mirror and "centers_mm" in array:
             array["centers_mm"] = _mirrored(array["centers_mm"])
         return
     if "centers_mm" in array:
-        raise InputError(f"{path}: found both `array.centers_file` and `array.centers_mm`, allowed: one of them.")
+        raise InputError(f"{path}: only one of `array.centers_file` and `array.centers_mm` may be given.")
     sensor = data.get("sensor")
     sensor = sensor if isinstance(sensor, dict) else {}
     file = path.parent / keys.centers_file
@@ -112,8 +112,7 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
     if not columns or not isinstance(lens := data.setdefault("lens", {}), dict):
         return
     if both := next((name for name in columns if name in lens), None):
-        found = f"found `lens.{both}` and a column of that name in `array.centers_file`"
-        raise InputError(f"{path}: {found}, allowed: one of them.")
+        raise InputError(f"{path}: only one of `lens.{both}` and that column of `array.centers_file` may be given.")
     lens |= columns
 
 
@@ -205,7 +204,7 @@ def _unit(path: Path, names: tuple[str, str] | None, unit: str | None) -> str:
     found = _unit_in(names)
     if unit and found and unit != found:
         header = ",".join(names or ())
-        raise InputError(f"{path}: found the header {header:.120} and the unit {unit}, allowed: one unit.")
+        raise InputError(f"{path}: the unit must be that of the header {header:.120}, got {unit}.")
     return unit or found or "mm"
 
 

@@ -22,10 +22,13 @@ def check_whole(design) -> None:
         check(design)
 
 
+_CENTERS = "`array.centers_mm`"
+
+
 def _check_numbers(design) -> None:
     near, far = design.imaging.working_distance_mm
     if not near < far:
-        raise ValueError(f"`imaging.working_distance_mm`: found [{near}, {far}], allowed: near below far, in mm")
+        raise ValueError(f"`imaging.working_distance_mm` must be [near, far], near below far, got [{near}, {far}]")
 
 
 def of_each(design, key: str) -> tuple[float, ...]:
@@ -38,7 +41,7 @@ def _check_lenses(design) -> None:
     lens, count = design.lens, len(design.array.centers_mm)
     for key in LENS_KEYS:
         if (found := len(of_each(design, key))) != count:
-            raise ValueError(f"`lens.{key}`: found {found} numbers, allowed: one, or {count}, as there are lenses")
+            raise ValueError(f"`lens.{key}` must be one number or {count}, one a lens, got {found}")
     first: dict[tuple[float, ...], int] = {}
     for number, one in enumerate(zip(*(of_each(design, key) for key in LENS_KEYS), strict=True), 1):
         first.setdefault(one, number)
@@ -46,14 +49,14 @@ def _check_lenses(design) -> None:
         of_lens = f" of lens {number}" if len(first) > 1 else ""
         if aperture > (end := widest_diameter(radius, conic)):
             where = "twice `lens.radius_of_curvature_mm`" if not conic else "where the conic ends"
-            found = f"`lens.aperture_diameter_mm`: found {aperture}{of_lens}"
-            raise ValueError(f"{found}, allowed: at most {round(end, 6)} mm, {where}")
+            most = f"at most {round(end, 6)} mm, {where}"
+            raise ValueError(f"`lens.aperture_diameter_mm` must be {most}, got {aperture}{of_lens}")
         radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
         rising = sag_slope_over_r(radii**2, radius, conic, lens.aspheric_terms) <= 0
         if rising.any():
             which = f"lens {number} rises" if of_lens else "lenses rise"
-            found = f"found {list(lens.aspheric_terms)}, with which {which} at {radii[np.argmax(rising)]:.3g} mm"
-            raise ValueError(f"`lens.aspheric_terms`: {found}, allowed: lenses that fall from the vertex to the rim")
+            got = f"{list(lens.aspheric_terms)}, with which {which} at {radii[np.argmax(rising)]:.3g} mm"
+            raise ValueError(f"`lens.aspheric_terms` must give lenses that fall from the vertex to the rim, got {got}")
 
 
 def widest_diameter(radius: float, conic_constant: float) -> float:
@@ -72,15 +75,15 @@ def _check_plate(design) -> None:
     half = np.array(design.array.size_mm) / 2
     outside = (np.abs(centers) > half + 1e-9).any(axis=1)
     if outside.any():
-        allowed = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
+        plate = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
         lens = _lens(design, int(np.argmax(outside)))
-        raise ValueError(f"{lens}, allowed: {allowed}{other_reading(centers, half)}")
+        raise ValueError(f"{_CENTERS} must be {plate}, got {lens}{other_reading(centers, half)}")
 
 
 def _check_spacing(design) -> None:
     if pair := _close_pair(np.array(design.array.centers_mm)):
-        found = f"{_lens(design, pair[0])} and lens {pair[1] + 1} less than {MIN_SPACING_MM} mm from it"
-        raise ValueError(f"{found}, allowed: lenses at least that far apart")
+        got = f"{_lens(design, pair[0])} and lens {pair[1] + 1} nearer to it"
+        raise ValueError(f"{_CENTERS} must be at least {MIN_SPACING_MM} mm apart, got {got}")
 
 
 def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
@@ -106,8 +109,8 @@ def _check_reach(design) -> None:
     beyond = distance > radius
     if beyond.all() or (beyond.any() and design.sensor.origin_mm is None):
         index = int(np.argmax(beyond))
-        allowed = f"up to {radius:.4g} mm, the radius of its image of the field"
-        raise ValueError(f"{_lens(design, index)}, {distance[index]:.4g} mm beside the sensor, allowed: {allowed}")
+        most = f"at most {radius:.4g} mm beside the sensor, the radius of a lens's image of the field"
+        raise ValueError(f"{_CENTERS} must be {most}, got {_lens(design, index)}, {distance[index]:.4g} mm beside it")
 
 
 def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
@@ -137,4 +140,4 @@ def beside_sensor(
 
 
 def _lens(design, index: int) -> str:
-    return f"`array.centers_mm`: found lens {index + 1} at {list(design.array.centers_mm[index])} mm"
+    return f"lens {index + 1} at {list(design.array.centers_mm[index])} mm"

@@ -171,7 +171,7 @@ class Design(Table):
                 data[key] = value
             else:
                 nearest = difflib.get_close_matches(key, tables, n=3) or sorted(tables)
-                raise InputError(f"found the key {key}, allowed: {', '.join(nearest)}.")
+                raise InputError(f"keys must be those of a design file, such as {', '.join(nearest)}, got {key}.")
         return _validated(data)
 
 

@@ -15,7 +15,7 @@ def tables_of(imager: Imager) -> dict[str, Any]:
     """All tables but the working distance, which an imager has not."""
     array, sensor = imager.array, imager.sensor
     if not np.isfinite(array.plate).all():
-        raise InputError(f"`array.plate`: found {array.plate}, allowed: a plate of finite size.")
+        raise InputError(f"`array.size` must be finite, got {array.plate}.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
     return {
@@ -69,8 +69,8 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
             ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
     front = float(imager.reduced_depth(0.0))
     if not ends or not np.isfinite(ends).all() or min(ends) <= front:
-        found = "no depth that is in focus" if not ends else "sharp depths without an end"
-        raise InputError(f"working_distance_mm: found none, and {found}, allowed: nearest and farthest object, mm.")
+        why = "no depth is in focus" if not ends else "the sharp depths have no end"
+        raise InputError(f"working_distance_mm must be given as [nearest, farthest] in mm: {why}.")
     return round(min(ends) - front, 4), round(max(ends) - front, 4)
 
 

@@ -51,7 +51,7 @@ def problem(path: str, value: Any) -> str | None:
         Design.model_validate({table: {name: value}})
     except ValidationError as error:  # as all others are missing
         if any(found["loc"][:2] == (table, name) for found in error.errors()):
-            return f"found {value}, allowed: {design_keys()[path].allowed}."
+            return f"must be {design_keys()[path].allowed}, got {value}."
     return None
 
 

@@ -38,14 +38,14 @@ def check_unit_said(centers: Float[np.ndarray, "lens 2"]) -> None:
     """Of centres without a unit: `InputError` unless they may well be mm."""
     if (reach := float(np.abs(centers).max(initial=0))) > FARTHEST_MM:
         raise InputError(
-            f"found centres up to {reach:g} without a unit, allowed: --centers-unit um, px, or mm if meant."
+            f"centres reach {reach:g} without a unit: give --centers-unit um or px, or mm if that is meant."
         )
 
 
 def check_origin_said(centers: Float[np.ndarray, "lens 2"]) -> None:
     """Of centres without an origin: `InputError` unless they lie about it."""
     if len(centers) > 1 and (centers >= 0).all():
-        raise InputError("found no x or y below 0, allowed: --centers-origin corner, or center if that is meant.")
+        raise InputError("no x or y is below 0: give --centers-origin corner, or center if that is meant.")
 
 
 def plate_of(centers: Float[np.ndarray, "lens 2"]) -> tuple[float, float]:
@@ -58,13 +58,13 @@ def plate_of(centers: Float[np.ndarray, "lens 2"]) -> tuple[float, float]:
 def clash(key: str, value: Any, known: Known) -> str | None:
     """What of the others a value does not go with, as a line; None if it goes with all that are known."""
     if key == "working_distance_mm" and not value[0] < value[1]:
-        return f"found {value}, allowed: near below far."
+        return f"must be near below far, got {value}."
     if key == "aperture_diameter_mm" and value > (sphere := 2 * known["radius_of_curvature_mm"]):
-        return f"found {value}, allowed: at most {sphere:g} mm, twice the radius of curvature."
+        return f"must be at most {sphere:g} mm, twice the radius of curvature, got {value}."
     if key == "size_mm" and (centers := known.get("centers")) is not None:
         if (np.abs(centers) > np.array(value) / 2).any():
             width, height = plate_of(centers)
-            return f"found {value}, allowed: a plate that holds all lenses, such as {width:g} {height:g}."
+            return f"must be a plate that holds all lenses, such as {width:g} {height:g}, got {value}."
     return None
 
 

@@ -8,10 +8,10 @@ from jax.test_util import check_grads
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.codesign.array_psf import (
-    comb_spectrum,
+    array_spectrum,
     condition_number,
-    lens_shortage,
-    readback,
+    crosstalk,
+    mean_inverse_views,
     sidelobes,
     spectral_flatness,
 )
@@ -55,7 +55,7 @@ def test_readback_is_the_double_sum():
 
     expected = [[read(a, b) / read(a, a) for b in targets()] for a in SOURCES]
     # An identity in float64.
-    np.testing.assert_allclose(readback(microscope, SOURCES, targets(), width=WIDTH), expected, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(crosstalk(microscope, SOURCES, targets(), width=WIDTH), expected, rtol=1e-9, atol=1e-14)
 
 
 def test_a_point_reads_itself_and_a_lattice_has_full_ghosts():
@@ -63,7 +63,7 @@ def test_a_point_reads_itself_and_a_lattice_has_full_ghosts():
     microscope = imager(hexagonal_layout((60.0, 60.0), pitch=1.0), field_radius=15.0)
     source = np.array([[0.0, 0.0, 20.0]])
     shift = float(microscope.scale(20.0) / microscope.magnification(20.0))
-    found = readback(microscope, source, source + np.array([[0, 0, 0], [shift, 0, 0], [shift / 2, 0, 0]]), width=WIDTH)
+    found = crosstalk(microscope, source, source + np.array([[0, 0, 0], [shift, 0, 0], [shift / 2, 0, 0]]), width=WIDTH)
     assert found[0, 0] == pytest.approx(1, rel=1e-12)
     # All but the lenses that only one of the two sees.
     assert 0.5 < found[0, 1] < 1
@@ -84,7 +84,7 @@ def test_random_lenses_have_lower_ghosts_than_a_lattice():
 def test_the_peak_is_between_rms_and_maximum():
     microscope = random_imager()
     found = sidelobes(microscope, SOURCES, targets(), width=WIDTH, power=64.0, **OWN)
-    ghosts = readback(microscope, SOURCES, targets(), width=WIDTH)
+    ghosts = crosstalk(microscope, SOURCES, targets(), width=WIDTH)
     apart = SOURCES[:, None] - targets()[None]
     counted = ghosts * (1 - np.exp(-(apart[..., :2] ** 2).sum(-1) / 0.1**2 - apart[..., 2] ** 2))
     assert found.rms == pytest.approx(float(np.sqrt(np.mean(counted**2))), rel=1e-12)
@@ -96,7 +96,7 @@ def test_a_lattices_spectrum_is_its_reciprocal_lattice():
     microscope = imager(hexagonal_layout((40.0, 40.0), pitch=1.0), field_radius=8.0)
     scale = float(microscope.scale(20.0))
     first = np.array([0, 2 / 3**0.5]) / scale  # shortest reciprocal vector of rows along x
-    found = comb_spectrum(microscope, np.array([[0.0, 0.0, 20.0]]), np.array([[0.0, 0.0], first, first / 2]))[0]
+    found = array_spectrum(microscope, np.array([[0.0, 0.0, 20.0]]), np.array([[0.0, 0.0], first, first / 2]))[0]
     weights = envelope((microscope.centers**2).sum(1), microscope.reduced_depth(20.0), 8.0)
     assert found[0] == pytest.approx(float(weights.sum() ** 2 / (weights**2).sum()), rel=1e-12)
     assert found[1] == pytest.approx(float(found[0]), rel=1e-9)
@@ -107,14 +107,14 @@ def test_random_lenses_have_the_spectrum_1():
     """On average over layouts; 400 layouts of exponential powers have a standard error of 5 %."""
     frequency, point = np.array([[9.0, 4.0]]), np.array([[0.0, 0.0, 20.0]])
     layouts = np.stack([random_imager(seed).centers for seed in range(400)])
-    found = jax.vmap(lambda c: comb_spectrum(imager(c), point, frequency)[0, 0])(jnp.asarray(layouts))
+    found = jax.vmap(lambda c: array_spectrum(imager(c), point, frequency)[0, 0])(jnp.asarray(layouts))
     assert np.mean(found) == pytest.approx(1, abs=0.15)
 
 
-def test_lens_shortage_counts_lenses():
+def test_mean_inverse_views_counts_lenses():
     """A field so wide and flat that the envelope is 1."""
     microscope = imager(np.random.default_rng(0).uniform(-1, 1, (7, 2)), field_radius=50.0)
-    found = lens_shortage(microscope, np.array([[0.0, 0.0, 1e4], [100.0, 0.0, 1e4]]))
+    found = mean_inverse_views(microscope, np.array([[0.0, 0.0, 1e4], [100.0, 0.0, 1e4]]))
     assert found == pytest.approx((1 / 7.5 + 2) / 2, rel=1e-6)
 
 
@@ -135,10 +135,10 @@ def test_gradients():
 
     def terms(centers):
         microscope = with_centers(base, centers)
-        spectrum = comb_spectrum(microscope, SOURCES, frequencies)
+        spectrum = array_spectrum(microscope, SOURCES, frequencies)
         ghosts = sidelobes(microscope, SOURCES, targets(), width=0.05, **OWN)
         flat = spectral_flatness(spectrum), jnp.log(condition_number(spectrum))
-        return *ghosts, lens_shortage(microscope, SOURCES), *flat
+        return *ghosts, mean_inverse_views(microscope, SOURCES), *flat
 
     check_grads(terms, (base.array.centers,), order=1, modes=("fwd", "rev"), eps=1e-7, atol=1e-5, rtol=1e-5)
 
@@ -150,10 +150,10 @@ def test_gradients_are_finite(place):
 
     def total(c):
         microscope = with_centers(base, c)
-        spectrum = comb_spectrum(microscope, SOURCES, frequencies)
+        spectrum = array_spectrum(microscope, SOURCES, frequencies)
         ghosts = sidelobes(microscope, SOURCES, targets(), width=WIDTH, **OWN)
         return (
-            lens_shortage(microscope, SOURCES)
+            mean_inverse_views(microscope, SOURCES)
             + ghosts.peak
             + ghosts.rms
             + spectral_flatness(spectrum)
