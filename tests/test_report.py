@@ -19,7 +19,7 @@ from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
-from gs_jax.pictures.volume_pictures import slices, thinned
+from gs_jax.pictures.volume_pictures import downsample, make_slices
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run
@@ -182,7 +182,7 @@ def test_the_first_key_skips_to_the_content(made, browser):
         (("design.toml", "-o", "r.txt"), "allowed: .html"),
         (("design.toml", "points.csv", "-o", "r.html"), "points by --points"),
         (("design.toml", "-o", "r.html", "--tolerance", "capture.tif"), "capture.tif: "),
-        (("design.toml", "-o", "r.html", "--tolerance", "other.json"), "other.json: found no 'depth_mm'"),
+        (("design.toml", "-o", "r.html", "--tolerance", "other.json"), "got no 'depth_mm'"),
         (("design.toml", "-o", "r.html", "--capture", "small.tif"), "small.tif: found"),
         (("none.toml", "-o", "r.html"), "none.toml: "),
     ],
@@ -200,7 +200,7 @@ def test_wrong_input_is_one_line(made, tmp_path, monkeypatch, capsys, arguments,
 
 def test_tolerances_of_another_kind_are_refused():
     with pytest.raises(InputError, match="gs-jax tolerance"):
-        report_tables.tolerance_facts(TOLERANCE | {"drawn": {}})
+        report_tables.tolerance_table(TOLERANCE | {"drawn": {}})
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_tolerances_of_another_kind_are_refused():
     ],
 )
 def test_folders_are_left_out(text, kept):
-    assert report_tables.without_folders(text) == kept
+    assert report_tables.strip_folders(text) == kept
 
 
 def test_the_largest_volumes_stay_small():
@@ -223,9 +223,9 @@ def test_the_largest_volumes_stay_small():
     for shape in ((100, side, side), (3, 1500, 1400)):
         volume = np.random.default_rng(0).random(shape, np.float32)
         grid = Grid(np.linspace(18, 22, shape[0]), shape[1:], 0.01)
-        shown = slices(volume, grid, views.SLICE_BYTES)
-        drawn = [p.picture for p in views.projections(volume, grid)]
-        cloud = views.cloud(volume, grid)
+        shown = make_slices(volume, grid, views.SLICE_BYTES)
+        drawn = [p.picture for p in views.make_projections(volume, grid)]
+        cloud = views.voxel_view(volume, grid)
         assert cloud["count"] <= 60_000 and len(shown.pictures) == shape[0]
         assert sum(map(len, [*shown.pictures, *drawn, cloud["voxels"]])) < 11e6
 
@@ -235,7 +235,7 @@ def test_the_cloud_is_where_the_voxels_are():
     grid = Grid(np.linspace(18, 22, 7), (501, 401), 0.02, (1.0, -2.0))
     volume = np.zeros(grid.volume_shape, np.float32)
     volume[4, 300, 123] = 1
-    cloud = views.cloud(volume, grid)
+    cloud = views.voxel_view(volume, grid)
     x, y, z, value = np.frombuffer(base64.b64decode(cloud["voxels"]), np.uint8)
     assert cloud["count"] == 1 and value == 255
     place = [cloud["first"][0] + x * cloud["pitch"][0], cloud["first"][1] + y * cloud["pitch"][1], cloud["depths"][z]]
@@ -245,7 +245,7 @@ def test_the_cloud_is_where_the_voxels_are():
 def test_lenses_that_see_a_point():
     """Counted one by one, at some points."""
     imager = geomscope().imager()
-    seen = drawings.lenses_seen(imager, 20.0)
+    seen = drawings.count_lenses(imager, 20.0)
     left, top, right, bottom = seen.box
     rows, columns = seen.lenses.shape
     for row, column in ((0, 0), (60, 60), (100, 17)):
@@ -262,11 +262,12 @@ def test_the_contrast_of_a_perfect_lens():
     data["lens"] |= {"focal_length_mm": 4.6, "aperture_diameter_mm": 0.3}
     imager = type(design).model_validate(data).imager()
     depth = 1 / (1 / 4.6 - 1 / 5.8) - 1 / 1.43
-    found = drawings.spots_of(imager, np.array([depth]), 0.3, 0.05)
-    curve = drawings.contrast(found.images[0, 0], float(found.caught[0, 0]), 0.0045, float(imager.magnification(depth)))
-    ideal = drawings.perfect(curve.frequency, imager, depth, 0.3)
+    found = drawings.simulate_psfs(imager, np.array([depth]), 0.3, 0.05)
+    frequency, curve = drawings.mtf(
+        found.images[0, 0], float(found.caught[0, 0]), 0.0045, float(imager.magnification(depth))
+    )
     # Light beside the window, and a pupil of squares.
-    np.testing.assert_allclose(curve.contrast, ideal.contrast, atol=0.02)
+    np.testing.assert_allclose(curve, drawings.ideal_mtf(frequency, imager, depth, 0.3), atol=0.02)
 
 
 @pytest.mark.integration
@@ -281,5 +282,5 @@ def test_charts_draw_what_is_finite():
 @pytest.mark.integration
 def test_thinning_is_the_mean_of_squares():
     image = np.arange(36.0).reshape(6, 6)
-    np.testing.assert_allclose(thinned(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))
-    assert thinned(np.ones((1, 9)), 3).shape == (1, 3)
+    np.testing.assert_allclose(downsample(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))
+    assert downsample(np.ones((1, 9)), 3).shape == (1, 3)

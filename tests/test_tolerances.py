@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
-from gs_jax.apps.report.report_tables import tolerance_facts
+from gs_jax.apps.report.report_tables import tolerance_table
 from gs_jax.apps.tolerance.device_model import (
     CONSTANT,
     ERROR_FIELDS,
@@ -293,7 +293,7 @@ def test_the_picture_and_the_numbers(outcome):
     low, middle, high = (numbers["drawn"]["spot_width_um"][key] for key in ("p5", "p50", "p95"))
     assert all(a < b < c for a, b, c in zip(low, middle, high, strict=True))
     assert set(numbers["by_gradient"]) == {*ERROR_FIELDS, "all"} and sorted(numbers["costs"]) == sorted(ERROR_FIELDS)
-    shown = tolerance_facts(numbers)
+    shown = tolerance_table(numbers)
     assert {row[0] for row in shown.rows} > set(ERROR_FIELDS) and {len(row) for row in shown.rows} == {6}
     assert shown.widths["devices, median"] == (numbers["depth_mm"], middle)
 

@@ -21,8 +21,8 @@ import numpy as np
 from ...base.errors import InputError
 from ...codesign.study import Study
 from ...design.design import Design, write_design
-from ...pictures.volume_pictures import in_range, png
-from ..report.drawings import layout, line_chart
+from ...pictures.volume_pictures import png_uri, to_uint8
+from ..report.drawings import draw_layout, line_chart
 from ..report.page import render
 from .evaluation import (
     SPOT_DEPTHS,
@@ -103,7 +103,7 @@ class Session:
             "violations": self.html.violations(violations),
             "numbers": self.html.numbers(evaluation, self.kept[0][2]),
             "spots": self._spots(evaluation, values),
-            "layout": layout(imager, picture, ghosts.box, "where back-projection puts a point"),
+            "layout": draw_layout(imager, picture, ghosts.box, "where back-projection puts a point"),
             "chart": self._chart(evaluation),
         }
         return {"parts": parts, "ms": round(1000 * (time.perf_counter() - began))}
@@ -161,7 +161,7 @@ class Session:
 
 
 def _picture(values: np.ndarray, low: float, high: float) -> str:
-    return png(in_range(values, low, high), "magma")
+    return png_uri(to_uint8(values, low, high), "magma")
 
 
 def _free_path(path: Path) -> Path:

@@ -1,7 +1,8 @@
-"""The page: what a microscope is, what it promises and what it showed, in one file."""
+"""The HTML report of a design and of what was imaged with it, in one file."""
 
 from collections.abc import Mapping
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,16 +18,27 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
-from ...pictures.volume_pictures import in_range, palette, png, slices, slider
+from ...pictures.volume_pictures import color_table, make_slices, png_uri, slider_html, to_uint8
 from ...typing import Image, PathLike, Points
-from . import drawings, report_tables, views
-from .drawings import line_chart
+from . import report_tables as tables, views
+from .drawings import (
+    Psfs,
+    count_lenses,
+    draw_layout,
+    draw_section,
+    ideal_mtf,
+    line_chart,
+    mtf,
+    simulate_psfs,
+)
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
     "Complexity”, Laser & Photonics Reviews 15, 2100072 (2021)",
     "doi": "10.1002/lpor.202100072",
 }
+# Points in the table, the brightest.
+_LISTED_POINTS = 300
 
 
 def write_report(
@@ -43,9 +55,9 @@ def write_report(
     provenance: Provenance | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Writes a page of HTML that shows a design, and what was imaged with it; whole or not at all.
+    """Writes an HTML report of a design, and of what was imaged with it, atomically.
 
-    The page needs no network and has no path of this machine. It has less than 15 MB, however large the volume is.
+    The page needs no network and contains no path of this machine. It has less than 15 MB, whatever the volume's size.
 
     Parameters
     ----------
@@ -54,217 +66,168 @@ def write_report(
     design
         The microscope.
     volume, grid
-        What was reconstructed, `grid.volume_shape`, and where its voxels are.
+        A reconstruction of shape `grid.volume_shape`, and the positions of its voxels.
     points
         `(x, y, z, intensity)`, mm.
     image
         The capture.
     tolerance
-        Numbers of `gs-jax tolerance`, as in its JSON file.
+        The JSON of `gs-jax tolerance`.
     notes
-        A sentence for the page's beginning, "page", and for its parts "capture", "volume" and "points".
+        A sentence for the beginning of the page, "page", and for its sections "capture", "volume" and "points".
     origins
-        By a file's name, where it comes from.
+        Provenance of the inputs, by file name.
     provenance
-        Where the page comes from.
+        Of the page.
     progress
-        Shows how far it is; nothing by default.
+        Shows the steps; nothing by default.
 
     Raises
     ------
     InputError
-        As `check_output`, for `.html`, before any work; if `tolerance` is none.
+        As `check_output`, for `.html`, before any work; if `tolerance` has other contents.
     ValueError
-        If there is a volume without its grid, or it is not of the grid's shape.
+        If a volume has no grid, or another shape than its grid.
     """
     path, progress = check_output(path, [".html"]), progress or Progress()
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
-    tolerances = report_tables.tolerance_facts(tolerance) if tolerance else None
-    said = dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {})
-    context: dict[str, Any] = {"design": design, "notes": said, "paper": PAPER}
-    context["colours"] = {name: palette(name) for name in ("magma", "viridis")}
-    context |= _made_of(design, provenance, origins or {})
-    context |= _optics(design, progress)
+    context: dict[str, Any] = {
+        "design": design,
+        "notes": dict.fromkeys(("page", "capture", "volume", "points"), "") | dict(notes or {}),
+        "paper": PAPER,
+        "colors": {name: color_table(name) for name in ("magma", "viridis")},
+        "calibration": tables.calibration_rows(design),
+        "calibration_summary": tables.calibration_summary(design),
+        "tolerance": tables.tolerance_table(tolerance) if tolerance else None,
+        "capture": None if image is None else views.capture_view(np.asarray(image)),
+        "volume": None,
+        "points": None,
+        **_origins(design, provenance, origins or {}),
+        **_optics(design, progress),
+    }
     with progress.step("Mold"):
         context |= _mold(design)
     with progress.step("Pictures"):
-        context["tolerance"] = tolerances
-        if tolerances:
-            context["tolerance_chart"] = line_chart(
-                tolerances.widths,
-                x="depth z, mm",
-                y="width of a spot, um",
-                title="Spots by depth",
-                marks=True,
-            )
-        if image is not None:
-            whole, middle, step = views.capture_pictures(np.asarray(image))
-            context["capture"] = {"whole": whole, "middle": middle, "step": step, "shape": image.shape}
+        if context["tolerance"]:
+            labels: Any = {"x": "depth z, mm", "y": "width of a spot, um", "title": "Spots by depth"}
+            context["tolerance_chart"] = line_chart(context["tolerance"].widths, **labels, marks=True)
         if volume is not None and grid is not None:
-            _add_volume(context, np.asarray(volume), grid)
+            volume = np.asarray(volume)
+            context["volume"] = {
+                "shape": volume.shape,
+                "pitch_um": 1000 * grid.pitch,
+                "depths": np.asarray(grid.depths, float),
+                "slider": slider_html(make_slices(volume, grid, views.SLICE_BYTES)),
+                "projections": views.make_projections(volume, grid),
+            }
+            context["views"]["volume"] = views.voxel_view(volume, grid)
         if points is not None:
-            _add_points(context, np.asarray(points, float), grid)
+            points = np.asarray(points, float)
+            listed = points[np.argsort(-points[:, 3], kind="stable")[:_LISTED_POINTS]]
+            context["points"] = {"count": len(points), "listed": listed.tolist()}
+            if len(points):
+                context["views"]["points"] = views.point_view(points, grid)
     write_text(path, render("report.html", context), [".html"])
 
 
 def render(name: str, context: Mapping[str, Any], folder: str = "report") -> str:
-    """A template of a folder of `gs_jax`, with this page's style sheet and its own script inside."""
+    """Renders a template in a folder of `gs_jax/apps` with the style sheet of the report and its own script."""
     import jinja2
 
-    made = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    inside = {"style": _asset("report", "page.css"), "script": _asset(folder, name.replace(".html", ".js"))}
-    return made.from_string(_asset(folder, name)).render({**inside, **context})
+    read = lambda *parts: resources.files("gs_jax").joinpath("apps", *parts).read_text("utf-8")
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    embedded = {"style": read("report", "page.css"), "script": read(folder, name.replace(".html", ".js"))}
+    return environment.from_string(read(folder, name)).render({**embedded, **context})
 
 
-def _asset(folder: str, name: str) -> str:
-    return (resources.files("gs_jax") / "apps" / folder / name).read_text("utf-8")
-
-
-def _made_of(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _origins(design: Design, provenance: Provenance | None, origins: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     own = {key: value for key, value in design.provenance.items() if not key.startswith("calibrated_")}
-    tables = {"this page": report_tables.origin_rows(provenance or {}), "the design": report_tables.origin_rows(own)}
-    tables |= {report_tables.name_of(name): report_tables.origin_rows(found) for name, found in origins.items()}
+    by_name = {"this page": provenance or {}, "the design": own}
+    by_name |= {Path(name).name: origin for name, origin in origins.items()}
+    rows = {name: tables.provenance_rows(origin) for name, origin in by_name.items()}
     return {
-        "versions": report_tables.versions(),
-        "origins": {name: rows for name, rows in tables.items() if rows},
-        "text_of_design": report_tables.without_folders(design_text(design)),
-        "calibration": report_tables.calibration_rows(design),
-        "calibration_summary": report_tables.calibration_summary(design),
-        "capture": None,
-        "volume": None,
-        "points": None,
-        "tolerance": None,
+        "versions": tables.versions(),
+        "origins": {name: each for name, each in rows.items() if each},
+        "design_text": tables.strip_folders(design_text(design)),
     }
 
 
 def _optics(design: Design, progress: Progress) -> dict[str, Any]:
-    """What the design promises and does."""
     with progress.step("Datasheet"):
         sheet = datasheet(design)
-        said = findings(design, sheet)
+        violations = findings(design, sheet)
     imager, depths = design.imager(), np.array(sheet["depth_mm"])
     middle = float(depths[len(depths) // 2])
     with progress.step("Drawing"):
-        seen = drawings.lenses_seen(imager, middle)
-        drawn = {"section": drawings.section(design), "layout": _layout(imager, seen)}
+        counts = count_lenses(imager, middle)
+        count_map = png_uri(to_uint8(counts.lenses, 0.0, max(float(counts.lenses.max()), 1.0)), "viridis")
+        layout = draw_layout(imager, count_map, counts.box, "the number of lenses that see each point")
+        section = draw_section(design)
     with progress.step("Spots"):
         diameter = sheet["focal_length_mm"] / sheet["f_number"]
         radius = np.max(np.array(sheet["spot_radius_um"]) * sheet["magnification"]) / 1000
-        found = drawings.spots_of(imager, depths, diameter, float(radius))
-    width = {
+        psfs = simulate_psfs(imager, depths, diameter, float(radius))
+    widths = {
         "spot, exact rays": (depths, sheet["spot_width_um"]),
-        "promised (Eq. 5)": (depths, sheet["lateral_resolution_um"]),
+        "predicted (Eq. 5)": (depths, sheet["lateral_resolution_um"]),
         "radius of 80 %": (depths, sheet["spot_radius_um"]),
-        "axial, promised (Eq. 6)": (depths, sheet["axial_resolution_um"]),
+        "axial, predicted (Eq. 6)": (depths, sheet["axial_resolution_um"]),
     }
+    labels: Any = {"x": "depth z, mm", "y": "in the object, um", "title": "Resolution by depth"}
     return {
         "sheet": sheet,
-        "sheet_rows": report_tables.sheet_rows(design, sheet),
-        "findings": said,
-        "device": report_tables.device_facts(design, sheet),
-        "section": drawn["section"],
-        "layout": drawn["layout"],
-        "seen": {"depth": middle, "most": int(seen.lenses.max()), "mean": float(_over_plate(seen, design).mean())},
-        "count_bar": png(np.tile(np.arange(256, dtype=np.uint8), (1, 1)), "viridis"),
-        "widths": line_chart(
-            width, x="depth z, mm", y="in the object, um", title="Resolution by depth", log=True, marks=True
-        ),
-        "spots": _spot_pictures(found, imager),
-        "mtf_depth": _contrast_by_depth(found, imager, diameter),
-        "mtf_field": _contrast_by_field(found, imager),
+        "sheet_rows": tables.datasheet_rows(design, sheet),
+        "violations": violations,
+        "device": tables.device_rows(design, sheet),
+        "section": section,
+        "layout": layout,
+        "seen": {"depth": middle, "most": int(counts.lenses.max()), "mean": counts.mean},
+        "count_bar": png_uri(np.arange(256, dtype=np.uint8)[None], "viridis"),
+        "widths": line_chart(widths, **labels, log=True, marks=True),
+        "psfs": _psf_pictures(psfs, imager),
+        **_mtf_charts(psfs, imager, diameter),
     }
 
 
-def _layout(imager: Imager, seen: drawings.Seen) -> str:
-    picture = png(in_range(seen.lenses, 0.0, max(float(seen.lenses.max()), 1.0)), "viridis")
-    return drawings.layout(imager, picture, seen.box, "the number of lenses that see each point")
-
-
-def _over_plate(seen: drawings.Seen, design: Design) -> np.ndarray:
-    """Counts where the plate is."""
-    left, top, right, bottom = seen.box
-    rows, columns = seen.lenses.shape
-    x = left + (np.arange(columns) + 0.5) * (right - left) / columns
-    y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
-    half_x, half_y = (side / 2 for side in design.array.size_mm)
-    return seen.lenses[np.ix_(np.abs(y) <= half_y, np.abs(x) <= half_x)]
-
-
-def _spot_pictures(found: drawings.Spots, imager: Imager) -> dict[str, Any]:
-    root = np.sqrt(found.images / found.images.max((2, 3), keepdims=True))
-    cells = [
-        [
-            {"picture": png(in_range(root[i, j], 0.0, 1.0), "magma"), "caught": 100 * float(found.caught[i, j])}
-            for i in range(len(found.depths))
-        ]
-        for j in range(len(found.heights))
+def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
+    root = to_uint8(np.sqrt(psfs.images / psfs.images.max((2, 3), keepdims=True)), 0.0, 1.0)
+    rows = [
+        [(png_uri(root[i, j], "magma"), 100 * float(psfs.caught[i, j])) for i in range(len(psfs.depths))]
+        for j in range(len(psfs.heights))
     ]
-    size = found.images.shape[-1]
+    size = root.shape[-1]
+    width = 1000 * size * imager.sensor.pixel_pitch
+    return {"depths": psfs.depths, "rows": list(zip(psfs.heights, rows, strict=True)), "size": size, "width_um": width}
+
+
+def _mtf_charts(psfs: Psfs, imager: Imager, diameter: float) -> dict[str, str]:
+    def curve(i: int, j: int):
+        magnification = float(imager.magnification(jnp.asarray(psfs.depths[i])))
+        return mtf(psfs.images[i, j], float(psfs.caught[i, j]), imager.sensor.pixel_pitch, magnification)
+
+    def chart(curves, title: str) -> str:
+        return line_chart(curves, x="frequency in the object, 1/mm", y="contrast", title=title, bounds=(0.0, 1.0))
+
+    by_depth = {f"{z:.4g} mm": curve(i, 0) for i, z in enumerate(psfs.depths)}
+    middle = float(psfs.depths[len(psfs.depths) // 2])
+    frequency = next(iter(by_depth.values()))[0]
+    by_depth[f"ideal, {middle:.4g} mm"] = (frequency, ideal_mtf(frequency, imager, middle, diameter))
+    sharpest = int(np.argmax((psfs.images.max((2, 3)) * psfs.caught)[:, 0]))
+    by_field = {f"{h:.3g} mm off axis": curve(sharpest, j) for j, h in enumerate(psfs.heights)}
     return {
-        "depths": [f"{z:.4g}" for z in found.depths],
-        "heights": [f"{h:.3g}" for h in found.heights],
-        "cells": cells,
-        "size": size,
-        "wide_um": 1000 * size * imager.sensor.pixel_pitch,
+        "mtf_depth": chart(by_depth, "On the axis, by depth"),
+        "mtf_field": chart(by_field, f"Over the field, at {psfs.depths[sharpest]:.4g} mm"),
     }
-
-
-def _contrast_by_depth(found: drawings.Spots, imager: Imager, diameter: float) -> str:
-    lines = {f"{z:.4g} mm": _contrast(found, imager, i, 0) for i, z in enumerate(found.depths)}
-    middle = float(found.depths[len(found.depths) // 2])
-    frequency = lines[next(iter(lines))].frequency
-    lines[f"perfect, {middle:.4g} mm"] = drawings.perfect(frequency, imager, middle, diameter)
-    return _contrast_chart(lines, "On the axis, by depth")
-
-
-def _contrast_by_field(found: drawings.Spots, imager: Imager) -> str:
-    # Where it is sharpest.
-    best = int(np.argmax((found.images.max((2, 3)) * found.caught)[:, 0]))
-    lines = {f"{h:.3g} mm beside the axis": _contrast(found, imager, best, j) for j, h in enumerate(found.heights)}
-    return _contrast_chart(lines, f"Over the field, at {found.depths[best]:.4g} mm")
-
-
-def _contrast(found: drawings.Spots, imager: Imager, depth: int, height: int) -> drawings.Contrast:
-    magnification = float(imager.magnification(jnp.asarray(found.depths[depth])))
-    image, caught = found.images[depth, height], float(found.caught[depth, height])
-    return drawings.contrast(image, caught, imager.sensor.pixel_pitch, magnification)
-
-
-def _contrast_chart(lines: dict[str, drawings.Contrast], title: str) -> str:
-    return line_chart(
-        {name: (line.frequency, line.contrast) for name, line in lines.items()},
-        x="frequency in the object, 1/mm",
-        y="contrast",
-        title=title,
-        bounds=(0.0, 1.0),
-    )
 
 
 def _mold(design: Design) -> dict[str, Any]:
-    """The mold to turn, or why there is none."""
     if design.lens.focal_length_mm is not None:
-        return {"turned": {}, "no_mold": "an ideal lens has no surface."}
+        return {"views": {}, "no_mold": "an ideal lens has no surface."}
     try:
-        return {"turned": {"mold": views.part(design.imager().array)}, "no_mold": ""}
+        return {"views": {"mold": views.mold_view(design.imager().array)}, "no_mold": ""}
     except (InputError, ValueError) as error:
-        return {"turned": {}, "no_mold": str(error)}
-
-
-def _add_volume(context: dict[str, Any], volume: np.ndarray, grid: Grid) -> None:
-    depths, pitch = np.asarray(grid.depths, float), grid.pitch
-    context["volume"] = {
-        "slider": slider(slices(volume, grid, views.SLICE_BYTES)),
-        "projections": views.projections(volume, grid),
-        "said": f"{' x '.join(map(str, volume.shape))} voxels (z, y, x), {1000 * pitch:.4g} um laterally, "
-        f"{len(depths)} depth{'s' * (len(depths) != 1)} from {depths.min():g} to {depths.max():g} mm",
-    }
-    context["turned"]["volume"] = views.cloud(volume, grid)
-
-
-def _add_points(context: dict[str, Any], points: np.ndarray, grid: Grid | None) -> None:
-    order = np.argsort(-points[:, 3], kind="stable")[: views.LISTED]
-    context["points"] = {"count": len(points), "listed": points[order].tolist(), "most": views.LISTED}
-    if len(points):
-        context["turned"]["points"] = views.scatter(points, grid)
+        return {"views": {}, "no_mold": str(error)}

@@ -9,8 +9,8 @@ let printing = false;
 const theme = () => dark.matches && !print.matches && !printing
   ? {ink: "#e6edf3", soft: "#6e7781", paper: [23, 28, 35], part: [120, 160, 205]}
   : {ink: "#1b1f24", soft: "#8c959f", paper: [246, 248, 250], part: [140, 178, 220]};
-const colour = (name, share) => {
-  const i = 3 * Math.max(0, Math.min(255, Math.round(share * 255))), p = data.colours[name];
+const color = (name, share) => {
+  const i = 3 * Math.max(0, Math.min(255, Math.round(share * 255))), p = data.colors[name];
   return [p[i], p[i + 1], p[i + 2]];
 };
 
@@ -41,7 +41,7 @@ const scenes = {
             if (light[r * w + c] < value) light[r * w + c] = value;
       }
       const image = context.createImageData(w, h), out = new Uint32Array(image.data.buffer), table = new Uint32Array(256);
-      for (let k = 0; k < 256; k++) { const [r, g, b] = colour("magma", k / 255); table[k] = (255 << 24 | b << 16 | g << 8 | r) >>> 0; }
+      for (let k = 0; k < 256; k++) { const [r, g, b] = color("magma", k / 255); table[k] = (255 << 24 | b << 16 | g << 8 | r) >>> 0; }
       for (let i = 0; i < light.length; i++) out[i] = table[light[i]];
       context.putImageData(image, 0, 0);
     };
@@ -57,7 +57,7 @@ const scenes = {
       order.sort((a, b) => b[3] - a[3]);
       const radius = (scene.count > 1000 ? 2.5 : 4.5) * view.unit;
       for (const [i, x, y] of order) {
-        const [r, g, b] = colour("viridis", high > low ? (at[3 * i + 2] - low) / (high - low) : 0.5);
+        const [r, g, b] = color("viridis", high > low ? (at[3 * i + 2] - low) / (high - low) : 0.5);
         context.beginPath();
         context.arc(x, y, radius, 0, 7);
         context.fillStyle = `rgb(${r},${g},${b})`;
@@ -214,7 +214,7 @@ class View {
   grow(by) { this.zoom = Math.max(0.3, Math.min(12, this.zoom * by)); this.later(); }
 }
 
-const all = [...document.querySelectorAll("canvas[data-view]")].map(c => new View(c, data.turned[c.dataset.view]));
+const all = [...document.querySelectorAll("canvas[data-view]")].map(c => new View(c, data.views[c.dataset.view]));
 const again = () => all.forEach(view => view.draw());
 dark.addEventListener("change", again);
 print.addEventListener("change", again);
