@@ -73,7 +73,7 @@ def reconstructed(asked: Asked, progress: Watched) -> Found:
     try:
         depths = Depths().convert(asked.depths, None, None)
     except click.BadParameter as error:
-        raise InputError(f"Depths: {error.message}") from error
+        raise InputError(f"Depths {error.message}") from error
     camera = CaptureOptions(dark=None, flat=None, bad_pixels="auto", offset=0.0)
     with progress.step("Reading"):
         imager = camera.imager(read_design(asked.design).imager())
@@ -103,10 +103,10 @@ def _corrected(name, pixels, sensor):
 
     pixels = np.asarray(pixels)
     if pixels.shape != sensor.shape or pixels.dtype.name not in DTYPES:
-        found, allowed = (" x ".join(map(str, each)) for each in (pixels.shape, sensor.shape))
+        given, needed = (" x ".join(map(str, shape)) for shape in (pixels.shape, sensor.shape))
         raise InputError(
-            f"{name}: found {found} pixels of {pixels.dtype}, allowed: {allowed} (rows x columns, as the design's "
-            f"sensor) of {', '.join(DTYPES)}."
+            f"{name}: the layer must have {needed} pixels (rows x columns, as the design's sensor) of type "
+            f"{', '.join(DTYPES)}, got {given} of {pixels.dtype}."
         )
     found = read_frame(name, checked(name, iter([pixels])), prepare(pixels.shape))
     return found.image, found.warnings
@@ -185,7 +185,7 @@ class Reconstruct(Container):
         elif layer is not None:
             name, capture = layer.name, layer.data
         else:
-            show_error("Capture: found none, allowed: a layer, or a file.")
+            show_error("Capture must be a layer or a file, got none.")
             return
         asked = Asked(
             name,

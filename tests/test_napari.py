@@ -204,9 +204,9 @@ def test_a_widget_that_is_closed_ends_its_work(widget, viewer, fourth_step):
     [
         ("design_file", "wrong.toml", "wrong.toml: `lens.refractive_index`: found -1"),
         ("design_file", "none.toml", "none.toml: "),
-        ("depths", "18:17:1", "Depths: found '18:17:1', allowed: "),
-        ("voxel", 0.01, "allowed: .* GiB of the memory"),
-        ("suppress", "unet", "--suppress unet: found --method fista, allowed: backproject"),
+        ("depths", "18:17:1", "Depths must have .* got '18:17:1'"),
+        ("voxel", 0.01, "at most .* GiB of the free memory"),
+        ("suppress", "unet", "--suppress unet must be used with --method backproject, got fista"),
         ("file", "small.npy", "small.npy: "),
     ],
 )
@@ -224,10 +224,10 @@ def test_what_is_wrong_is_one_line(widget, viewer, folder, field, value, message
 
 def test_a_layer_that_is_no_capture_is_refused(widget, viewer):
     widget.run.clicked.emit(True)
-    assert errors() == ["Capture: found none, allowed: a layer, or a file."]
+    assert errors() == ["Capture must be a layer or a file, got none."]
     viewer.add_image(np.zeros((96, 80)), name="double")
     widget.reset_choices()
     widget.run.clicked.emit(True)
     until(widget)
     (found,) = errors()
-    assert found.startswith("double: found 96 x 80 pixels of float64, allowed: 96 x 80 (rows x columns")
+    assert found.startswith("double: the layer must have 96 x 80 pixels (rows x columns")

@@ -89,9 +89,9 @@ def test_beads_of_a_recording(folder, monkeypatch, capsys):
 def test_what_cannot_be_tracked_is_one_line(folder, monkeypatch, capsys):
     tifffile.imwrite("rec.tif", np.full((2, 96, 80), 16, np.uint16), photometric="minisblack")
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100"))
-    assert status == 2 and "--track: found no --points, allowed: with POINTS.csv, which has the particles." in err
+    assert status == 2 and "--track must be used with --points POINTS.csv, which has the particles." in err
     status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--track", "100", "--points", "p.csv"))
-    assert status == 2 and "--track: found a single capture" in err
+    assert status == 2 and "--track must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "trackpy", None)
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100", "--points", "p.csv"))
     assert (status, err) == (2, "gs-jax: --track: found no trackpy, allowed: after pip install 'gs-jax[track]'.\n")

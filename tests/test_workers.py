@@ -128,7 +128,7 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
             status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
             assert status == 2 and words in err and err.count("\n") == 1
     status, _, err = run(monkeypatch, capsys, *command("capture.tif", "--workers", "2"))
-    assert status == 2 and "--workers or --scheduler: found a single capture" in err
+    assert status == 2 and "--workers or --scheduler must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "distributed", None)
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--workers", "2"))
     assert (status, err) == (
