@@ -128,7 +128,7 @@ def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, monkeypa
     np.testing.assert_allclose(layer.translate, first)
     low, high = layer.contrast_limits
     assert volume.min() <= low < high <= volume.max()
-    assert widget.said.value == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
+    assert widget.status.value == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
 
 
 def test_a_layer_becomes_points_in_the_same_place(widget, viewer):
@@ -165,7 +165,7 @@ def fourth_step(widget, folder, monkeypatch):
     monkeypatch.setattr(pipeline, "_step", slow)
     widget.file.value, widget.method.value = folder / "capture.tif", "list-rl"
     widget.run.clicked.emit(True)
-    until(widget, lambda: widget.said.value.startswith("Iterating: 3 of 20, about "))
+    until(widget, lambda: widget.status.value.startswith("Iterating: 3 of 20, about "))
     yield taken, goes_on
     goes_on.set()
 
@@ -174,10 +174,10 @@ def test_progress_is_shown_and_cancel_ends_between_two_steps(widget, viewer, fou
     taken, goes_on = fourth_step
     assert (widget.bar.native.value(), widget.bar.native.maximum()) == (3, 20)
     widget.cancel.clicked.emit(True)
-    assert widget.said.value == "Ends after this step."
+    assert widget.status.value == "Stops after this step."
     goes_on.set()
     until(widget)
-    assert widget.said.value == "Cancelled." and len(taken) == 4 and not viewer.layers and errors() == []
+    assert widget.status.value == "Cancelled." and len(taken) == 4 and not viewer.layers and errors() == []
     assert threading.main_thread() not in taken
     widget.method.value = "backproject"
     widget.run.clicked.emit(True)
