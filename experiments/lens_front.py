@@ -31,8 +31,8 @@ from gs_jax.codesign.pareto import searcher, sweep_of
 from gs_jax.codesign.search import initial_design
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
-from gs_jax.design.checks import plate_as_air
 from gs_jax.design.design import Design, read_design
+from gs_jax.design.validation import reduced_thicknesses
 from gs_jax.pictures.style import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"
@@ -84,7 +84,7 @@ def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
 def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[float, float]:
     """The least light, of the farthest depth, and the most, of the nearest, for a share at `MIDDLE`, %."""
     lens = design.lens
-    front, _ = plate_as_air(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    front, _ = reduced_thicknesses(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
     near, far = (light * ((MIDDLE + front) / (depth + front)) ** 2 for depth in span)
     return far, MORE * near
 

@@ -1,4 +1,4 @@
-"""Lenses and sensor, and where a lens images a point (Eqs. 1, 3).
+"""Sensor and imager: the map from a point to its image under each lens (Eqs. 1, 3).
 
 Every length is in millimetres, the wavelength too. Lateral points are `(x, y)`, images are
 `[row, column]`. The lateral frame is the whole sensor's: origin at its
@@ -19,35 +19,35 @@ from .base.arrays import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
 
-# A wavelength beyond these is in another unit: 520 nm are 520e-6 mm. 10 nm to 0.1 mm.
+# Limits of the wavelength, mm: others are in another unit.
 SHORTEST, LONGEST = 1e-5, 0.1
 _WAVELENGTH: Rule = (
     f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)",
     lambda x: (x >= SHORTEST) & (x <= LONGEST),
 )
 
-# Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a
-# gradient, narrow enough to leave the paper's N_e lenses nearly alone (it adds 5 % to the radius to visit).
+# Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a gradient, and
+# so narrow that it adds 5 % to the radius in which lenses see a point.
 FALLOFF = 0.1
 
 
 def chief_ray(center, point, magnification):
-    """Where the chief ray from `point` through the lens at `center` meets the sensor.
+    """Position on the sensor of the chief ray from `point` through the lens at `center`.
 
     `p = c + (c - q) v/z' = s_z c - M_z q` with `M_z = v/z'` (Eq. 3) and `s_z = 1 + M_z` (Eq. 1).
-    It acts on each coordinate alone, so every argument may be one coordinate or a whole vector; all
-    broadcast. Everything in the package that needs the map calls this function.
+    It acts on each coordinate by itself, so arguments may be coordinates or vectors; all broadcast. It is the only
+    implementation of the map.
     """
     return center + magnification * (center - point)
 
 
 def envelope(distance_squared, reduced_depth, field_radius):
-    """The envelope C: how much of a point's light a lens gives to its image, 1 on the lens's axis.
+    """The envelope C: relative light of a point's image under a lens, 1 on the lens's axis.
 
-    `cos(theta)^4` of the chief ray (Lambert's law and the foreshortened aperture; the paper cites the
-    law and gives no formula), times a falloff at the field radius that is smooth, so that lens positions
-    have gradients. The falloff is 1/2 at the field radius, where the paper takes the Strehl ratio to be
-    half its peak, and its integral over the plane is `A_e = pi field_radius^2` exactly.
+    It is `cos(theta)^4` of the chief ray (Lambert's law and the foreshortened aperture; the paper cites the law without
+    a formula) times a falloff at the field radius. The falloff is smooth, so that lens positions have gradients. It is
+    1/2 at the field radius, where the paper takes the Strehl ratio to be half its peak, and its integral over the plane
+    is exactly `A_e = pi field_radius^2`.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ def envelope(distance_squared, reduced_depth, field_radius):
 
 
 def falloff(distance_squared, field_radius):
-    """From 1 to 0 across the field radius, where it is 1/2; 0 from `field_limit` on."""
+    """Falloff from 1 to 0 across the field radius, where it is 1/2; 0 from `field_limit` on."""
     outer = field_limit(field_radius) ** 2
     t = jnp.clip((outer - distance_squared) / (2 * FALLOFF * field_radius**2), 0, 1)
     return t * t * (3 - 2 * t)
 
 
 def field_limit(field_radius):
-    """The lateral distance from a lens's axis at which the envelope becomes zero, mm."""
+    """Lateral distance from a lens's axis at which the envelope becomes zero, mm."""
     return field_radius * (1 + FALLOFF) ** 0.5
 
 
@@ -82,11 +82,11 @@ class Sensor(eqx.Module):
     Parameters
     ----------
     shape
-        `(rows, columns)`, two pixels each way at least: interpolation needs neighbours.
+        `(rows, columns)`, at least two each: interpolation needs neighbours.
     pixel_pitch
-        Distance of pixel centres, mm. It is a plain number, not an array: a camera is given, not optimised.
+        Distance of pixel centres, mm: a plain number, as a camera is not optimised.
     origin
-        `(x, y)` of the middle of these pixels, mm: of a region of the whole sensor, whose centre is the frame's origin.
+        `(x, y)` of the middle of these pixels, mm, for a region of a sensor whose centre is the frame's origin.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class Sensor(eqx.Module):
 
 
 class Views(NamedTuple):
-    """How lenses see points, one view for each pair of a lens and a point.
+    """Views of points by lenses, one for each pair of a lens and a point.
 
     `spot`: where the chief ray meets the sensor, `(*view, 2)`, mm. `offset`: the point's `(x, y)` from the lens's axis,
     mm. `reduced_depth`: `z'`, mm, which broadcasts.
@@ -159,8 +159,8 @@ class Imager(eqx.Module):
     sensor_distance
         `v`, from the array's back to the sensor, mm: from the lens vertices, or from the plano face if that is behind.
     field_radius
-        `sqrt(A_e / pi)`, mm: how far beside its axis a lens still counts as seeing a point (paper, "Field
-        of view"). It decides how many voxels a lens visits, hence shapes, so it is a plain number.
+        `sqrt(A_e / pi)`, mm: largest distance of a point from a lens's axis at which the lens sees it (paper, "Field of
+        view"). It decides array shapes, so it is a plain number.
     rotation
         Of the array about the frame's origin, radians, from +x toward +y.
     shift
@@ -168,14 +168,14 @@ class Imager(eqx.Module):
     wavelength
         Of the light, mm: 520e-6 for 520 nm.
     tilt
-        Slopes `(x, y)` of the array's plane, which goes through the point `v` above the sensor's centre: by how much it
-        rises toward the object along +x and +y. None, the default, is an array parallel to the sensor.
+        Slopes `(x, y)` of the array's plane toward the object along +x and +y, about the point `v` above the sensor's
+        centre. None, the default, is an array parallel to the sensor.
 
     Raises
     ------
     ValueError
-        If `field_radius` or `sensor_distance` is not positive, a number is not finite, or `wavelength` is none in mm
-        (values that JAX traces are not looked at).
+        If `field_radius` or `sensor_distance` is not positive, a number is not finite, or `wavelength` is not one in mm
+        (traced values are not checked).
 
     Examples
     --------
@@ -206,9 +206,8 @@ class Imager(eqx.Module):
     def centers(self) -> Scalars:
         """Lens vertices `(lens, 2)` in the sensor's frame, mm.
 
-        A rotated array is nothing but moved centres: in the sensor's frame the chief-ray map stays
-        separable in x and y, which is what makes back-projection fast. So does a tilted one, seen from above; its
-        `heights` give each lens a magnification of its own.
+        Rotation only moves the centres, so the chief-ray map stays separable in x and y in the sensor's frame, which
+        makes back-projection fast. So does a tilt, whose `heights` give each lens a magnification of its own.
         """
         centers = self._in_plane
         if self.tilt is None:
@@ -218,7 +217,7 @@ class Imager(eqx.Module):
 
     @property
     def heights(self) -> Scalars:
-        """Lens vertices `(lens,)` above `v`, toward the object, mm: 0 unless the array is tilted."""
+        """Heights `(lens,)` of the vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
             return library_of(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
         return self._cosine * (self._in_plane @ self.tilt)
@@ -233,40 +232,40 @@ class Imager(eqx.Module):
 
     @property
     def _cosine(self):
-        """Of the angle of the tilt."""
+        """Cosine of the tilt's angle."""
         assert self.tilt is not None
         return 1 / library_of(self.tilt).sqrt(1 + (self.tilt**2).sum())
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
-        """`z'`: from the object to the lens vertices as the optics sees it, mm.
+        """Reduced depth `z'` from the object to the lens vertices, mm.
 
-        `z + t/n`, as the plate counts as `t/n` of air, or `z` with the curved side in front. An imager of NumPy's
+        It is `z + t/n` with the plate in front, and `z` with the curved side in front. An imager of NumPy's
         numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
         """
-        return library_of(self.sensor_distance).asarray(depth) + self.array.air_in_front
+        return library_of(self.sensor_distance).asarray(depth) + self.array.reduced_thickness_front
 
     @property
     def reduced_sensor_distance(self) -> Scalar:
-        """`v'`: from the lens vertices to the sensor as the optics sees it, `v`, or `v + t/n` with the plate behind."""
-        return self.sensor_distance + self.array.air_behind
+        """Reduced distance `v'` from the lens vertices to the sensor: `v`, or `v + t/n` with the plate behind."""
+        return self.sensor_distance + self.array.reduced_thickness_back
 
     def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
         return self.reduced_sensor_distance / self.reduced_depth(depth)
 
     def magnifications(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "lens depth"]:
-        """Of each lens: `(v' + h) / (z' - h)` at the height `h`. One row for all lenses unless the array is tilted."""
+        """Magnification of each lens, `(v' + h) / (z' - h)` at the height `h`; one row unless the array is tilted."""
         if self.tilt is None:
             return self.magnification(depth)[None]
         return self.magnification_of(self.magnification(depth)[None], self.heights[:, None])
 
     def magnification_of(self, magnification, height):
-        """What `M = v'/z'` becomes for a lens at a height, mm: `(v' + h) / (z' - h)`; they broadcast."""
+        """Magnification of a lens at a height, mm, from `M = v'/z'`: `(v' + h) / (z' - h)`; they broadcast."""
         v = self.reduced_sensor_distance
         return magnification * (v + height) / (v - height * magnification)
 
     def axis_offset(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
-        """How far beside its vertex a lens's axis is at a depth, mm, `(*batch, 2)`: it is normal to the array."""
+        """Offset of a lens's axis, which is normal to the array, from its vertex at a depth, mm, `(*batch, 2)`."""
         xp, reduced = library_of(self.sensor_distance), self.reduced_depth(depth)
         tilt = xp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
         return -xp.multiply.outer(reduced, tilt)
@@ -282,10 +281,10 @@ class Imager(eqx.Module):
         *,
         distortion: Scalars = 1.0,
     ) -> Views:
-        """How lenses see points `(x, y, z)`, mm: the map from a point to its spot, with the tilt.
+        """The map from points `(x, y, z)`, mm, to their spots under lenses.
 
-        Everything asks it but the kernels, which keep x and y apart (`gs_jax.projection.rays`) and are tested against
-        it. `points` and `lenses` broadcast. An imager of NumPy's numbers gives NumPy's.
+        All code uses it but the kernels, whose separable form (`gs_jax.projection.rays`) is tested against it. `points`
+        and `lenses` broadcast. An imager of NumPy's numbers gives NumPy's.
 
         Parameters
         ----------
@@ -294,8 +293,8 @@ class Imager(eqx.Module):
         lenses
             Indices of `array.centers`.
         distortion
-            By what the spot's distance from the image of the lens's axis is multiplied: 1 of a chief ray, and of a
-            spot's core what `gs_jax.optics.psf_core` finds.
+            Factor of the spot's distance from the image of the lens's axis: 1 for the chief ray, others for the core of
+            a spot (`gs_jax.optics.psf_core`).
         """
         xp = library_of(self.sensor_distance)
         depth, lenses = points[..., 2], xp.asarray(lenses)
@@ -303,20 +302,20 @@ class Imager(eqx.Module):
         center, point = self.centers[lenses], points[..., :2]
         if self.tilt is None:
             return Views(chief_ray(center, point, magnification[..., None]), point - center, reduced)
-        lean = self.axis_offset(depth)
+        offset = self.axis_offset(depth)
         magnification = self.magnification_of(magnification, self.heights[lenses])
-        # Distances are from the lens's axis, which leans.
-        drawn = point + xp.broadcast_to(1 / distortion - 1, reduced.shape)[..., None] * lean
-        return Views(chief_ray(center, drawn, magnification[..., None]), point - center - lean, reduced)
+        # Distances are from the lens's axis, which is tilted.
+        distorted = point + xp.broadcast_to(1 / distortion - 1, reduced.shape)[..., None] * offset
+        return Views(chief_ray(center, distorted, magnification[..., None]), point - center - offset, reduced)
 
     def views_of_all(self, points: Float[Array | np.ndarray, "point 3"]) -> Views:
-        """How each lens sees each point: `views`, `(lens, point)`."""
+        """`views` of each point by each lens, `(lens, point)`."""
         return self.views(points[None], np.arange(len(self.array.centers))[:, None])
 
     def project(self, points: Float[Array | np.ndarray, "point 3"]) -> Scalars:
-        """Where each lens images each point `(x, y, z)`, `(lens, point, 2)`, mm on the sensor."""
+        """Spot of each point `(x, y, z)` under each lens, `(lens, point, 2)`, mm on the sensor."""
         return self.views_of_all(points).spot
 
     def brightness(self, views: Views) -> Scalars:
-        """The envelope C of views: how much of a point's light a lens gives to its spot."""
+        """The envelope C of views."""
         return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)

@@ -1,4 +1,4 @@
-"""The lenses on their plate, and the shape of their surface. Lengths are in millimetres."""
+"""Microlenses on a plate, and the shape of their surface. Lengths are in millimetres."""
 
 import dataclasses
 import math
@@ -15,9 +15,9 @@ from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Rule, as_float, as_floa
 from .base.errors import InputError
 from .typing import Scalar, Scalars
 
-# Side of the lenses that faces the object.
+# The side of the lenses that faces the object.
 Orientation = Literal["plano", "curved"]
-# Numbers that lenses may have of their own.
+# Numbers that may differ between lenses.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
 _SIZE: Rule = ("positive, or infinite", lambda x: x > 0)
 _INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
@@ -36,14 +36,14 @@ class MicrolensArray(eqx.Module):
     centers
         Lens vertices `(lens, 2)` in the array's own frame, mm.
     radius_of_curvature, aperture_diameter
-        One number for all lenses, or `(lens,)`, mm. The aperture is the one before neighbours clip it: a lens ends
-        where its surface meets theirs, for lenses that are alike at the edge of its Voronoi cell.
+        One number for all lenses, or `(lens,)`, mm. The aperture is nominal: overlapping lenses are truncated where
+        their surfaces intersect, which for identical lenses is the Voronoi edge.
     refractive_index, substrate_thickness
-        Of the lenses and of the plate that carries them; mm, from its plano face to the vertices.
+        Index of lenses and plate; distance from the plate's plano face to the vertices, mm.
     thin_lens_focal_length
         Overrides the focal length that follows from the radius, mm, for a thin-lens study.
     size
-        `(x, y)` of the plate, centred, mm: where the outer lenses end. By default they are as wide as their discs.
+        `(x, y)` of the centred plate, mm, which truncates the outer lenses; infinite by default.
     orientation
         The side of the lenses that faces the object, `"plano"` or `"curved"`.
     conic_constant
@@ -59,9 +59,8 @@ class MicrolensArray(eqx.Module):
     Raises
     ------
     ValueError
-        If `centers` is not `(lens, 2)` or holds no lens, a number of each lens is there for too few or too many, a
-        number is not finite or out of range (values that JAX traces are not looked at), or there is no such
-        orientation.
+        If a shape is wrong, a number is not finite or out of range (traced values are not checked), or the orientation
+        does not exist.
 
     Examples
     --------
@@ -114,11 +113,11 @@ class MicrolensArray(eqx.Module):
 
     @property
     def alike(self) -> bool:
-        """Whether all lenses have the same numbers, as one lens unit has; all numbers are scalars then."""
+        """Whether all lenses have the same numbers, which are scalars then."""
         return not any(getattr(self, name).ndim for name in EACH)
 
     def check_alike(self) -> None:
-        """`InputError` unless all lenses are alike: what is computed for a lens unit has one for all of them."""
+        """Raise `InputError` unless all lenses are alike."""
         if not self.alike:
             found = ", ".join(name for name in EACH if getattr(self, name).ndim)
             raise InputError(f"Lenses must be alike, got lenses that differ in {found}; `lens(k)` is one of them.")
@@ -128,10 +127,7 @@ class MicrolensArray(eqx.Module):
         return dataclasses.replace(self, centers=self.centers[index][None], others=None, **self._numbers(index))
 
     def subset(self, which: Sequence[int] | Int[np.ndarray, " kept"]) -> "MicrolensArray":
-        """Lenses that are alike, such as one of `lenses_by_type`, as an array whose `others` are the rest.
-
-        The numbers are those of the first of them.
-        """
+        """Lenses that are alike, such as those of a type, as an array whose `others` are the rest."""
         which = np.array(which)
         rest = np.setdiff1d(np.arange(len(self.centers)), which)
         others = dataclasses.replace(self, centers=self.centers[rest], **self._numbers(rest)) if rest.size else None
@@ -139,7 +135,7 @@ class MicrolensArray(eqx.Module):
 
     @property
     def whole(self) -> "MicrolensArray":
-        """These lenses and then the others, as one array."""
+        """These lenses and the others as one array."""
         if self.others is None:
             return self
         both = self, self.others
@@ -161,32 +157,32 @@ class MicrolensArray(eqx.Module):
         return self.thin_lens_focal_length
 
     @property
-    def air_in_front(self) -> Scalar:
-        """The glass between the object and the vertices as so much air, `t/n`: none if the curved side is in front."""
+    def reduced_thickness_front(self) -> Scalar:
+        """Reduced thickness `t/n` of the plate in front of the vertices, mm; 0 if the curved side is in front."""
         reduced = self.substrate_thickness / self.refractive_index
         return reduced if self.orientation == "plano" else 0 * reduced
 
     @property
-    def air_behind(self) -> Scalar:
-        """The glass between the vertices and the sensor as so much air, mm."""
-        return self.substrate_thickness / self.refractive_index - self.air_in_front
+    def reduced_thickness_back(self) -> Scalar:
+        """Reduced thickness `t/n` of the plate behind the vertices, mm."""
+        return self.substrate_thickness / self.refractive_index - self.reduced_thickness_front
 
     @property
     def departure(self) -> Scalar:
-        """By how much `r^4` the surface falls more than the sphere, `k / (8 R^3) + A_4`, 1/mm^3."""
+        """Coefficient of `r^4` in the departure from a sphere, `k / (8 R^3) + A_4`, 1/mm^3."""
         departure = self.conic_constant / (8 * self.radius_of_curvature**3)
         return departure + self.aspheric_terms[0] if self.aspheric_terms.size else departure
 
     def reaches(self, squared_radius: Scalars) -> Scalars:
-        """Whether there is a surface at a squared distance from the axis, mm^2: a conic may end."""
+        """Whether the surface exists at a squared distance from the axis, mm^2: a conic may end."""
         return (1 + self.conic_constant) * squared_radius < self.radius_of_curvature**2
 
     def sag(self, squared_radius: Scalars) -> Scalars:
-        """How far the surface is below its vertex, mm, where it `reaches`."""
+        """Depth of the surface below its vertex, mm, where it `reaches`."""
         return sag(squared_radius, *self._shape)
 
     def sag_slope_over_r(self, squared_radius: Scalars) -> Scalars:
-        """Slope of the surface over the radius, `s'(r) / r`, 1/mm: that has no division by zero on the axis."""
+        """Slope of the surface over the radius, `s'(r) / r`, 1/mm, finite on the axis."""
         return sag_slope_over_r(squared_radius, *self._shape)
 
     @property

@@ -8,7 +8,7 @@ from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.cli.options import shipped_designs
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design, write_design
-from gs_jax.design.plausible import USUAL, slip
+from gs_jax.design.validation import USUAL, slip
 
 from .helpers import needs
 from .test_cli import DESIGN, folder, run

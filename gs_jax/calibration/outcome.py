@@ -10,9 +10,9 @@ from rich.table import Table
 
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
-from ..design.checks import reach
 from ..design.design import Design
 from ..design.tables import CalibrationTable
+from ..design.validation import reach
 from ..io.provenance import Provenance
 from ..io.toml import one_line
 from ..lenses import EACH, MicrolensArray

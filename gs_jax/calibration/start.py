@@ -106,7 +106,7 @@ def _seen(found: Similarity, point, imager: Imager) -> Imager:
     magnification = scale - 1
     array = _mirrored(imager.array) if found.mirrored else imager.array
     reduced = imager.reduced_sensor_distance if np.isnan(z) else magnification * float(imager.reduced_depth(z))
-    distance = reduced - imager.array.air_behind
+    distance = reduced - imager.array.reduced_thickness_back
     shift = (found.shift + magnification * complex(x, y)) / scale
     shift = imager.shift if np.isnan(shift) else (shift.real, shift.imag)
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
@@ -186,7 +186,7 @@ def begin_without_lenses(
         raise InputError(f"captures: found {text}, allowed: {allowed}")
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift, i.tilt)
     zero = jnp.zeros((), imager.sensor_distance.dtype)
-    distance = imager.reduced_sensor_distance * step - imager.array.air_behind
+    distance = imager.reduced_sensor_distance * step - imager.array.reduced_thickness_back
     # Rotation, shift and tilt are in the lenses' places.
     types = [imager.array.lens(int(which[0])) for which in lenses_by_type(imager.array)]
     new = (moved_lenses(types[0], centers), distance, zero, jnp.zeros(2, zero.dtype), None)

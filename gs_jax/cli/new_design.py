@@ -271,8 +271,8 @@ def _fill(known: dict[str, Any], key: str, asking: bool) -> None:
 def _ask(known: dict[str, Any], path: str, default: Any, meaning: str = "") -> Any:
     """Ask until the answer is allowed; confirm values that look like a wrong unit."""
     from ..design.keys import design_keys, problem
-    from ..design.plausible import USUAL, meant, slip
     from ..design.start import clash
+    from ..design.validation import USUAL, meant, slip
 
     key = design_keys()[path]
     hint = f"usually {key.usual}" if key.usual else key.allowed

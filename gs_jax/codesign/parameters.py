@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
-from ..design.checks import plate_as_air
 from ..design.design import Design
+from ..design.validation import reduced_thicknesses
 from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH, type_of_lens
@@ -103,7 +103,7 @@ def _largest_magnification(design: Design, near: float, far: float, free: Mappin
     # Of an index that is free the one that makes it largest: the plate is in front, or behind.
     in_front = design.lens.orientation == "plano"
     index = (most if in_front else least)("refractive_index", design.lens.refractive_index)
-    front, back = plate_as_air(design.array.substrate_thickness_mm, index, design.lens.orientation)
+    front, back = reduced_thicknesses(design.array.substrate_thickness_mm, index, design.lens.orientation)
     nearest = (near + far - most("depth_span_mm", far - near)) / 2
     distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
     return (distance + back) / (nearest + front)

@@ -17,8 +17,8 @@ import numpy as np
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
-from ..design.checks import plate_as_air
 from ..design.design import Design, read_design
+from ..design.validation import reduced_thicknesses
 from ..layouts import interleave
 from ..lenses import lenses_by_type
 from ..typing import PathLike
@@ -199,7 +199,7 @@ def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndar
     """Focal lengths of thin lenses focused on equal parts of the depths, in vergence, relative to the middle's."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
     lens, array = design.lens, design.array
-    front, back = plate_as_air(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    front, back = reduced_thicknesses(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
     ends = 1 / (near + front), 1 / (far + front)
     share = (np.arange(types) + 0.5) / types
     behind = 1 / (design.imaging.sensor_distance_mm + back)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
-from ..design.checks import of_each
 from ..design.design import Design, write_design
+from ..design.validation import of_each
 from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import lenses_by_type

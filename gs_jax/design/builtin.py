@@ -1,4 +1,4 @@
-"""The built-in designs, as the paper describes them."""
+"""The built-in design of the paper."""
 
 from ..layouts import random_layout
 from .design import Design

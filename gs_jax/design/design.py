@@ -1,7 +1,4 @@
-"""Design files: what a microscope is, as TOML.
-
-A key carries its unit, and this module is where units end: `Design.imager` gives the geometry in mm and radians.
-"""
+"""Design files: a microscope as TOML. Keys carry their units; `Design.imager` gives the geometry in mm and radians."""
 
 import difflib
 import math
@@ -22,10 +19,9 @@ from ..io.toml import Table, one_line
 from ..lenses import MicrolensArray
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
-from .checks import check_whole, of_each
 from .imagers import sharp_depths, tables_of
-from .plausible import doubts, slips
 from .tables import ArrayTable, CalibrationTable, ImagingTable, LensTable, SensorTable
+from .validation import check_whole, doubts, of_each, slips
 
 
 class Design(Table):
@@ -42,7 +38,7 @@ class Design(Table):
     >>> scope = design.imager()  # in mm and radians
     """
 
-    name: str = Field(title="what reports call it", description="a string")
+    name: str = Field(title="name in reports", description="a string")
     sensor: SensorTable = Field(title="the camera", description="a table")
     lens: LensTable = Field(title="plano-convex microlenses, alike or not", description="a table")
     array: ArrayTable = Field(title="the plate, and where its lenses are", description="a table")
@@ -52,9 +48,7 @@ class Design(Table):
         title="the array as found on the sensor; `gs-jax calibrate` writes it",
         description="a table",
     )
-    provenance: dict[str, Any] = Field(
-        default={}, title="where the file comes from; anything may stand here", description="a table"
-    )
+    provenance: dict[str, Any] = Field(default={}, title="where the file comes from; free-form", description="a table")
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Design":

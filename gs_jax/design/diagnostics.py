@@ -152,7 +152,7 @@ def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Condition
     )
     paraxial = sheet["focus_distance_mm"]
     if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:
-        image = paraxial[0] + float(array.air_behind)
+        image = paraxial[0] + float(array.reduced_thickness_back)
         sharpest = 1 / (1 / image + 2 * float(error.spherical[0, 0]) / pupil**2)
         found.append(
             "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "

@@ -1,4 +1,4 @@
-"""The tables of a design file from an imager: in the file's units, by the fewest decimals that give its numbers."""
+"""Design tables of an imager: in the file's units, with the fewest decimals that reproduce its numbers."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from ..optics.apertures import clear_diameter
 
 
 def tables_of(imager: Imager) -> dict[str, Any]:
-    """All tables but the working distance, which an imager has not."""
+    """All tables of an imager; it has no working distance."""
     array, sensor = imager.array, imager.sensor
     if not np.isfinite(array.plate).all():
         raise InputError(f"`array.size` must be finite, got {array.plate}.")
@@ -34,7 +34,7 @@ def tables_of(imager: Imager) -> dict[str, Any]:
             "focal_length_mm": None if focal_length is None else _decimal(focal_length),
         },
         "array": {
-            "size_mm": array.plate,
+            "size_mm": _decimal(array.size),
             "substrate_thickness_mm": _decimal(array.substrate_thickness),
             "centers_mm": _decimal(array.centers),
         },
@@ -52,12 +52,12 @@ def tables_of(imager: Imager) -> dict[str, Any]:
 
 
 def sharp_depths(imager: Imager) -> tuple[float, float]:
-    """Nearest and farthest depth that is sharp by Eq. 8, for any of the lenses, mm; two pixels are a point.
+    """Nearest and farthest depth in focus for any lens type (Eq. 8), with a circle of confusion of two pixels, mm.
 
     Raises
     ------
     InputError
-        If no depth is in focus, or what is sharp has no end.
+        If no depth is in focus, or the depth of field is infinite.
     """
     v, circle_of_confusion, ends = float(imager.reduced_sensor_distance), 2 * imager.sensor.pixel_pitch, []
     for which in lenses_by_type(imager.array):
@@ -75,12 +75,12 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
 
 
 def _decimal(value: Any) -> Any:
-    """Numbers, or lists of them, by the fewest decimals that are read back as they are."""
+    """Numbers, or lists of them, with the fewest decimals that reproduce them."""
     value = np.asarray(value)
     return [_decimal(part) for part in value] if value.ndim else float(str(value[()]))
 
 
 def _scaled(value: Any) -> Any:
-    """Numbers, or lists of them, without the last digits, which a change of units rounds."""
+    """Numbers, or lists of them, without the last digits, which the change of units rounds."""
     digits = np.finfo(value.dtype).precision
     return [_scaled(part) for part in value] if value.ndim else float(f"{value:.{digits}g}")

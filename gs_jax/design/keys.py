@@ -1,6 +1,6 @@
-"""What each key of a design file is: of one source comments in files, the schema for editors and the page of keys.
+"""Documentation of design keys: comments in files, the schema for editors and the page of keys.
 
-All is read from the fields of the tables: a title is what a key means, a description what is allowed.
+All of it is read from the fields of the tables, whose titles are meanings and whose descriptions are allowed values.
 """
 
 import textwrap
@@ -11,20 +11,20 @@ from pydantic import BaseModel, ValidationError
 
 from .centers import LENS_KEYS, CentersTable
 from .design import Design, as_toml
-from .plausible import USUAL, unit_of
+from .validation import USUAL, unit_of
 
 FRAME = (
     "Lengths have the unit that their key ends in. +x is along a row of the image as it is shown (right), +y along a "
     "column (down), both from the sensor's middle; depths z are positive from the array's front toward the object, the "
     "sensor distance v is positive from its back to the sensor."
 )
-# Of a file with comments: the many centres come late.
+# Tables at the end of a commented file: the centres are long.
 _LAST = ("array", "provenance")
 _WIDTH = 110
 
 
 class Key(NamedTuple):
-    """A key of a design file; `table` is empty at the top, `usual` is empty where nothing is."""
+    """A key of a design file. `table` is empty at the top level, `usual` where there is no usual range."""
 
     table: str
     name: str
@@ -45,7 +45,7 @@ def design_keys() -> dict[str, Key]:
 
 
 def problem(path: str, value: Any) -> str | None:
-    """What is wrong with a value of the key at `path` alone, as a line; None if it is allowed."""
+    """The error of a value of the key at `path`, checked by itself; None if it is allowed."""
     table, _, name = path.partition(".")
     try:
         Design.model_validate({table: {name: value}})
@@ -56,9 +56,9 @@ def problem(path: str, value: Any) -> str | None:
 
 
 def commented(design: Design) -> str:
-    """A design as TOML, each key with what it means and what is allowed; what is read back is equal."""
+    """A design as TOML with a comment on each key."""
     known, data = design_keys(), design.model_dump(exclude_defaults=True)
-    lines = [*_comment(f"A microscope for gs-jax. {FRAME}"), "", *_comment(_told(known["name"]))]
+    lines = [*_comment(f"A microscope for gs-jax. {FRAME}"), "", *_comment(_comment_text(known["name"]))]
     lines.append(as_toml({"name": design.name}).rstrip())
     tables = [table for table in data if table != "name"]
     for table in sorted(tables, key=lambda table: (table in _LAST, table == _LAST[1])):
@@ -67,7 +67,7 @@ def commented(design: Design) -> str:
             lines.append(as_toml({table: data[table]}).partition("\n")[2].rstrip())
             continue
         for name, value in data[table].items():
-            lines += [*_comment(_told(known[f"{table}.{name}"])), as_toml({name: value}).rstrip()]
+            lines += [*_comment(_comment_text(known[f"{table}.{name}"])), as_toml({name: value}).rstrip()]
     return "\n".join(lines) + "\n"
 
 
@@ -78,7 +78,7 @@ def schema() -> dict[str, Any]:
     array["properties"] |= more["properties"]
     array["required"].remove("centers_mm")
     array["oneOf"] = [{"required": [name]} for name in ("centers_mm", "centers_file")]
-    # That file may hold these.
+    # The centres file may have these columns.
     lens = made["$defs"]["LensTable"]
     lens["required"] = [name for name in lens["required"] if name not in LENS_KEYS]
     for table, model in _models().items():
@@ -86,7 +86,7 @@ def schema() -> dict[str, Any]:
         for name, field in where["properties"].items():
             key = design_keys()[f"{table}.{name}".removeprefix(".")]
             field.pop("title", None)
-            field["description"] = _told(key)
+            field["description"] = _comment_text(key)
     return {"$schema": "http://json-schema.org/draft-07/schema#"} | _for_toml(made) | {"title": "A design of gs-jax"}
 
 
@@ -107,8 +107,8 @@ def _all_keys() -> Iterator[Key]:
             yield Key(table, name, unit, field.title or "", field.description or "", usual, field.is_required())
 
 
-def _told(key: Key) -> str:
-    """In one line."""
+def _comment_text(key: Key) -> str:
+    """Meaning, allowed values and usual range of a key."""
     allowed = f"; {key.allowed}" if key.allowed != "a table" else ""
     return f"{key.meaning}{allowed}{f'; usually {key.usual}' if key.usual else ''}"
 
@@ -123,7 +123,7 @@ def _comment(text: str) -> list[str]:
 
 
 def _for_toml(node: Any) -> Any:
-    """Without what TOML has not (null) and what not all editors know (`prefixItems`, of draft 2020-12)."""
+    """Remove null, which TOML lacks, and `prefixItems` (draft 2020-12), which not all editors know."""
     if isinstance(node, list):
         return [_for_toml(each) for each in node]
     if not isinstance(node, dict):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from ..base.errors import InputError
 from ..layouts import nearest_neighbour_distances, random_layout
-from .checks import beside_sensor
+from .validation import beside_sensor
 
 # The paper's material, plate and light.
 PDMS, PLATE_MM, GREEN_NM = 1.43, 1.0, 520.0

@@ -1,4 +1,4 @@
-"""The tables of a design file, and what each key may be."""
+"""Tables of a design file, with the type, range and meaning of each key."""
 
 from typing import Annotated
 
@@ -9,15 +9,15 @@ from ..io.toml import EACH, ONE, Table, one_or_each
 from ..lenses import Orientation
 from .centers import MAX_LENSES
 
-# Every description is what the error message says is allowed, every title what the key means: comments in files, the
-# schema for editors and the page of keys are made of both.
+# Descriptions are the allowed values, titles the meaning of a key. Error messages, comments in files, the schema for
+# editors and the page of keys are made of them.
 Length = Annotated[float, Field(ge=1e-6, le=1e4, description="a number of mm from 1e-6 to 1e4")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Pixels = Annotated[int, Field(ge=2, le=65536)]
 Wavelength = Annotated[
     float, Field(ge=1e6 * SHORTEST, le=1e6 * LONGEST, description="a number of nanometres from 10 to 1e5")
 ]
-# Strict as everything else, but a TOML array is a list and a frozen model wants tuples.
+# Not strict: a TOML array is a list, and a frozen model needs tuples.
 Point = Annotated[tuple[Coordinate, Coordinate], Field(strict=False, description="[x, y] in mm, up to 1e4")]
 Size = Annotated[tuple[Length, Length], Field(strict=False, description="[x, y] in mm from 1e-6 to 1e4")]
 Range = Annotated[tuple[Length, Length], Field(strict=False, description="[near, far] in mm, near below far")]
@@ -30,7 +30,7 @@ Terms = Annotated[
 ]
 Conic = Annotated[float, Field(ge=-100, le=100)]
 _ForEach = Field(strict=False, min_length=1, max_length=MAX_LENSES)
-# Of all lenses, or of each.
+# One number for all lenses, or one for each.
 Lengths = Annotated[Annotated[Length, Tag(ONE)] | Annotated[tuple[Length, ...], _ForEach, Tag(EACH)], one_or_each]
 Conics = Annotated[Annotated[Conic, Tag(ONE)] | Annotated[tuple[Conic, ...], _ForEach, Tag(EACH)], one_or_each]
 _ONE_EACH = "or a list with one for each lens, in the order of the centres"
@@ -50,7 +50,7 @@ Centers = Annotated[
 class SensorTable(Table):
     """`[sensor]`: the camera. With `origin_mm` it is a region of a larger one, whose centre is the frame's origin.
 
-    The key is the region's middle. Lenses need not reach a region, but one of them.
+    `origin_mm` is the region's middle. At least one lens has to have an image on a region.
     """
 
     pixel_pitch_um: float = Field(
@@ -70,9 +70,9 @@ class SensorTable(Table):
 class LensTable(Table):
     """`[lens]`: plano-convex microlenses. `focal_length_mm` overrides the radius, for a thin-lens study.
 
-    What may be a list is a number of each lens; columns of these names in the `centers_file` are read into it.
-    At the radius r the curved side is `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A4 r^4 + A6 r^6 + ...` below its
-    vertex, with `c = 1/R` and all lengths in mm.
+    A list has one number for each lens; columns of these names in the `centers_file` are read into it. At the radius
+    r the curved side is `c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A4 r^4 + A6 r^6 + ...` below its vertex,
+    with `c = 1/R` and all lengths in mm.
     """
 
     radius_of_curvature_mm: Lengths = Field(

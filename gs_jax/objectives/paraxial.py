@@ -85,7 +85,7 @@ def focus_distance(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Sensor distance `v` at which a thin lens images each depth; infinite if it does not; a row a type."""
     at = as_conditions(imager, depths)
     reduced = theory.focus_distance(imager.array.focal_length, imager.reduced_depth(at.depths))
-    return reduced - imager.array.air_behind
+    return reduced - imager.array.reduced_thickness_back
 
 
 @by_type

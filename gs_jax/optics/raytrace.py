@@ -128,7 +128,7 @@ def _curve_first(imager, depth, point, field) -> Refraction:
 def _ideally(imager, depth, point, field) -> Refraction:
     """An ideal lens: the slope behind it is `(image - point) / v'`, written with `1/v'`, may be zero."""
     array, v, xp = imager.array, imager.reduced_sensor_distance, library_of(point)
-    reduced = depth + array.air_in_front
+    reduced = depth + array.reduced_thickness_front
     focal_length: Scalars = array.thin_lens_focal_length
     vergence = 1 / focal_length - 1 / reduced
     slope = (point - field) / reduced
@@ -136,7 +136,7 @@ def _ideally(imager, depth, point, field) -> Refraction:
     landing = chief_ray(xp.zeros_like(point), field, v / reduced) + point * (1 - v * vergence)
     zero = xp.zeros_like(slope[0])
     faces = zero + 1, zero + 1
-    air = zero + array.air_in_front
+    air = zero + array.reduced_thickness_front
     return Refraction(point, zero, zero, air, slope, slope, tangent, faces, faces, landing, zero == 0)
 
 
@@ -363,7 +363,7 @@ def best_focus(
     points, weights = pupil_quadrature(pupil_radius(imager, radius))
 
     def error(vergence):
-        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence - imager.array.air_behind)
+        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence - imager.array.reduced_thickness_back)
         return _without_tilt(wavefront(moved, depth, points, field), points, weights)
 
     # Gauss-Newton: the wavefront is all but linear in 1/v', so that the first step is right to 1e-3.
@@ -373,12 +373,12 @@ def best_focus(
         value, slope = jax.jvp(error, (vergence,), (jnp.ones_like(vergence),))
         return vergence - jnp.sum(weights * value * slope) / jnp.sum(weights * slope**2)
 
-    return 1 / jax.lax.fori_loop(0, _FOCUS_STEPS, step, vergence) - imager.array.air_behind
+    return 1 / jax.lax.fori_loop(0, _FOCUS_STEPS, step, vergence) - imager.array.reduced_thickness_back
 
 
 def chief_ray_length(imager: Imager, chief: LensletRay) -> Float[Array, ""]:
     """From the vertex, as it is seen from the sensor, to the sensor along the chief ray, mm."""
-    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.air_behind
+    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.reduced_thickness_back
     if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `refraction.equivalent_air`
         behind = behind * n / jnp.sqrt(n**2 + (n**2 - 1) * squared)
     return (imager.sensor_distance + behind) * jnp.sqrt(1 + squared)

@@ -1,0 +1,298 @@
+"""Validation of designs: errors where the parts do not fit together, questions where a number is implausible.
+
+`check_whole` reports one problem at a time and names its key. `slips` and `doubts` ask about numbers that are possible
+but unusual, such as a length in another unit.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..lenses import sag_slope_over_r
+from .centers import LENS_KEYS, other_reading
+
+MIN_SPACING_MM = 1e-3
+# Radii at which the slope of a lens is checked.
+_RADII = 64
+
+
+def check_whole(design) -> None:
+    """Raise `ValueError` unless the numbers, the plate, the lenses and the sensor of a design fit together."""
+    for check in (_check_numbers, _check_lenses, _check_plate, _check_spacing, _check_reach):
+        check(design)
+
+
+_CENTERS = "`array.centers_mm`"
+
+
+def _check_numbers(design) -> None:
+    near, far = design.imaging.working_distance_mm
+    if not near < far:
+        raise ValueError(f"`imaging.working_distance_mm` must be [near, far], near below far, got [{near}, {far}]")
+
+
+def of_each(design, key: str) -> tuple[float, ...]:
+    """One of `LENS_KEYS` as a number for each lens."""
+    value = getattr(design.lens, key)
+    return value if isinstance(value, tuple) else (value,) * len(design.array.centers_mm)
+
+
+def _check_lenses(design) -> None:
+    lens, count = design.lens, len(design.array.centers_mm)
+    for key in LENS_KEYS:
+        if (found := len(of_each(design, key))) != count:
+            raise ValueError(f"`lens.{key}` must be one number or {count}, one a lens, got {found}")
+    first: dict[tuple[float, ...], int] = {}
+    for number, one in enumerate(zip(*(of_each(design, key) for key in LENS_KEYS), strict=True), 1):
+        first.setdefault(one, number)
+    for (radius, aperture, conic), number in first.items():
+        of_lens = f" of lens {number}" if len(first) > 1 else ""
+        if aperture > (end := widest_diameter(radius, conic)):
+            where = "twice `lens.radius_of_curvature_mm`" if not conic else "where the conic ends"
+            most = f"at most {round(end, 6)} mm, {where}"
+            raise ValueError(f"`lens.aperture_diameter_mm` must be {most}, got {aperture}{of_lens}")
+        radii = np.linspace(0, aperture / 2, _RADII + 1)[1:-1]
+        rising = sag_slope_over_r(radii**2, radius, conic, lens.aspheric_terms) <= 0
+        if rising.any():
+            which = f"lens {number} rises" if of_lens else "lenses rise"
+            got = f"{list(lens.aspheric_terms)}, with which {which} at {radii[np.argmax(rising)]:.3g} mm"
+            raise ValueError(f"`lens.aspheric_terms` must give lenses that fall from the vertex to the rim, got {got}")
+
+
+def widest_diameter(radius: float, conic_constant: float) -> float:
+    """Largest diameter of a conic surface, mm; infinite for paraboloids and hyperboloids."""
+    return 2 * radius / math.sqrt(1 + conic_constant) if conic_constant > -1 else math.inf
+
+
+def reduced_thicknesses(thickness: float, refractive_index: float, orientation: str) -> tuple[float, float]:
+    """Reduced thickness `t/n` of the plate in front of the lens vertices and behind them, mm; one of them is 0."""
+    reduced = thickness / refractive_index
+    return (reduced, 0.0) if orientation == "plano" else (0.0, reduced)
+
+
+def _check_plate(design) -> None:
+    centers = np.array(design.array.centers_mm)
+    half = np.array(design.array.size_mm) / 2
+    outside = (np.abs(centers) > half + 1e-9).any(axis=1)
+    if outside.any():
+        plate = f"within the plate `array.size_mm`, |x| up to {half[0]} mm and |y| up to {half[1]} mm"
+        lens = _lens(design, int(np.argmax(outside)))
+        raise ValueError(f"{_CENTERS} must be {plate}, got {lens}{other_reading(centers, half)}")
+
+
+def _check_spacing(design) -> None:
+    if pair := _close_pair(np.array(design.array.centers_mm)):
+        got = f"{_lens(design, pair[0])} and lens {pair[1] + 1} nearer to it"
+        raise ValueError(f"{_CENTERS} must be at least {MIN_SPACING_MM} mm apart, got {got}")
+
+
+def _close_pair(centers: np.ndarray) -> tuple[int, int] | None:
+    # Two lenses in one cell of half the spacing are too close. Without such pairs few lenses are close along x.
+    _, cells = np.unique(np.floor(centers / (MIN_SPACING_MM / 2)), axis=0, return_inverse=True)
+    order = np.argsort(cells.ravel(), kind="stable")
+    together = np.flatnonzero(np.diff(cells.ravel()[order]) == 0)
+    if together.size:
+        return int(order[together[0]]), int(order[together[0] + 1])
+    along, least, pairs = np.argsort(centers[:, 0], kind="stable"), MIN_SPACING_MM * (1 - 1e-9), []
+    for step in range(1, len(centers)):
+        apart = centers[along[step:]] - centers[along[:-step]]
+        if apart[:, 0].min() > least:
+            break
+        near = np.flatnonzero(np.hypot(*apart.T) <= least)
+        pairs += [tuple(sorted(map(int, pair))) for pair in zip(along[near], along[near + step], strict=True)]
+    return min(pairs, default=None)
+
+
+def _check_reach(design) -> None:
+    """Each lens has a sub-image on the sensor; on a region of a larger sensor one lens has."""
+    distance, radius = reach(design)
+    beyond = distance > radius
+    if beyond.all() or (beyond.any() and design.sensor.origin_mm is None):
+        index = int(np.argmax(beyond))
+        most = f"at most {radius:.4g} mm beside the sensor, the radius of a lens's image of the field"
+        raise ValueError(f"{_CENTERS} must be {most}, got {_lens(design, index)}, {distance[index]:.4g} mm beside it")
+
+
+def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
+    """Distance of each lens beside the sensor, and the radius of its image of the field at the nearest depth, mm.
+
+    That image is the disc `v'/z' field_radius` about its vertex.
+    """
+    imaging, calibration = design.imaging, design.calibration
+    angle = math.radians(calibration.rotation_deg)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
+    middle = np.array(design.sensor.origin_mm or (0.0, 0.0))
+    distance = beside_sensor(centers - middle, design.sensor.shape, design.sensor.pixel_pitch_um)
+    lens = design.lens
+    front, back = reduced_thicknesses(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
+    near, v = imaging.working_distance_mm[0] + front, imaging.sensor_distance_mm + back
+    radius = v / near * imaging.field_radius_mm
+    return distance, radius
+
+
+def beside_sensor(
+    centers: Float[np.ndarray, "lens 2"], shape: tuple[int, int], pixel_pitch_um: float
+) -> Float[np.ndarray, " lens"]:
+    """Lateral distance of each lens from a sensor, mm; 0 above it."""
+    half = np.array(shape)[::-1] * pixel_pitch_um / 2000
+    return np.hypot(*np.maximum(np.abs(centers) - half, 0).T)
+
+
+def _lens(design, index: int) -> str:
+    return f"lens {index + 1} at {list(design.array.centers_mm[index])} mm"
+
+
+# Usual ranges, in the unit of the key: the smallest and the largest microlenses that are built.
+USUAL: dict[str, tuple[float, float]] = {
+    "sensor.pixel_pitch_um": (0.5, 50.0),
+    "lens.radius_of_curvature_mm": (0.1, 50.0),
+    "lens.refractive_index": (1.3, 4.1),
+    "lens.aperture_diameter_mm": (0.02, 20.0),
+    "lens.focal_length_mm": (0.1, 100.0),
+    "array.size_mm": (0.5, 200.0),
+    "array.substrate_thickness_mm": (0.01, 20.0),
+    "imaging.sensor_distance_mm": (0.5, 100.0),
+    "imaging.working_distance_mm": (0.2, 2000.0),
+    "imaging.wavelength_nm": (150.0, 15_000.0),
+    "imaging.field_radius_mm": (0.02, 200.0),
+}
+_FACTORS = (1e-3, 1e3, 1e-6, 1e6, 1e9)
+_LADDER = ("nm", "um", "mm", "m")
+# Larger numbers are not lengths, and larger integers not floats.
+_ENDLESS = 1e30
+# Largest usual ratio of the sensor distance and the distance of the image.
+_OFF = 3.0
+# Largest usual field radius in units of the depth: 63 degrees.
+_WIDEST = 2.0
+# Lenses closer than their diameter over this number are in another unit, such as metres that are read as mm.
+_CLOSEST = 50.0
+
+# Lenses whose nearest neighbour is computed.
+_SOME = 100
+
+
+def slips(data: Mapping[str, Any]) -> list[str]:
+    """Questions about numbers of a design's tables that would be usual in another unit.
+
+    Parameters
+    ----------
+    data
+        The tables of a file; entries that are not numbers are ignored.
+    """
+    return [question for key in USUAL if (question := slip(key, _value(data, key)))]
+
+
+def slip(key: str, value: Any) -> str | None:
+    """The question about a value of a key; None if it is usual, or not a positive number."""
+    numbers = _positive(value)
+    low, high = USUAL[key]
+    if not numbers or all(low <= each <= high for each in numbers):
+        return None
+    found, unit = f"{key} = {_numbers(numbers)}", unit_of(key)
+    if (other := _other(key, numbers)) is None:
+        return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    meant, their_unit = other
+    as_given = f" ({_numbers(numbers)} {their_unit})" if their_unit else ""
+    return f"{found}: did you mean {_numbers(meant)} {unit}{as_given}?"
+
+
+def meant(key: str, value: Any) -> float | list[float] | None:
+    """The usual value, in the key's unit, of a value that is in another unit; None if there is none."""
+    if slip(key, value) is None or (other := _other(key, _positive(value))) is None:
+        return None
+    return other[0] if isinstance(value, list | tuple) else other[0][0]
+
+
+def doubts(data: Mapping[str, Any]) -> list[str]:
+    """Questions about valid tables of a design: those of `slips`, or else unlikely combinations."""
+    return slips(data) or list(_unlikely(data))
+
+
+def unit_of(key: str) -> str:
+    """The unit at the end of a key; empty if there is none."""
+    unit = key.rpartition("_")[2]
+    return unit if unit in (*_LADDER, "deg") else ""
+
+
+def _positive(value: Any) -> list[float]:
+    """The positive numbers of a value as floats; empty for anything else."""
+    numbers = list(value) if isinstance(value, list | tuple) else [value]
+    right = all(type(each) in (int, float) and 0 < each < _ENDLESS for each in numbers)
+    return [float(each) for each in numbers] if right else []
+
+
+def _other(key: str, numbers: list[float]) -> tuple[list[float], str | None] | None:
+    """Usual numbers that differ by a power of a thousand, and the unit in which the given numbers would be these."""
+    low, high = USUAL[key]
+    if (unit := unit_of(key)) not in _LADDER:
+        return None
+    for factor in _FACTORS:
+        usual = [float(f"{each * factor:.9g}") for each in numbers]
+        if all(low <= each <= high for each in usual):
+            step = _LADDER.index(unit) + round(math.log10(factor) / 3)
+            return usual, _LADDER[step] if 0 <= step < len(_LADDER) else None
+    return None
+
+
+def _value(data: Mapping[str, Any], key: str) -> Any:
+    table, _, name = key.partition(".")
+    inner = data.get(table)
+    found = inner.get(name) if isinstance(inner, Mapping) else None
+    if table == "lens" and (numbers := sorted(set(_positive(found)))):
+        return [numbers[0], numbers[-1]] if len(numbers) > 1 else numbers[0]  # one number a lens: the extremes
+    return found
+
+
+def _numbers(values: list[float]) -> str:
+    shown = [f"{value:.9g}" for value in values]
+    return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
+
+
+def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
+    lens, array, imaging = data["lens"], data["array"], data["imaging"]
+    near, far = imaging["working_distance_mm"]
+    kind = lens.get("orientation", "plano")
+    front, back = reduced_thicknesses(array["substrate_thickness_mm"], lens["refractive_index"], kind)
+    v = imaging["sensor_distance_mm"]
+    radius, diameters = (np.array(lens[key], float) for key in ("radius_of_curvature_mm", "aperture_diameter_mm"))
+    f = np.array(lens.get("focal_length_mm") or radius / (lens["refractive_index"] - 1))
+    least, most = float(f.min()), float(f.max())
+    focal = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
+    depths = f"{near:g} to {far:g} mm"
+    if near + front <= least:
+        said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
+        yield f"{said} Nearer than the focal length, {focal} mm, no real image forms."
+    else:
+        image = lambda f, depth: 1 / (1 / f - 1 / (depth + front)) - back if depth + front > f else math.inf
+        longest, shortest = image(most, near), image(least, far)
+        if not shortest / _OFF <= v <= longest * _OFF:
+            said = f"imaging.sensor_distance_mm = {v:g}: is it meant?"
+            yield f"{said} Lenses of f = {focal} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
+    if (field := imaging["field_radius_mm"]) > _WIDEST * far:
+        yield f"imaging.field_radius_mm = {field:g}: is it meant? A lens sees so far beside its axis at {depths}."
+    if (diameter := float(diameters.max())) > 2 * (plate_size := max(array["size_mm"])):
+        yield f"lens.aperture_diameter_mm = {diameter:g}: is it meant? The whole plate is {plate_size:g} mm."
+    pitch = _pitch(np.array(array["centers_mm"], float))
+    if pitch < diameter / _CLOSEST:
+        yield (
+            f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; did you mean "
+            f"{pitch * 1000:.3g} mm, a list in another unit?"
+        )
+    half = np.minimum(np.minimum(diameters, pitch) / 2, radius)
+    height = float(np.max(radius - np.sqrt(radius**2 - half**2)))  # of spheres, which others are not far from
+    if 0 < (thickness := array["substrate_thickness_mm"]) < height and not lens.get("focal_length_mm"):
+        said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
+        yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
+
+
+def _pitch(centers: np.ndarray) -> float:
+    """Mean distance of about a hundred lenses from their nearest neighbour; infinite for two lenses or fewer."""
+    if len(centers) <= 2:
+        return math.inf
+    some = centers[:: len(centers) // _SOME + 1]
+    # Without SciPy, whose import takes longer. The nearest point is the lens itself.
+    return float(np.mean([np.partition(np.hypot(*(centers - center).T), 1)[1] for center in some]))
