@@ -17,6 +17,7 @@ from jax.test_util import check_grads
 import gs_jax as gs
 from gs_jax import InputError, objectives
 from gs_jax.codesign.lbfgsb import LBFGSB
+from gs_jax.objectives.conditions import per_type
 
 DEPTHS = np.array([18.0, 20.0, 22.0])
 
@@ -176,11 +177,12 @@ def test_depths_behind_the_array_are_refused():
         objectives.spot_width(small(), np.array([20.0, -3.0]))
 
 
-def test_objectives_of_lenses_that_differ_are_of_all_or_refused():
+def test_objectives_of_lenses_that_differ_are_of_the_plate_of_each_type_or_of_the_best():
     scope = small(radius_of_curvature=[2.0, 2.2, 2.0])
     assert objectives.occupancy(scope, DEPTHS).shape == (3,)
-    with pytest.raises(InputError, match="lenses that differ"):
-        objectives.spot_width(scope, DEPTHS)
+    assert objectives.lateral_resolution(scope, DEPTHS).shape == (2, 3)
+    widths = [objectives.spot_width(*part) for part in per_type(scope, DEPTHS)]
+    np.testing.assert_allclose(objectives.spot_width(scope, DEPTHS), np.min(widths, 0), rtol=1e-12)
 
 
 def test_an_objective_of_ones_own_to_a_file(tmp_path):

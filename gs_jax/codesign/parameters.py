@@ -113,7 +113,11 @@ def start_values(imager: Imager, at: Conditions) -> Values:
     """Every parameter by name. Of lenses that differ, radius, aperture and conic constant have one value a type."""
     array = imager.array
     first = np.unique(type_of_lens(array), return_index=True)[1]
-    radius, diameter, conic = (x if x.ndim == 0 else x[first] for x in (getattr(array, name) for name in EACH))
+    numbers = [getattr(array, name) for name in EACH]
+    if len(first) > 1:
+        # A number that all types share may differ between them in a search.
+        numbers = [jnp.broadcast_to(number, len(array.centers))[first] for number in numbers]
+    radius, diameter, conic = numbers
     return {
         "sensor_distance_mm": imager.sensor_distance,
         "radius_of_curvature_mm": radius,
