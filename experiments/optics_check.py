@@ -30,10 +30,11 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
-from gs_jax.optics.aberrations import independent_rms, seidel_of_array
+from gs_jax.optics.aberrations import best_focus, independent_rms, seidel_of_array, wavefront_rms
 from gs_jax.optics.apertures import aperture_area
-from gs_jax.optics.psf import diffraction_psf, geometric_psf, strehl
-from gs_jax.optics.raytrace import best_focus, pupil_quadrature, trace_lenslet, wavefront_rms
+from gs_jax.optics.diffraction import strehl
+from gs_jax.optics.psf import diffraction_psf, geometric_psf
+from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
 
 WAVELENGTH = 520e-6
 # Of the pupil, mm: near half the paper's pitch (1.23 mm), and as far as its lens can be traced to a field of 3 mm.

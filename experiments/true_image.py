@@ -33,9 +33,9 @@ from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import random_layout
 from gs_jax.lenses import Orientation
+from gs_jax.optics.aberrations import best_focus
 from gs_jax.optics.field_varying import RINGS, field_varying_psf
 from gs_jax.optics.psf import psf_of_depth
-from gs_jax.optics.raytrace import best_focus
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.simulation.phantoms import letters, random_points, rasterize
 from gs_jax.simulation.synthetic import simulate_points

@@ -14,7 +14,7 @@ The microscope:
     read_design          The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`
     write_design         Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal
     geomscope            The paper's microscope (Table 1), with a random layout of our own of the same statistics
-    random_layout        A random layout with a wanted pitch and no hole between the lenses
+    random_layout        A random layout with a given pitch, without gaps between the lenses
     calibrate            Finds a microscope's geometry in captures of point sources, from a design that is about right
 
 From a capture to a volume:

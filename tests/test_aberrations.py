@@ -18,8 +18,8 @@ from gs_jax.optics.aberrations import (
     seidel,
     seidel_of_array,
     strehl,
+    wavefront,
 )
-from gs_jax.optics.raytrace import wavefront
 from gs_jax.optics.theory import focus_distance
 
 R, F, N, DEPTH, WAVELENGTH = 2.0, 2 / 0.43, 1.43, 20.7, 520e-6

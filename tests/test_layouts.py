@@ -133,7 +133,7 @@ def test_random_layout_is_on_the_plate_and_the_same_again(count, size, seed):
         (100, PLATE, {}, "`count` must be 154 or more for lenses of 2 mm to cover 20 x 20 mm, got 100"),
         (1, (1.9, 1.0), {"diameter": 2.1}, "`count` must be 2 or more"),
         (1, (1.0, 1.0), {"pitch": 1.0}, "must be None for a single lens"),
-        (12, (5.0, 5.0), {}, "the search came to pitch 1.* mm of 1.296, SD .* largest hole 1.* mm of at most 1"),
+        (12, (5.0, 5.0), {}, "the search came to pitch 1.* mm of 1.296, SD .* largest gap 1.* mm of at most 1"),
     ],
 )
 def test_random_layout_says_what_is_wrong(count, size, options, message):

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from experiments.many_foci import gain, numbers_of, picture, run
 from gs_jax import random_layout
 from gs_jax.base.progress import Progress
-from gs_jax.layouts import interleave
+from gs_jax.optics.lens_types import interleave
 
 pytestmark = pytest.mark.integration
 

@@ -7,8 +7,10 @@ from scipy.special import j0, j1
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray
-from gs_jax.optics.psf import diffraction_psf, gaussian_psf, geometric_psf, strehl, window_fraction
-from gs_jax.optics.raytrace import best_focus, trace_lenslet, wavefront_rms
+from gs_jax.optics.aberrations import best_focus, wavefront_rms
+from gs_jax.optics.diffraction import strehl
+from gs_jax.optics.psf import diffraction_psf, gaussian_psf, geometric_psf, window_fraction
+from gs_jax.optics.raytrace import trace_lenslet
 
 WAVELENGTH, RADIUS = 520e-6, 0.65
 KINDS = [diffraction_psf, geometric_psf, gaussian_psf]

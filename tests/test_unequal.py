@@ -10,7 +10,7 @@ import pytest
 
 from gs_jax import MicrolensArray
 from gs_jax.lenses import lenses_by_type
-from gs_jax.optics.apertures import _edges, aperture_area
+from gs_jax.optics.apertures import _edge_distances, aperture_area
 from gs_jax.optics.psf_core import aperture_profile
 
 from .test_aperture import layout
@@ -41,7 +41,7 @@ def test_two_spheres_meet_in_a_circle():
     with np.errstate(invalid="ignore"):
         roots = (-q + np.sqrt(q**2 - 4 * p * s) * [[-1], [1]]) / (2 * p)
     roots = np.where((roots > 0) & (b * roots >= a), roots, np.inf)
-    np.testing.assert_allclose(_edges(array, 512)[0], np.minimum(roots.min(0), 1.0), rtol=1e-9)
+    np.testing.assert_allclose(_edge_distances(array, 512)[0], np.minimum(roots.min(0), 1.0), rtol=1e-9)
 
 
 def test_alike_lenses_end_at_their_cells():

@@ -19,8 +19,8 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design, read_design
 from ..design.validation import reduced_thicknesses
-from ..layouts import interleave
 from ..lenses import lenses_by_type
+from ..optics.lens_types import interleave
 from ..typing import PathLike
 from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Float64
 from skimage.measure import label, regionprops
 
 from ..grid import Grid
-from ..layouts import Number
+from ..typing import Number
 
 # Standard deviation of a normal distribution over its median deviation from the median.
 _DEVIATION = 1.4826

@@ -1,8 +1,7 @@
-"""Optics of lenses that differ: what is computed for one lens unit, for each type of lens, and how much a kind counts.
+"""Arrays of several lens types: the optics of each type, its weight in sums over the lenses, and the sharpness.
 
-Images are linear in the lenses: the image by all is the sum of the images by each type, whose lenses are alike.
-
-Whether a microscope is in focus: the part of a spot's light that falls into its core. Host code."""
+Images are linear in the lenses: the image is the sum of the images by each type, whose lenses are identical.
+"""
 
 import math
 import warnings
@@ -10,24 +9,29 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 
 from ..base.errors import InputWarning
 from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import lenses_by_type
+from .apertures import clear_area
 from .field_varying import FieldVaryingPsf
-from .psf_core import clear_area, ensquared_light
+from .psf_core import ensquared_light
 
-# Points of the field at which a lens's light is computed.
-_LIGHT_FIELDS = 17
+# Smallest fraction of a spot's light in its core for finding points. The paper's microscope has 21 to 51 % in focus,
+# over 18 to 22 mm, and 1 % with its sensor at 4 mm; its first lenses on pixels three times as wide have 6 % there, and
+# show one of three points.
+MIN_SHARPNESS = 0.08
+# Half the side of the square that collects a core's light, in pixels, and fields at which that is computed.
+HALF_SIDE, FIELDS = 3, 17
 
 
 class PerTypePsf(eqx.Module):
-    """Optics of each type of lens; `gs_jax.optics_of` makes it.
+    """PSFs of each lens type; `gs_jax.optics_of` makes it.
 
-    `lenses`: which are of the type. `optics`: its PSF at each depth, with the sum of the light that it has over that of
-    the mean lens; or all of its light.
+    `lenses`: indices of each type's lenses. `optics`: for each type, its PSF at each depth, with the sum of its light
+    over that of the mean lens; or all of its light.
     """
 
     lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -35,81 +39,83 @@ class PerTypePsf(eqx.Module):
 
 
 def split_by_type(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
-    """The imager with the lenses of each type alone; the others still end these where their surfaces meet."""
+    """The imager with the lenses of each type alone, whose apertures the other lenses still bound."""
     return [eqx.tree_at(lambda i: i.array, imager, imager.array.subset(which)) for which in lenses]
 
 
-def relative_areas(imagers: Sequence[Imager]) -> Float64[np.ndarray, " kind"]:
-    """Mean clear area of each type's lenses over that of all lenses: the light that a kind has near its axis."""
+def interleave(centers: Float[np.ndarray, "lens 2"], types: int) -> Int[np.ndarray, " lens"]:
+    """Assign a lens type, 0 to `types - 1`, to each lens, in about equal numbers, so that neighbours differ.
+
+    Column after column, each lens gets the type that is rarest among its six nearest neighbours so far, and of those
+    the rarest on the plate.
+    """
+    assigned = np.full(len(centers), -1)
+    if types == 1 or len(centers) == 1:
+        return assigned + 1
+    # Imaging needs no layouts, and importing SciPy takes as long as a back-projection.
+    from scipy.spatial import KDTree
+
+    distance, near = (np.asarray(part)[:, 1:] for part in KDTree(centers).query(centers, k=min(7, len(centers))))
+    columns = np.round(centers[:, 0] / distance[:, 0].mean())
+    for lens in np.lexsort((centers[:, 1], columns)):
+        others = np.bincount(assigned[near[lens]][assigned[near[lens]] >= 0], minlength=types)
+        rare = np.bincount(assigned[assigned >= 0], minlength=types)
+        assigned[lens] = np.lexsort((rare, others))[0]
+    return assigned
+
+
+def relative_areas(imagers: Sequence[Imager]) -> Float64[np.ndarray, " type"]:
+    """Mean clear area of each type over that of all lenses: its relative light near the axis."""
     areas = [np.asarray(clear_area(one.array), np.float64) for one in imagers]
     return np.array([area.mean() for area in areas]) / np.concatenate(areas).mean()
 
 
 def type_weights(
     imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float
-) -> Float64[np.ndarray, "kind depth"]:
-    """How much each kind counts in a sum over the lenses, at each depth; 1 on average over the lenses.
+) -> Float64[np.ndarray, "type depth"]:
+    """Weights of the types in a sum over the lenses, at each depth; their mean over the lenses is 1.
 
-    A point of brightness a gives the pixel that lens j reads for its voxel `y_j = s_j a + noise`. Of all sums `w_j y_j`
-    that with the weights `w_j = s_j / var_j` has the largest signal over noise (matched filter, Gauss and Markov). The
-    noise is the camera's and that of the light of all voxels, which is about the same under every lens, so a lens
-    counts by `s_j`: the share of the point's light that it brings into a square about its core, by exact rays over its
-    field. Lenses that are alike count equally.
-
-    Parameters
-    ----------
-    imagers
-        `split_by_type`.
-    depths
-        From the array's front, mm.
-    side
-        Of the square on the sensor that a voxel is read from, mm.
+    Matched filter: a point of brightness a gives the pixel that lens j reads for its voxel `y_j = s_j a + noise`, and
+    of all sums `w_j y_j` that with `w_j = s_j / var_j` has the largest signal over noise. The variance (camera, and
+    light of all voxels) is about the same under every lens, so the weight is `s_j`: the fraction of the point's light
+    in a square of `side` (mm, on the sensor) about the core, by exact rays over the field. `imagers` are
+    `split_by_type`'s.
     """
-    fields = np.linspace(0, imagers[0].field_radius, _LIGHT_FIELDS)
-    # Lenses are spread evenly: there are as many more at a field as its circle is longer.
+    fields = np.linspace(0, imagers[0].field_radius, FIELDS)
+    # Lenses are spread evenly: their number at a field is proportional to the circle's length.
     signal = np.stack([ensquared_light(one, depths, fields, side) @ fields for one in imagers])
     count = np.array([len(one.array.centers) for one in imagers], np.float64)
     mean = count @ signal / count.sum()
     return np.divide(signal, mean, out=np.ones_like(signal), where=mean > 0)
 
 
-# Least part of a spot's light, of lenses within the field radius, that must fall into its core. The paper's microscope
-# has 21 to 51 % in focus, over 18 to 22 mm, and 1 % with its sensor at 4 mm; its first lenses on pixels three times as
-# wide have 6 % there, and show one of three points.
-MIN_SHARPNESS = 0.08
-# Half the side, in pixels, of the square in which the light of a core is summed, and fields at which it is.
-HALF_SIDE, FIELDS = 3, 17
-
-
 def core_width(imager: Imager) -> float:
-    """Side of the square in which the light of a core is summed, mm."""
+    """Side of the square that collects a core's light, mm."""
     return (2 * HALF_SIDE + 1) * imager.sensor.pixel_pitch
 
 
 def sharpness(imager: Imager, grid: Grid) -> float:
-    """The part of a spot's light that falls into its core, of lenses within the field radius.
+    """Fraction of a spot's light in its core, for lenses within the field radius: the least over the grid's depths.
 
-    The least over the depths of a grid, by exact rays. Points are found by their cores: below `MIN_SHARPNESS` what is
-    found are caustics, and no points.
+    By exact rays, for the sharpest type at each depth. Below `MIN_SHARPNESS` bright places are caustics, not points.
     """
     depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
     fields = np.linspace(0, imager.field_radius, FIELDS)
     each = [imager] if imager.array.alike else split_by_type(imager, lenses_by_type(imager.array))
-    in_square = lambda one, side: ensquared_light(one, depths, fields, side) @ fields
-    # At each depth the type of lenses that is the sharpest.
+    light = lambda one, side: ensquared_light(one, depths, fields, side) @ fields
     core = core_width(imager)
-    return float(np.max([in_square(one, core) / in_square(one, math.inf) for one in each], 0).min())
+    return float(np.max([light(one, core) / light(one, math.inf) for one in each], 0).min())
 
 
-def blur_warning(share: float, what: str, then: str) -> str | None:
-    """A warning that something needs sharper spots than this `sharpness`, and what that means; None if not."""
-    if share >= MIN_SHARPNESS:
+def blur_warning(fraction: float, what: str, then: str) -> str | None:
+    """Text for a `sharpness` below `MIN_SHARPNESS`: `what` needs more, else `then`; None if it is sharp enough."""
+    if fraction >= MIN_SHARPNESS:
         return None
-    found = f"{share:.1%} of a spot's light falls into its core"
+    found = f"{fraction:.1%} of a spot's light falls into its core"
     return f"out of focus at these depths: {found}, where {what} need {MIN_SHARPNESS:.0%}; {then}"
 
 
 def warn_if_blurred(imager: Imager, grid: Grid, what: str, then: str) -> None:
-    """`InputWarning` where spots are not sharp enough for something."""
-    if blurred := blur_warning(sharpness(imager, grid), what, then):
-        warnings.warn(blurred, InputWarning, stacklevel=3)
+    """Issue `blur_warning` as an `InputWarning`."""
+    if text := blur_warning(sharpness(imager, grid), what, then):
+        warnings.warn(text, InputWarning, stacklevel=3)

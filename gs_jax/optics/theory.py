@@ -1,9 +1,8 @@
-"""What the paper's formulas promise of a microscope: resolution, depth of field, occupancy (Eqs. 4-8, 11).
+"""The paper's formulas for resolution, depth of field and occupancy (Eqs. 4-8, 11).
 
-Plain functions of numbers and arrays that broadcast, lengths in mm. Every depth here, argument or result, is the
-reduced depth `z' = z + t/n` that the optics sees (`Imager.reduced_depth`): subtract `t/n` to show a limit to a user.
-Bare equation numbers mean the GEOMScope paper. Its Eqs. 7 and 8 take the lens's 2 mm for the diameter, its
-numerical aperture the pitch; `diameter` here is meant to be that of the clear aperture (`aperture.clear_diameter`).
+Functions of numbers and arrays that broadcast, lengths in mm. Every depth, argument or result, is the reduced depth
+`z' = z + t/n` (`Imager.reduced_depth`). `diameter` is meant to be that of the clear aperture
+(`apertures.clear_diameter`); the paper takes the lens's 2 mm in Eqs. 7 and 8, and the pitch in its numerical aperture.
 """
 
 import math
@@ -25,10 +24,7 @@ def f_number(focal_length: Real, diameter: Real) -> Result:
 
 
 def numerical_aperture(focal_length: Real, diameter: Real) -> Result:
-    """Numerical aperture `NA = D / (2 f)` of a lens unit, on the sensor's side.
-
-    The paper's "effective NA" of 0.13 is this with the pitch for the diameter ("Design of the microlens array").
-    """
+    """Numerical aperture `NA = D / (2 f)` on the sensor's side; the paper's "effective NA" of 0.13 is for the pitch."""
     return jnp.asarray(diameter) / (2 * focal_length)
 
 
@@ -56,7 +52,7 @@ def axial_resolution(lateral: Real, reduced_depth: Real, field_radius: Real) -> 
 
 
 def focus_distance(focal_length: Real, reduced_depth: Real) -> Result:
-    """Where a thin lens images a point, `1/v_f = 1/f - 1/z'`, mm behind it; infinite for `z' <= f`."""
+    """Image distance of a thin lens, `1/v_f = 1/f - 1/z'`, mm; infinite for `z' <= f`."""
     return safe_quotient(jnp.asarray(focal_length) * reduced_depth, jnp.asarray(reduced_depth) - focal_length)
 
 
@@ -66,22 +62,21 @@ def depth_in_focus(focal_length: Real, sensor_distance: Real) -> Result:
 
 
 def blur(focal_length: Real, diameter: Real, reduced_depth: Real, sensor_distance: Real) -> Result:
-    """Diameter of the patch that a point out of focus makes on the sensor, `D |v - v_f| / v_f`, mm.
+    """Diameter of a defocused point on the sensor, `D |v - v_f| / v_f`, mm, by the rays of a thin lens.
 
-    Written as `D |1 - v (1/f - 1/z')|`, which holds for virtual images too. Rays of a thin lens alone: neither
-    diffraction nor aberrations.
+    Written as `D |1 - v (1/f - 1/z')|`, which holds for virtual images too.
     """
     vergence = 1 / jnp.asarray(focal_length) - 1 / jnp.asarray(reduced_depth)
     return jnp.abs(1 - vergence * sensor_distance) * diameter
 
 
 def object_blur(focal_length: Real, diameter: Real, reduced_depth: Real, sensor_distance: Real) -> Result:
-    """The same patch as seen in the object, `blur / M` with `M = v/z'` (Eq. 3), mm."""
+    """`blur` in the object, `blur / M` with `M = v/z'` (Eq. 3), mm."""
     return blur(focal_length, diameter, reduced_depth, sensor_distance) * reduced_depth / sensor_distance
 
 
 def near_limit(focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real) -> Result:
-    """The nearest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
+    """Nearest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
 
     `z_N = z f^2 / (f^2 - c F f + c F z)`, where the patch on the sensor is `circle_of_confusion`, a diameter in mm.
     """
@@ -90,7 +85,7 @@ def near_limit(focal_length: Real, f_number: Real, reduced_depth: Real, circle_o
 
 
 def far_limit(focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real) -> Result:
-    """The farthest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
+    """Farthest depth that is sharp when the sensor is focused on `z'` (Eq. 8), mm.
 
     `z_F = z f^2 / (f^2 + c F f - c F z)`; infinite from the hyperfocal distance `f^2 / (c F) + f` on.
     """
@@ -109,10 +104,10 @@ def depth_of_field(focal_length: Real, f_number: Real, reduced_depth: Real, circ
 def approximate_depth_of_field(
     focal_length: Real, f_number: Real, reduced_depth: Real, circle_of_confusion: Real
 ) -> Result:
-    """The paper's approximation of it, `2 F c z^2 f^2 / (f^4 - F^2 c^2 z^2)` (Eq. 7), mm.
+    """The paper's approximation `2 F c z^2 f^2 / (f^4 - F^2 c^2 z^2)` (Eq. 7), mm.
 
-    It leaves `f` out beside `z`, so it is larger than `depth_of_field`, by the factor `z / (z - f)` for a small
-    circle_of_confusion: 1.3 for the paper's lens at 20 mm.
+    It neglects `f` beside `z`: it is larger than `depth_of_field` by the factor `z / (z - f)` for a small
+    circle of confusion: 1.3 for the paper's lens at 20 mm.
     """
     squared = jnp.asarray(focal_length) ** 2
     spread = jnp.asarray(f_number) * circle_of_confusion * reduced_depth
@@ -125,7 +120,7 @@ def effective_area(field_radius: Real) -> Result:
 
 
 def lenses_per_point(count: Real, plate_area: Real, field_radius: Real) -> Result:
-    """Mean number `N_e` of lenses that see a point: their density times `A_e`. For a point near the plate's middle."""
+    """Mean number `N_e` of lenses that see a point near the plate's middle: their density times `A_e`."""
     return effective_area(field_radius) * count / plate_area
 
 
@@ -138,21 +133,16 @@ def count_lenses(
 
 
 def occupancy(lenses_per_point: Real, magnification: Real) -> Result:
-    """Occupancy `V = N_e M^2` (Eq. 11): the illuminated share of the sensor for an object that fills the field."""
+    """Occupancy `V = N_e M^2` (Eq. 11): the illuminated fraction of the sensor for an object that fills the field."""
     return jnp.asarray(magnification) ** 2 * lenses_per_point
 
 
 def field_of_view(plate: Real, sensor: Real, magnification: Real, field_radius: Real) -> Result:
-    """Width of the object along x or y that at least one lens images onto the sensor, mm.
+    """Width of the object along an axis that at least one lens images onto the sensor, mm.
 
-    A point at `q` counts if some place `c` of the plate, `|c| <= plate/2`, is within the field radius of it and its
-    chief ray lands at `|s c - M q| <= sensor/2`. The outermost lens whose ray still lands, at
-    `c = min(plate/2, sensor/2 + M r)`, sees points up to `c + r`. Near the field's edge only few lenses see a point.
-
-    Parameters
-    ----------
-    plate, sensor
-        Widths along the axis, mm; both centred.
+    A lens at `c`, `|c| <= plate/2`, sees a point at `q` within the field radius r whose chief ray lands at
+    `|s c - M q| <= sensor/2`. The outermost such lens, at `c = min(plate/2, sensor/2 + M r)`, sees points up to `c +
+    r`.
     """
     half = jnp.asarray(sensor) / 2 + magnification * field_radius
     return 2 * (jnp.minimum(jnp.asarray(plate) / 2, half) + field_radius)

@@ -14,7 +14,7 @@ from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
-from ..optics.psf import phasor
+from ..optics.diffraction import phasor
 from .cpu import dispatch as native
 from .cpu.dispatch import native_on_cpu
 from .linear_map import linear_call

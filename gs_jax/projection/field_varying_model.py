@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 
 from ..geometry import Imager, Sensor
 from ..grid import Grid
+from ..optics.apertures import clear_area
 from ..optics.field_varying import FieldVaryingPsf, StrayLight
-from ..optics.psf_core import clear_area, ring_edges
+from ..optics.psf_core import ring_edges
 from .bilinear import Shapes, volume_to_image
 from .convolution import convolved, doubled, image_in_groups, with_margin
 from .linear_map import linear_call

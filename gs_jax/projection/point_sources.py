@@ -221,7 +221,7 @@ def full_image_of_points(
     halo = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_shared(points, coarse, grid), imager.sensor_distance.dtype)
     image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
-    size = kernel_size(imager, halo)
+    size = kernel_size(imager, halo.grid)
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for ends, *parts, profiles in rings:
         kernels = np.stack([render_kernel(profile, STEPS * size, STEPS) for profile in profiles])

@@ -19,7 +19,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ..base.errors import InputError, short_repr
 from ..grid import Grid
-from ..layouts import Number, check_positive, half_size
+from ..layouts import check_positive, half_size
+from ..typing import Number
 
 Emitters = Float[np.ndarray, "emitter 4"]
 

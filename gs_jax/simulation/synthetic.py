@@ -21,7 +21,6 @@ from ..geometry import Imager, Sensor
 from ..grid import Grid
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
-from ..layouts import Number
 from ..lenses import lenses_by_type
 from ..optics.field_varying import field_varying_psf, make_polar_grid
 from ..optics.lens_types import relative_areas, split_by_type
@@ -29,7 +28,7 @@ from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import forward
 from ..projection.levels import LEVELS
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
-from ..typing import PathLike
+from ..typing import Number, PathLike
 
 # From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
 EXPANDED = 16.0

@@ -26,8 +26,8 @@ from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
 from ...objectives.paraxial import third_order_wavefront
 from ...optics import aberrations
-from ...optics.psf import GOLDEN_ANGLE, diffraction_psf, window_fraction
-from ...optics.raytrace import trace_lenslet
+from ...optics.psf import diffraction_psf, window_fraction
+from ...optics.raytrace import GOLDEN_ANGLE, trace_lenslet
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)

@@ -40,7 +40,7 @@ from ...geometry import Imager
 from ...lenses import MicrolensArray
 from ...objectives.conditions import Conditions, clear_diameter
 from ...objectives.spot_size import spot_width
-from ...optics.psf import axial_strehl
+from ...optics.diffraction import axial_strehl
 from ...optics.raytrace import to_numpy
 from ...optics.theory import FWHM
 from ...typing import ScalarLike
