@@ -1,4 +1,4 @@
-"""How good a reconstruction is: images against the truth, and points against the truth. Host code."""
+"""Quality of a reconstruction: volumes and points against the truth. Host code."""
 
 from typing import NamedTuple
 
@@ -29,20 +29,20 @@ def quality(estimate: Volume, truth: Volume) -> Quality:
 
     *Host.*
 
-    Reconstructions have no absolute scale, so the estimate is first multiplied by
-    `max(<estimate, truth> / <estimate, estimate>, 0)`, the gain of least MSE; an estimate of zeros stays zero. The
-    data range is the truth's largest value. SSIM is taken plane by plane (7 x 7 window, uniform, as in scikit-image)
-    and averaged. On sparse volumes all-zero scores well: put it beside every other.
+    Reconstructions have no absolute scale: the estimate is first multiplied by the gain of least MSE,
+    `max(<estimate, truth> / <estimate, estimate>, 0)`. The data range is the truth's largest value. SSIM is the mean
+    over planes (7 x 7 window, uniform, as in scikit-image). On sparse volumes zeros score well: compare with that
+    score.
 
     Parameters
     ----------
     estimate, truth
-        Of one shape, planes of 7 x 7 at least. The truth is not negative.
+        Volumes of one shape, with planes of 7 x 7 at least; the truth is not negative, and positive somewhere.
 
     Raises
     ------
     ValueError
-        If the shapes differ, or the truth is nowhere positive.
+        If they are not as described.
 
     Examples
     --------
@@ -68,10 +68,9 @@ def quality(estimate: Volume, truth: Volume) -> Quality:
 
 
 class Localization(NamedTuple):
-    """Scores of points, and which found point is which true one: `pairs` is `(pair, 2)`, found and true.
+    """Scores of points; `pairs` `(pair, 2)` are indices of found and true points that match.
 
-    The errors are root mean squares over the pairs, mm: lateral over the distance in the plane, axial over z; NaN
-    without a pair.
+    The errors are root mean squares over the pairs, mm: of the distance in the plane, and of z; NaN without a pair.
     """
 
     precision: float
@@ -87,16 +86,15 @@ def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: f
 
     *Host.*
 
-    A pair may be `lateral` mm apart in the plane and `axial` mm in depth. As many pairs as possible are made, and
-    among these matchings the closest, by the distance in units of the two limits.
+    Of all matchings with the most pairs, the closest is taken, by the distance in units of the two limits.
 
     Parameters
     ----------
     found, truth
-        `(point, 3 or more)`, x, y, z first, mm; either may be empty. Nothing found where nothing is scores 1.
+        `(point, 3 or more)`, x, y, z first, mm; either may be empty. If both are, the scores are 1.
     lateral, axial
-        How far apart a pair may be, mm: by default a few times what the paper's microscope resolves, 0.03 and 0.3 mm.
-        Give those of a microscope of another size; points of 0.1 mm pitch all are within 0.1 mm of one.
+        Largest distance of a pair in the plane and in depth, mm. The defaults are a few times the resolution of the
+        paper's microscope, 0.03 and 0.3 mm; choose them for the microscope and the density of points.
 
     Examples
     --------
@@ -118,7 +116,7 @@ def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: f
 
 
 def _matching(a: np.ndarray, b: np.ndarray, lateral: float, axial: float) -> np.ndarray:
-    """Pairs within the limits, group by group of points that are near each other: the groups are small."""
+    """Best pairs within the limits, for each connected group of near points: the groups are small."""
     near = KDTree(a[:, :2]).query_ball_tree(KDTree(b[:, :2]), lateral) if len(a) and len(b) else []
     links = [(i, j) for i, some in enumerate(near) for j in some if abs(a[i, 2] - b[j, 2]) <= axial]
     if not links:

@@ -19,9 +19,9 @@ from gs_jax.design.design import read_design
 from gs_jax.detection.clustering import find_clusters
 from gs_jax.detection.evidence import point_evidence
 from gs_jax.detection.locate import find_points
-from gs_jax.layouts import interleave
 from gs_jax.metrics import localization
 from gs_jax.optics.apertures import clear_area
+from gs_jax.optics.lens_types import interleave
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import Camera, expose, simulate, simulate_points
 

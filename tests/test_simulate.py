@@ -93,9 +93,9 @@ def test_depths_are_taken_some_at_a_time(monkeypatch):
 
 def test_what_cannot_be_simulated_is_refused():
     options: dict[str, Any] = dict(progress=Progress())
-    with pytest.raises(InputError, match="blurred over .* pixels of the sensor each way, allowed: 128"):
+    with pytest.raises(InputError, match="blur must reach at most 128 pixels of the sensor each way, got"):
         simulate_points(np.array([[0.0, 0.0, 0.05, 1.0]]), imager(pixel=0.002), **options)
-    with pytest.raises(InputError, match="found a voxel of -1, allowed: 0 or more"):
+    with pytest.raises(InputError, match="voxels must not be negative, got -1"):
         simulate_volume(-np.ones((1, 3, 3), np.float32), imager(), Grid([20.0], (3, 3), 0.05), **options)
     for scene, grid, message in (
         (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene: found 9 of 9 voxels NaN or infinite"),
@@ -103,7 +103,7 @@ def test_what_cannot_be_simulated_is_refused():
         (
             np.array([[0.0, 0.0, 20.0, 1.0], [0.0, 0.0, -20.0, 1.0]]),
             None,
-            "found a point at the depth -20 mm, allowed:",
+            "depths of points must be positive, got -20 mm",
         ),
     ):
         with pytest.raises(InputError, match=message):

@@ -63,10 +63,7 @@ class RmsTerms(eqx.Module):
 
 @jax.jit
 def wavefront(
-    imager: Imager,
-    depth: ScalarLike,
-    pupil_points: Float[Array | np.ndarray, "*batch 2"],
-    field: Point = (0.0, 0.0),
+    imager: Imager, depth: ScalarLike, pupil_points: Float[Array | np.ndarray, "*batch 2"], field: Point = (0.0, 0.0)
 ) -> Float[Array, "*batch"]:
     """Wavefront error, mm: optical path to the reference sphere less the chief ray's; positive where light is late.
 

@@ -239,10 +239,7 @@ def _fresnel(n_in, cos_in, n_out, cos_out):
 
 @jax.jit
 def trace_lenslet(
-    imager: Imager,
-    depth: ScalarLike,
-    pupil_points: Float[Array | np.ndarray, "*batch 2"],
-    field: Point = (0.0, 0.0),
+    imager: Imager, depth: ScalarLike, pupil_points: Float[Array | np.ndarray, "*batch 2"], field: Point = (0.0, 0.0)
 ) -> LensletRay:
     """Trace rays from one object point through points of the lenslet to the sensor.
 

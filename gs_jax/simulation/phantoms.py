@@ -1,9 +1,9 @@
 """Scenes to image: emitters finer than any voxel, and the volume that they make on a grid.
 
-A scene is `(emitter, 4)`, rows of `(x, y, z, intensity)`, in mm and the frame of `geometry`; put scenes together
-with `np.concatenate`. What has an area or a volume is filled with emitters, and the intensity of each is the area
-(mm^2) or volume (mm^3) that it stands for: brightness does not depend on how fine they are. Scenes are made in
-NumPy, volumes in JAX.
+A scene is `(emitter, 4)`, rows of `(x, y, z, intensity)`, in mm and the frame of `geometry`; `np.concatenate` joins
+scenes. Areas and volumes are filled with emitters, whose intensity is the area (mm^2) or volume (mm^3) that each stands
+for: brightness does not depend on their spacing, `pitch`, the largest distance of neighbouring emitters in mm. Scenes
+are made in NumPy, volumes in JAX. Lengths and counts out of range raise `InputError`.
 """
 
 import math
@@ -26,28 +26,15 @@ Emitters = Float[np.ndarray, "emitter 4"]
 
 # Bars of a USAF element of width 1, a corner at the origin: three across x, a gap of two widths, three across y.
 _ELEMENT = np.array([(x, x + 1, 0, 5) for x in (0, 2, 4)] + [(7, 12, y, y + 1) for y in (0, 2, 4)], float)
-# Middle lines of a snowflake's arm along +x, of length 1, from and to x + iy.
+# Centre lines of a snowflake's arm along +x, of length 1, from and to x + iy.
 _SIDES = np.exp(1j * np.pi / 3 * np.array([1, -1]))
 _ARM = np.array([(0, 1), *((x, x + length * side) for x, length in ((0.45, 0.27), (0.72, 0.2)) for side in _SIDES)])
-# Text is drawn at least this high in pixels: Pillow fits letters to whole pixels.
+# Smallest height of rendered text in pixels, as Pillow fits letters to whole pixels.
 _LEAST_ROWS = 600
 
 
 def random_points(count: int, size: Sequence[Number], depth_range: Sequence[Number], *, seed: int = 0) -> Emitters:
-    """Points of intensity 1, uniform in a box.
-
-    Parameters
-    ----------
-    count, seed
-        Number of points, and which they are.
-    size, depth_range
-        `(x, y)` of the box, its middle on the axis, and `(near, far)`, mm; the same twice for a plane.
-
-    Raises
-    ------
-    InputError
-        If there is no point, or a length is out of range.
-    """
+    """Points of intensity 1, uniform in a box of the size `(x, y)` on the axis and the depths `(near, far)`, mm."""
     return _emitters(_uniform(count, half_size(size), _range(depth_range), seed).T, 1)
 
 
@@ -60,23 +47,18 @@ def beads(
     pitch: Number,
     seed: int = 0,
 ) -> Emitters:
-    """Glowing balls at random in a slab, as those in PDMS of Fig. 7 (5 um, in 2.5 mm); there they clump, here not.
+    """Fluorescent balls at random in a slab, as those in PDMS of Fig. 7 (5 um, in 2.5 mm), which clump there.
 
     Balls lie wholly inside and may overlap. Each is filled with a cubic lattice of emitters.
 
     Parameters
     ----------
     count, seed
-        Number of balls, and where they are.
+        Number of balls, and the seed of their positions.
     size, depth_range
         `(x, y)` of the slab, its middle on the axis, and its `(near, far)` sides, mm.
     diameter, pitch
-        Of a ball, and the most that neighbouring emitters in it are apart, mm.
-
-    Raises
-    ------
-    InputError
-        If there is no ball, a length is out of range, or a ball is larger than the slab.
+        Of a ball, and the spacing of its emitters, mm.
     """
     _check_lengths(diameter=diameter, pitch=pitch)
     half, (near, far), radius = half_size(size), _range(depth_range), diameter / 2
@@ -89,17 +71,11 @@ def beads(
 
 
 def usaf_bars(groups: Sequence[int] = (2, 3)) -> Float[np.ndarray, "bar 4"]:
-    """Bars of the 1951 USAF target: rows of `(x_min, x_max, y_min, y_max)`, mm.
+    """Bars of the 1951 USAF target (MIL-STD-150A): rows of `(x_min, x_max, y_min, y_max)`, mm.
 
-    Element `e` of group `g` has `2^(g + (e - 1) / 6)` line pairs per mm, three bars across x and then three
-    across y, five times as long as wide, as far apart as wide (MIL-STD-150A). So an element has six rows; groups
-    come as given, elements from 1 to 6. Where an element lies is ours: each group is a column, its first element
-    at the top (the least y), columns go from left to right, and the middle of the whole is on the axis.
-
-    Raises
-    ------
-    InputError
-        If there is no group.
+    Element `e` of group `g` has `2^(g + (e - 1) / 6)` line pairs per mm: three bars across x, then three across y, five
+    times as long as wide, as far apart as wide. The arrangement is ours: each group is a column of six elements, the
+    first at the top (the least y), columns go from left to right, and the middle of the whole is on the axis.
     """
     if len(groups) == 0:
         raise InputError("`groups` must be one group or more, got none.")
@@ -115,18 +91,7 @@ def usaf_bars(groups: Sequence[int] = (2, 3)) -> Float[np.ndarray, "bar 4"]:
 
 
 def usaf_1951(groups: Sequence[int] = (2, 3), *, depth: Number, pitch: Number) -> Emitters:
-    """The bars of `usaf_bars`, glowing, in the plane `depth` (Fig. 6).
-
-    Parameters
-    ----------
-    groups, depth, pitch
-        Of the target, its plane, and the most that neighbouring emitters in a bar are apart, mm.
-
-    Raises
-    ------
-    InputError
-        If there is no group, or a length is not positive.
-    """
+    """The bars of `usaf_bars`, glowing, in the plane `depth` (Fig. 6)."""
     _check_lengths(depth=depth, pitch=pitch)
     cells = [(_cells(a, b, pitch), _cells(c, d, pitch)) for a, b, c, d in usaf_bars(groups)]
     grids = [(np.tile(x, len(y)), np.repeat(y, len(x)), dx * dy) for (x, dx), (y, dy) in cells]
@@ -143,22 +108,17 @@ def snowflake(
 ) -> Emitters:
     """A flat six-armed snowflake, inclined so that it just spans a range of depths, as that of Fig. 8.
 
-    An arm is a line with two pairs of branches at 60 degrees, its ends round; it is turned about the middle by
-    60 degrees five times. The paper gives the width of its features and the depths; the rest is ours.
+    An arm is a line with two pairs of branches at 60 degrees, its ends round. The paper gives the width of its features
+    and the depths; the rest is ours.
 
     Parameters
     ----------
     depth_range
         `(near, far)` of the outline, mm; emitters on it stand out half a pitch. The same twice: not inclined.
     size, width, pitch
-        From tip to tip, of its lines, and the distance of its emitters, mm.
+        From tip to tip, of its lines, and the spacing of its emitters, mm. The size is at least 14 widths.
     tilt
         The direction toward which it becomes deeper, radians from +x (along an arm) to +y.
-
-    Raises
-    ------
-    InputError
-        If a length is out of range, or the size is less than 14 widths (branches would merge) or the depths' span.
     """
     near, far = _range(depth_range)
     _check_lengths(size=size, width=width, pitch=pitch)
@@ -177,22 +137,14 @@ def snowflake(
 
 
 def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitters:
-    """Glowing text in Pillow's own font, upright in an image with row 0 at the top; its middle is on the axis.
+    """Glowing text, one line or more, upright in an image with row 0 at the top, its middle on the axis.
 
-    Parameters
-    ----------
-    text, depth, height, pitch
-        One line or more, its plane, the height of a capital H, and the most that neighbouring emitters are apart, mm.
-
-    Raises
-    ------
-    InputError
-        If nothing of the text is visible, or a length is not positive.
+    In Pillow's own font, with capitals of a `height`, in the plane `depth`, mm.
     """
     _check_lengths(depth=depth, height=height, pitch=pitch)
     rows = math.ceil(height / pitch)
     parts = math.ceil(_LEAST_ROWS / rows)
-    ink = _inked(text, rows * parts * 1000 / len(_inked("H", 1000)))
+    ink = _render_text(text, rows * parts * 1000 / len(_render_text("H", 1000)))
     if not ink.any():
         raise InputError(f"`text` must have a visible character, got {text!r}.")
     padded, square = np.pad(ink, [(0, -n % parts) for n in ink.shape]), height / rows
@@ -203,23 +155,23 @@ def letters(text: str, *, depth: Number, height: Number, pitch: Number) -> Emitt
 
 
 def rasterize(emitters: Float[Array | np.ndarray, "emitter 4"], grid: Grid) -> Float[Array, "depth y x"]:
-    """The volume that a scene makes on a grid: emitters are shared out linearly along x, y, z.
+    """The volume that a scene makes on a grid: linear weights along x, y and z.
 
     *Host.*
 
-    The weights of an emitter between voxel centres keep its total and its centroid. In the outer half of a voxel
-    at the grid's edge all goes to that voxel, and what lies beyond is left out. Of a single depth, the voxels are
-    as thick as `grid.pitch`. Differentiable with respect to the emitters and the depths.
+    The weights of an emitter between voxel centres keep its total and its centroid. In the outer half of a voxel at the
+    grid's edge all goes to that voxel; what lies beyond is left out. Of a single depth, voxels are as thick as
+    `grid.pitch`. Differentiable with respect to the emitters and the depths.
 
     Parameters
     ----------
     emitters, grid
-        The scene, and the voxels, whose depths ascend, evenly or not. The volume is of the grid's type.
+        The scene, and the voxels, whose depths ascend, evenly or not. The volume has the grid's type.
 
     Raises
     ------
     ValueError
-        If the depths do not ascend or a number is not finite (values that JAX traces are not looked at).
+        If the depths do not ascend or a number is not finite (values traced by JAX are not checked).
 
     Examples
     --------
@@ -261,7 +213,7 @@ def _depth_index(z, grid):
 
 
 def _shares(index, size):
-    """The two neighbours of fractional indices along an axis, as `(index, weight)`; no weight off the axis."""
+    """The two neighbours of fractional indices along an axis, as `(index, weight)`; zero weight off the axis."""
     inside = ((index >= -0.5) & (index <= size - 0.5)).astype(index.dtype)
     index = jnp.clip(index, 0, size - 1)
     below = jnp.clip(jnp.floor(index), 0, max(size - 2, 0))
@@ -269,7 +221,7 @@ def _shares(index, size):
     return (below, inside * (1 - fraction)), (below + 1, inside * fraction)
 
 
-def _surely_not(condition) -> bool:  # what JAX traces has no value yet
+def _surely_not(condition) -> bool:  # a traced condition has no value
     return not isinstance(condition, Tracer) and not condition
 
 
@@ -295,14 +247,14 @@ def _emitters(xyz, intensity) -> Emitters:
 
 
 def _cells(start, end, pitch):
-    """Middles of the fewest equal parts of an interval that are no longer than `pitch`, and their length."""
+    """Middles and length of the fewest equal parts of an interval that are no longer than `pitch`."""
     count = math.ceil((end - start) / pitch * (1 - 1e-9))
     step = (end - start) / count
     return start + (np.arange(count) + 0.5) * step, step
 
 
 def _filled_sixth(arm, width, pitch):
-    """Square lattice over the arm in its sector, 30 degrees to both sides, and the area covered of each square."""
+    """Square lattice over the arm in its sector, 30 degrees to both sides, and the covered area of each square."""
     count = math.ceil((arm.real.max() + width) / pitch)
     x, y = (np.arange(count) + 0.5) * pitch, (np.arange(-count, count) + 0.5) * pitch
     points = (x + 1j * y[:, None]).ravel()
@@ -313,8 +265,8 @@ def _filled_sixth(arm, width, pitch):
     return points[covered > 0], covered[covered > 0] * pitch**2
 
 
-def _inked(text, font_size):
-    """How much of each pixel `(row, column)` of a text's bounding box is covered, 0 to 1."""
+def _render_text(text, font_size):
+    """Coverage, 0 to 1, of each pixel `(row, column)` of a text's bounding box."""
     font = ImageFont.load_default(size=font_size)
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), text, font=font)
     page = Image.new("L", (math.ceil(right - left) + 2, math.ceil(bottom - top) + 2))

@@ -1,6 +1,4 @@
-"""What a camera makes of an image: shot noise, read noise, saturation, whole counts; and back to electrons.
-
-From a scene to the image on the sensor."""
+"""Synthetic captures: the noiseless image of a scene on the sensor, and a camera's noise and counts."""
 
 import math
 from pathlib import Path
@@ -30,16 +28,171 @@ from ..projection.levels import LEVELS
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
 from ..typing import Number, PathLike
 
-# From this mean on, `poisson` uses an expansion. The first term of the sum below is larger than `_summed` needs.
+Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]
+
+# Chief rays alone make no image of a point.
+OPTICS = tuple(level for level in LEVELS if level != "pinhole")
+# Spacing of the depths at which the PSF of points is computed, mm: between, it changes by less than a pixel's width;
+# and the number of these depths held in memory at once.
+_STEP, _SLAB = 0.1, 48
+# Mean from which `poisson` uses an expansion. The first term of the sum below is larger than `_poisson_by_sum` needs.
 EXPANDED = 16.0
-# Rows that are handled at once: what is computed of them stays in the cache.
+# Rows exposed at once: their data stay in the cache.
 _ROWS = 16
 
-Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]
+
+def read_scene(path: PathLike) -> tuple[np.ndarray, Grid | None]:
+    """Read a scene: points `(point, 4)` from a CSV file, else a volume with its grid."""
+    if Path(path).suffix.lower() == ".csv":
+        return read_points(path), None
+    return read_volume(path)
+
+
+def simulate(
+    scene: Float[Array | np.ndarray, "..."],
+    imager: Imager,
+    grid: Grid | None = None,
+    *,
+    optics: str = "full",
+    psf: str | None = None,
+    progress: Progress | None = None,
+) -> Float[np.ndarray, "row column"]:
+    """The noiseless image of points, or of a volume on a grid, on the sensor; `expose` adds a camera's noise.
+
+    *Host.*
+
+    Parameters
+    ----------
+    scene
+        Points `(point, 4)`, `(x, y, z, intensity)` in mm; or, with a grid, a volume of `grid.volume_shape`. Neither is
+        negative.
+    imager
+        The microscope.
+    grid
+        Of a volume.
+    optics
+        "full": all light of every lens, by exact rays; intensities are what is emitted in all directions. "near":
+        Eq. (2), one PSF for all lenses (of a type) within the field radius; intensities are what the mean lens on the
+        axis gets.
+    psf
+        Of a lens, for "near": "diffraction" (the default), "geometric" (rays alone) or "gaussian", from slow to fast.
+    progress
+        Shows the progress.
+
+    Raises
+    ------
+    InputError
+        If an option does not exist, a voxel is negative, a number is not finite, a point's depth is not positive, the
+        work does not fit into the memory, or a depth is blurred over more than 128 pixels each way ("near").
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> image.shape
+    (200, 200)
+    """
+    if optics not in OPTICS:
+        raise InputError(f"`optics` must be one of {', '.join(OPTICS)}, got {short_repr(optics)}.")
+    if psf and optics == "full":
+        raise InputError(f'`psf` needs optics "near", which has one PSF; got {short_repr(psf)} with "full".')
+    if psf not in (None, *PSFS):
+        raise InputError(f"`psf` must be one of {', '.join(PSFS)}, got {short_repr(psf)}.")
+    kind = "full" if optics == "full" else psf or "diffraction"
+
+    def image_of(imager):
+        if grid is None:
+            return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
+        return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
+
+    if imager.array.alike:
+        return image_of(imager)
+    each = split_by_type(imager, lenses_by_type(imager.array))
+    light = np.ones(len(each)) if optics == "full" else relative_areas(each)
+    images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
+    return np.sum(images, 0)
+
+
+def simulate_volume(
+    volume: Float[Array | np.ndarray, "depth y x"],
+    imager: Imager,
+    grid: Grid,
+    *,
+    kind: str = "diffraction",
+    progress: Progress | None = None,
+) -> Float[np.ndarray, "row column"]:
+    """`simulate` for a volume of evenly lit voxels and identical lenses, plane by plane.
+
+    Voxels are divided until they are half a pixel on the sensor or less, which leaves a ripple of 3 % at most. `kind`
+    is a key of `gs_jax.optics.psf.PSFS`, or "full".
+    """
+    check_finite("scene", volume, "voxels")
+    volume = np.asarray(volume, np.float32)
+    finest = float(imager.magnification(grid.depths).max()) * grid.pitch / imager.sensor.pixel_pitch
+    parts = math.ceil(2 * finest)
+    rows, columns = (n * parts for n in grid.shape)
+    if 16 * rows * columns > (memory := available_memory()):
+        raise InputError(
+            f"planes of {grid.shape} voxels of {grid.pitch * 1000:g} um, divided to half a pixel, need "
+            f"{16 * rows * columns / 2**30:.3g} GiB of memory, got {memory / 2**30:.3g} GiB that are free."
+        )
+    if np.min(volume) < 0:
+        raise InputError(f"voxels must not be negative, got {np.min(volume):g}.")
+    of_depth = _psf_at_depth(imager, grid, kind)
+    image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or Progress()
+    for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
+        if not plane.any():
+            continue
+        fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
+        one = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
+        image += forward(fine[None], imager, one, of_depth(depth))
+    return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
+
+
+def _psf_at_depth(imager, grid, kind):
+    depths = np.asarray(grid.depths, np.float64)
+    if kind == "full":
+        extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
+        polar_grid = make_polar_grid(imager, depths, extent=extent)
+        return lambda depth: field_varying_psf(imager, np.array([depth], np.float64), polar_grid=polar_grid)
+    kernel = psf_of_depth(imager, depths, kind)
+    return lambda depth: kernel(depth)[None]
+
+
+def simulate_points(
+    points: Float[np.ndarray, "point 4"], imager: Imager, *, kind: str = "diffraction", progress: Progress | None = None
+) -> Float[np.ndarray, "row column"]:
+    """`simulate` for points `(x, y, z, intensity)` and identical lenses; `kind` as in `simulate_volume`."""
+    check_finite("scene", points, "numbers")
+    if (behind := ~(points[:, 2] > 0)).any():
+        raise InputError(f"scene: depths of points must be positive, got {points[behind][0, 2]:g} mm.")
+    if not len(points):
+        return np.zeros(imager.sensor.shape, np.float32)
+    if kind == "full":
+        return full_image_of_points(points, imager, progress)
+    near, far = points[:, 2].min(), points[:, 2].max()
+    depths = np.unique(points[:, 2])
+    if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
+        depths = np.linspace(near, far, count)
+    sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
+    kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
+    # Each point is between two depths of its slab, whose last depth is the first of the next slab.
+    between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))
+    slabs, image, progress = between // _SLAB, 0, progress or Progress()
+    for slab in np.unique(slabs):
+        some = depths[slab * _SLAB :][: _SLAB + 1]
+        fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])
+        image = image + forward_points(points[slabs == slab], imager, stamps(some, fine), progress)
+    return np.asarray(image)
 
 
 class Camera(eqx.Module):
-    """What turns electrons into counts.
+    """A camera, which converts electrons to counts.
 
     *Compiled.*
 
@@ -59,7 +212,7 @@ class Camera(eqx.Module):
     Raises
     ------
     ValueError
-        If a number is out of range (values that JAX traces are not looked at).
+        If a number is out of range (values traced by JAX are not checked).
 
     Examples
     --------
@@ -87,35 +240,29 @@ def expose(
     *,
     peak_electrons: Number | Float[Array, ""],
 ) -> UInt8[Array, "row column"] | UInt16[Array, "row column"]:
-    """The counts of one exposure.
+    """The counts of one exposure: uint8 for a camera of up to 8 bits, else uint16.
 
     *Compiled.*
 
-    The image is scaled, Poisson noise drawn, the well filled at most, Gaussian read noise added, and the sum
-    divided by the gain, put on the offset, rounded and clipped to the converter's range. Each row has its own
-    key, and a few rows are handled at a time: beside the image and the counts it needs little memory.
+    The image is scaled; Poisson noise, the full well, Gaussian read noise, gain, offset, rounding and the converter's
+    range follow. A few rows are computed at a time, each with its own key: memory is little beside image and counts.
 
     Parameters
     ----------
     image
         Linear intensity in any unit, finite and not negative.
     camera
-        What it is taken with.
+        Its noise and range.
     key
         Of `jax.random`; the same key gives the same noise.
     peak_electrons
         Mean number of electrons in the brightest pixel. An image without light stays without.
 
-    Returns
-    -------
-    Array
-        uint8 for a camera of up to 8 bits, else uint16.
-
     Raises
     ------
     ValueError
-        If the image is negative somewhere, NaN or infinite, or `peak_electrons` is not positive and finite
-        (values that JAX traces are not looked at).
+        If the image has a negative or infinite value or a NaN, or `peak_electrons` is not positive and finite (values
+        traced by JAX are not checked).
 
     Examples
     --------
@@ -150,10 +297,7 @@ def _expose(image, camera, key, peak):
 
 
 def electrons(counts: Counts, camera: Camera) -> Float32[Array, "row column"]:
-    """Electrons of counts, linear: `gain (counts - offset)`.
-
-    The inverse of `expose` but for its noise and rounding; pixels in the dark come out on both sides of zero.
-    """
+    """Convert counts to electrons, `gain (counts - offset)`; dark pixels are on both sides of zero."""
     gain, offset = camera.gain.astype(jnp.float32), camera.offset.astype(jnp.float32)
     return gain * (jnp.asarray(counts).astype(jnp.float32) - offset)
 
@@ -161,30 +305,23 @@ def electrons(counts: Counts, camera: Camera) -> Float32[Array, "row column"]:
 def poisson(key: PRNGKeyArray, mean: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Poisson variates as whole floats, many times faster on a CPU than `jax.random.poisson`.
 
-    One uniform variate `u` a number, and the inverse of the distribution at it. Below a mean `m` of 16 the
-    probabilities are added up: exact. Above, with the normal quantile `w` of `u`, it is the expansion
+    The inverse of the distribution at one uniform variate `u` each. Below a mean `m` of 16 it is exact, by summing
+    probabilities. Above, with the normal quantile `w` of `u`, it is
 
         floor(m + sqrt(m) w + (w^2 + 2) / 6 - (w^3 + 2 w) / (72 sqrt(m)))
 
-    (the first terms of Giles, ACM Trans. Math. Softw. 42, 7, 2016). It is at its worst at `m = 16`: cumulated
-    probabilities are off by up to 1.3e-4, the mean by less than 1e-6, the variance by 2.4e-5 of itself. In float32
-    `u` has steps of 1e-7, and what is rarer than this does not occur.
-
-    Parameters
-    ----------
-    key
-        Of `jax.random`.
-    mean
-        Finite and not negative; in float32 below 1.6e7, where whole numbers end.
+    (Giles, ACM Trans. Math. Softw. 42, 7, 2016), worst at `m = 16`: cumulated probabilities are off by up to 1.3e-4,
+    the mean by less than 1e-6, the variance by a fraction of 2.4e-5. In float32 `u` has steps of 1e-7: rarer events do
+    not occur, and means are to be below 1.6e7, where whole numbers end.
     """
     # Without the ends, -1 and 1, where w would be infinite.
     v = jax.random.uniform(key, mean.shape, mean.dtype, minval=jnp.nextafter(jnp.array(-1, mean.dtype), 0))
     w, root = math.sqrt(2) * lax.erf_inv(v), jnp.sqrt(jnp.maximum(mean, EXPANDED))
     many = jnp.floor(mean + root * w + (w**2 + 2) / 6 - (w**3 + 2 * w) / (72 * root))
-    return jnp.where(mean < EXPANDED, _summed((v + 1) / 2, jnp.where(mean < EXPANDED, mean, 0)), many)
+    return jnp.where(mean < EXPANDED, _poisson_by_sum((v + 1) / 2, jnp.where(mean < EXPANDED, mean, 0)), many)
 
 
-def _summed(u, mean):
+def _poisson_by_sum(u, mean):
     """The smallest number whose cumulated probability reaches `u`."""
     # A term below the rounding of a sum near 1 adds nothing: without this bound some searches would not end.
     least = jnp.finfo(u.dtype).eps / 4
@@ -207,186 +344,3 @@ def _summed(u, mean):
 def _check_value(name: str, value, ok: Bool[Array, ""], allowed: str):
     if not isinstance(ok, Tracer) and not ok:
         raise ValueError(f"`{name}` must be {allowed}, got {value}.")
-
-
-# Chief rays alone make no image of a point.
-OPTICS = tuple(level for level in LEVELS if level != "pinhole")
-# Distance of the depths at which the PSF of points is computed, mm: it changes by less than a pixel's width between.
-_STEP = 0.1
-# As many of these depths at a time, which bounds the memory.
-_SLAB = 48
-
-
-def read_scene(path: PathLike) -> tuple[np.ndarray, Grid | None]:
-    """A scene from a file: points `(point, 4)` if it is a CSV, else a volume with its grid.
-
-    Raises
-    ------
-    InputError
-        As `read_points` and `read_volume`.
-    """
-    if Path(path).suffix.lower() == ".csv":
-        return read_points(path), None
-    return read_volume(path)
-
-
-def simulate(
-    scene: Float[Array | np.ndarray, "..."],
-    imager: Imager,
-    grid: Grid | None = None,
-    *,
-    optics: str = "full",
-    psf: str | None = None,
-    progress: Progress | None = None,
-) -> Float[np.ndarray, "row column"]:
-    """The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s.
-
-    *Host.*
-
-    Parameters
-    ----------
-    scene
-        Points `(point, 4)`, `(x, y, z, intensity)` in mm; or, with a grid, a volume of `grid.volume_shape`. Neither is
-        negative.
-    imager
-        What sees it.
-    grid
-        Of a volume.
-    optics
-        "full": all light of every lens, where it lands, by exact rays; intensities are what is sent out in all
-        directions. "near": Eq. (2), one PSF for all lenses (of a kind) within the field radius; intensities are what
-        the mean lens on the axis gets.
-    psf
-        Of a lens, for "near": "diffraction" (the default), "geometric" (rays alone) or "gaussian"; the quicker ones
-        last.
-    progress
-        Shows how far it is.
-
-    Raises
-    ------
-    InputError
-        If there is no such optics or PSF, a voxel is negative, a number is not finite, a point's depth is not positive,
-        the work would not fit into the memory, or a depth is blurred over more than 128 pixels each way ("near").
-
-    Examples
-    --------
-    >>> import gs_jax as gs
-    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
-    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
-    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> import numpy as np
-    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
-    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
-    >>> image.shape
-    (200, 200)
-    """
-    if optics not in OPTICS:
-        raise InputError(f"`optics`: found {short_repr(optics)}, allowed: {', '.join(OPTICS)}.")
-    if psf and optics == "full":
-        raise InputError(f'`psf`: found {short_repr(psf)} with optics "full", allowed: with "near", which has one PSF.')
-    if psf not in (None, *PSFS):
-        raise InputError(f"`psf`: found {short_repr(psf)}, allowed: {', '.join(PSFS)}.")
-    kind = "full" if optics == "full" else psf or "diffraction"
-
-    def image_of(imager):
-        if grid is None:
-            return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
-        return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
-
-    if imager.array.alike:
-        return image_of(imager)
-    each = split_by_type(imager, lenses_by_type(imager.array))
-    light = np.ones(len(each)) if optics == "full" else relative_areas(each)
-    images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
-    return np.sum(images, 0)
-
-
-def simulate_volume(
-    volume: Float[Array | np.ndarray, "depth y x"],
-    imager: Imager,
-    grid: Grid,
-    *,
-    kind: str = "diffraction",
-    progress: Progress | None = None,
-) -> Float[np.ndarray, "row column"]:
-    """The image of a volume whose voxels are evenly lit boxes, one plane after the other.
-
-    Voxels are divided until they are half a pixel on the sensor or less: the image has no dots, and what is left of
-    their raster is a ripple of 3 % at most.
-
-    Parameters
-    ----------
-    volume
-        `grid.volume_shape`, not negative.
-    imager, grid
-        As for `forward`.
-    kind
-        Of the PSF: a key of `gs_jax.optics.psf.PSFS`; or "full", all of the light.
-
-    Raises
-    ------
-    InputError
-        If a voxel is negative or not finite, a divided plane would not fit into the memory, or the blur is too wide.
-    """
-    check_finite("scene", volume, "voxels")
-    volume = np.asarray(volume, np.float32)
-    finest = float(imager.magnification(grid.depths).max()) * grid.pitch / imager.sensor.pixel_pitch
-    parts = math.ceil(2 * finest)
-    rows, columns = (n * parts for n in grid.shape)
-    if 16 * rows * columns > (memory := available_memory()):
-        raise InputError(
-            f"found planes of {grid.shape} voxels of {grid.pitch * 1000:g} um, which divided to half a pixel take "
-            f"{16 * rows * columns / 2**30:.3g} GiB, allowed: the {memory / 2**30:.3g} GiB that are free."
-        )
-    if np.min(volume) < 0:
-        raise InputError(f"found a voxel of {np.min(volume):g}, allowed: 0 or more.")
-    of_depth = _optics_of_depth(imager, grid, kind)
-    image, progress = jnp.zeros(imager.sensor.shape, jnp.float32), progress or Progress()
-    for depth, plane in zip(progress.track(np.asarray(grid.depths), "Imaging depths"), volume, strict=True):
-        if not plane.any():
-            continue
-        fine = np.kron(plane, np.full((parts, parts), 1 / parts**2, np.float32))
-        one = Grid(depth[None], (rows, columns), grid.pitch / parts, grid.origin)
-        image += forward(fine[None], imager, one, of_depth(depth))
-    return np.maximum(np.asarray(image), 0)  # an FFT's rounding may be below zero
-
-
-def _optics_of_depth(imager, grid, kind):
-    depths = np.asarray(grid.depths, np.float64)
-    if kind == "full":
-        extent = max(grid.shape) * grid.pitch + 2 * float(jnp.abs(grid.origin).max())
-        nodes = make_polar_grid(imager, depths, extent=extent)
-        return lambda depth: field_varying_psf(imager, np.array([depth], np.float64), polar_grid=nodes)
-    kernel = psf_of_depth(imager, depths, kind)
-    return lambda depth: kernel(depth)[None]
-
-
-def simulate_points(
-    points: Float[np.ndarray, "point 4"],
-    imager: Imager,
-    *,
-    kind: str = "diffraction",
-    progress: Progress | None = None,
-) -> Float[np.ndarray, "row column"]:
-    """The image of points `(x, y, z, intensity)`, mm; parameters and errors as for `simulate`."""
-    check_finite("scene", points, "numbers")
-    if (behind := ~(points[:, 2] > 0)).any():
-        raise InputError(f"scene: found a point at the depth {points[behind][0, 2]:g} mm, allowed: above 0.")
-    if not len(points):
-        return np.zeros(imager.sensor.shape, np.float32)
-    if kind == "full":
-        return full_image_of_points(points, imager, progress)
-    near, far = points[:, 2].min(), points[:, 2].max()
-    depths = np.unique(points[:, 2])
-    if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
-        depths = np.linspace(near, far, count)
-    sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
-    kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
-    # Each point between two depths of its slab, the last of which is the first of the next slab.
-    between = np.clip(np.searchsorted(depths, points[:, 2], "right") - 1, 0, max(depths.size - 2, 0))
-    slabs, image, progress = between // _SLAB, 0, progress or Progress()
-    for slab in np.unique(slabs):
-        some = depths[slab * _SLAB :][: _SLAB + 1]
-        fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])
-        image = image + forward_points(points[slabs == slab], imager, stamps(some, fine), progress)
-    return np.asarray(image)
