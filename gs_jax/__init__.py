@@ -41,10 +41,10 @@ Without the background:
 
 From a scene to a capture:
 
-    simulate             The image of points, or of a volume on a grid, on the sensor; a camera's noise is `expose`'s
-    Camera               What turns electrons into counts
-    expose               The counts of one exposure
-    rasterize            The volume that a scene makes on a grid: emitters are shared out linearly along x, y, z
+    simulate             The noiseless image of points or of a volume on the sensor; `expose` adds a camera's noise
+    Camera               A camera, which converts electrons to counts
+    expose               The counts of one exposure: uint8 for a camera of up to 8 bits, else uint16
+    rasterize            The volume that a scene makes on a grid: linear weights along x, y and z
     write_capture        Writes a capture as it is, by its suffix a TIFF, a PNG or an .npy; whole or not at all
 
 The operators themselves, differentiable:

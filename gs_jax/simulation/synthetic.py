@@ -57,7 +57,7 @@ def simulate(
     psf: str | None = None,
     progress: Progress | None = None,
 ) -> Float[np.ndarray, "row column"]:
-    """The noiseless image of points, or of a volume on a grid, on the sensor; `expose` adds a camera's noise.
+    """The noiseless image of points or of a volume on the sensor; `expose` adds a camera's noise.
 
     *Host.*
 
