@@ -137,7 +137,7 @@ def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
 def _refract_ideal(imager, depth, point, field) -> RefractedRay:
     """An ideal lens. The slope `(image - point) / v'` behind it is written with `1/v'`, which may be zero."""
     array, v, xp = imager.array, imager.reduced_sensor_distance, library_of(point)
-    reduced = depth + array.air_in_front
+    reduced = depth + array.reduced_thickness_front
     focal_length: Scalars = array.thin_lens_focal_length
     vergence = 1 / focal_length - 1 / reduced
     slope = (point - field) / reduced
@@ -145,7 +145,7 @@ def _refract_ideal(imager, depth, point, field) -> RefractedRay:
     landing = chief_ray(xp.zeros_like(point), field, v / reduced) + point * (1 - v * vergence)
     zero = xp.zeros_like(slope[0])
     faces = zero + 1, zero + 1
-    air = zero + array.air_in_front
+    air = zero + array.reduced_thickness_front
     return RefractedRay(point, zero, zero, air, slope, slope, tangent, faces, faces, landing, zero == 0)
 
 
@@ -305,7 +305,7 @@ def _thick_path(imager: Imager, depth: Array, ray: RefractedRay, field: Array) -
 
 def chief_ray_length(imager: Imager, chief: LensletRay) -> Float[Array, ""]:
     """Length of the chief ray from the vertex, as seen from the sensor, to the sensor, mm."""
-    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.air_behind
+    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.reduced_thickness_back
     if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `equivalent_air`
         behind = behind * n / jnp.sqrt(n**2 + (n**2 - 1) * squared)
     return (imager.sensor_distance + behind) * jnp.sqrt(1 + squared)
