@@ -1,9 +1,9 @@
-"""How fast is back-projection? Against hand-written loops at full scale, and how its cost grows.
+"""Time back-projection against hand-written kernels at full scale, and its growth with problem size.
 
 The paper takes 18 s for an image of 5120^2 pixels, 13 depths of 555^2 voxels and 213 lenses (MATLAB, nearest pixel,
-8 threads). Here `gs_jax` runs the same job against the paper's loop and per-lens patches in parallel numba, and a
-NumPy port: the same sum, bilinear, float32, checked against each other before they are timed in turns, all on all
-cores. Compilation is timed apart.
+8 threads). Here `gs_jax` runs the same problem against the paper's loop and per-lens patches in parallel numba, and a
+NumPy port. All compute the same sum (bilinear, float32) on all cores; results are compared before they are timed in
+interleaved rounds. Compilation is timed separately.
 
     python experiments/backprojection_speed.py [--out DIR]
 
@@ -40,7 +40,7 @@ FIELD_MM = 5120 * 0.0045
 
 
 class Job(NamedTuple):
-    """A size of the problem; the sensor and the grid cover the same 23 mm whatever their numbers."""
+    """Problem size; the sensor and the grid cover the same 23 mm for any number of pixels and voxels."""
 
     voxels: int = 555  # along a side
     pixels: int = 5120  # along a side
@@ -75,7 +75,7 @@ class Inputs(NamedTuple):
 
 
 def inputs(job: Job) -> Inputs:
-    """A random image and volume, and the paper's microscope with a random layout."""
+    """Return a random image and volume, and the paper's microscope with a random layout."""
     rng = np.random.default_rng(0)
     plate = (20.0, 20.0)
     centers = (
@@ -91,13 +91,13 @@ def inputs(job: Job) -> Inputs:
 
 
 def bilinear_form(centers, sensor_distance, s: Inputs):
-    """A number that depends on the geometry: what a design is optimised by costs about as much."""
+    """Scalar function of the geometry, whose gradient costs about as much as that of a design objective."""
     moved = eqx.tree_at(lambda i: (i.array.centers, i.sensor_distance), s.imager, (centers, sensor_distance))
     return jnp.vdot(backproject(s.image, moved, s.grid), s.volume)
 
 
 def hessian_vector_product(centers, sensor_distance, s: Inputs):
-    """Of the sum of a volume's squares, along a direction of centres and sensor distance."""
+    """Hessian-vector product of the sum of a volume's squares, by centres and sensor distance."""
     here, along = (centers, sensor_distance), (jnp.ones_like(centers), jnp.ones_like(sensor_distance))
 
     def squares(centers, sensor_distance):
@@ -137,7 +137,7 @@ def _as_uint16(image):
 
 
 def prepared(name: str, arguments: tuple) -> tuple[Callable[[], Any], float]:
-    """A contestant ready to run, and the seconds that its compilation took."""
+    """Compile a contestant; return a function that runs it, and the compilation time in seconds."""
     function = CONTESTANTS[name].function
     if lower := getattr(function, "lower", None):
         seconds, compiled = timed(lambda: lower(*arguments).compile())
@@ -145,11 +145,11 @@ def prepared(name: str, arguments: tuple) -> tuple[Callable[[], Any], float]:
     call = lambda: function(*arguments)
     if function is numpy_patches:
         return call, 0.0
-    return call, max(0.0, timed(call)[0] - timed(call)[0])  # numba compiles in the first call, once for all sizes
+    return call, max(0.0, timed(call)[0] - timed(call)[0])  # numba compiles once for all sizes, in the first call
 
 
 def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
-    """Seconds of each contestant in a steady state, in turns so that what else the machine does meets all alike."""
+    """Time the contestants in interleaved rounds, so that other load on the machine affects all equally."""
     s = inputs(job)
     calls, results, compiled_s = {}, {}, {}
     for name in names:
@@ -162,23 +162,23 @@ def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
     times, processor = {name: [] for name in calls}, {name: [] for name in calls}
     for number in range(rounds):
         for name, call in calls.items():
-            if number < 3 or np.median(times[name]) < 1:  # three times is enough for the slow
-                call()  # what the last contestant left behind, in caches and in pages to map, is not this one's cost
+            if number < 3 or np.median(times[name]) < 1:  # three rounds are enough for slow contestants
+                call()  # warm caches and mapped pages again after the previous contestant
                 before = time.process_time()
                 times[name].append(timed(call)[0])
                 processor[name].append(time.process_time() - before)
-                time.sleep(0.02)  # threads that wait for more work of the last contestant go to sleep
+                time.sleep(0.02)  # lets idle worker threads of the previous contestant go to sleep
     pairs = count_pairs(plain(s.imager, s.grid), s.imager.sensor.shape)
     measured = {
         name: {
             "median_s": float(np.median(t)),
             "min_s": min(t),
-            # Of all cores together, at least: on a busy machine the steadiest.
+            # Least processor time of all cores together, which varies least on a loaded machine.
             "processor_s": min(processor[name]),
             "rounds": len(t),
             "compile_s": compiled_s[name],
             "pairs_per_s": pairs / float(np.median(t)),
-            # Round by round: then it matters less what else the machine does.
+            # Ratios are taken within a round, which reduces the effect of other load.
             "ratio": float(np.median([a / b for a, b in zip(t, times["gs_jax"], strict=False)])),
             "processor_ratio": min(processor[name]) / min(processor["gs_jax"]),
         }
@@ -188,7 +188,7 @@ def race(job: Job, names: Iterable[str], rounds: int, compile_s: dict) -> dict:
 
 
 def check(s: Inputs, results: Mapping[str, Any]) -> None:
-    """All compute the same sum, and the adjoint is its adjoint."""
+    """Check that all implementations compute the same sum, and that the adjoint is the adjoint of it."""
     ours = results["gs_jax"]
     for name in set(SAME_RESULT) & set(results):
         error = np.abs(np.asarray(results[name]) - np.asarray(ours)).max() / np.asarray(ours).max()
@@ -201,11 +201,11 @@ def check(s: Inputs, results: Mapping[str, Any]) -> None:
 
 
 def memory(name: str, job: Job) -> dict[str, float]:
-    """What a contestant adds to the memory of a fresh process that has imported everything and made the inputs.
+    """Memory that a contestant adds to a new process that has imported everything and made the inputs.
 
     Peak resident set while it compiles and runs twice, minus the resident set before: output, temporaries, code
-    and compiler; and the peak of the whole process. Linux only; `ru_maxrss` will not do, as a child starts with its
-    parent's.
+    and compiler; and the peak of the whole process. Linux only; `ru_maxrss` does not work, because a child process
+    inherits its parent's value.
     """
     s = inputs(job)
     arguments = jax.block_until_ready(CONTESTANTS[name].arguments(s))
@@ -234,7 +234,7 @@ def run(
     memory_of: Sequence[str] = tuple(CONTESTANTS) if sys.platform == "linux" else (),
     progress: Progress,
 ) -> dict:
-    """Everything that `speed.json` holds; units are in the keys."""
+    """Return the content of `speed.json`; units are in the keys."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     found: dict[str, Any] = {"machine": describe() | {"load average before": f"{load:.1f}"}}
     compile_s = {}
@@ -251,7 +251,7 @@ def run(
 
 
 def amount(axis: str, result: dict) -> int:
-    """Voxels and pixels are counted in all, not along a side."""
+    """Total number of voxels or pixels, not along a side."""
     n = result[axis]
     return {"voxels": n * n * result["depths"], "pixels": n * n}.get(axis, n)
 
@@ -263,7 +263,7 @@ def slope(axis: str, results: Sequence[dict], name: str) -> float:
 
 
 def bars(result: dict) -> list[dict]:
-    """What was promised for full scale, and what was found."""
+    """Targets at full scale, and the measured values."""
     of = lambda name, key: result["contestants"].get(name, {}).get(key, float("nan"))
     ratios = lambda name: np.array([of(name, "ratio"), of(name, "processor_ratio")])
     volume_mib = result["depths"] * result["voxels"] ** 2 * 4 / 2**20
@@ -293,7 +293,7 @@ def bars(result: dict) -> list[dict]:
             "met": bool(found >= bar if sign == ">=" else found <= bar),
         }
         for what, (found, processor), sign, bar in rows
-        if not np.isnan(found)  # memory is measured for the first
+        if not np.isnan(found)  # memory is measured for the first problem only
     ]
 
 
@@ -356,7 +356,7 @@ def markdown(found: dict) -> str:
 
 
 def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
-    """Cost against each size, the others at full scale."""
+    """Plot the cost against each size, with the other sizes at full scale."""
     figure = Figure(figsize=(8, 6.4), dpi=110, layout="constrained")
     for axes, (axis, results) in zip(figure.subplots(2, 2, sharey=True).flat, study.items(), strict=False):
         x = [amount(axis, result) for result in results]
@@ -371,7 +371,6 @@ def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
 
 
 def report(progress: Progress, **sizes: Any) -> Report:
-    """With the arguments of `run`."""
     found = run(progress=progress, **sizes)
     files = {"speed.json": found, "speed.md": markdown(found), "speed.png": picture(found["study"])}
     return Report(files, [table(columns, rows, title) for title, columns, rows in tables(found)])

@@ -1,15 +1,15 @@
-"""Calibration: geometry found in captures of single points, on another group's tracer and on random devices.
+"""Calibration with ray-traced captures of single points, and with simulated random devices.
 
-- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm beside it): what is fitted, by default and of
-  everything that can be, and how far spots are from where a geometry that was fitted to other depths puts them. Then
-  `find_points` on 120 points, with it and with the design; and their capture alone, from a design that is turned.
-- Random devices, simulated with all of the light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of
-  up to 2 mm, a tilt up to 1 degree each way, a sensor distance up to 20 % off; three captures each. Deviations from
-  what is true, in the standard deviations that the calibration gives.
+- Ray-traced captures of 15 points (18, 20 and 22 mm, on the axis and 3 mm off it): fits with the default and with all
+  parameters, and prediction errors at a depth that a fit did not use. Then `find_points` on 120 points, with the
+  calibrated and the nominal design; and calibration from their capture alone, with a design that is rotated.
+- Random devices, simulated with all light and noise: a rotation of 0 to 360 degrees, mirrored or not, a shift of up to
+  2 mm, a tilt of up to 1 degree in each direction, a sensor distance up to 20 % off; three captures each. Deviations
+  from the truth are given in standard deviations of the calibration.
 
     python -m experiments.calibration [DATA] [--devices N] [--out DIR]
 
-DATA holds `P1.toml` and `P1_i_*.tif`; without it there are only the random devices. Writes `calibration.json`,
+DATA holds `P1.toml` and `P1_i_*.tif`; without it only the random devices run. Writes `calibration.json`,
 `calibration.md` and `calibration.png`; about half an hour on two cores.
 """
 
@@ -39,14 +39,14 @@ from gs_jax.reconstruction.pipeline import voxel_grid
 
 NAMES = ("sensor_distance_mm", "rotation_deg", "shift_x_mm", "shift_y_mm", "tilt_x_deg", "tilt_y_deg")
 DEPTHS = (18.0, 20.0, 22.0)
-# Of a random device: lenses on a plate, mm, and a sensor that sees about a third of them.
+# A random device: lenses on a plate, in mm, and a sensor that sees about a third of them.
 LENSES, PLATE, PIXELS, PIXEL, FIELD = 60, 11.0, 1536, 0.006, 2.5
-# By how much the design of the self-check is turned, and where its scene is, mm.
+# Rotation of the design in the calibration from a scene, and depths of the scene, mm.
 TURN, SCENE = np.radians(2.0), [17.5, 22.5]
 
 
 def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
-    """What the ray-traced captures say of a microscope whose geometry is known."""
+    """Calibrate from the ray-traced captures, whose geometry is known."""
     imager = read_design(data / "P1.toml").imager()
     names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*.tif"))
     points = np.array([points_of(data, name)[0, :3] for name in names])
@@ -90,7 +90,7 @@ def _said(found: Calibration) -> dict:
 
 
 def device(seed: int) -> tuple[Imager, Imager, bool]:
-    """A device as it is, as its design has it, and whether it is mirrored."""
+    """Return a random true device, its nominal design, and whether it is mirrored."""
     rng = np.random.default_rng(seed)
     centers = np.asarray(random_layout(LENSES, (PLATE, PLATE), diameter=None, seed=seed))
     sensor, mirrored = Sensor((PIXELS, PIXELS), PIXEL), bool(rng.random() < 0.5)
@@ -104,14 +104,14 @@ def device(seed: int) -> tuple[Imager, Imager, bool]:
 
 
 def true_values(imager: Imager) -> dict[str, float]:
-    """What a calibration should find."""
+    """True values of the calibrated parameters."""
     assert imager.tilt is not None
     numbers = (imager.sensor_distance, np.degrees(imager.rotation), *imager.shift, *np.degrees(np.arctan(imager.tilt)))
     return dict(zip(NAMES, map(float, numbers), strict=True))
 
 
 def on_device(seed: int, progress: Progress) -> dict:
-    """Deviations of a calibrated device, in standard deviations and in their units."""
+    """Calibrate a simulated device; return the deviations in their units and in standard deviations."""
     actual, design, mirrored = device(seed)
     rng = np.random.default_rng([seed, 1])
     points = np.column_stack([rng.uniform(-1.5, 1.5, (len(DEPTHS), 2)), DEPTHS])
@@ -129,7 +129,7 @@ def on_device(seed: int, progress: Progress) -> dict:
 
 
 def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, Calibration | None]:
-    """What `calibration.json` holds, and the calibration of the captures."""
+    """Return the content of `calibration.json`, and the calibration from the captures."""
     captures, whole = on_captures(data, progress) if data else ({}, None)
     found = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
     return {"captures": captures, "devices": found}, whole

@@ -1,11 +1,11 @@
-"""Calibration errors: what a fit of sensor distance, rotation and shift leaves where something else is wrong.
+"""Residuals that a fit of sensor distance, rotation and shift leaves if something else is wrong.
 
-Chief rays of the built-in design alone, without an image: lenses within 6 mm of a source at the four places of
-`design/LAB.md`, whose table this is.
+Uses only the chief rays of the built-in design, without images: lenses within 6 mm of a source at the four positions
+of `design/LAB.md`.
 
     python -m experiments.calibration_errors [--out DIR]
 
-Writes `calibration_errors.json` and `calibration_errors.md`; a second.
+Writes `calibration_errors.json` and `calibration_errors.md`; takes a second.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ REACH = 6.0
 
 
 class Device(NamedTuple):
-    """What the spots of point sources come from, mm; the tilt is about y, radians."""
+    """Geometry that determines the spots of point sources, mm; the tilt is about y, in radians."""
 
     centers: np.ndarray
     places: np.ndarray
@@ -33,7 +33,7 @@ class Device(NamedTuple):
 
 
 def spots(device: Device, seen: np.ndarray, distance: float, rotation: float, *shift: float) -> np.ndarray:
-    """Of the lenses `seen`, `(source, lens)`, with the geometry that is fitted."""
+    """Spots `(source, lens)` of the lenses `seen`, with the fitted geometry."""
     cos, sin = np.cos(rotation), np.sin(rotation)
     centers = device.centers @ np.array([[cos, sin], [-sin, cos]]) + shift
     v = distance + centers[:, :1] * np.tan(device.tilt)
@@ -42,14 +42,14 @@ def spots(device: Device, seen: np.ndarray, distance: float, rotation: float, *s
 
 
 def moved(which: int | slice, axis: int, by: float) -> np.ndarray:
-    """The places, some of them off by mm along x, y or z."""
+    """Source positions, some of them displaced along x, y or z, mm."""
     places = PLACES.copy()
     places[which, axis] += by
     return places
 
 
 def run() -> list[tuple[str, float, float]]:
-    """Of each mistake its name, the residual in pixels RMS, and by how much the sensor distance is off, um."""
+    """Return for each mistake its name, the residual in pixels RMS, and the error of the sensor distance in um."""
     design = geomscope()
     v, pixel = design.imaging.sensor_distance_mm, design.sensor.pixel_pitch_um / 1000
     plate = design.array.substrate_thickness_mm / design.lens.refractive_index

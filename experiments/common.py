@@ -1,7 +1,8 @@
-"""What the experiments share: their command line, the files that they leave, and the ray-traced captures.
+"""Helpers for all experiments: command line, output files, and ray-traced captures.
 
-An experiment has `run`, which a test calls at a small size, and `report`, which takes the values of the command line,
-runs it at its own size and says what to write and to print; the last line of the script is `main(report)`.
+An experiment has a function `run`, which tests call at a small size, and a function `report`, which takes the values
+of the command line, calls `run` at full size, and returns what to write and print. The last line of the script is
+`main(report)`.
 """
 
 import argparse
@@ -26,17 +27,17 @@ from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.pictures.style import PALETTE
 
 OPTIONAL_PATH = {"type": Path, "nargs": "?"}
-# Of every picture of an experiment.
+# Resolution of all pictures of experiments.
 matplotlib.rcParams.update({"axes.prop_cycle": cycler(color=PALETTE), "font.size": 9.5, "legend.frameon": False})
 
 
 class Report(NamedTuple):
-    """What an experiment leaves.
+    """Output of an experiment.
 
     Parameters
     ----------
     files
-        Contents by file name: a figure for `.png`, text for `.md`, and anything that JSON holds for `.json`.
+        Contents by file name: a figure for `.png`, text for `.md`, and any JSON-serialisable value for `.json`.
     shown
         Tables and text for the terminal.
     """
@@ -46,18 +47,16 @@ class Report(NamedTuple):
 
 
 def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | None = None, folder: str = "") -> None:
-    """The command line of the script that `report` is in; `--out DIR` is where its files go.
+    """Run the command line of a script; `--out DIR` names the output folder. Invalid input exits with status 2.
 
     Parameters
     ----------
     report
         Takes the values of the arguments by name, and `progress`.
     arguments
-        Of the script, beside `--out`: their name, and the options of `add_argument`.
+        Arguments of the script beside `--out`: their names, and the options of `add_argument`.
     folder
-        Below `out/`, by default the name of the script.
-
-    Wrong input is one line, and exit status 2.
+        Subfolder of `out/`; by default the name of the script.
     """
     explanation = inspect.getdoc(inspect.getmodule(report)) or ""
     parser = argparse.ArgumentParser(description=explanation.splitlines()[0])
@@ -76,7 +75,7 @@ def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | N
 
 
 def write(folder: Path, report: Report) -> None:
-    """The files of a report, each whole or not at all."""
+    """Write the files of a report, each atomically."""
     for name, content in report.files.items():
         if isinstance(content, Figure):
             write_figure(folder / name, content)
@@ -87,7 +86,7 @@ def write(folder: Path, report: Report) -> None:
 
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> Table:
-    """For the terminal."""
+    """Build a table for the terminal."""
     made = Table(*columns, title=title, title_justify="left")
     for row in rows:
         made.add_row(*row)
@@ -95,10 +94,10 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | No
 
 
 def design_of(data: Path | None) -> Design:
-    """What the captures in a folder were traced with; without one, the built-in design."""
+    """Design of the ray-traced captures in a folder; without a folder, the built-in design."""
     return read_design(data / "P1.toml") if data else geomscope()
 
 
 def points_of(data: Path, scene: str) -> np.ndarray:
-    """The points `(x, y, z, flux)` of a ray-traced scene, mm."""
+    """Points `(x, y, z, flux)` of a ray-traced scene, mm."""
     return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])

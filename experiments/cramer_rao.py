@@ -1,9 +1,10 @@
 """The Cramer-Rao bound of `gs_jax.codesign.fisher` against maximum likelihood on noisy images of a single point.
 
-Two layouts of 23 lenses: Poisson discs, and the same after gradient descent on the bound in z (least distance and plate
-kept). For each and for several brightnesses, 500 noisy images of a point at random subpixel places are drawn (Poisson
-light and background, Gaussian read noise), and x, y, z and brightness found by Fisher scoring on the likelihood. If the
-bound is right, the ratio of the error to it is 1, and the better layout is better by as much as the bounds say.
+Two layouts of 23 lenses: Poisson discs, and the same after gradient descent on the bound in z (minimum spacing and
+plate fixed). For each layout and several brightnesses the script draws 500 noisy images of a point at random subpixel
+positions (Poisson light and background, Gaussian read noise), and estimates x, y, z and brightness by Fisher scoring on
+the likelihood. If the bound is right, the ratio of the error to the bound is 1, and the better layout is better by the
+ratio of the bounds.
 
     python -m experiments.cramer_rao [--out DIR]
 
@@ -39,7 +40,7 @@ def imager(centers: Float[Array | np.ndarray, "lens 2"]) -> Imager:
 
 
 def improved(centers: Float[np.ndarray, "lens 2"], steps: int) -> Float[np.ndarray, "lens 2"]:
-    """Centres that lower the bound in z of points near the axis, as far apart as they were at least."""
+    """Centres that lower the bound in z of points near the axis, with the minimum spacing kept."""
     points = np.array([(x, y, DEPTH) for x in (-0.3, 0, 0.3) for y in (-0.3, 0, 0.3)])
     first, second = np.triu_indices(len(centers), 1)
     half, solver = jnp.array([PLATE]) / 2, optax.adam(0.03)
@@ -75,7 +76,7 @@ def errors(
 
     def one(key):
         place, light, read, start = jax.random.split(key, 4)
-        # One pixel in the object: every phase of the images on their pixels.
+        # One pixel in the object, so that images take every subpixel phase.
         pixel = camera.sensor.pixel_pitch / camera.magnification(DEPTH)
         lateral = pixel * jax.random.uniform(place, (2,), minval=-0.5, maxval=0.5)
         truth = jnp.concatenate([lateral, jnp.array([DEPTH, 0.0])])
@@ -95,7 +96,7 @@ def errors(
             step = unit * jnp.linalg.solve(unit[:, None] * information * unit[None], unit * score)
             return p + jnp.clip(step, -0.1, 0.1), None
 
-        # Started beside the truth, by ten pixels' worth of depth and a pixel: finding the peak is not the matter here.
+        # Starts near the truth, within ten pixels of depth and one pixel: global search is not tested here.
         beside = jnp.array([pixel, pixel, 0.05, 0.2]) * jax.random.normal(start, (4,)) / 2
         found, _ = jax.lax.scan(scoring, truth + beside, length=STEPS)
         bound = cramer_rao(truth[None, :3], camera, photons=photons, **OPTIONS)[0]
@@ -111,7 +112,7 @@ def run(
     *,
     progress: Progress,
 ) -> dict:
-    """Everything that `cramer_rao.json` holds; units are in the keys."""
+    """Return the content of `cramer_rao.json`; units are in the keys."""
     before = next(
         c for c in (poisson_disc_layout(PLATE, min_distance=DISTANCE, seed=s) for s in range(1000)) if len(c) == 23
     )
@@ -131,7 +132,7 @@ def run(
 
 
 def picture(found: dict) -> Figure:
-    """Errors and bounds against photons, along x and z; the layouts."""
+    """Plot errors and bounds in x and z against photons, and the layouts."""
     figure = Figure(figsize=(11, 3.6), dpi=100, layout="constrained")
     *plots, right = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1))
     for color, name in zip(("C0", "C3"), found["centers_mm"], strict=True):
@@ -149,7 +150,7 @@ def picture(found: dict) -> Figure:
 
 
 def report(progress: Progress) -> Report:
-    # Second derivatives of a bright point's likelihood differ from each other by more than float32 resolves.
+    # The second derivatives of a bright point's likelihood span more than the range of float32.
     jax.config.update("jax_enable_x64", True)
     found = run(progress=progress)
     triple = lambda row, key: " ".join(f"{x:.3g}" for x in row[key])

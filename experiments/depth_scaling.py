@@ -1,14 +1,14 @@
-"""Eqs. (1) and (3): by how much the pattern of a point's images grows with depth.
+"""Eqs. (1) and (3): the scale of the pattern of a point's images against depth.
 
-The images of a point at depth z are the layout of the lenses, scaled by `s_z = (z' + v) / z'`, and each lens magnifies
-by `M_z = s_z - 1`; z' counts the plate as air. Here s_z is measured as a user would who knows nothing but the layout:
-spots in captures of a point on the axis, by an independent ray tracer, each beside its lens, and a line through their
-places against those of the lenses. The paper says that s_z is the same over the field and "scales linearly with depth".
+The images of a point at depth z are the layout of the lenses scaled by `s_z = (z' + v) / z'`, and each lens magnifies
+by `M_z = s_z - 1`; z' is the reduced depth. The script measures s_z with the layout alone: it matches the spots in
+captures of a point on the axis, by an independent ray tracer, with the lenses, and fits a line through spot positions
+against lens positions. The paper says that s_z is constant over the field and "scales linearly with depth".
 
     python -m experiments.depth_scaling [DATA] [--out DIR]
 
-DATA holds `P1.toml` and `P1_i_*_c.tif`; without it there are only the captures by our own tracer, of the built-in
-design. Writes `depth_scaling.json` and `depth_scaling.png`; about a minute on two cores.
+DATA holds `P1.toml` and `P1_i_*_c.tif`; without it only captures of our own tracer, of the built-in design, are used.
+Writes `depth_scaling.json` and `depth_scaling.png`; about a minute on two cores.
 """
 
 from collections.abc import Sequence
@@ -28,14 +28,14 @@ from gs_jax.design.design import Design
 from gs_jax.io.captures import read_capture
 
 DEPTHS = (18.0, 19.0, 20.0, 21.0, 22.0, 23.0, 24.0, 26.0)
-# A spot belongs to a lens this near to the place that a scale of 1.3 would give it, mm: half of the least pitch.
+# A spot matches a lens within this distance of its position at a scale of 1.3, mm: half of the smallest pitch.
 _ROUGHLY, _NEAR = 1.3, 0.45
 
 
 def run(
     design: Design, data: Path | None, *, depths: Sequence[float] = DEPTHS, rays: int = 20_000, progress: Progress
 ) -> dict[str, list[dict]]:
-    """For each source of captures and each depth: the scale, by Eq. (1), and how far spots are from the line."""
+    """Return the scale by source and depth, its value by Eq. (1), and the residuals of the line."""
     imager = design.imager()
     point = lambda depth: np.array([[0.0, 0.0, depth, 1e6]])
     found = {
@@ -51,13 +51,13 @@ def run(
 
 
 def measured(image: np.ndarray, imager: Imager, depth: float) -> dict:
-    """Of one capture of a point on the axis."""
+    """Measure the scale in a capture of a point on the axis."""
     seen, scale = imager.field_radius, _ROUGHLY
     centers = np.asarray(imager.centers, np.float64)
     centers = centers[np.hypot(*centers.T) < float(seen)]
     spots = np.asarray(imager.sensor.to_mm(find_spots(image, 2 * len(centers))))
     tree: Any = KDTree(spots)
-    # Matched twice: the first line says where spots are to be expected.
+    # Match twice; the second time with the positions predicted by the first fit.
     for reach in (_NEAR, _NEAR / 10):
         distance, nearest = tree.query(scale * centers)
         sure = distance < reach
@@ -70,7 +70,7 @@ def measured(image: np.ndarray, imager: Imager, depth: float) -> dict:
 
 
 def picture(found: dict[str, list[dict]]) -> Figure:
-    """The scale against depth, and how far it is from Eq. (1)."""
+    """Plot the scale against depth, and its difference from Eq. (1)."""
     figure = Figure(figsize=(9.5, 3.8), dpi=100, layout="constrained")
     left, right = figure.subplots(1, 2)
     ours = next(iter(found.values()))

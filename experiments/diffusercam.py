@@ -1,9 +1,9 @@
-"""A hand through a diffuser: the solvers on a real image and a measured point spread function.
+"""The solvers on a real DiffuserCam image with a measured point spread function.
 
-The data are those of Waller Lab's DiffuserCam tutorial (1200 x 1600 pixels). As there, the mean of the PSF's dark
-corner is taken off both, pixels are averaged by 4 x 4 (once also not at all), and total variation weighs 1e-4 of the
-image's norm. With the Python of an environment that has LenslessPiCam, its ADMM runs on the same data for as many
-steps, in turns with ours.
+The data are those of Waller Lab's DiffuserCam tutorial (1200 x 1600 pixels). As in the tutorial, the mean of the PSF's
+dark corner is subtracted from both images, pixels are averaged 4 x 4 (and once not at all), and the weight of total
+variation is 1e-4 of the image's norm. Given the Python of an environment with LenslessPiCam, its ADMM runs on the same
+data for as many steps, interleaved with ours.
 
     python experiments/diffusercam.py DATA [--peer PYTHON] [--out DIR]
 
@@ -37,7 +37,7 @@ Image = Float[Array, "row column"]
 
 
 def read(folder: Path, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """PSF and image, without background, averaged over squares, each of norm 1."""
+    """Read PSF and image, subtract the background, average over squares, and normalise each."""
     raw = [tifffile.imread(folder / f"{name}.tif").astype(np.float32) for name in ("psf_sample", "rawdata_hand_sample")]
     dark = raw[0][5:15, 5:15].mean()
     rows, columns = (n // factor for n in raw[0].shape)
@@ -47,12 +47,12 @@ def read(folder: Path, factor: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
-    """The scene by one method."""
+    """Reconstruct the scene by one method."""
     rows, columns = image.shape
     system = Convolution.of(psf[None], (rows, columns))
     A = system.operator
     if method == "ADMM":
-        tv = TV / jnp.max(A.T.mv(image))  # the solver's unit
+        tv = TV / jnp.max(A.T.mv(image))  # in the unit of the solver
         return solve(system, image, ConvolutionADMM(steps, sparsity=0.0, tv=tv)).x
     solver = RichardsonLucy(steps, accelerate=True) if method == "Richardson-Lucy" else FISTA(steps, sparsity=0.0)
     return solve(A, image, solver).x
@@ -60,21 +60,21 @@ def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
 
 @jax.jit
 def objective(psf: Image, image: Image, scene: Image) -> Float[Array, ""]:
-    """What ADMM minimises: half the squared residual, and total variation."""
+    """Objective of ADMM: half the squared residual plus total variation."""
     rows, columns = image.shape
     residual = Convolution.of(psf[None], (rows, columns))(scene[None]) - image
     return jnp.vdot(residual, residual) / 2 + TV * total_variation(differences(scene[None], wrap=True), isotropic=False)
 
 
 def ours(psf: np.ndarray, image: np.ndarray, method: str, steps: int):
-    """A warm call, and what it takes to compile it."""
+    """Time a warm call, and the compilation."""
     run = jax.jit(partial(estimate, method=method, steps=steps))
     compile_s, call = timed(lambda: run.lower(jnp.asarray(psf), jnp.asarray(image)).compile())
     return compile_s, lambda: jax.block_until_ready(call(jnp.asarray(psf), jnp.asarray(image)))
 
 
 def theirs(python: str, psf: np.ndarray, image: np.ndarray, steps: int) -> tuple[float, np.ndarray]:
-    """Seconds a step of LenslessPiCam, and its scene."""
+    """Run LenslessPiCam; return its seconds per step and its scene."""
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(given, psf=psf, image=image)
@@ -93,7 +93,7 @@ def run(
     peer: str | None,
     progress: Progress,
 ) -> tuple[dict, dict[str, np.ndarray]]:
-    """What `diffusercam.json` holds, and the pictures by title. Full size takes a fifth of the steps."""
+    """Return the content of `diffusercam.json`, and the pictures by title. Full size takes a fifth of the steps."""
     rows, pictures = [], {}
     for factor in factors:
         psf, image = read(folder, factor)
@@ -120,7 +120,7 @@ def run(
 
 
 def _rounds(call, peer, psf, image, steps, count):
-    """Seconds a step in each round, ours and theirs in turns, and the results."""
+    """Seconds per step in each round, ours and theirs interleaved, and the results."""
     found = {"gs_jax": call()}
     seconds: dict[str, list[float]] = {"gs_jax": []}
     for _ in range(count):
@@ -132,7 +132,7 @@ def _rounds(call, peer, psf, image, steps, count):
 
 
 def picture(pictures: dict[str, np.ndarray]) -> Figure:
-    """The hand as each sees it, from zero to its 99.9th percentile."""
+    """Plot the reconstructions, each from zero to its 99.9th percentile."""
     columns = min(5, len(pictures))
     rows = -(-len(pictures) // columns)
     figure = Figure(figsize=(3.2 * columns, 2.7 * rows), dpi=90, layout="constrained")

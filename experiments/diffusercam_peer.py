@@ -1,8 +1,9 @@
-"""LenslessPiCam's ADMM on the data of `diffusercam.py`, in an environment of its own (`pip install lensless torch`).
+"""Run LenslessPiCam's ADMM on the data of `diffusercam.py`, in a separate environment (`pip install lensless torch`).
 
     PYTHON experiments/diffusercam_peer.py INPUT.npz OUTPUT.npz STEPS
 
-NumPy, as its solver in PyTorch was slower on two cores; its own default weights. It imports nothing of this package.
+Uses its NumPy solver, which was faster than its PyTorch solver on two cores, with its default weights. The script
+imports nothing of gs_jax.
 """
 
 import sys

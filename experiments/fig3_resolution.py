@@ -1,13 +1,13 @@
-"""Fig. 3: how sharp a point is reconstructed at 20 mm, and how close two may be.
+"""Fig. 3: width of a reconstructed point at 20 mm, and resolution of two points.
 
-Points at 20 mm, one alone, two 40 um apart laterally, two 300 um apart axially, are imaged by the focused design
-and back-projected. The images are made twice: by our forward model with diffraction, and, if DATA is given, by an
-independent ray tracer. The paper says: about 40 um and 300 um FWHM, and both pairs resolved, the lateral one with a
-dip to about 85 %.
+Points at 20 mm (one alone, two 40 um apart laterally, two 300 um apart axially) are imaged by the focused design
+and back-projected. Images come from our forward model with diffraction and, if DATA is given, from an independent ray
+tracer. The paper reports about 40 um and 300 um FWHM, and both pairs resolved, the lateral one with a dip to about
+85 %.
 
     python -m experiments.fig3_resolution [DATA] [--out DIR]
 
-DATA holds `P1.toml` and `P1_a.tif`, `P1_b.tif`, `P1_c.tif`. Without it the built-in design is taken.
+DATA holds `P1.toml` and `P1_a.tif`, `P1_b.tif`, `P1_c.tif`. Without it the built-in design is used.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ BARS = {"lateral_fwhm_um": 40, "axial_fwhm_um": 300, "lateral_dip": 0.85, "axial
 
 
 def run(design: Design, data: Path | None, *, progress: Progress) -> dict:
-    """Profiles of each scene, and the four figures, for every source of images."""
+    """Return the profiles of each scene, and the four numbers, for every source of images."""
     imager = design.imager()
     images = {"gs_jax": lambda name: _simulated(SCENES[name], imager, progress)}
     if data is not None:
@@ -57,7 +57,7 @@ def _captured(path, imager):
 
 
 def picture(found: dict) -> Figure:
-    """The profiles, sources on top of each other."""
+    """Plot the profiles of all sources."""
     panels = (("a", "x", "one point, laterally"), ("a", "z", "one point, axially"))
     panels += (("b", "x", "two points 40 um apart"), ("c", "z", "two points 300 um apart"))
     figure = Figure(figsize=(9, 6), dpi=100, layout="constrained")
@@ -77,7 +77,7 @@ def picture(found: dict) -> Figure:
 
 
 def numbers(found: dict) -> dict:
-    """Without the profiles."""
+    """Results without the profiles."""
     return {source: {key: result[key] for key in BARS} for source, result in found.items()}
 
 

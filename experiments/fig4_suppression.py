@@ -1,13 +1,13 @@
-"""Fig. 4A: points in 3-D, plain back-projection, particle clustering and `find_points`.
+"""Fig. 4A: points in 3-D by plain back-projection, particle clustering and `find_points`.
 
-120 points at 18 to 22 mm are reconstructed and shown at three depths: the plain stack, the stack of the points that
-`find_points` makes of it, and the truth. The table puts methods side by side: nothing at all, the peaks above a
-threshold (scikit-image), the paper's particle clustering, ours. Images come from our simulation (all light, shot and
-read noise), and, if DATA is given, from an independent ray tracer, with haze and clipped apertures.
+120 points at 18 to 22 mm are reconstructed and shown at three depths: the plain stack, the stack rendered from the
+points that `find_points` detects, and the truth. The table compares methods: an empty volume, the peaks above a
+threshold (scikit-image), the paper's particle clustering, and `find_points`. Images come from our simulation (all
+light, shot and read noise) and, if DATA is given, from an independent ray tracer, with haze and clipped apertures.
 
     python -m experiments.fig4_suppression [DATA] [--out DIR]
 
-DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is taken.
+DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is used.
 """
 
 from collections.abc import Callable
@@ -33,16 +33,16 @@ from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize
 
 SHOWN = (18.0, 20.0, 22.0)  # mm
-# How wide a point is drawn.
+# Width of a rendered point.
 _POINT_MM = 0.6
-# Parts of the maximum. Peaks and clustering get the best of these as their lowest threshold, knowing the truth.
+# Fractions of the maximum. Peaks and clustering use the threshold that scores best against the truth.
 THRESHOLDS = (0.08, 0.1, 0.12, 0.15, 0.2)
-# How often the search is timed after the first.
+# Timed runs of the search after the first.
 _ROUNDS = 3
 
 
 def run(design: Design, data: Path | None, *, count=120, voxel=0.03, step=0.25, progress: Progress) -> dict:
-    """Scores of every method on every source of images, and the planes to show."""
+    """Return scores of every method on every source of images, and the planes to plot."""
     grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, step), pitch=voxel)
     captures = {"simulated": scene(count, 0, design, progress)}
     if data is not None:
@@ -80,7 +80,7 @@ def _best(method: Callable[[float], np.ndarray], truth: np.ndarray) -> np.ndarra
 
 
 def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
-    """Local maxima of what exceeds a part of the highest, above the median of each plane."""
+    """Local maxima above a fraction of the highest value, above the median of each plane."""
     above = volume - np.median(volume, axis=(1, 2), keepdims=True)
     return local_maxima(above, grid, threshold_rel=threshold)
 
@@ -99,13 +99,13 @@ def _scores(found, truth, expected, grid) -> dict:
         "lateral_rmse_um": 1000 * score.lateral_rmse,
         "axial_rmse_um": 1000 * score.axial_rmse,
         "axial_bias_um": 1000 * float((a[:, 2] - b[:, 2]).mean()) if paired else None,
-        # Of the ratio of intensities, in parts of its mean.
+        # Standard deviation of the intensity ratio, relative to its mean.
         "intensity_sd": float(ratio.std() / ratio.mean()) if paired else None,
     } | stack._asdict()
 
 
 def picture(result: dict) -> Figure:
-    """Rows are depths; columns the stack, the points and the truth."""
+    """Plot depths in rows; the stack, the detected points and the truth in columns."""
     planes, pitch = result["planes"], result["pitch"]
     half = planes["truth"].shape[1] * pitch / 2
     figure = Figure(figsize=(9, 9.4), dpi=90, layout="constrained")

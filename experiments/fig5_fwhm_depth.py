@@ -1,12 +1,12 @@
-"""Fig. 5: the width of a reconstructed point against its depth.
+"""Fig. 5: width of a reconstructed point against depth.
 
-A point on the axis is imaged by our forward model at each depth, and back-projected; with DATA the same for the
-ray-traced captures at 18, 20 and 22 mm. The paper measures a width that is stable over about 5 mm around 20 mm, at
-457 nm and with the sensor at a distance that it gives as about 4 mm.
+A point on the axis is imaged by our forward model at each depth, and back-projected; with DATA also the
+ray-traced captures at 18, 20 and 22 mm. The paper reports widths that are stable over about 5 mm around 20 mm, at
+457 nm and with a sensor distance of about 4 mm.
 
     python -m experiments.fig5_fwhm_depth [DATA] [--out DIR]
 
-DATA holds `P1.toml` and `P1_i_18_c.tif`, `P1_a.tif`, `P1_i_22_c.tif`. Without it the built-in design is taken.
+DATA holds `P1.toml` and `P1_i_18_c.tif`, `P1_a.tif`, `P1_i_22_c.tif`. Without it the built-in design is used.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ DEPTHS = tuple(np.arange(17, 25.01, 0.5).tolist())
 
 
 def run(design: Design, data: Path | None, *, depths: Sequence[float] = DEPTHS, progress: Progress) -> dict:
-    """Widths (um) against depth, and the depths over which they stay within the paper's 40 and 300 um."""
+    """Return widths (um) against depth, and the depth ranges within the paper's 40 and 300 um."""
     imager = design.imager()
     images = {z: _simulated(z, imager, progress) for z in progress.track(depths, "Depths")}
     found = {"gs_jax": [_widths(image, imager, z) for z, image in images.items()]}
@@ -54,7 +54,7 @@ def _widths(image: np.ndarray, imager: Imager, depth: float) -> dict[str, float]
 
 
 def picture(found: dict) -> Figure:
-    """Lateral and axial width against depth."""
+    """Plot lateral and axial width against depth."""
     figure = Figure(figsize=(9, 3.6), dpi=100, layout="constrained")
     for axes, key, bar in zip(figure.subplots(1, 2), ("lateral_fwhm_um", "axial_fwhm_um"), (40, 300), strict=True):
         for (source, rows), style in zip(found.items(), ("o-", "s"), strict=False):

@@ -1,10 +1,10 @@
-"""Fig. 6: a resolution target at six depths, which of its lines are told apart, and in which plane it is sharpest.
+"""Fig. 6: a resolution target at six depths, its resolved lines, and the plane where it is sharpest.
 
 Groups 2 and 3 of a USAF 1951 target (MIL-STD-150A), self-luminous, are imaged by the focused design at each of the
-paper's depths through the independent ray tracer, with a camera's noise, and back-projected at all six. A plane's
-contrast is that of the bars of an element and the gaps between them, `(I_bar - I_gap) / (I_bar + I_gap)`, less than the
-object's by the pedestal of back-projection too. The paper says: at each depth of the target the plane in focus is the
-sharpest, and of the one at 18 mm group 3, element 2 (9 line pairs a mm) is clearly resolved, without any suppression.
+paper's depths through the independent ray tracer, with camera noise, and back-projected at all six. The contrast of a
+plane is that of the bars of an element against the gaps between them, `(I_bar - I_gap) / (I_bar + I_gap)`; the pedestal
+of back-projection lowers it. The paper says that for each depth of the target the plane in focus is the sharpest, and
+that at 18 mm group 3, element 2 (9 line pairs per mm) is clearly resolved, without any suppression.
 
     python -m experiments.fig6_usaf [--out DIR]
 
@@ -31,13 +31,13 @@ from gs_jax.pictures.style import draw_image
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.synthetic import Camera, electrons, expose
 
-DEPTHS = (18.0, 18.64, 19.27, 19.91, 20.54, 21.18)  # mm, the paper's
-# mm: voxels, emitters, and the left and upper edges of the groups.
+DEPTHS = (18.0, 18.64, 19.27, 19.91, 20.54, 21.18)  # mm, from the paper
+# mm: pitch of voxels and emitters, and the left and upper edges of the groups.
 _VOXEL, _EMITTERS, _LEFT, _TOP = 0.005, 0.005, {2: -1.25, 3: 0.5}, 1.93
 _PEAK_ELECTRONS = 10_000
-# Contrast from which lines are told apart, of the Rayleigh criterion for slits.
+# Contrast from which lines count as resolved (Rayleigh criterion for slits).
 RESOLVED = 0.1
-# Along a bar, of its length: without its ends.
+# Fraction of a bar's length that is averaged, without its ends.
 _MIDDLE = 0.6
 
 
@@ -52,12 +52,12 @@ class Element(NamedTuple):
 
     @property
     def pairs(self) -> float:
-        """Line pairs a mm."""
+        """Line pairs per mm."""
         return 0.5 / self.width
 
 
 def target() -> list[Element]:
-    """Groups 2 and 3; a bar is five times as long as it is wide, and `2^(group + (number - 1) / 6)` pairs make a mm."""
+    """Elements of groups 2 and 3: bars five times as long as wide, `2^(group + (number - 1) / 6)` line pairs per mm."""
     elements = []
     for group, left in _LEFT.items():
         top = _TOP
@@ -74,7 +74,7 @@ def target() -> list[Element]:
 def run(
     design: Design, *, depths: Sequence[float] = DEPTHS, voxel: float = _VOXEL, rays: int = 8, progress: Progress
 ) -> dict:
-    """For each depth of the target volumes `(target, depth, y, x)`, contrasts `(target, depth, element, direction)`."""
+    """Return volumes `(target, depth, y, x)` and contrasts `(target, depth, element, direction)`."""
     imager, elements = design.imager(), target()
     side = round(4.2 / voxel / 2) * 2 + 1
     grid = Grid(np.array(depths), (side, side), voxel)
@@ -89,12 +89,12 @@ def run(
 
 
 def _contrasts(plane: np.ndarray, grid: Grid, element: Element) -> tuple[float, float]:
-    """Of vertical and of horizontal bars."""
+    """Contrasts of the vertical and the horizontal bars."""
     return contrast(*profile(plane, grid, element, 0)), contrast(*profile(plane, grid, element, 1))
 
 
 def profile(plane: np.ndarray, grid: Grid, element: Element, direction: int) -> tuple[np.ndarray, np.ndarray]:
-    """Across the bars, `direction` 0 of the vertical ones: places, in bar widths from the first edge, and means."""
+    """Positions in bar widths from the first edge, and mean values across the bars (`direction` 0: vertical bars)."""
     x0, x1, y0, y1 = np.transpose((element.vertical, element.horizontal)[direction])
     x0, x1, y0, y1 = x0.min(), x1.max(), y0.min(), y1.max()
     across = np.linspace(-1, 6, 141)
@@ -109,14 +109,14 @@ def profile(plane: np.ndarray, grid: Grid, element: Element, direction: int) -> 
 
 
 def contrast(across: np.ndarray, values: np.ndarray) -> float:
-    """Of the middle halves of the three bars and of the two gaps between them."""
+    """Contrast between the middle halves of the three bars and of the two gaps between them."""
     mean = lambda places: np.mean([values[np.abs(across - place) <= 0.25].mean() for place in places])
     bar, gap = mean((0.5, 2.5, 4.5)), mean((1.5, 3.5))
     return float((bar - gap) / (bar + gap))
 
 
 def numbers(found: dict) -> list[dict]:
-    """For each depth of the target: which plane is sharpest, and what is resolved in its own."""
+    """For each depth of the target: the sharpest plane, and the finest resolved element in the target's own plane."""
     elements, rows = target(), []
     number = next(i for i, e in enumerate(elements) if (e.group, e.number) == (3, 2))
     for k, depth in enumerate(found["depths"]):
@@ -130,7 +130,7 @@ def numbers(found: dict) -> list[dict]:
 
 
 def picture(found: dict) -> Figure:
-    """A row for each depth of the target, a column for each plane; beside them lines of group 3, element 2."""
+    """Plot a row per depth of the target and a column per plane, with lines of group 3, element 2 beside them."""
     depths, grid, elements = found["depths"], found["grid"], target()
     extent, count = grid.extent, len(depths)
     figure = Figure(figsize=(13.5, 8.6), dpi=75, layout="constrained")
@@ -172,7 +172,7 @@ def picture(found: dict) -> Figure:
 
 
 def _draw_zoom(axes, plane: np.ndarray, grid: Grid, element: Element) -> None:
-    """What is around group 3, element 2, with the element's frame."""
+    """Draw the surroundings of group 3, element 2, with the element's frame."""
     left, _, _, top = grid.extent
     (x0, x1), (y0, y1) = (0.4, 1.35), (0.8, 2.0)
     rows, columns = (

@@ -1,12 +1,12 @@
 """Fig. 7: fluorescent beads in a slab, from the capture to points in 3-D.
 
-The paper embeds 5 um beads in a slab about 2.5 mm thick. Ours are balls filled with emitters, brighter and dimmer,
-imaged with all of their light and exposed with shot and read noise; the reconstruction knows neither. With DATA, the
-120 points of an independent ray tracer go the same way.
+The paper embeds 5 um beads in a slab about 2.5 mm thick. Ours are balls filled with emitters, of different brightness,
+imaged with all their light and with shot and read noise; the reconstruction uses neither radius nor brightness. With
+DATA, the 120 points of an independent ray tracer are processed the same way.
 
     python -m experiments.fig7_beads [DATA] [--out DIR]
 
-DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is taken.
+DATA holds `P1.toml`, `P1_d.tif`, `d.json`. Without it the built-in design is used.
 """
 
 from pathlib import Path
@@ -28,14 +28,14 @@ from gs_jax.pictures.style import draw_image
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
-# mm: the slab, its sides, and how far emitters in a ball of 5 um may be apart.
+# mm: depths and sides of the slab, and spacing of emitters in a ball of 5 um.
 SIZE, SLAB, APART = (20.0, 20.0), (18.75, 21.25), 0.002
-# Of each square of so many pixels the brightest is shown: spots are a pixel or two wide.
+# The plot shows the brightest of each square of so many pixels, because spots are one or two pixels wide.
 SHOWN = 40
 
 
 def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> dict:
-    """Truth, capture, found points and scores of each scene."""
+    """Return truth, capture, detected points and scores of each scene."""
     scenes = {"beads, simulated": _beads(design, count, progress)}
     if data is not None:
         truth = points_of(data, "d")
@@ -51,7 +51,7 @@ def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> 
 
 
 def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
-    """Middles of the beads with their light, and a capture."""
+    """Centres of the beads with their light, and a capture."""
     emitters = beads(count, SIZE, SLAB, pitch=APART)
     each = emitters.reshape(count, -1, 4)
     each[..., 3] *= np.random.default_rng(0).uniform(0.3, 1.7, (count, 1)) / each[0, :, 3].sum()
@@ -61,7 +61,7 @@ def _beads(design: Design, count: int, progress: Progress) -> tuple[np.ndarray, 
 
 
 def picture(results: dict) -> Figure:
-    """A row for each scene: the capture, and the points found (dots) and true (rings) from the front and the side."""
+    """Plot per scene the capture, and detected points (dots) and true points (rings) from the front and the side."""
     figure = Figure(figsize=(11.5, 3.6 * len(results)), dpi=80, layout="constrained")
     rows = figure.subplots(len(results), 3, squeeze=False)
     depths = np.concatenate([result["truth"][:, 2] for result in results.values()])

@@ -1,15 +1,15 @@
-"""Figs. 4 and 8: background suppression by a network, of a snowflake, letters and a resolution target.
+"""Figs. 4 and 8: background suppression by networks, for a snowflake, letters and a resolution target.
 
-Captures are reconstructed by plain back-projection and then cleaned by the paper's network, which sees one slice at
-a time, and by ours, which sees seven. Neither saw these scenes or this layout in training, and neither did our voxel
-model render them: two captures come from an independent ray tracer (if DATA is given), two from points that are finer
-than any voxel, with all of the light, and all have a camera's noise. The truth is the scene on the voxels, blurred
-laterally by one voxel (standard deviation), so that sub-voxel shifts do not decide.
+Captures are back-projected and then cleaned by the paper's network, which sees one slice at a time, and by ours, which
+sees seven. Neither network saw these scenes or this layout in training, and our voxel model rendered none of the
+captures: two come from an independent ray tracer (if DATA is given), two from points that are finer than any voxel,
+with all light, and all have camera noise. The truth is the scene on the voxels, blurred laterally by one voxel
+(standard deviation), so that sub-voxel shifts do not matter.
 
     python -m experiments.fig8_snowflake [DATA] [--out DIR]
 
-DATA holds `P1.toml`, `P1_h.tif`, `P1_f.tif` and their scenes `h.json`, `f.json`. Without it the built-in design is
-taken, and the simulated captures alone.
+DATA holds `P1.toml`, `P1_h.tif`, `P1_f.tif` and their scenes `h.json`, `f.json`. Without it the built-in design and
+only the simulated captures are used.
 """
 
 import json
@@ -40,10 +40,10 @@ from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_poin
 
 DEPTHS = tuple(np.arange(17.0, 23.01, 0.5))
 VOXEL_MM = 0.04
-# Distance of emitters: the simulated image has no dots, and the truth no raster.
+# Spacing of emitters, fine enough to leave no dots in the image and no pattern in the truth.
 EMITTERS_MM = 0.03
 PEAK_ELECTRONS = 10_000
-# Half the side of the square that the resolution target is judged in.
+# Half the side of the square in which the resolution target is scored.
 _TARGET_MM = 2.8
 METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "all zero": np.zeros_like,
@@ -57,7 +57,7 @@ NETWORKS = "paper's network", "our network"
 
 
 def run(design: Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progress: Progress) -> dict:
-    """For each scene the truth and, by method, volumes and scores; what is made of noise; and the time of a slice."""
+    """Return per scene the truth, volumes and scores by method; the response to noise; and the time of a slice."""
     imager = design.imager()
     grid = Grid.over(imager.sensor, depths=DEPTHS, pitch=voxel_mm)
     captures = {name: _simulated(emitters, design, progress) for name, emitters in simulated_scenes().items()}
@@ -71,7 +71,7 @@ def run(design: Design, data: Path | None, *, voxel_mm: float = VOXEL_MM, progre
     scenes = {}
     for name, (counts, emitters) in captures.items():
         truth = gaussian_filter(np.asarray(rasterize(emitters, grid), np.float32), (0, 1, 1))
-        # The target is small: its part of the field only.
+        # The target is small; reconstruct only its part of the field.
         half = round(_TARGET_MM / voxel_mm) if "USAF" in name else max(grid.shape)
         part = slice(None), *(slice(max(n // 2 - half, 0), n // 2 + half + 1) for n in grid.shape)
         volume = _back_projected(counts, imager, grid, progress)
@@ -102,9 +102,9 @@ def _simulated(emitters: np.ndarray, design: Design, progress: Progress) -> tupl
 
 
 def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
-    """What the networks make of captures without an object: their largest voxel in the volume's standard deviations.
+    """Largest output of the networks for captures without an object, in standard deviations of the volume.
 
-    A dark capture with read noise, and an evenly lit one with shot noise.
+    The captures are dark with read noise, and uniformly lit with shot noise.
     """
     found = {name: {} for name in ("dark", "evenly lit")}
     for name, image in zip(found, (np.zeros, np.ones), strict=True):
@@ -120,7 +120,7 @@ def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
 
 
 def _seconds(rounds: int = 5) -> dict:
-    """Of a slice of 512 x 512 in a stack of seven, the medians of rounds in turns, once compiled."""
+    """Median time of a 512 x 512 slice in a stack of seven, in interleaved rounds after compilation."""
     volume = np.random.default_rng(0).random((7, 512, 512), np.float32)
     taken = {name: [] for name in NETWORKS}
     for _ in range(rounds + 1):
@@ -132,12 +132,12 @@ def _seconds(rounds: int = 5) -> dict:
 
 
 def numbers(found: dict) -> dict:
-    """Without the volumes."""
+    """Results without the volumes."""
     return found | {"scenes": {name: scene["scores"] for name, scene in found["scenes"].items()}}
 
 
 def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upward: bool = False) -> Figure:
-    """Planes of the truth and of what each method makes, each volume from zero to its 99.99th percentile."""
+    """Plot planes of the truth and of each method's volume, from zero to its 99.99th percentile."""
     columns = {"truth": scene["truth"]} | {
         k: v for k, v in scene["volumes"].items() if k in ("back-projection", *NETWORKS)
     }

@@ -1,20 +1,21 @@
-"""Fig. 9 (B-D) on images that no model of ours rendered: every method with its defaults on ray-traced captures.
+"""Fig. 9 (B-D) on ray-traced images: every method with its defaults on whole captures.
 
 `gs-jax benchmark` compares times and, on simulated particles, quality. Here every method does what the command line
-does with a whole capture. Another group's tracer made three (exact refraction, aberrations, clipped lenses, noise, a
-camera's offset): 120 points between 18 and 22 mm, letters in three of nine planes, a USAF target at 18 mm. Our own
-tracer, which shares no code with the package, made an inclined snowflake with the same lenses, and letters with other
-lenses, layout and depths. Iterative methods take 20 steps with all of the light in their model; back-projection and
-what follows it get the same voxels, four pixels wide. The truth of the points, and the points that a method finds, are
-as wide as the microscope resolves (Eq. 5: a voxel); zeros are the floor, the truth itself is the ceiling. F1 is that of
-as many of the brightest peaks of a volume, or points found, as scores best: a threshold that no user has, and that
-favours the volumes. "Imaged again" is how far the volume's image is from the capture (`gs_jax.forward_residual`).
+does with a whole capture. Another group's tracer made three captures (exact refraction, aberrations, clipped lenses,
+noise, a camera's offset): 120 points between 18 and 22 mm, letters in three of nine planes, a USAF target at 18 mm. Our
+own tracer, which shares no code with the package, made an inclined snowflake with the same lenses, and letters with
+other lenses, layout and depths. Iterative methods take 20 steps with the full model; back-projection and the methods
+that build on it use the same voxels, four pixels wide. True points, and points that a method detects, are rendered as
+wide as the microscope resolves (Eq. 5: a voxel). The tables include an empty volume and the truth itself as bounds. F1
+is that of the number of brightest peaks of a volume, or points, that scores best: a threshold that no user has, and
+that favours the volumes. "Imaged again" is the difference between the volume's image and the capture
+(`gs_jax.forward_residual`).
 
     python -m experiments.fig9_benchmark DATA [--out DIR] [--scenes letters,points] [--weights FILE]
 
-DATA holds `P1.toml`, `P1_*.tif` and their truth, `*.json`. Points match within 0.1 mm laterally and 0.6 mm axially: the
-voxels are coarse. FILE is what `gs-jax train --network unrolled` wrote, in the place of what is shipped. Writes
-`captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
+DATA holds `P1.toml`, `P1_*.tif` and their truth, `*.json`. Points match within 0.1 mm laterally and 0.6 mm axially,
+because the voxels are coarse. FILE is the output of `gs-jax train --network unrolled`, used instead of the shipped
+weights. Writes `captures.json`, `captures.md` and `captures.png`; about ten minutes a scene on two cores.
 """
 
 import json
@@ -53,7 +54,7 @@ from gs_jax.solvers.unrolled import read_unrolled
 
 ITERATIVE = ("list-rl", "richardson-lucy", "fista", "admm")
 STEPS = 20
-# Of the largest value: what is darker is no peak.
+# Peaks below this fraction of the largest value are ignored.
 DARKEST = 0.01
 # Rays from each emitter to each lens.
 _RAYS = 8
@@ -68,7 +69,7 @@ class Scene(NamedTuple):
 
 
 def _captured(data: Path, name: str, depths: np.ndarray, emitters: np.ndarray | None) -> Scene:
-    """A capture of another group's, on the voxels that iterative methods have by default."""
+    """Load a capture of the other group's tracer, on the default voxels of iterative methods."""
     imager = read_design(data / "P1.toml").imager()
     image = read_capture(data / f"P1_{name}.tif", imager.sensor.shape)
     grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
@@ -120,26 +121,26 @@ SCENES: dict[str, Callable[[Path], Scene]] = {
 }
 
 
-# Drawn by others with +y upwards.
+# These scenes have +y upwards.
 _UPWARD = ("letters",)
 
 
 class View(NamedTuple):
-    """Maxima over the depths, and `(left, right, bottom, top)`, mm."""
+    """Maxima over the depths, and their extent `(left, right, bottom, top)`, mm."""
 
     maxima: np.ndarray
     extent: tuple[float, float, float, float]
 
 
 class Result(NamedTuple):
-    """A volume, and the points `(x, y, z, intensity)` that it was made of, if it was."""
+    """A volume, and the points `(x, y, z, intensity)` it was rendered from, if any."""
 
     volume: np.ndarray
     points: np.ndarray | None = None
 
 
 def methods(s: Scene, networks: Unrolled, steps: int, progress: Progress) -> dict[str, Callable[[], Result]]:
-    """Every method, as a call without arguments."""
+    """Every method as a function without arguments, by name."""
     by = lambda method: reconstruct(s.image, s.imager, s.grid, method, progress=progress)
     solve = lambda name: by(METHODS[name](steps))
     of = lambda points: Result(spots(points, s.grid, float(s.grid.pitch) / FWHM), points)
@@ -171,7 +172,7 @@ def best_f1(result: Result, s: Scene) -> float | None:
 def run(
     data: Path, networks: Unrolled, scenes: Sequence[str] = tuple(SCENES), *, steps: int = STEPS, progress: Progress
 ) -> tuple[dict, dict[tuple[str, str], View]]:
-    """What `captures.json` holds, and maxima over the depths by scene and method."""
+    """Return the content of `captures.json`, and maxima over the depths by scene and method."""
     rows, pictures = [], {}
     for name in scenes:
         s = SCENES[name](data)
@@ -194,7 +195,7 @@ def markdown(found: dict) -> str:
 
 
 def picture(pictures: dict[tuple[str, str], View]) -> Figure:
-    """Maxima over the depths, each up to its 99.9th percentile."""
+    """Plot maxima over the depths, each up to its 99.9th percentile."""
     columns = 4
     rows = -(-len(pictures) // columns)
     figure = Figure(figsize=(12, 3.2 * rows), dpi=66, layout="constrained")

@@ -1,11 +1,10 @@
-"""The forward model: what it costs, and how far the paper's zones are from the exact sum.
+"""Cost of the forward model, and the difference between the paper's zones and the exact sum.
 
 Cost: `gs_jax.forward` at full scale (5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at
-each depth) and with more or fewer depths, lenses and pixels; in focus also with all of the light, the cores of six
-rings or of two, the adjoints, a step of Richardson-Lucy, and Eq. (2) by FFTs of whole images, in turns.
-ApertureProfile: Eq. (2) takes the envelope C from the centre of the zone that a voxel lies in, `gs_jax.forward` from
-the voxel; nothing else differs. The zone of a lens is its Voronoi cell, so the departure follows from the envelope
-alone.
+each depth) and with more or fewer depths, lenses and pixels. In focus also the full model with cores of six rings or of
+two, the adjoints, a step of Richardson-Lucy, and Eq. (2) by FFTs of whole images, interleaved. Zones: Eq. (2) takes the
+envelope C at the centre of the zone that a voxel lies in, `gs_jax.forward` at the voxel; there is no other difference.
+The zone of a lens is its Voronoi cell, so the difference follows from the envelope alone.
 
     python -m experiments.forward_model [--out DIR]
 
@@ -37,20 +36,20 @@ STUDY = {
     "lenses": [Job(lenses=n) for n in (13, 53, 213, 850)],
     "pixels": [Job(pixels=n) for n in (640, 1280, 2560, 5120)],
 }
-# Where all of the light is compared with one PSF.
+# Sensor distance at which the full and the near model are compared.
 FOCUSED = Job(sensor_distance_mm=5.8)
 WHOLE = "near, by FFTs of whole images"
 PSF_PIXELS = 65
 
 
 def cost(job: Job, rounds: int = 3) -> dict[str, float]:
-    """Warm median, compile time and what XLA allocates beside the arguments."""
+    """Warm median, compilation time, and memory that XLA allocates beside the arguments."""
     s: Inputs = inputs(job)
     return _in_turns({"near": (forward, (s.volume, s.imager, s.grid, _psf(job)))}, rounds)["near"]
 
 
 def levels(job: Job, rounds: int = 3) -> dict[str, dict[str, float]]:
-    """`cost` with one PSF ("near") and all of the light ("full"; "two rings"), and of what is made of them."""
+    """`cost` of the near model, the full model and the full model with two rings, and of adjoints and solver steps."""
     s: Inputs = inputs(job)
     full = lambda **options: field_varying_psf(s.imager, s.grid.depths, **options)
     geometry = s.imager, s.grid
@@ -70,7 +69,7 @@ def levels(job: Job, rounds: int = 3) -> dict[str, dict[str, float]]:
 
 
 def by_whole_images(volume, imager, grid, psf):
-    """`forward` with the spectra of whole images added up, which needs one transform back."""
+    """`forward` by adding the spectra of whole images, which needs one inverse transform."""
     size, (rows, columns) = psf.shape[-1], imager.sensor.shape
     padded = rows + size - 1, columns + size - 1
     wide = with_margin(imager, size)
@@ -125,7 +124,7 @@ def _in_turns(calls, rounds):
 
 
 def bars(found: Mapping[str, Mapping]) -> list[list[str]]:
-    """What was promised of Eq. (2): round by round, as other work meets both alike."""
+    """Compare Eq. (2) by tiles and by whole images with its targets, in interleaved rounds."""
     rows = []
     for what in ("", ", adjoint", ", Richardson-Lucy step"):
         before, now = (found[model + what]["rounds_s"] for model in (WHOLE, "near"))
@@ -138,7 +137,7 @@ def bars(found: Mapping[str, Mapping]) -> list[list[str]]:
 
 
 def zone_departure(imager: Imager, depth: float, size: tuple[float, float], points: int = 20_000) -> dict[str, float]:
-    """How much light of a point the zones put at wrong lenses: sum |C_zone - C| / sum C, over random points."""
+    """Share of a point's light that zones assign to wrong lenses, sum |C_zone - C| / sum C, over random points."""
     rng = np.random.default_rng(0)
     centers = np.asarray(imager.centers)
     place = rng.uniform(-0.5, 0.5, (points, 2)) * size
@@ -157,7 +156,7 @@ def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def run(study: Mapping[str, Sequence[Job]] = STUDY, focused: Job = FOCUSED, *, progress: Progress) -> dict:
-    """Everything that `forward.json` holds; units are in the keys."""
+    """Return the content of `forward.json`; units are in the keys."""
     jobs = dict.fromkeys(job for axis in study.values() for job in axis)
     costs = {job: cost(job) for job in progress.track(list(jobs), "Forward model")}
     design = geomscope()
@@ -170,7 +169,7 @@ def run(study: Mapping[str, Sequence[Job]] = STUDY, focused: Job = FOCUSED, *, p
 
 
 def picture(found: dict) -> Figure:
-    """Time against each number, the others at full scale."""
+    """Plot time against each size, with the other sizes at full scale."""
     figure = Figure(figsize=(10, 3.2), dpi=100, layout="constrained")
     for axes, (axis, rows) in zip(figure.subplots(1, 3, sharey=True), found["cost"].items(), strict=True):
         axes.loglog([row[axis] for row in rows], [row["median_s"] for row in rows], "o-")

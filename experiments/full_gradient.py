@@ -1,8 +1,8 @@
-"""What the end-to-end gradient costs at full scale, in forward passes with back-projection.
+"""Cost of an end-to-end gradient at full scale, relative to forward model and back-projection.
 
 5120^2 pixels, 213 lenses, 13 depths of 555^2 voxels, a PSF of 65 x 65 pixels at each depth. The gradient is that of
-the misfit after `forward` and `backproject`, with respect to every leaf of the imager. Both are timed in turns, so
-that the ratio holds on a busy machine too; memory is what XLA plans beside the arguments.
+the squared error after `forward` and `backproject`, with respect to every leaf of the imager. Both are timed in
+interleaved rounds, so that the ratio holds on a loaded machine too; memory is XLA's plan beside the arguments.
 
     python -m experiments.full_gradient [--out DIR] [--rounds N]
 
@@ -23,7 +23,7 @@ from gs_jax.codesign.end_to_end import misfit_db
 
 
 def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:
-    """Everything that `full_gradient.json` holds; units are in the keys."""
+    """Return the content of `full_gradient.json`; units are in the keys."""
     job = Job() if job is None else job
     s: Inputs = inputs(job)
     psf = jnp.full((job.depths, PSF_PIXELS, PSF_PIXELS), PSF_PIXELS**-2.0, jnp.float32)

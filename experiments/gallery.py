@@ -1,11 +1,11 @@
-"""Every figure and table of the paper that can be simulated: what it claims, what we find, and the pictures.
+"""All figures and tables of the paper that can be simulated: the paper's claims, our results, and pictures.
 
     make figures
     python -m experiments.gallery [DATA] [--out DIR]
 
-DATA holds the ray-traced captures (`P1.toml`, `P1_*.tif`, `*.json`); without it the simulated ones stand alone. Writes
-`gallery.md` and the pictures; under half an hour on two cores. The experiments' own scripts do more: other sizes,
-controls, and what is not the paper's.
+DATA holds the ray-traced captures (`P1.toml`, `P1_*.tif`, `*.json`); without it only simulated captures are used.
+Writes `gallery.md` and the pictures; under half an hour on two cores. The experiments' own scripts do more: other
+sizes, controls, and results that are not in the paper.
 """
 
 import re
@@ -38,7 +38,7 @@ from gs_jax.base.progress import Progress
 
 
 class Claim(NamedTuple):
-    """A row of the table; `met` says yes, or why not."""
+    """A row of the table; `met` is yes, or the reason why not."""
 
     where: str
     what: str
@@ -48,13 +48,13 @@ class Claim(NamedTuple):
 
 
 class Page(NamedTuple):
-    """What a figure of the paper becomes: pictures by file name, and its claims."""
+    """Pictures by file name, and claims, of one figure of the paper."""
 
     pictures: dict[str, Figure]
     claims: list[Claim]
 
 
-# Of Fig. 9: pixels along a side, and the paper's exponents of time in pixel-voxel pairs.
+# Fig. 9: pixels along a side, and the paper's exponents of time against pixel-voxel pairs.
 _SIDES = (32, 56, 100, 212)
 _EXPONENTS = {"backproject": 0.5, "richardson-lucy, dense": 1.0, "admm, dense": 1.0}
 
@@ -64,7 +64,7 @@ def _met(found: bool, why: str) -> str:
 
 
 def _is_within(ours: str, paper: str) -> bool:
-    """The same words, or a number within a range, such as 520 nm and 500-530 nm."""
+    """Whether the texts are equal, or a number lies within a range, such as 520 nm and 500-530 nm."""
     number, limits = re.fullmatch(r"([\d.]+)( .*)?", ours), re.fullmatch(r"([\d.]+)-([\d.]+)( .*)?", paper)
     if ours == paper or not (number and limits):
         return ours == paper
@@ -284,7 +284,7 @@ PAGES: dict[str, Callable[[Path | None, Progress], Page]] = {
 
 
 def run(data: Path | None, pages: list[str], *, progress: Progress) -> tuple[dict[str, Page], dict[str, float]]:
-    """Each page, and the seconds that it took."""
+    """Return each page, and the seconds it took."""
     found, seconds = {}, {}
     for title in progress.track(pages, "Figures"):
         begun = time.monotonic()

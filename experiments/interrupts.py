@@ -1,7 +1,7 @@
-"""Ctrl-C at random moments of every command: how it ends, how soon, and what it leaves.
+"""Interrupt every command at random moments: exit status, delay, and files left behind.
 
-Each run begins in a new folder with copies of its inputs. It should end within two seconds with what a shell calls
-status 130, or have done its work; its inputs should be as they were, and no unfinished file should be left.
+Each run starts in a new folder with copies of its inputs. It should end within two seconds with exit status 130, or
+have finished; its inputs should be unchanged, and no unfinished file should remain.
 
     python -m experiments.interrupts [--rounds N] [--out DIR]
 
@@ -24,7 +24,7 @@ from gs_jax import geomscope, write_capture, write_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 
-# Seconds within which a command must end, and the longest wait before it is interrupted: most end by themselves later.
+# Seconds within which a command must end, and the longest delay before the interrupt.
 SOON, LATEST = 2.0, 12.0
 POINTS = "x_mm,y_mm,z_mm,intensity\n0.1,0.2,20,1\n1.1,-0.2,19,1\n"
 COMMANDS = {
@@ -50,9 +50,9 @@ COMMANDS = {
 
 
 def interrupted(arguments: list[str], folder: Path, wait: float) -> dict:
-    """One run, interrupted after some seconds."""
+    """Run a command once, and interrupt it after some seconds."""
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    # A process of its own, to which nobody else's Ctrl-C goes.
+    # A process group of its own, so that the signal reaches no other process.
     process = subprocess.Popen(
         [sys.executable, "-m", "gs_jax", *arguments],
         cwd=folder,
@@ -76,14 +76,14 @@ def interrupted(arguments: list[str], folder: Path, wait: float) -> dict:
     lost = [str(path) for path, data in before.items() if not path.exists() or path.read_bytes() != data]
     left = [path.name for path in folder.rglob("*") if path.name.startswith(".gs-jax-")]
     status = process.wait()
-    # Before Python runs our code, the signal itself ends the process.
+    # Before Python runs the package's code, the signal itself ends the process.
     ended = (0, 130, -signal.SIGINT) if signalled else (0,)
     good = not lost and not left and status in ended and took <= SOON
     return {"after_s": wait, "status": status, "took_s": took, "lost": lost, "left": left, "good": good}
 
 
 def run(commands: dict[str, str], rounds: int, *, progress: Progress, latest: float = LATEST) -> dict[str, list[dict]]:
-    """Runs by command, as many in all as there are rounds."""
+    """Run `rounds` commands in total; return the results by command."""
     rng, found = np.random.default_rng(0), {name: [] for name in commands}
     with tempfile.TemporaryDirectory() as place:
         inputs = Path(place) / "inputs"

@@ -1,7 +1,7 @@
-"""Back-projection written by hand, in numba and in NumPy, to measure `gs_jax.backproject` against.
+"""Back-projection written by hand in numba and NumPy, as a reference for the speed of `gs_jax.backproject`.
 
-Each is the same sum with the same envelope, bilinear, without the rays that miss the sensor. Pixels, weights and
-sums are float32; only coordinates are float64, so that all agree with `gs_jax` to float32's rounding.
+Each kernel computes the same sum with the same envelope, bilinear, without the rays that miss the sensor. Pixels,
+weights and sums are float32; only coordinates are float64, so that all agree with `gs_jax` to float32 rounding.
 """
 
 from math import ceil, floor, sqrt
@@ -14,14 +14,14 @@ from gs_jax import Grid, Imager
 from gs_jax.geometry import FALLOFF, field_limit
 
 ZERO, ONE, TWO, THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
-# Numba takes an index of any other type for one that may be negative, and then does not vectorise.
+# With any other index type numba allows for negative indices, and does not vectorise.
 INDEX = np.uint64
-# Bands of rows for the threads to share.
+# Bands of rows, distributed over the threads.
 BANDS = 16
 
 
 class Geometry(NamedTuple):
-    """An imager and a grid in plain numbers and arrays, mm."""
+    """An imager and a grid as plain numbers and arrays, mm."""
 
     x: np.ndarray  # of the lenses
     y: np.ndarray
@@ -31,13 +31,13 @@ class Geometry(NamedTuple):
     columns: int
     voxel_pitch: float
     pixel_pitch: float
-    limit: float  # where the envelope ends
+    limit: float  # distance where the envelope ends
     limit2: np.float32
-    slope: np.float32  # of its falloff
+    slope: np.float32  # width of the envelope's falloff
 
 
 def plain(imager: Imager, grid: Grid) -> Geometry:
-    """What the kernels need, lenses in an order that keeps neighbours together."""
+    """Data for the kernels; lenses are sorted so that neighbours are close in memory."""
     x, y = np.asarray(imager.centers, np.float64).T
     band = np.floor(y / 1.5)
     order = np.lexsort((np.where(band % 2 == 0, x, -x), band))
@@ -58,12 +58,12 @@ def plain(imager: Imager, grid: Grid) -> Geometry:
 
 
 def numpy_patches(image, geometry: Geometry):
-    """Lens by lens and depth by depth, whole patches of voxels at a time: how one would write it in MATLAB."""
+    """Process whole patches of voxels per lens and depth, as one would in MATLAB."""
     g = geometry
     volume = np.zeros((len(g.depth2), g.rows, g.columns), np.float32)
 
     def axis(center, voxels, pixels, magnification):
-        """The voxels near a lens, the pixel below each and what it weighs, and the squared distance."""
+        """Voxels near a lens, the pixel below each with its weight, and the squared distance."""
         q = (np.arange(voxels) - (voxels - 1) / 2) * g.voxel_pitch
         near = np.flatnonzero(np.abs(q - center) < g.limit)
         pixel = (center + magnification * (center - q[near])) / g.pixel_pitch + (pixels - 1) / 2
@@ -100,7 +100,7 @@ def _envelope(distance2, depth2, limit2, slope):
 def paper_loop(image, geometry):
     """The paper's loop: each voxel tests each lens, and adds the pixels of those that see it.
 
-    It lists the lenses first and adds then, which is faster than to add at once: the test is without a branch.
+    Listing the lenses first and adding afterwards is faster than adding at once, because the test has no branch.
     """
     g = geometry
     height, width = image.shape
@@ -139,7 +139,7 @@ def paper_loop(image, geometry):
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
 def _axis(centers, geometry, voxels, pixels):
-    """Tables per lens: first voxel of the patch; pixel and the two weights per depth; squared distance."""
+    """Tables per lens: first voxel of the patch; pixel and two weights per depth; squared distance."""
     g = geometry
     size = min(voxels, int(2 * g.limit / g.voxel_pitch) + 1)
     lenses, depths = centers.size, g.depth2.size
@@ -165,19 +165,19 @@ def _axis(centers, geometry, voxels, pixels):
 
 
 def lens_patches(image, geometry: Geometry):
-    """Each lens visits its patch of voxels; the volume comes from NumPy, which asks for huge pages."""
+    """Visit a patch of voxels per lens; NumPy allocates the volume, because it requests huge pages."""
     volume = np.empty((len(geometry.depth2), geometry.rows, geometry.columns), np.float32)
     return _lens_patches(image, geometry, volume)
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
 def _lens_patches(image, geometry, volume):
-    """The best we could write: threads share bands of rows, lenses visit their voxels row by row.
+    """Our fastest hand-written kernel: threads share bands of rows, and lenses visit their voxels row by row.
 
-    In a row all rays through a lens read the same two rows of the image, which are blended first; then there are
-    two pixels to gather for a voxel and not four. Loops stay apart where that is what LLVM vectorises (all but the
-    gathers). Faster than the same with four corners gathered, with the loops fused, with rows padded to the
-    vector length, or with slices, whose reference counts the threads fight over.
+    In a row all rays through a lens read the same two rows of the image. These are blended first, which leaves two
+    pixels to gather per voxel instead of four. Loops are separate where that lets LLVM vectorise them (all but the
+    gathers). Slower variants: gathering four corners, fused loops, rows padded to the vector length, and slices, whose
+    reference counts the threads contend for.
     """
     g = geometry
     y_start, y_low, y_weights, y_distance2 = _axis(g.y, g, g.rows, image.shape[0])
@@ -215,7 +215,7 @@ def _lens_patches(image, geometry, volume):
                             j = INDEX(x_low[lens, d, begin + c]) - left
                             before, after = x_weights[0, lens, d, begin + c], x_weights[1, lens, d, begin + c]
                             sample[c] = before * blended[j] + after * blended[j + INDEX(1)]
-                    else:  # few voxels among many pixels
+                    else:  # sparse voxels on many pixels
                         for c in range(many):
                             j = INDEX(x_low[lens, d, begin + c])
                             j1 = j + INDEX(1)
@@ -230,7 +230,7 @@ def _lens_patches(image, geometry, volume):
 
 
 def count_pairs(geometry: Geometry, sensor_shape: tuple[int, int]) -> int:
-    """The voxel-lens pairs that count: within the field, and with the ray on the sensor."""
+    """Number of voxel-lens pairs within the field whose ray meets the sensor."""
     g = geometry
     (_, _, y_weights, y2), (_, _, x_weights, x2) = (
         _axis(centers, g, voxels, pixels)

@@ -1,15 +1,14 @@
-"""What a lens layout alone can gain: optimised layouts against the best of 200 random ones, and hexagonal ones.
+"""Gain of optimised lens layouts over the best of 200 random ones and over hexagonal ones.
 
-The prescription, the plate, the number of lenses and their least distance are fixed; only the centres move. The object
-fills most of the plate, and sub-images overlap. For each of five seeds 200 Poisson-disc layouts are scored by
-the end-to-end loss (`gs_jax.codesign.end_to_end.reconstruction_loss`), and the best one is the competitor. From there
-Adam goes down the gradient of that same loss, on other scenes at each step. The controls, of as many lenses: the best
-of 200 layouts in even rows over the whole plate, each lens moved a little, which is what the optimum taught us; and
-hexagonal lattices, which nothing optimised, at the least distance and spread as wide as the plate allows. All are then
-judged by PSNR on 30 held-out scenes that the loss's model did not render (`experiments.layout_scenes`). The
-reconstruction is the same for all: normalised back-projection less its local background
-(`gs_jax.codesign.end_to_end.reconstruct`), and as a second method, which nothing was optimised for, ten steps of
-Richardson-Lucy on the same pixel-voxel lists.
+The prescription, the plate, the number of lenses and their minimum spacing are fixed; only the centres move. The object
+fills most of the plate, and sub-images overlap. For each of five seeds, 200 Poisson-disc layouts are scored by the
+end-to-end loss (`gs_jax.codesign.end_to_end.reconstruction_loss`), and the best one is the competitor. From there Adam
+follows the gradient of the same loss, with other scenes at each step. Controls with as many lenses: the best of 200
+layouts in even rows over the whole plate, each lens displaced a little, as the optima suggest; and hexagonal lattices
+at the minimum spacing and spread as wide as the plate allows, which are not optimised. All are scored by PSNR on 30
+held-out scenes that the loss's model did not render (`experiments.layout_scenes`). The reconstruction is the same for
+all: normalised back-projection less its local background (`gs_jax.codesign.end_to_end.reconstruct`), and as a second
+method, for which nothing was optimised, ten steps of Richardson-Lucy on the same pixel-voxel lists.
 
     python -m experiments.layout_gain [--out DIR] [--seeds N]
 
@@ -38,7 +37,7 @@ PAIRS = (*((name, "best") for name in NAMES[1:]), *(("ours", name) for name in N
 
 
 def candidates(study: Study, seed: int) -> Float[np.ndarray, "layout lens 2"]:
-    """Random layouts of one number of lenses, the commonest."""
+    """Random layouts with equal numbers of lenses, the most frequent number."""
     draw = lambda n: poisson_disc_layout(study.plate, min_distance=study.distance, seed=int(n))
     layouts = lambda rng: map(draw, rng.integers(2**31, size=10**5))
     first = layouts(np.random.default_rng(0))
@@ -48,17 +47,17 @@ def candidates(study: Study, seed: int) -> Float[np.ndarray, "layout lens 2"]:
 
 
 def hexagonal(study: Study, seed: int, count: int, pitch: float) -> Float[np.ndarray, "lens 2"]:
-    """The control: of a lattice that is turned and shifted at random, the lenses nearest to the axis.
+    """Control: the lenses nearest to the axis of a lattice that is rotated and shifted at random.
 
     Raises
     ------
     ValueError
-        If the plate has no room for so many.
+        If they do not fit on the plate.
     """
     rng = np.random.default_rng(2000 + seed)
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    # Wider by a millionth, so that rounding leaves the least distance.
+    # Wider by a millionth, so that rounding does not violate the minimum spacing.
     lattice = hexagonal_layout((20.0, 20.0), pitch=pitch * (1 + 1e-6)) @ turn + rng.uniform(-0.5, 0.5, 2) * pitch
     on_plate = lattice[(np.abs(lattice) <= np.array(study.plate) / 2).all(1)]
     if len(on_plate) < count:
@@ -67,7 +66,7 @@ def hexagonal(study: Study, seed: int, count: int, pitch: float) -> Float[np.nda
 
 
 def spread(study: Study, seed: int, count: int) -> Float[np.ndarray, "lens 2"]:
-    """The other control: the same at the widest pitch, in steps of 1 %, that leaves room for all lenses."""
+    """Control: the hexagonal lattice at the widest pitch, in steps of 1 %, at which all lenses fit."""
     for share in np.arange(1.2, 1.0, -0.01):
         try:
             return hexagonal(study, seed, count, study.distance * share)
@@ -77,7 +76,7 @@ def spread(study: Study, seed: int, count: int) -> Float[np.ndarray, "lens 2"]:
 
 
 def rows(study: Study, seed: int, count: int) -> Float[np.ndarray, "layout lens 2"]:
-    """The strongest control: even rows from edge to edge of the plate, every lens moved at random by `study.jitter`."""
+    """Strongest control: even rows from edge to edge of the plate, every lens displaced at random by `study.jitter`."""
     rng, (width, height) = np.random.default_rng(3000 + seed), study.plate
     number = round((count * height / width) ** 0.5)
     lenses = np.diff(np.round(np.linspace(0, count, number + 1)).astype(int))
@@ -88,7 +87,7 @@ def rows(study: Study, seed: int, count: int) -> Float[np.ndarray, "layout lens 
 
 
 def too_near(centers: Centers, distance: float) -> Float[Array, ""]:
-    """What pairs lack of a half per cent more than the least distance, squared and summed, mm^2."""
+    """Sum of squared deficits of pair distances below 1.005 times the minimum spacing, mm^2."""
     first, second = np.triu_indices(len(centers), 1)
     squared = jnp.sum((centers[first] - centers[second]) ** 2, axis=1)
     return jnp.sum(jnp.maximum(1.005 * distance - jnp.sqrt(squared + 1e-12), 0) ** 2)
@@ -98,7 +97,7 @@ _push = jax.jit(jax.grad(too_near))
 
 
 def apart(centers: Centers, study: Study) -> Float[np.ndarray, "lens 2"]:
-    """Centres moved until every pair keeps the least distance, on the plate."""
+    """Move centres until every pair keeps the minimum spacing, on the plate."""
     centers, half = np.array(centers, np.float64), np.array(study.plate) / 2
     for _ in range(1000):
         centers = np.clip(centers, -half, half)
@@ -111,7 +110,7 @@ def apart(centers: Centers, study: Study) -> Float[np.ndarray, "lens 2"]:
 def optimise(
     start: Centers, psfs: Array, study: Study, seed: int, progress: Progress
 ) -> tuple[Float[np.ndarray, "lens 2"], list[float]]:
-    """Adam on the end-to-end loss of new scenes, with the least distance as a penalty and then exactly.
+    """Run Adam on the end-to-end loss of new scenes, with the minimum spacing first as a penalty and then exactly.
 
     Returns the centres, and the loss at each step.
     """
@@ -137,7 +136,7 @@ def optimise(
 def best_of(
     layouts: Float[np.ndarray, "layout lens 2"], score: Callable[[Centers], float], progress: Progress
 ) -> tuple[Float[np.ndarray, "lens 2"], list[float]]:
-    """The layout of the least loss, and the losses of all."""
+    """The layout with the smallest loss, and the losses of all."""
     losses = [score(layout) for layout in progress.track(layouts, "Scoring layouts")]
     return layouts[int(np.argmin(losses))], losses
 
@@ -188,7 +187,7 @@ def gains(rows: list[dict]) -> dict[str, dict[str, float | list[float]]]:
 def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float | list[float]]:
     """Mean gain, and its 95 % interval by Student's t over the seeds' means.
 
-    The scenes are the same for every layout, so a pair differs by its layouts alone.
+    The scenes are the same for every layout, so pairs differ by their layouts only.
     """
     means = np.mean(np.subtract(ours, others), axis=1)
     half = stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / len(means) ** 0.5
@@ -200,7 +199,7 @@ def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float 
 
 
 def picture(found: dict) -> Figure:
-    """Losses of the random layouts, the controls and ours; one seed's layouts."""
+    """Plot losses of the random layouts, the controls and the optimised layout; and one seed's layouts."""
     figure = Figure(figsize=(17, 3.8), dpi=100, layout="constrained")
     left, *right = figure.subplots(1, 6, width_ratios=(1.6, 1, 1, 1, 1, 1))
     colors = "C0", "C2", "C1", "#009e73", "C4"

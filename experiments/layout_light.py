@@ -1,9 +1,9 @@
-"""Does the ranking of layouts change when all of the light counts?
+"""Whether the ranking of layouts changes with the full model.
 
-Co-design judges layouts with the near model: one PSF for all lenses, within the field radius, where a tenth of the
-light is. Here a small microscope with one of several layouts of as many lenses images random scenes, by the near model
-and by the full one, with noise, and list-RL inverts each with the model that made it. Scenes lie on voxels half as
-large, between the planes that are reconstructed. The score is the PSNR above that of an empty volume.
+Co-design evaluates layouts with the near model: one PSF for all lenses, within the field radius, which has a tenth of
+the light. Here a small microscope with several layouts of equally many lenses images random scenes with the near and
+with the full model, with noise, and list-RL inverts each with the model that made it. Scenes lie on voxels half as
+large, between the reconstructed planes. The score is the PSNR above that of an empty volume.
 
     python -m experiments.layout_light [--out DIR]
 
@@ -44,7 +44,7 @@ _ELECTRONS = 5000 * KIND.binning**2
 
 
 def layouts() -> dict[str, np.ndarray]:
-    """As many lenses each, those nearest to the middle where a pattern has more; mm."""
+    """Layouts with equally many lenses, those nearest to the middle of a pattern; mm."""
     side, wide = 1.05 * KIND.side, 2 * KIND.side
     rng = np.random.default_rng(0)
     rows = np.repeat(np.cumsum([0, 0.9, 1.5, 1.0, 1.6, 0.9, 1.5]), 7)
@@ -61,7 +61,7 @@ def layouts() -> dict[str, np.ndarray]:
 
 
 def run(names: list[str] | None = None, *, scenes: int = 6, steps: int = STEPS, progress: Progress) -> dict:
-    """Scores, dB, by level and layout, one a scene; and Spearman's correlation of the two rankings."""
+    """Return scores in dB by level and layout, one per scene; and Spearman's correlation of the two rankings."""
     chosen = {name: centers for name, centers in layouts().items() if names is None or name in names}
     gains = {level: {} for level in LEVELS}
     for name, centers in progress.track(chosen.items(), "Layouts"):

@@ -1,8 +1,8 @@
-"""What layouts of lenses are judged on: the system of `experiments.layout_gain`, its scenes, and their scores.
+"""System, scenes and scores of `experiments.layout_gain`.
 
-The held-out scenes are not rendered by the model that a reconstruction or a loss uses: voxels three times finer, blobs
-between them and 0.1 mm off the reconstructed depths, the diffraction PSF instead of a Gaussian, and a camera's noise
-and counts.
+The held-out scenes are not rendered by the model of the reconstruction or the loss: voxels are three times finer, blobs
+lie between them and 0.1 mm off the reconstructed depths, the PSF is that of diffraction instead of a Gaussian, and a
+camera adds noise and quantises.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ from gs_jax.solvers.richardson_lucy import RichardsonLucy
 # Standard deviation of a blob and of the local background, mm.
 WIDTH, BACKGROUND = 0.06, 0.2
 ELECTRONS, READ_NOISE = 1000.0, 2.0
-# Finer voxels and planes of the held-out scenes.
+# Refinement of voxels and planes in the held-out scenes.
 FINER, OFF_PLANE = 3, (-0.1, 0.0, 0.1)
 METHODS = ("backproject", "list_rl")
 
@@ -34,7 +34,7 @@ Scores = dict[str, list[float]]
 
 
 class Study(NamedTuple):
-    """Sizes in mm; `field` is the width of the object, which is in the middle."""
+    """Sizes in mm; `field` is the width of the object, which is centred."""
 
     plate: tuple[float, float] = (3.5, 3.5)
     distance: float = 0.65
@@ -57,7 +57,8 @@ class Study(NamedTuple):
         return self.depths[len(self.depths) // 2]
 
     def imager(self, centers) -> Imager:
-        # Focused at 14 mm. Apertures are smaller than the least distance, so no layout clips them: all have one PSF.
+        # Focused at 14 mm. Apertures are smaller than the minimum spacing, so no layout clips them, and all have the
+        # same PSF.
         array = MicrolensArray(centers, radius_of_curvature=1.8, aperture_diameter=0.5)
         return Imager(array, Sensor((self.pixels, self.pixels), self.pixel), 5.8, self.field_radius)
 
@@ -71,14 +72,14 @@ class Study(NamedTuple):
 
 
 def psf_of(make: Callable[..., Array], study: Study, grid: Grid) -> Float[Array, "depth row column"]:
-    """One PSF a depth; it does not depend on the layout."""
+    """PSFs, one per depth, which do not depend on the layout."""
     imager = study.imager(np.zeros((1, 2)))
     return jnp.stack([make(imager, depth, size=33) for depth in grid.depths])
 
 
 @partial(jax.jit, static_argnames="study")
 def loss(centers: Centers, key: PRNGKeyArray, psfs: Array, study: Study) -> Float[Array, ""]:
-    """The end-to-end loss of one scene, dB: PSFs as given, voxels as reconstructed."""
+    """End-to-end loss of one scene, dB, with given PSFs and the voxels of the reconstruction."""
     return reconstruction_loss(
         study.imager(centers),
         key,
@@ -94,7 +95,7 @@ def loss(centers: Centers, key: PRNGKeyArray, psfs: Array, study: Study) -> Floa
 
 
 def held_out(study: Study, key: PRNGKeyArray) -> tuple[Array, Array]:
-    """A scene on fine voxels, and the truth on those of the reconstruction."""
+    """A scene on fine voxels, and the truth on the voxels of the reconstruction."""
     fine, grid = study.fine_grid(), study.grid()
     part = FINER**2 * len(OFF_PLANE)
     scene = random_scene(key, fine, density=study.density / part, width=WIDTH)
@@ -118,7 +119,7 @@ def _reconstructed(image, centers, study, method):
 def judge(
     layouts: Mapping[str, Centers], study: Study, psfs: Array, progress: Progress
 ) -> tuple[dict[str, Scores], list[float]]:
-    """PSNR and SSIM of every layout on every held-out scene, by both methods; and what an empty volume would score."""
+    """PSNR and SSIM of every layout on every held-out scene by both methods, and the scores of an empty volume."""
     camera = Camera(read_noise=READ_NOISE)
     columns = [f"{method}_{what}" for method in METHODS for what in ("psnr_db", "ssim")]
     scores: dict[str, Scores] = {name: {column: [] for column in columns} for name in layouts}
@@ -129,7 +130,7 @@ def judge(
         empty.append(quality(jnp.zeros_like(truth), truth).psnr_db)
         for name, centers in layouts.items():
             clean = _imaged(scene, jnp.asarray(centers), psfs, study)
-            # One exposure for all layouts: the brightest pixel has as many electrons as the scene gives it.
+            # Scenes are in electrons, so all layouts have the same exposure.
             image = electrons(expose(clean, camera, noise_key, peak_electrons=clean.max()), camera)
             for method in METHODS:
                 score = quality(_reconstructed(image, jnp.asarray(centers), study, method), truth)
@@ -147,6 +148,6 @@ def _lit(centers, study):
 
 
 def overlap(centers: Centers, study: Study) -> float:
-    """How many lenses share a lit pixel, on average over lit pixels, for an object that fills the middle plane."""
+    """Mean number of lenses that share a lit pixel, for an object that fills the middle plane."""
     count = _lit(jnp.asarray(centers), study)
     return float(count.sum() / (count > 0).sum())

@@ -1,17 +1,18 @@
-"""What learned inversion owes to what: held-out captures that the training's generator makes from another seed.
+"""What networks and operator contribute to learned inversion, on held-out simulated captures.
 
-Every method gets the same captures of 24 scenes by three random microscopes, sub-fields of 288 x 288 pixels. Gains are
-of PSNR over that of an empty volume, the mean over the scenes and its 95 % interval by bootstrap. Simulated with all of
-the light, misaligned microscopes and noise, on voxels half as large; what devices make is in `fig9_benchmark.py`.
+The training's generator makes the captures from another seed: 24 scenes by three random microscopes, sub-fields of
+288 x 288 pixels, the same for every method. Gains are of PSNR over that of an empty volume, the mean over the scenes
+with its 95 % interval by bootstrap. Captures have all light, misaligned microscopes and noise, on voxels half as
+large. `fig9_benchmark.py` tests ray-traced captures.
 
-- The operator inside: our U-Net after back-projection against the unrolled inversion, and list-RL without networks.
-- The networks: the unrolled inversion with networks that leave every voxel as it is.
+- The operator: our U-Net after back-projection against the unrolled inversion, and list-RL without networks.
+- The networks: the unrolled inversion with networks that leave every voxel unchanged.
 - The last steps: the unrolled inversion without its conjugate gradients.
-- Noise alone: of captures that show nothing, the standard deviation of the volume imaged again over the image's.
+- Noise: for captures that show nothing, the standard deviation of the volume's image over that of the capture.
 
     python -m experiments.learned [--scenes N] [--weights FILE] [--out DIR]
 
-FILE is what `gs-jax train --network unrolled` wrote, in the place of what is shipped. Writes `learned.json` and
+FILE is the output of `gs-jax train --network unrolled`, used instead of the shipped weights. Writes `learned.json` and
 `learned.md`; about fifteen minutes on two cores.
 """
 
@@ -36,14 +37,14 @@ from gs_jax.projection.forward_model import forward
 from gs_jax.reconstruction.methods import METHODS, Method
 from gs_jax.solvers.unrolled import read_unrolled
 
-# Not that of the training.
+# Different from the seed of the training.
 SEED = 1
 STEPS = 20
 _DRAWS = 10_000
 
 
 def methods(networks: Unrolled, progress: Progress) -> dict[str, Callable[[Example], np.ndarray]]:
-    """Volumes of an example, by name."""
+    """Volumes of an example, by method."""
     without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)
     by = lambda method: lambda e: solved(e, method, progress)
     cleaned = lambda name: lambda e: suppress(solved(e, METHODS["backproject"](1), progress), pretrained(name))
@@ -60,7 +61,7 @@ def methods(networks: Unrolled, progress: Progress) -> dict[str, Callable[[Examp
 
 
 def idle(networks: Unrolled) -> Unrolled:
-    """As many steps, of Richardson-Lucy alone where the networks were."""
+    """Unrolled inversion with plain Richardson-Lucy steps in place of the networks."""
     zeros = jax.tree.map(jnp.zeros_like, networks.layers)
     return eqx.tree_at(lambda n: (n.layers, n.power), networks, (zeros, jnp.ones_like(networks.power)))
 
@@ -70,7 +71,7 @@ def solved(e: Example, method: Method, progress: Progress) -> np.ndarray:
 
 
 def gain(volume: np.ndarray, e: Example) -> float:
-    """PSNR over that of an empty volume, dB."""
+    """PSNR above that of an empty volume, dB."""
     return quality(volume, e.truth).psnr_db - quality(np.zeros_like(e.truth), e.truth).psnr_db
 
 
@@ -81,7 +82,7 @@ def imaged_noise(volume: np.ndarray, e: Example) -> float:
 
 
 def run(networks: Unrolled, scenes: int, kind: Kind = UNROLLED, *, progress: Progress) -> dict[str, dict]:
-    """`gains` of the scenes with something in them, dB, and `noise` of the others, by method."""
+    """Return `gains` of the scenes with an object, dB, and `noise` of the others, by method."""
     by_name = methods(networks, progress)
     found = {name: {"gains": [], "noise": []} for name in by_name}
     for number in progress.track(range(scenes), "Scenes"):
@@ -96,7 +97,7 @@ def run(networks: Unrolled, scenes: int, kind: Kind = UNROLLED, *, progress: Pro
 
 
 def interval(values: list[float]) -> tuple[float, float]:
-    """Of the mean, 95 %, by bootstrap."""
+    """95 % interval of the mean, by bootstrap."""
     rng = np.random.default_rng(0)
     means = rng.choice(values, (_DRAWS, len(values))).mean(1)
     low, high = np.quantile(means, (0.025, 0.975))

@@ -1,13 +1,13 @@
-"""What light and a span of depths cost each kind of lens: spheres and conics, either side in front, one to three foci.
+"""Error of volumes against light and span of depths, for spheres and conics with either side facing the object.
 
-For each span of depths, share of a point's light and kind of lens the search of `geomscope-exposure` (in
-`design/studies`) for the least `volume_error`: the error of the best linear estimate of a volume at equal exposure, in
-which a lens out of focus is blur and its light noise, so that it is fair to lenses of one focus and of several. Four
-planes over the span are searched with; what is shown is the mean over these and the three halfway between them, which
-are told apart for themselves, so that foci that lie on the planes and nowhere else do not pay. Light is held within 2 %
-and given for 20.5 mm; there is no mask between the apertures. With the plano side in front conics start from what was
-found of spheres with the same light, several foci from that of one focus, and these two from what was found with less
-light.
+For each span of depths, share of a point's light and lens type (with one to three foci), the search of
+`geomscope-exposure` (in `design/studies`) minimises `volume_error`: the error of the best linear estimate of a volume
+at equal exposure, in which a lens out of focus contributes blur and its light contributes noise, so that it is fair to
+lenses of one focus and of several. The search uses four planes over the span; the results are means over these and the
+three halfway between them, which are resolved separately, so that foci on the searched planes only do not pay. Light is
+held within 2 % and given for 20.5 mm; there is no mask between the apertures. Conics with the plano side facing the
+object start from the result for spheres with the same light, several foci from that of one focus, and these two from
+the result with less light.
 
     python -m experiments.lens_front [--out DIR]
 
@@ -37,14 +37,14 @@ from gs_jax.pictures.style import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"
 SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))
-# Shares of the light of a point 20.5 mm away, %, and how much more it may be.
+# Shares of the light of a point 20.5 mm away, %, and their tolerance.
 LIGHTS, MIDDLE, MORE = (0.05, 0.1, 0.2, 0.4), 20.5, 1.02
 PLANES, STEPS = 4, 30
 _TARGETS = ("light_percent", "occupancy", "lenses_per_point", "thickness_mm", "field_of_view_mm", "edge_slope_deg")
 
 
 class Kind(NamedTuple):
-    """A kind of lens: the design it starts from, whether it is a conic, its foci, and the kind whose end it goes on."""
+    """A lens type: its initial design, whether it is a conic, its foci, and the type whose result it starts from."""
 
     design: str
     conic: bool
@@ -62,7 +62,7 @@ KINDS = {
 
 
 def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
-    """The study of a kind over a span, without a mask, and with limits of the light from both sides."""
+    """Study of a lens type over a span, without a mask, and with lower and upper limits of the light."""
     data = read_study(FOLDER / "studies" / "geomscope-exposure.toml").model_dump()
     kept = [term for term in data["terms"] if term["name"] in (*_TARGETS, "volume_error")]
     sides = ("at_least", "at_most")
@@ -82,7 +82,7 @@ def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
 
 
 def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[float, float]:
-    """The least light, of the farthest depth, and the most, of the nearest, for a share at `MIDDLE`, %."""
+    """Lower limit (farthest depth) and upper limit (nearest depth) of the light, %, for a share at `MIDDLE`."""
     lens = design.lens
     front, _ = reduced_thicknesses(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
     near, far = (light * ((MIDDLE + front) / (depth + front)) ** 2 for depth in span)
@@ -90,7 +90,7 @@ def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[
 
 
 def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | None, steps: int) -> list[dict]:
-    """A record for each share of the light."""
+    """Results of a lens type, one record per share of the light."""
     design, study = posed(kind, span, steps)
     sweep = sweep_of(design, study)
     search, judge = searcher(sweep), judge_of(design, study)
@@ -109,14 +109,14 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
 
 
 def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, Study]:
-    """The design that a kind starts from, and its study."""
+    """Initial design of a lens type, and its study."""
     design, study = read_design(FOLDER / f"{kind.design}.toml"), study_of(kind, span, steps)
     lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
     return initial_design(design.model_copy(update={"lens": lens}), study), study
 
 
 def off_target(point, sweep, limits) -> float:
-    """By how much the worst target is missed, relative to it; a per cent is none."""
+    """Relative violation of the worst target; up to a per cent counts as none."""
     moved = (term.model_copy(update={term.kind: limit}) for term, limit in zip(sweep.moving, limits, strict=True))
     pairs = zip([*sweep.kept, *moved], point.rows, strict=True)
     missed = [
@@ -128,7 +128,7 @@ def off_target(point, sweep, limits) -> float:
 
 
 def spread(values: dict, first: dict) -> dict:
-    """What was found of lenses that are alike, for the kinds of a design: radii in the ratios of its own."""
+    """Start for several types from a result of identical lenses, with radii in the ratios of the design."""
     moved = {name: values[name] for name in ("sensor_distance_mm", "pitch_mm")}
     for name in ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant"):
         moved[name] = jnp.broadcast_to(values[name], first[name].shape)
@@ -137,7 +137,7 @@ def spread(values: dict, first: dict) -> dict:
 
 
 def judge_of(design: Design, study: Study):
-    """From parameters to the error of the planes between, and the width by the kind in focus at the worst depth."""
+    """From parameters to the error of the planes between, and the width by the type in focus at the worst depth."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
     half = (far - near) / (PLANES - 1) / 2
     between = evaluated(design, depths_mm=(near + half, far - half), depth_count=PLANES - 1, exposure=study.exposure)
@@ -157,7 +157,7 @@ def judge_of(design: Design, study: Study):
 
 
 def together(searched: float, between: float) -> float:
-    """The error of all planes, dB, of those of both sets."""
+    """Error of all planes, dB, from those of both sets."""
     power = PLANES * 10 ** (searched / 10) + (PLANES - 1) * 10 ** (between / 10)
     return 10 * float(np.log10(power / (2 * PLANES - 1)))
 
@@ -167,7 +167,7 @@ def decibels(error: float) -> float:
 
 
 def run(spans=SPANS, lights=LIGHTS, kinds=tuple(KINDS), steps: int = STEPS, *, progress: Progress) -> list[dict]:
-    """For each span the fronts by kind; a record a share of the light."""
+    """Return for each span the results by lens type, one record per share of the light."""
     found = [{"span_mm": span, "fronts": {}} for span in spans]
     cases = [(row, name) for row in found for name in kinds]
     for row, name in progress.track(cases, "Fronts"):
@@ -178,7 +178,7 @@ def run(spans=SPANS, lights=LIGHTS, kinds=tuple(KINDS), steps: int = STEPS, *, p
 
 
 def picture(found: list[dict]) -> Figure:
-    """Error against light, a panel for each span."""
+    """Plot the error against light, one panel per span."""
     figure = Figure(figsize=(3.6 * len(found) + 0.6, 4.2), dpi=100, layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
     for axes, row in zip(panels, found, strict=True):
@@ -198,7 +198,7 @@ def picture(found: list[dict]) -> Figure:
 
 
 def numbers_of(record: dict) -> dict[str, Any]:
-    """A record without what a file needs not."""
+    """A record without the parts that are not written."""
     names = ("sensor_distance_mm", "pitch_mm", "radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
     values = {name: np.round(np.asarray(record["values"][name], float), 4).tolist() for name in names}
     return {key: value for key, value in record.items() if key != "values"} | values
@@ -210,7 +210,7 @@ def report(progress: Progress) -> Report:
 
 
 def shown(found: list[dict]) -> Report:
-    """A table of errors and widths, and the picture; all numbers in a file."""
+    """Table of errors and widths, and the picture; the file has all numbers."""
     plain = [
         row | {"fronts": {name: [numbers_of(record) for record in records] for name, records in row["fronts"].items()}}
         for row in found
@@ -227,7 +227,7 @@ def shown(found: list[dict]) -> Report:
 
 
 def cell(record: dict) -> str:
-    """Error and width; `!` where a target is missed."""
+    """Error and width; `!` marks a missed target."""
     return f"{record['error_db']:.1f} / {record['width_um']:.0f}{' !' if record['off_target'] else ''}"
 
 

@@ -1,8 +1,8 @@
-"""Better lenses, not only better layouts: what each kind of lens makes of the same light.
+"""Sharpness against light, for plano or curved side facing the object, spheres or conics.
 
-Lenses with the plano or the curved side to the object, spherical or conic, each with the search of
-`design/studies/lens-kinds.toml`: the least width of the spot from 18 to 23 mm for a share of the light. The designs are
-judged by what they were not made with: Optiland's rays over the field, and the diffraction PSF.
+For each lens type and share of the light the search of `design/studies/lens-kinds.toml` minimises the width of the spot
+from 18 to 23 mm. The designs are evaluated by quantities that the search does not use: Optiland's rays over the field,
+and the diffraction PSF.
 
     python -m experiments.lens_kinds [--out DIR]
 
@@ -40,14 +40,14 @@ KINDS = {
     "curved side, conic": ("curved", True),
 }
 DEPTHS = (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
-# Heights of the field, as shares of its radius: middles of rings of equal area, others than the search's.
+# Field heights relative to its radius: middles of rings of equal area, different from those of the search.
 HEIGHTS = np.sqrt((np.arange(6) + 0.5) / 6)
-# Of the PSF's window, mm on the sensor, in which its width is measured.
+# Width of the PSF's window in which its width is measured, mm on the sensor.
 WINDOW = 0.6
 
 
 def initial_design(kind: str, study: Study, design: Design) -> tuple[Design, Study]:
-    """A design and a study of a kind of lens."""
+    """Initial design and study of a lens type."""
     orientation, conic = KINDS[kind]
     lens = design.lens.model_copy(update={"orientation": orientation, "conic_constant": 0.0})
     free = {name: bounds for name, bounds in study.free.items() if conic or name != "conic_constant"}
@@ -55,7 +55,7 @@ def initial_design(kind: str, study: Study, design: Design) -> tuple[Design, Stu
 
 
 def width_by_optiland(design: Design, depth: float) -> float:
-    """Full width at half height of a Gaussian of the variance of Optiland's rays over the field, in the object, um."""
+    """FWHM of a Gaussian with the variance of Optiland's rays over the field, in the object, um."""
     imager = design.imager()
     points, weights = map(np.asarray, pupil_quadrature(clear_diameter(imager.array) / 2, 12))
     square, total = 0.0, 0.0
@@ -69,7 +69,7 @@ def width_by_optiland(design: Design, depth: float) -> float:
 
 
 def core_by_diffraction(design: Design, depth: float) -> float:
-    """Diameter of the circle about the PSF's brightest place that holds half of its light, in the object, um."""
+    """Diameter of the circle about the PSF's peak that holds half of its light, in the object, um."""
     imager = design.imager()
     size = 2 * round(WINDOW / imager.sensor.pixel_pitch / 2) + 1
     radius = clear_diameter(imager.array) / 2
@@ -83,14 +83,14 @@ def core_by_diffraction(design: Design, depth: float) -> float:
 
 
 def judged(design: Design) -> dict[str, Any]:
-    """What independent rays and diffraction say of a design; lengths in the object."""
+    """Evaluate a design by independent rays and diffraction; lengths in the object."""
     widths = [width_by_optiland(design, depth) for depth in DEPTHS]
     cores = [core_by_diffraction(design, depth) for depth in DEPTHS]
     return {"optiland_width_um": widths, "half_light_um": cores}
 
 
 def run(study: Study, start: Design, kinds=tuple(KINDS), *, progress: Progress) -> dict[str, list[dict[str, Any]]]:
-    """For each kind a list with one record a share of the light; `design` is the design."""
+    """Return for each lens type one record per share of the light, with its `design`."""
     found = {}
     for kind in kinds:
         design, question = initial_design(kind, study, start)
@@ -106,7 +106,7 @@ def run(study: Study, start: Design, kinds=tuple(KINDS), *, progress: Progress) 
 
 
 def curves(found: dict[str, list[dict[str, Any]]]) -> Figure:
-    """Width at the worst depth against light."""
+    """Plot the width at the worst depth against light."""
     axes = (figure := Figure(figsize=(6.4, 4.4), dpi=110, layout="constrained")).subplots()
     for kind, rows in found.items():
         light = [row["light_percent"] for row in rows]

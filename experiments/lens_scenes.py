@@ -1,10 +1,10 @@
-"""Whether better lenses make better volumes: scenes at three depths, seen by three microscopes for the same time.
+"""Volumes by three lens designs: scenes at three depths, imaged with equal exposure.
 
 Letters, beads and snowflakes at 18.5, 20.5 and 22.5 mm are imaged by `experiments/ray_tracer.py`, which shares no code
-with `gs_jax`, on the sensor's own pixels; photons and read noise are those of one exposure for all designs, so a small
-aperture pays for its sharpness. Volumes are found by Richardson-Lucy with the full model. They are scored, after the
-gain that fits best, against the scene on the voxels, as both are, and both blurred laterally by one voxel (standard
-deviation), which forgives what is finer.
+with `gs_jax`, on the sensor's own pixels. Photon and read noise are those of one exposure time for all designs, so
+small apertures have more noise. Volumes are reconstructed by Richardson-Lucy with the full model, and scored after the
+best gain against the scene on the voxels, both unblurred and with both blurred laterally by one voxel (standard
+deviation), which forgives errors finer than that.
 
     python -m experiments.lens_scenes [--out DIR]
 
@@ -33,14 +33,14 @@ from gs_jax.simulation.phantoms import letters, random_points, rasterize, snowfl
 FOLDER = Path(__file__).parents[1] / "design"
 DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")
 DEPTHS = (18.5, 20.5, 22.5)
-# Where each depth's part of a scene is, mm, and how large it is.
+# Position and size of each depth's part of a scene, mm.
 PLACES, HEIGHT = ((-1.2, -0.5), (0.0, 0.9), (1.2, -0.5)), 1.1
-# Pixels of the sensor's middle, lenses that are looked at, and the volume, mm. Voxels are as wide as the resolution
-# that the designs aim at: if pixels were wider in the object, the voxels of that design would fit noise.
+# Pixels of the cropped sensor, distance of the lenses from the axis, and voxels and width of the volume, mm. Voxels are
+# as wide as the target resolution of the designs; narrower than a pixel in the object, they would fit noise.
 PIXELS, REACH, VOXEL, FIELD = 2560, 6.5, 0.04, 4.4
-# Emitters of a scene, drawn at random, and rays of each to each lens.
+# Sampled emitters of a scene, and rays from each to each lens.
 SAMPLES, RAYS = 60_000, 12
-# Electrons of the brightest pixel of `geomscope`'s capture: the exposures. And of read noise.
+# Electrons of the brightest pixel of `geomscope`'s capture (the exposures), and of read noise.
 EXPOSURES, READ_NOISE = (20_000, 1_000), 2.0
 STEPS = 20
 
@@ -56,13 +56,13 @@ def cropped(imager: Imager, pixels: int = PIXELS, reach: float = REACH) -> Image
 
 
 def scenes() -> dict[str, np.ndarray]:
-    """Emitters `(x, y, z, intensity)` of each scene, close together."""
+    """Dense emitters `(x, y, z, intensity)` of each scene."""
     at = lambda part, xy: part + np.array([*xy, 0.0, 0.0])
     places = list(zip(DEPTHS, PLACES, strict=True))
     words = [at(letters(a, depth=z, height=HEIGHT, pitch=0.008), xy) for a, (z, xy) in zip("GSJ", places, strict=True)]
     flakes = [at(snowflake((z, z), 1.7, width=0.12, pitch=0.01), xy) for z, xy in places]
     middles = [random_points(15, (FIELD - 0.6, FIELD - 0.6), (z, z + 1e-6), seed=k) for k, z in enumerate(DEPTHS)]
-    # Of a bead's disc, 60 um wide.
+    # A bead is a disc, 60 um wide.
     r, turn = 0.03 * np.sqrt((np.arange(60) + 0.5) / 60), np.arange(60) * np.pi * (3 - 5**0.5)
     disc = np.stack([r * np.cos(turn), r * np.sin(turn), 0 * r, 0 * r], -1)
     beads = (np.concatenate(middles)[:, None] + disc).reshape(-1, 4)
@@ -71,10 +71,10 @@ def scenes() -> dict[str, np.ndarray]:
 
 
 def sampled(emitters: np.ndarray, count: int, blur: float = 0.004) -> np.ndarray:
-    """Emitters as many as light wants, each as often as it is bright, a little off: no lattice.
+    """Draw emitters in proportion to their brightness, each with a small displacement, so that they form no lattice.
 
-    They are drawn evenly along rows of the scene. At random, their own unevenness would be in all images of a scene,
-    and a volume could not be better than that.
+    They are drawn evenly along rows of the scene. Random draws would put their own unevenness into all images of a
+    scene, which would limit the volumes.
     """
     rng = np.random.default_rng(0)
     rows = emitters[np.lexsort((emitters[:, 0], emitters[:, 1], emitters[:, 2]))]
@@ -86,7 +86,7 @@ def sampled(emitters: np.ndarray, count: int, blur: float = 0.004) -> np.ndarray
 
 
 def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Progress, **sizes: Any) -> dict[str, Any]:
-    """For each scene the truth, and for each design and exposure scores and the volume."""
+    """Return for each scene the truth, and for each design and exposure scores and the volume."""
     count = round(FIELD / VOXEL) | 1
     grid = Grid(DEPTHS, (count, count), VOXEL)
     imagers = {name: cropped(read_design(FOLDER / f"{name}.toml").imager(), **sizes) for name in names}
@@ -109,13 +109,13 @@ def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Pr
 
 
 def scores(volume: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """PSNR and SSIM as it is, and PSNR with both blurred laterally by a voxel."""
+    """PSNR and SSIM unblurred, and PSNR with both blurred laterally by a voxel."""
     as_it_is, blurred = quality(volume, truth), quality(*(gaussian_filter(x, (0, 1, 1)) for x in (volume, truth)))
     return {"psnr_db": as_it_is.psnr_db, "ssim": as_it_is.ssim, "blurred_psnr_db": blurred.psnr_db}
 
 
 def pictures(found: dict[str, Any], names=DESIGNS) -> Figure:
-    """The brightest of the depths, in the truth and in each volume at the longer exposure, on one scale a scene."""
+    """Plot maxima over the depths of the truth and of each volume at the longer exposure, on one scale per scene."""
     figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(found)), dpi=100, layout="constrained")
     axes = figure.subplots(len(found), len(names) + 1, squeeze=False)
     for row, parts in zip(axes, found.values(), strict=True):

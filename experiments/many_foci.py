@@ -1,18 +1,17 @@
-"""Whether lenses of several foci on one plate pay: the best of one, two and three kinds, by the same search.
+"""Whether lenses of several foci on one plate pay: the best of one, two and three lens types, by the same search.
 
-What is minimised is the error of the best linear estimate of a volume (`gs_jax.codesign.linear_error`): transfer
-functions of exact rays, light, shot and read noise at equal exposure, and parallax. Free are the sensor distance, the
-radius of curvature and the aperture of each kind, up to what a mask leaves of the nearest neighbours. Kinds are
-interleave so that neighbours differ (`kinds` of a study), and start from what one kind came to, their radii spread.
-Over 18 to 23 mm, and over a longer span, where one focus has to be a compromise. Each is done for several layouts of
-the same statistics, the same for all numbers of kinds; gains are of pairs, with intervals by Student's t over the
-layouts. What was found for the first layout is then judged by what it was not found by: letters at three depths of the
-span, imaged by `experiments/ray_tracer.py` with the camera's noise, and reconstructed by Richardson-Lucy with the full
-model.
+The search minimises the error of the best linear estimate of a volume (`volume_error`): transfer functions of exact
+rays, light, shot and read noise at equal exposure, and parallax. Free are the sensor distance, and the radius of
+curvature and aperture of each type, up to what a mask leaves of the nearest neighbours. Types are interleaved so that
+neighbours differ (`kinds` of a study), and start from the result for one type, with their radii spread. The spans are
+18 to 23 mm and a longer one, over which one focus is a compromise. Each search runs for several layouts of the same
+statistics, the same for all numbers of types; gains are paired, with intervals by Student's t over the layouts. The
+result for the first layout is then tested on a task that was not optimised: letters at three depths of the span, imaged
+by `experiments/ray_tracer.py` with camera noise, and reconstructed by Richardson-Lucy with the full model.
 
     python -m experiments.many_foci [--out DIR] [--layouts N]
 
-Writes `many_foci.json` and `many_foci.png`; three quarters of an hour on a core, by what a part of it took.
+Writes `many_foci.json` and `many_foci.png`; about three quarters of an hour on a core.
 """
 
 from collections.abc import Sequence
@@ -33,23 +32,23 @@ from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
 from gs_jax.simulation.phantoms import letters, rasterize
 
-# Ends of the depths, mm, and planes that are told apart.
+# Ends of the depths, mm, and planes to be resolved.
 SPANS = {"18 to 23 mm": ((18.0, 23.0), 3), "15 to 30 mm": ((15.0, 30.0), 4)}
 KINDS = (1, 2, 3)
-# Of the layout, mm: lenses, plate, pitch, and what a mask needs between apertures.
+# Layout: lenses, plate, pitch, and width of the mask between apertures; mm.
 LENSES, PLATE, PITCH, WEB = 200, 17.1, 1.05, 0.1
 CONIC = -0.7
 BOUNDS = {"sensor_distance_mm": (2.0, 6.0), "radius_of_curvature_mm": (1.0, 3.0), "aperture_diameter_mm": (0.2, 2.0)}
-# Of v, R and D, mm.
+# Bounds of v, R and D, mm.
 START = (2.95, 1.34, 0.75)
 STEPS = 60
 _OF_KINDS = ("radius_of_curvature", "aperture_diameter")
-# Of the letters: emitters, and electrons of all of an emitter's light, that brightest pixels have some thousands of.
+# Letters: number of emitters, and electrons of all light of an emitter; the brightest pixels have some thousands.
 _SAMPLES, _ELECTRONS = 200_000, 2e10
 
 
 def start(seed: int, lenses: int) -> Design:
-    """Conics with their curved side to the object, at random on the paper's camera, as dense however many they are."""
+    """Random layout of conics with the curved side facing the object, on the paper's camera, with a fixed density."""
     side = PLATE * (lenses / LENSES) ** 0.5
     centers = np.asarray(random_layout(lenses, (side, side), pitch=PITCH, pitch_sd=0.08, seed=seed))
     v, radius, diameter = START
@@ -62,7 +61,7 @@ def start(seed: int, lenses: int) -> Design:
 
 
 def study_of(span: tuple[float, float], planes: int, kinds: int, steps: int) -> Study:
-    """The least error of volumes, with a mask between the apertures."""
+    """Study for the least error of volumes, with a mask between the apertures."""
     return Study.model_validate(
         {
             "depths_mm": span,
@@ -79,7 +78,7 @@ def study_of(span: tuple[float, float], planes: int, kinds: int, steps: int) -> 
 
 
 def best(design: Design, study: Study) -> dict:
-    """The least error, dB, and where."""
+    """Least error, dB, and its parameters."""
     end = run_study(design, study)
     return {"loss_db": 20 * float(np.log10(end.after[0].high)), "design": end.design}
 
@@ -87,11 +86,11 @@ def best(design: Design, study: Study) -> dict:
 def run(
     layouts: int, *, spans=SPANS, kinds=KINDS, lenses: int = LENSES, steps: int = STEPS, progress: Progress
 ) -> dict:
-    """For each span and number of kinds what was found for each layout, and gains over one kind."""
+    """Return for each span and number of types the results for each layout, and gains over one type."""
     found: dict = {span: {k: [] for k in kinds} for span in spans}
     cases = [(span, seed, k) for span in spans for seed in range(layouts) for k in kinds]
     for span, seed, k in progress.track(cases, "Searches"):
-        # Several also start where one ended: they cannot be worse by a local minimum alone.
+        # Several types also start from the result for one type, so a local minimum alone cannot make them worse.
         starts = [start(seed, lenses), *(end["design"] for end in found[span][1][seed:])]
         ends, planes = spans[span]
         tried = [best(design, study_of(ends, planes, k, steps)) for design in starts]
@@ -108,7 +107,7 @@ def run(
 def judged(
     design: Design, span: tuple[float, float], *, samples: int = _SAMPLES, progress: Progress
 ) -> dict[str, float]:
-    """PSNR, dB, of letters that our tracer images with what was found for the first layout; as in `lens_scenes`."""
+    """PSNR, dB, of ray-traced letters with the result for the first layout; as in `lens_scenes`."""
     imager, near = lens_scenes.cropped(design.imager()), (span[0], sum(span) / 2, span[1])
     parts = zip("GSJ", near, lens_scenes.PLACES, strict=True)
     words = [letters(a, depth=z, height=lens_scenes.HEIGHT, pitch=0.008) + [*xy, 0, 0] for a, z, xy in parts]
@@ -118,21 +117,21 @@ def judged(
     truth = np.asarray(rasterize(emitters, grid), np.float32)
     clean = traced(lens_scenes.sampled(emitters, samples), imager, lens_scenes.RAYS)
     rng = np.random.default_rng(0)
-    # The same time for all: light is in shares of what an emitter sends out.
+    # Equal exposure for all: images are in shares of an emitter's light.
     image = rng.poisson(_ELECTRONS * clean) + rng.normal(0, lens_scenes.READ_NOISE, clean.shape)
     volume = reconstruct(image.astype(np.float32), imager, grid, RichardsonLucy(lens_scenes.STEPS), progress=progress)
     return lens_scenes.scores(np.asarray(volume), truth)
 
 
 def gain(alike: Sequence[float], several: Sequence[float]) -> dict:
-    """By how many dB the error is less, with its 95 % interval over the layouts."""
+    """Reduction of the error in dB, with its 95 % interval over the layouts."""
     less = np.subtract(alike, several)
     half = stats.t.ppf(0.975, len(less) - 1) * less.std(ddof=1) / len(less) ** 0.5 if len(less) > 1 else np.nan
     return {"mean": float(less.mean()), "interval": [float(less.mean() - half), float(less.mean() + half)]}
 
 
 def picture(found: dict) -> Figure:
-    """Error against the number of kinds, a line for each layout."""
+    """Plot the error against the number of types, one line per layout."""
     figure = Figure(figsize=(4.2 * len(found["found"]), 3.6), dpi=100, layout="constrained")
     for axes, (span, each) in zip(
         figure.subplots(1, len(found["found"]), squeeze=False).flat, found["found"].items(), strict=True
@@ -146,7 +145,7 @@ def picture(found: dict) -> Figure:
 
 
 def numbers_of(end: dict) -> dict[str, Any]:
-    """Of what a search found, for a file."""
+    """Result of a search, for a file."""
     lens = end["design"].lens
     ends = {name: sorted(set(np.ravel(getattr(lens, f"{name}_mm")).tolist())) for name in _OF_KINDS}
     return {"loss_db": end["loss_db"], "sensor_distance": end["design"].imaging.sensor_distance_mm} | ends

@@ -1,8 +1,8 @@
-"""From the paper's array to a part: what the facets of its mold cost, and whether they are where the lenses should be.
+"""Errors of molds for the paper's array: facets, and positions and shapes of the lenses.
 
-The array and its mold are made for several chord errors, written as STL, read back and measured: volume, places, radii
-and conic constants of the lenses, and the wavefront error of the facets. Then the same with lenses that all differ, in
-radius, conic constant and aperture. Without the authors' centres our built-in layout is used.
+The array and its mold are made for several chord errors, written as STL, read back and measured: volume, positions,
+radii and conic constants of the lenses, and the wavefront error of the facets. The same follows for lenses that all
+differ in radius, conic constant and aperture. Without the authors' centres the built-in layout is used.
 
     python -m experiments.mold_check [--out DIR]
 """
@@ -42,7 +42,7 @@ CHORDS_UM = (0.2, 0.5, 1.0, 2.0, 5.0)
 
 
 def run(design: Design, chords_um: Sequence[float] = CHORDS_UM, progress: Progress | None = None) -> list[dict]:
-    """One record a chord error."""
+    """Return one record per chord error."""
     items = chords_um if progress is None else progress.track(chords_um, "Chord errors")
     return [measure(design.imager(), chord_um, design.name) for chord_um in items]
 
@@ -60,7 +60,7 @@ def differing(imager: Imager) -> Imager:
 
 
 def measure(imager: Imager, chord_um: float, label: str = "") -> dict:
-    """The array and the mold at one chord error, through a file and back."""
+    """Make the array and the mold at one chord error, write, read back and measure."""
     array, shape = imager.array, MoldShape(label=label)
     started = time.perf_counter()
     part = array_solid(array, chord_um / 1000)
@@ -91,7 +91,7 @@ def _through_file(solid, path: Path) -> Mesh:
 
 
 def draw(design: Design, records: list[dict]) -> Figure:
-    """The mold, facets of a few lenses, and what facets cost."""
+    """Plot the mold, facets of a few lenses, and the errors of the facets."""
     array = design.imager().array
     figure = Figure(figsize=(15, 4.6), dpi=110, layout="constrained")
     view = figure.add_subplot(1, 3, 1, projection="3d")

@@ -1,9 +1,9 @@
-"""The exact rays and the PSF of one lens unit against an independent ray tracer, and against ray-traced captures.
+"""Exact rays and PSF of one lenslet against an independent ray tracer, and against ray-traced captures.
 
-Optiland (a general ray tracer) sends rays through the same plane, plate and sphere, or aspheres with either side in
-front. Compared are where they land, their optical paths, and what follows: spot size, wavefront error and Strehl ratio
-against field and depth, with the third-order theory beside them. With a folder of ray-traced captures, the spots that
-each lens makes of a single point are compared with our PSF in place, size and brightness.
+Optiland (a general ray tracer) sends rays through the same plane, plate and sphere, or aspheres with either side
+facing the object. The script compares landing points and optical paths, and the resulting spot size, wavefront error
+and Strehl ratio against field and depth, with third-order theory beside them. With a folder of ray-traced captures, it
+compares the spots of each lens for a single point with our PSF in position, size and brightness.
 
     python -m experiments.optics_check [DATA] [--out DIR]
 
@@ -37,7 +37,8 @@ from gs_jax.optics.psf import diffraction_psf, geometric_psf
 from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
 
 WAVELENGTH = 520e-6
-# Of the pupil, mm: near half the paper's pitch (1.23 mm), and as far as its lens can be traced to a field of 3 mm.
+# Pupil radius, mm: about half the paper's pitch (1.23 mm), and the largest at which the lens can be traced to a field
+# of 3 mm.
 RADIUS = 0.65
 FIELDS, DEPTHS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0), (18.0, 19.0, 20.0, 21.0, 22.0, 23.0)
 SPOTS = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
@@ -57,8 +58,8 @@ Rays = tuple[Float[np.ndarray, "ray 2"], Float[np.ndarray, "ray 2"], Float[np.nd
 def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2"], field: float) -> Rays:
     """Landing points, slopes and optical paths of the rays through `points` of the convex surface, by Optiland.
 
-    The object is `field` beside the axis along x. Where a ray has to meet the first vertex's plane is found by repeated
-    tracing.
+    The object is `field` off the axis along x. Repeated tracing finds where a ray has to cross the plane of the first
+    vertex.
     """
     with warnings.catch_warnings():
         # Optiland's just-in-time compiler warns about itself.
@@ -74,7 +75,7 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
         shape = dict(
             radius=toward * float(array.radius_of_curvature),
             conic=float(array.conic_constant),
-            # Of r^2, r^4, ....
+            # Coefficients of r^2, r^4, ...
             coefficients=[0.0, *(toward * float(term) for term in array.aspheric_terms)],
             surface_type="even_asphere",
             tol=1e-14,
@@ -103,7 +104,7 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
 
 
 def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) -> dict:
-    """Ours and Optiland's rays of one object point: largest differences, and what both say of the spot."""
+    """Largest differences between our and Optiland's rays of one object point, and the spot by both."""
     points, weights = map(np.asarray, pupil_quadrature(radius, 16))
     theirs, slopes, path = optiland_rays(imager, depth, np.vstack([[0, 0], points]), field)
     ours = trace_lenslet(imager, depth, points, (field, 0.0))
@@ -125,8 +126,8 @@ def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) 
 
 
 def _on_sphere(landing: np.ndarray, slopes: np.ndarray, path: np.ndarray, imager: Imager) -> np.ndarray:
-    """Path to the sphere through the vertex, as the sensor sees it, about the end of the first ray, less that ray's."""
-    # Where the first ray, which comes from the vertex, would have come from without the plate.
+    """Path difference to the first ray, on the sphere through the vertex about the end of the first ray."""
+    # Origin of the first ray, from the vertex, if there were no plate.
     length2 = (landing[0] ** 2).sum() * (1 + 1 / max((slopes[0] ** 2).sum(), 1e-30))
     if not slopes[0].any():
         length2 = float(imager.reduced_sensor_distance) ** 2
@@ -147,7 +148,7 @@ def _rms(error: np.ndarray, points: np.ndarray, weights: np.ndarray) -> float:
 def _strehl(imager: Imager, rays: Rays, points: np.ndarray, weights: np.ndarray) -> float:
     """Highest `|sum exp(2 pi i (L + |P - B|) / wavelength)|^2` over points P of the sensor: Huygens' principle.
 
-    B are the points where rays leave the array, L the paths to them. Nothing of our pupil is in it.
+    B are the points where rays leave the array, L the paths to them. This is independent of our pupil.
     """
     landing, slopes, path = (part[1:] for part in rays)
     behind = np.full(len(points), float(imager.sensor_distance))
@@ -173,9 +174,9 @@ def _third_order(imager: Imager, depth: float, field: float, radius: float) -> f
 
 
 def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: float = 3.0) -> list[dict]:
-    """Each spot of a single point in a capture beside our PSF: lenses within `reach` of the point, mm.
+    """Compare each spot of a single point in a capture with our PSF, for lenses within `reach` of the point, mm.
 
-    Places are centroids over the window less the chief ray of the geometry; sizes hold half of the window's light.
+    Positions are centroids over the window, relative to the chief ray; radii hold half of the window's light.
     """
     imager = read_design(data / f"{design}.toml").imager()
     image = 10 * (read_capture(data / f"{design}_{scene}.tif", imager.sensor.shape).astype(float) - 16)
@@ -209,7 +210,7 @@ def spots(data: Path, scene: str, design: str = "P1", half: int = 64, reach: flo
 @partial(jax.jit, static_argnames="half")
 def _model(imager, depth, field, offset, edges, half: int) -> dict:
     arguments = dict(size=2 * half + 1, field=field, offset=offset, edges=edges)
-    # Lenses reach to 1 mm: 4 samples would fold the edge of their halo back into the window.
+    # Lenses extend to 1 mm; 4 samples would alias the edge of their halo into the window.
     return {
         "rays": geometric_psf(imager, depth, **arguments),
         "diffraction": diffraction_psf(imager, depth, samples=6, **arguments),
@@ -217,12 +218,12 @@ def _model(imager, depth, field, offset, edges, half: int) -> dict:
 
 
 def _padded(neighbours: np.ndarray, count: int = 16) -> np.ndarray:
-    """Half-way points, always as many, so that all lenses share one compiled function: far edges cut nothing."""
+    """Points padded to a fixed number, so that all lenses share one compiled function; distant edges cut nothing."""
     return np.vstack([neighbours / 2, np.full((count, 2), 10.0)])[:count]
 
 
 def _measures(image, offset: np.ndarray) -> dict:
-    """Centroid from the chief ray, of all and of the core, and radius of half the light, pixels.
+    """Centroids of the spot and of its core relative to the chief ray, and radius of half the light, pixels.
 
     The core is 5 x 5 pixels about the brightest; a spot out of focus has none.
     """
@@ -257,7 +258,7 @@ def summary(rows: list[dict]) -> dict:
 
 
 def run(fields=FIELDS, depths=DEPTHS) -> dict:
-    """Against Optiland, with the sensor at our best focus for 20 mm: over the field, and over the depth on the axis."""
+    """Compare with Optiland over the field, and over the depth on the axis, with the sensor focused for 20 mm."""
     imager = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((3, 3), 0.0045), 5.8, 3.0)
     v = best_focus(imager, 20.0, radius=RADIUS)
     imager = eqx.tree_at(lambda i: i.sensor_distance, imager, v)
@@ -270,7 +271,7 @@ def run(fields=FIELDS, depths=DEPTHS) -> dict:
 
 
 def shapes(fields=(0.0, 1.5, 3.0)) -> dict:
-    """Aspheres with either side in front, each with the sensor at its best focus for 20 mm, against Optiland."""
+    """Compare aspheres with either side facing the object with Optiland, each with the sensor focused for 20 mm."""
     found = {}
     for name, lens in SHAPES.items():
         imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((3, 3), 0.0045), 5.8, 3.0)
@@ -292,7 +293,7 @@ def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0))
 
 
 def curves(result: dict) -> Figure:
-    """Wavefront error and Strehl ratio over field and depth."""
+    """Plot wavefront error and Strehl ratio over field and depth."""
     axes = (figure := Figure(figsize=(10, 6.5), dpi=90, layout="constrained")).subplots(2, 2)
     for column, (name, label) in enumerate([("field", "field, mm"), ("depth", "depth, mm")]):
         at = lambda key, name=name: [row[key] for row in result[name]]
@@ -312,7 +313,7 @@ def curves(result: dict) -> Figure:
 
 
 def gallery(rows: list[dict], count: int = 5) -> Figure:
-    """Spots from the point's nearest lens outward: capture, our rays, our diffraction."""
+    """Plot spots from the nearest lens outward: capture, rays, diffraction."""
     ordered = sorted(rows, key=lambda row: row["field_mm"])
     rows = [ordered[round(i)] for i in np.linspace(0, len(rows) - 1, count)]
     figure = Figure(figsize=(2.2 * count, 6.8), dpi=90, layout="constrained")
@@ -337,7 +338,7 @@ _OF_SHAPES = {
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    with jax.enable_x64(True):  # paths to 1e-11 waves
+    with jax.enable_x64(True):  # accurate to 1e-11 waves
         result = run() | {"breakdown": breakdown(), "shapes": shapes()}
     keys = ("depth_mm", "field_mm", "landing_difference_nm", "path_difference_waves")
     columns = ("depth, mm", "field, mm", "largest difference to Optiland: landing, nm", "path, waves")

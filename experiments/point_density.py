@@ -1,10 +1,10 @@
-"""How many points a capture may show: the F1 score of `find_points` against their density.
+"""F1 score of `find_points` against the density of points.
 
-Points at random over 20 x 20 mm and 18 to 22 mm, of intensities 0.5 to 1.5, are imaged with all of their light by
-`simulate_points`, which places them finer than any voxel, and exposed with shot and read noise. Each capture goes to
-`find_points` with the same settings. For comparison: the brightest peaks of the back-projection, as many as there are
-points, which a user cannot know. Cores are where `find_points` expects them, so the simulation is a little optimistic;
-the ray-traced captures of `fig4_suppression` are not.
+Random points over 20 x 20 mm and 18 to 22 mm, with intensities of 0.5 to 1.5, are imaged with all their light by
+`simulate_points`, which positions them finer than any voxel, and exposed with shot and read noise. `find_points` gets
+each capture with the same settings. The reference is the brightest peaks of the back-projection, as many as there are
+points, a number that a user does not know. The simulation places cores where `find_points` expects them, so the result
+is slightly optimistic; the ray-traced captures of `fig4_suppression` are not.
 
     python -m experiments.point_density [DESIGN.toml] [--out DIR]
 """
@@ -27,13 +27,13 @@ from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 
-# Points, and captures of so many.
+# Numbers of points, and numbers of captures of each.
 SCENES = {10: 3, 30: 2, 100: 1, 300: 1, 1000: 1, 3000: 1}
 SIZE, DEPTHS = (20.0, 20.0), (18.0, 22.0)
 
 
 def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, step=0.25, progress: Progress) -> list:
-    """Scores of both methods for each number of points, each from all of its captures together."""
+    """Return the scores of both methods for each number of points, over all captures together."""
     imager = design.imager()
     grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0] - 1, DEPTHS[1] + 1.001, step), pitch=voxel)
     rows = []
@@ -48,7 +48,7 @@ def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, ste
 
 
 def scene(count: int, seed: int, design: Design, progress: Progress) -> tuple[np.ndarray, np.ndarray]:
-    """Points and a capture of them."""
+    """Points, and a capture of them."""
     truth = random_points(count, SIZE, DEPTHS, seed=seed)
     truth[:, 3] = np.random.default_rng(seed).uniform(0.5, 1.5, count)
     image = simulate_points(truth, design.imager(), kind="full", progress=progress)
@@ -62,7 +62,7 @@ def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int,
 
 
 def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
-    """Scores over several captures: their points put side by side, out of reach of each other."""
+    """Scores over several captures, whose points are placed side by side beyond the matching distance."""
     apart = [np.array([1000.0 * number, 0, 0, 0]) for number in range(len(pairs))]
     found, truth = (np.concatenate([pair[i] + a for pair, a in zip(pairs, apart, strict=True)]) for i in (0, 1))
     score = localization(found, truth)
@@ -76,7 +76,7 @@ def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
 
 
 def picture(rows: list) -> Figure:
-    """F1 and errors against the number of points."""
+    """Plot F1 and errors against the number of points."""
     figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained")
     score, error = figure.subplots(1, 2)
     count = [row["points"] for row in rows]

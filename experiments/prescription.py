@@ -1,9 +1,8 @@
-"""How sharp a prescription is at every depth: the optimised design against the paper's, refocused.
+"""Sharpness of the optimised design at every depth, against the paper's design in focus.
 
-A prescription is v, R, D and the pitch. It was optimised for the width of exact rays' spots; here one point on the
-axis is imaged with the diffraction PSF, on a sensor's pixels, and back-projected on voxels much finer than the spot.
-That PSF is the one on the lens's axis; spots beside the axis are judged by themselves, by the same diffraction
-integral.
+The prescription (v, R, D and the pitch) was optimised for the width of exact rays' spots. Here a point on the axis is
+imaged with the diffraction PSF on the sensor's pixels, and back-projected on voxels much finer than the spot. This PSF
+is the one on the lens axis; spots off the axis are evaluated separately, by the same diffraction integral.
 
     python -m experiments.prescription [--out DIR]
 """
@@ -28,16 +27,16 @@ from gs_jax.simulation.synthetic import simulate_points
 FOLDER = Path(__file__).parents[1] / "design"
 DESIGNS = ("geomscope", "geomscope-optimized")
 DEPTHS = (18.0, 20.0, 23.0)
-# Where a lens is judged beside its axis, mm.
+# Field heights at which a lens is evaluated, mm.
 FIELDS = (0.0, 1.5, 2.5)
-# Voxels of the reconstruction, its half width, and lines whose contrast is told, mm and cycles/mm: lines of 40 um.
+# Voxel and half width of the reconstruction, mm, and frequency of lines of 40 um, cycles/mm.
 VOXEL, HALF, LINES = 0.004, 0.4, 12.5
-# Pixels of the sensor and of the PSF's window: room for 3 mm of lenses, and for a blur of 0.7 mm.
+# Pixels of the sensor and of the PSF's window, for 3 mm of lenses and a blur of 0.7 mm.
 PIXELS, WINDOW = 2048, 161
 
 
 def run(names: Sequence[str] = DESIGNS, depths: Sequence[float] = DEPTHS, *, progress: Progress) -> dict[str, Any]:
-    """For each design a list with one record a depth; lengths in um, seen in the object."""
+    """Return for each design one record per depth; lengths in um, in the object."""
     found: dict[str, Any] = {}
     for name in names:
         design = read_design(FOLDER / f"{name}.toml")
@@ -47,7 +46,7 @@ def run(names: Sequence[str] = DESIGNS, depths: Sequence[float] = DEPTHS, *, pro
 
 
 def _cropped(imager: Imager) -> Imager:
-    """The middle of the sensor: a point on the axis lights no more."""
+    """The middle of the sensor, which holds all light of a point on the axis."""
     return eqx.tree_at(lambda i: i.sensor, imager, Sensor((PIXELS, PIXELS), imager.sensor.pixel_pitch))
 
 
@@ -69,7 +68,7 @@ def _at(design: Design, imager: Imager, depth: float, progress: Progress) -> dic
 
 
 def _unit(imager: Imager, depth: float, height: float) -> float:
-    """Radius of 80 % of one lens's light, seen in the object, um."""
+    """Radius of 80 % of one lens's light, in the object, um."""
     radius = clear_diameter(imager.array) / 2
     sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.sensor_distance))
     options: dict[str, Any] = dict(size=WINDOW, field=(height, 0.0), radius=radius)
@@ -89,12 +88,12 @@ def encircled(spot: np.ndarray, pitch: float, share: float) -> float:
 
 
 def contrast(spot: np.ndarray, axis: np.ndarray) -> float:
-    """Modulation that is left of lines as wide as their gaps, their fundamental, along x."""
+    """Modulation of lines as wide as their gaps, at their fundamental frequency, along x."""
     return float(np.abs(spot.sum(0) @ np.exp(2j * np.pi * LINES * axis)) / spot.sum())
 
 
 def picture(found: dict[str, Any]) -> Figure:
-    """Widths and contrast against depth, a colour for each design."""
+    """Plot widths and contrast against depth, one colour per design."""
     figure = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     panels = {
         "fwhm_um": "width at half height, um",

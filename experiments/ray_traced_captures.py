@@ -1,8 +1,8 @@
-"""Plain back-projection of ray-traced captures: are the points where they were?
+"""Positions of points in plain back-projections of ray-traced captures.
 
-The captures were made by an independent exact ray tracer with the paper's lens centres (sensor at 5.85 mm),
-aberrations, clipped apertures and noise included; nothing of this package's model is in them. Each is reconstructed
-with its design file as it stands, uncalibrated, and the brightest voxels are compared with the truth.
+An independent exact ray tracer made the captures with the paper's lens centres (sensor at 5.85 mm), including
+aberrations, clipped apertures and noise; they use nothing of this package's model. Each is reconstructed with its
+design file, uncalibrated, and the brightest voxels are compared with the truth.
 
     python experiments/ray_traced_captures.py DATA [--out DIR]
 
@@ -25,7 +25,7 @@ from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.reconstruction.pipeline import reconstruct
 
-# A peak counts as the point's within this distance, mm: the paper's resolution laterally and axially.
+# A peak matches a point within this distance, mm: the paper's lateral and axial resolution.
 LATERAL, AXIAL = 0.04, 0.3
 SINGLE = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px", "mx", "py", "my")))
 
@@ -33,9 +33,9 @@ SINGLE = ("a", *(f"i_{z}_{place}" for z in (18, 20, 22) for place in ("c", "px",
 def run(
     data: Path, *, singles=SINGLE, voxel_mm=0.02, step_mm=0.1, progress: Progress
 ) -> tuple[dict, Float32[np.ndarray, "y x"]]:
-    """Errors of the single points, and how many of the 120 points are peaks and how many peaks are points.
+    """Return errors of the single points, and how many of the 120 points are peaks and how many peaks are points.
 
-    Also the maximum over the depths of the reconstruction of the 120.
+    Also returns the maximum over the depths of the reconstruction of the 120 points.
     """
     imager = read_design(data / "P1.toml").imager()
     rows = [{"scene": name, **_single(data, name, imager, voxel_mm, progress)} for name in singles]
@@ -86,7 +86,7 @@ def _peaks(volume: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def picture(projection: Float32[np.ndarray, "y x"], data: Path, voxel_mm: float = 0.02) -> Figure:
-    """The 120 points: maximum over the depths, and the truth."""
+    """Plot the maximum over the depths for the 120 points, and the truth."""
     truth = points_of(data, "d")
     half = projection.shape[0] * voxel_mm / 2
     figure = Figure(figsize=(11, 5.4), dpi=90, layout="constrained")

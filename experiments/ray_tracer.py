@@ -1,7 +1,7 @@
-"""A ray tracer for random microlens arrays that shares no code with `gs_jax`, to judge its forward model by.
+"""Independent ray tracer for random microlens arrays, which shares no code with `gs_jax`, as a reference for its model.
 
-Rays from an isotropic emitter to the plano face, to a conic and to the sensor, or to the conic first, by the vector law
-of refraction and with Fresnel's losses; no diffraction. Of `gs_jax` it takes the numbers of an imager, nothing else.
+Rays from an isotropic emitter pass the plano face, then a conic, to the sensor, or the conic first, by the vector law
+of refraction and with Fresnel losses; no diffraction. From `gs_jax` it takes only the parameters of an imager.
 """
 
 import math
@@ -11,17 +11,17 @@ from numba import njit, prange
 
 from gs_jax import Imager
 
-# Parts of a scene that threads trace, each into an image of its own.
+# Parts of a scene, traced by threads, each into its own image.
 PARTS = 4
-# More lenses than these do not cut an aperture.
+# At most so many neighbours cut an aperture.
 NEIGHBOURS = 16
 
 
 def traced(emitters: np.ndarray, imager: Imager, rays: int) -> np.ndarray:
-    """The image of `(x, y, z, intensity)`: the part of each intensity that a pixel gets.
+    """Image emitters `(x, y, z, intensity)`; a pixel gets its share of each intensity.
 
-    `rays` go from each emitter toward each lens, at random but always the same. Apertures end at the disc and where a
-    neighbour's surface is higher, which is half-way if lenses are alike.
+    `rays` go from each emitter toward each lens, random but reproducible. Apertures end at their disc and where a
+    neighbour's surface is higher, which is half-way for identical lenses.
     """
     centers = np.asarray(imager.centers, np.float64)
     near = np.argsort(np.linalg.norm(centers[:, None] - centers, axis=-1))[:, 1 : NEIGHBOURS + 1]
@@ -54,7 +54,7 @@ def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
     x, y, z, intensity = emitter
     x, y = x - lens[0], y - lens[1]
     sag = _sag(aperture**2, radius, conic)
-    # The part of the front plane, a disc, that light of the whole aperture can come through.
+    # The disc of the front plane through which light reaches the aperture.
     if curve_first:
         air = math.hypot(x, y) / z
         disc, toward = aperture * (1 + sag / z) + sag * air / 2, sag / 2 / z
@@ -67,7 +67,7 @@ def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
         r, turn = disc * math.sqrt((i + np.random.random()) / rays), 2 * np.pi * np.random.random()
         sign = -1 if curve_first else 1
         front = r * math.cos(turn) + sign * x * toward, r * math.sin(turn) + sign * y * toward
-        # An isotropic emitter: the solid angle of a piece of the front plane.
+        # Isotropic emitter: solid angle of an element of the front plane.
         length = math.sqrt((front[0] - x) ** 2 + (front[1] - y) ** 2 + z**2)
         outside = (front[0] - x) / length, (front[1] - y) / length, z / length
         if curve_first:
@@ -93,9 +93,9 @@ def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
 
 @njit(fastmath=True, error_model="numpy")
 def _met(start, ray, below, toward, radius, conic):
-    """Where a ray meets `x^2 + y^2 = 2 R w - (1 + k) w^2`, `(x, y, w)`, and the normal there, along the ray.
+    """Intersection of a ray with `x^2 + y^2 = 2 R w - (1 + k) w^2`, `(x, y, w)`, and the normal there, along the ray.
 
-    It starts at `w = below`; `toward` is 1 if w grows along the light. Beside the surface w is out of reach.
+    The ray starts at `w = below`; `toward` is 1 if w increases along the light. Rays that miss have an unreachable w.
     """
     deeper = toward * ray[2]
     a = ray[0] ** 2 + ray[1] ** 2 + (1 + conic) * deeper**2
@@ -104,7 +104,7 @@ def _met(start, ray, below, toward, radius, conic):
     root = math.sqrt(max(b * b - a * c, 0.0))
     if b * b < a * c:
         return (0.0, 0.0, 1e9), (0.0, 0.0, 1.0)
-    # From outside the first meeting, from inside the one ahead.
+    # From outside take the first intersection, from inside the one ahead.
     way = c / (root - b) if toward > 0 else -c / (b + root)
     x, y, w = start[0] + way * ray[0], start[1] + way * ray[1], below + way * deeper
     along = radius - (1 + conic) * w
@@ -129,7 +129,7 @@ def _sag(squared, radius, conic):
 
 @njit(fastmath=True, error_model="numpy")
 def _refracted(ray, normal, ratio):
-    """The ray behind a face and the share of its light that passes, unpolarised; `ratio` of the indices before it."""
+    """The ray behind a face and its transmitted share, unpolarised; `ratio` is n before over n behind it."""
     before = ray[0] * normal[0] + ray[1] * normal[1] + ray[2] * normal[2]
     square = 1 - ratio**2 * (1 - before**2)
     if before <= 0 or square <= 0:

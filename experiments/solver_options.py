@@ -1,9 +1,9 @@
-"""What the solvers' defaults are for: three words of a ray-traced capture, with and without each of them.
+"""Effect of the solvers' defaults on three words of a ray-traced capture.
 
-- Three planes, 30 plain steps of Richardson-Lucy: what the full model alone makes of it.
-- Background: the capture as it is, and under a wide glow that no voxel emits, by list-RL with and without
-  a fitted background.
-- Rims: the near model, whose light is a sixth of the capture's, with and without holding back what few lenses see.
+- Three planes, 30 plain steps of Richardson-Lucy: the full model alone.
+- Background: the capture as it is, and with a wide glow that no voxel emits, by list-RL with and without the fitted
+  background.
+- Edges: the near model, whose light is a sixth of the capture's, with and without damping of rarely seen voxels.
 - Unrolled: with and without its conjugate gradients.
 
     python -m experiments.solver_options DATA [--out DIR]
@@ -25,13 +25,13 @@ from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS, Method
 
 STEPS = 20
-# The glow: its standard deviation in parts of the sensor, and its peak in means of the capture above its offset.
+# Glow: standard deviation relative to the sensor's width, and peak relative to the capture's mean above its offset.
 _WIDE, _BRIGHT = 0.25, 2.0
 _MIDDLE = (0.2, 0.7)
 
 
 def glow(image: np.ndarray) -> np.ndarray:
-    """A Gaussian over the sensor, in the capture's unit."""
+    """A Gaussian over the sensor, in the unit of the capture."""
     rows, columns = (
         np.exp(-((np.linspace(0, 1, n) - m) ** 2) / (2 * _WIDE**2)) for n, m in zip(image.shape, _MIDDLE, strict=True)
     )
@@ -39,7 +39,7 @@ def glow(image: np.ndarray) -> np.ndarray:
 
 
 def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
-    """By name: the scene, the method, and the optics."""
+    """Scene, method and optics of each case, by name."""
     planes = s.truth.any((1, 2))
     few = s._replace(grid=s.grid.at(np.asarray(s.grid.depths)[planes]), truth=s.truth[planes])
     bright = s._replace(image=s.image + glow(s.image).astype(np.float32))
@@ -66,7 +66,7 @@ def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
 
 
 def run(s: Scene, *, progress: Progress) -> dict:
-    """PSNR, that of an empty volume, dB, and how many lenses see the brightest voxel, by name."""
+    """Return by name the PSNR and that of an empty volume, dB, and how many lenses see the brightest voxel."""
     found = {}
     for name, (each, method, optics) in progress.track(cases(s).items(), "Options"):
         volume = reconstruct(each.image, each.imager, each.grid, method, optics=optics, progress=progress)
@@ -79,7 +79,7 @@ def run(s: Scene, *, progress: Progress) -> dict:
 
 
 def _lenses(volume: np.ndarray, s: Scene) -> int:
-    """How many lenses see the brightest voxel."""
+    """Number of lenses that see the brightest voxel."""
     _, row, column = np.unravel_index(int(volume.argmax()), volume.shape)
     place = np.array([float(s.grid.x[column]), float(s.grid.y[row])])
     distance = np.linalg.norm(np.asarray(s.imager.centers) - place, axis=1)

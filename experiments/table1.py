@@ -1,6 +1,6 @@
-"""Table 1: the paper's design parameters and performance, ours beside them, and why they differ where they do.
+"""Table 1: the paper's design parameters and performance, our values beside them, and reasons for differences.
 
-Ours are computed for the same lens with the sensor at the printed 4 mm, and at 5.8 mm, where it is in focus.
+Our values are computed for the same lens with the sensor at the printed 4 mm, and at 5.8 mm, where it is in focus.
 
     python -m experiments.table1 [--out DIR]
 """
@@ -19,12 +19,12 @@ from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.optics import aberrations, theory
 
 COLUMNS = ("what", "paper", "printed: v = 4 mm", "focused: v = 5.8 mm", "why")
-# The paper's own range of depths in its simulations and experiments, mm.
+# Range of depths in the paper's simulations and experiments, mm.
 DEPTHS = (18.0, 20.0, 30.0)
 
 
 def run() -> dict[str, list[dict[str, str]]]:
-    """The rows, and the figures of the conflicts that they name."""
+    """Return the rows of the table, and the numbers of the conflicts that they name."""
     printed, focused = geomscope(sensor_distance_mm=4.0), geomscope(sensor_distance_mm=5.8)
     sheets = [datasheet(design, DEPTHS) for design in (printed, focused)]
     rows = [*_given(printed, focused), *_performance(sheets), *_depth_of_field(printed)]
@@ -91,7 +91,7 @@ def _object_blur(sheet: dict) -> str:
 
 
 def _depth_of_field(design: Design) -> list[tuple[str, ...]]:
-    """At 20 mm; the sensor distance is not in Eqs. 7 and 8, and the paper leaves the diameter open."""
+    """Depth of field at 20 mm. Eqs. 7 and 8 do not use the sensor distance, and the paper leaves the diameter open."""
     rows = []
     for what, diameter in _diameters(design).items():
         lens = _lens(design, diameter)
@@ -118,13 +118,13 @@ def _diameters(design: Design) -> dict[str, float]:
 
 
 def _lens(design: Design, diameter: float) -> tuple[float, float, float]:
-    """Focal length, depth and F-number of the formulas, without the plate."""
+    """Focal length, depth and F-number for the formulas, without the plate."""
     f = float(design.imager().array.focal_length)
     return f, 20.0, f / diameter
 
 
 def _conflicts(design: Design) -> list[dict[str, str]]:
-    """What the paper's numbers would need."""
+    """Values that the paper's numbers would need."""
     facts = []
     for what, diameter in _diameters(design).items():
         needed = _confusion_for(5.0, _lens(design, diameter))
@@ -150,7 +150,7 @@ def _confusion_for(depth_of_field: float, lens: tuple[float, float, float]) -> f
 
 
 def _counted(design: Design) -> str:
-    """Away from the edge, where each point has its whole field."""
+    """Counted lenses per point, away from the edge, where each point has its whole field."""
     side = np.linspace(-7, 7, 57)
     points = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     counts = theory.count_lenses(np.array(design.array.centers_mm), points, design.imaging.field_radius_mm)
@@ -158,7 +158,7 @@ def _counted(design: Design) -> str:
 
 
 def markdown(found: dict[str, list[dict[str, str]]]) -> str:
-    """Both tables."""
+    """Both tables in Markdown."""
     return (
         "\n\n".join(markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in found.values())
         + "\n"

@@ -1,18 +1,17 @@
-"""How much of an image that no model of ours rendered the forward model explains.
+"""How much of an independently ray-traced image the forward model explains.
 
-The near model has one PSF, that on the axis, within the field radius; the full one has all of the light that lenses
-pass on (`field_varying_psf`, `full_image_of_points`). Nothing is fitted but one gain for a whole image, by least
-squares on its pixels. Error is the RMS of the difference over that of the image, correlation Pearson's, both of the
-images and of both binned by 4 and 16; light is the model's sum over the image's. Two rings are the full model with
-fewer cores.
+The near model has one PSF, that on the axis, within the field radius; the full model has all transmitted light
+(`full_optics`, `full_image_of_points`). One gain per image is fitted, by least squares on its pixels, and nothing else.
+Error is the RMS of the difference over that of the image, correlation is Pearson's, both for the images and for both
+binned by 4 and 16; light is the model's sum over the image's. "Two rings" is the full model with fewer core rings.
 
-- Captures by an independent ray tracer with the authors' array, noise included: letters, a USAF target, 120 points.
-- Devices of another kind, which nothing was tuned to, by `experiments/ray_tracer.py`. It shares no code with `gs_jax`
-  either, and is itself compared with the capture of the points.
+- Captures by another group's ray tracer with the authors' array, with noise: letters, a USAF target, 120 points.
+- Other devices, for which nothing was tuned, by `experiments/ray_tracer.py`, which shares no code with `gs_jax`
+  and is itself compared with the capture of the points.
 
     python -m experiments.true_image [DATA] [--out DIR]
 
-DATA holds `P1.toml`, `P1_*.tif` and the scenes' `*.json`; without it there are only the other devices. Writes
+DATA holds `P1.toml`, `P1_*.tif` and the scenes' `*.json`; without it only the other devices are used. Writes
 `true_image.json` and `true_image.md`; about twelve minutes on two cores.
 """
 
@@ -41,9 +40,9 @@ from gs_jax.simulation.phantoms import letters, random_points, rasterize
 from gs_jax.simulation.synthetic import simulate_points
 
 BINS = (1, 4, 16)
-# Of a full model that costs twice the near one.
+# Rings of a full model that costs twice the near one.
 TWO_RINGS = (1.0, 2.5)
-# Of the captures: electrons are so many a count, above a black level.
+# Captures: electrons per count, and the black level.
 GAIN, BLACK = 10, 16
 
 
@@ -64,7 +63,7 @@ class Device(NamedTuple):
     conic_constant: float = 0.0
 
     def imager(self) -> Imager:
-        """What the models get."""
+        """The imager of the models."""
         centers = random_layout(self.lenses, (self.plate, self.plate), diameter=self.aperture, seed=1)
         array = MicrolensArray(
             centers,
@@ -88,7 +87,7 @@ DEVICES = {
 
 
 def scores(model: np.ndarray, image: np.ndarray) -> dict:
-    """With the model's one gain."""
+    """Error, correlation and light, after the model's one gain."""
     gain = float(np.vdot(model, image) / np.vdot(model, model))
     found: dict = {"gain": gain, "light": gain * float(model.sum() / image.sum())}
     for size in BINS:
@@ -104,7 +103,7 @@ def _binned(image, size):
 
 
 def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndarray, progress: Progress) -> dict:
-    """Scores of the models with planes of emitters, as voxels."""
+    """Scores of the models for planes of emitters, as voxels."""
     depths, count = np.unique(emitters[:, 2]), 2 * math.ceil(np.abs(emitters[:, :2]).max() / pitch + 1) + 1
     grid = Grid(depths, (count, count), pitch)
     volume = rasterize(emitters, grid)
@@ -118,13 +117,13 @@ def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndar
 
 
 def of_points(points: np.ndarray, imager: Imager, image: np.ndarray, progress: Progress) -> dict:
-    """Scores of the near and the full model with points."""
+    """Scores of the near and the full model for points."""
     near = simulate_points(points, imager, kind="geometric", progress=progress)
     return {"near": scores(near, image), "full": scores(full_image_of_points(points, imager, progress), image)}
 
 
 def on_captures(data: Path, rays: int, progress: Progress) -> dict:
-    """Scores on the ray-traced captures; and of our own tracer on the points, with some rays."""
+    """Scores on the ray-traced captures, and of our own tracer on the points, with so many rays."""
     imager, points = read_design(data / "P1.toml").imager(), points_of(data, "d")
     electrons = lambda s: GAIN * (read_capture(data / f"P1_{s}.tif", imager.sensor.shape).astype(np.float64) - BLACK)
     target = json.loads((data / "f.json").read_text())["elements"]
@@ -168,7 +167,7 @@ def bars(elements: list[dict], depth: float = 18.0, pitch: float = 0.0025) -> np
 
 
 def on_device(device: Device, progress: Progress, *, points=25, samples=400_000, point_rays=200_000, rays=8) -> dict:
-    """Scores on what our tracer makes of points and of three thick letters (none if there are no samples)."""
+    """Scores on our tracer's images of points and of three thick letters (none if there are no samples)."""
     imager, size = device.imager(), 0.8 * device.plate
     scene = random_points(points, (size, size), device.depths, seed=3)
     found = {f"{points} points": of_points(scene, imager, traced(scene, imager, point_rays), progress)}
@@ -189,7 +188,7 @@ def on_device(device: Device, progress: Progress, *, points=25, samples=400_000,
 def run(
     data: Path | None, devices: dict[str, Device] | None = None, *, rays=50_000, progress: Progress, **sizes
 ) -> dict:
-    """Scores by what was imaged, scene and model; `rays` are for `on_captures`, `sizes` for `on_device`."""
+    """Return scores by image, scene and model; `rays` are for `on_captures`, `sizes` for `on_device`."""
     found = {"the authors' array": on_captures(data, rays, progress)} if data else {}
     for name, device in (DEVICES if devices is None else devices).items():
         found[name] = on_device(device, progress, **sizes)

@@ -1,12 +1,12 @@
-"""Two small changes of the network of seven slices, at equal size, data and training: do they help?
+"""Two variants of the network of seven slices, at equal size, data and training.
 
-- Spread: an eighth channel, the spread over the lenses of what back-projection sums in the slice that is wanted. Light
-  that is there is seen by all lenses; a ghost, by one.
-- Gated: the network weighs the slice that it cleans, by 0 to 2, rather than drawing a new one.
+- Spread: an eighth channel, the spread over the lenses of what back-projection sums in the wanted slice. All lenses see
+  real light; one lens sees a ghost.
+- Gated: the network weighs the slice by 0 to 2 instead of drawing a new one.
 
-Each is trained on the same simulated captures in the same order, then judged on those of another seed: PSNR over that
-of an empty volume, the mean over the scenes, and the mean difference from the network as it is with its 95 % interval
-by bootstrap. Shorter than the training of the weights that come with the package, on captures of coarser pixels.
+Each variant is trained on the same simulated captures in the same order, and tested on those of another seed: PSNR over
+that of an empty volume, the mean over the scenes, and the mean difference from the shipped network with its 95 %
+interval by bootstrap. The training is shorter than that of the shipped weights, on captures of coarser pixels.
 
     python -m experiments.two_step_variants [--steps N] [--stacks N] [--held-out N] [--out DIR]
 
@@ -37,12 +37,12 @@ from gs_jax.optics.psf_core import apparent_depths
 
 KIND = Kind(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8
-# As `gs_jax.apps.training.training_slices`: what errors are relative to at least.
+# As in `gs_jax.apps.training.training_slices`: smallest norm to which errors are relative.
 _GHOSTS, _LEAST_ENERGY = 0.05, 1e-3
 
 
 class Stack(NamedTuple):
-    """A back-projected volume and the spread over its lenses, each in its unit, what it shows, and its true slope."""
+    """A back-projected volume and the spread over its lenses, each normalised, with the truth and its slope."""
 
     volume: np.ndarray
     spread: np.ndarray
@@ -50,7 +50,7 @@ class Stack(NamedTuple):
 
 
 class Gated(eqx.Module):
-    """Weighs the wanted slice of those that it sees."""
+    """Network that weighs the wanted slice."""
 
     network: UNet
 
@@ -75,14 +75,14 @@ def stack(seed: int, number: int, kind: Kind = KIND) -> Stack:
 
 
 def channels(one: Stack, depth: int, place: tuple[slice, slice], spread: bool) -> np.ndarray:
-    """What a network sees for a part of a slice."""
+    """Input of a network for a part of a slice."""
     depths = np.clip(depth + np.arange(-3, 4), 0, len(one.volume) - 1)
     beside = [one.spread[depth][place]] if spread else []
     return np.stack([*one.volume[depths][:, *place], *beside])
 
 
 def batch(stacks: list[Stack], spread: bool, rng: np.random.Generator) -> Batch:
-    """Random pieces, three in four chosen of eight for showing something: the same for each variant."""
+    """Random patches, the same for each variant; three in four are the best of eight by content."""
     slices, truths = [], []
     for number in range(COUNT):
         one = stacks[rng.integers(len(stacks))]
@@ -98,13 +98,13 @@ def batch(stacks: list[Stack], spread: bool, rng: np.random.Generator) -> Batch:
 
 
 def _wider(key) -> UNet:
-    """The network as it is, with one more channel; its number stands for no slice."""
+    """The network with one more channel, whose number belongs to no slice."""
     like = eqx.filter_eval_shape(multislice_network, key)
     return UNet((*like.offsets, max(like.offsets) + 1), like.widths, standardized=True, key=key)
 
 
 def variants(stacks: list[Stack]) -> dict[str, tuple[Recipe, bool]]:
-    """Recipes, and whether they see the spread, by name."""
+    """Networks, and whether they see the spread, by name."""
 
     def recipe(network, spread) -> tuple[Recipe, bool]:
         optimizer = lambda steps: optax.adam(optax.warmup_cosine_decay_schedule(0, 1e-3, min(100, steps), steps + 1))
@@ -118,7 +118,7 @@ def variants(stacks: list[Stack]) -> dict[str, tuple[Recipe, bool]]:
 
 
 def cleaned(network: Any, one: Stack, spread: bool) -> np.ndarray:
-    """The volume by a network, of rows and columns that are a multiple of what it halves."""
+    """Clean a volume whose rows and columns are multiples of the network's downsampling."""
     apply = eqx.filter_jit(lambda network, slices: jnp.maximum(network(slices), 0))
     whole = slice(None), slice(None)
     return np.stack([np.asarray(apply(network, channels(one, d, whole, spread))) for d in range(len(one.volume))])
@@ -130,7 +130,7 @@ def _cut(one: Stack, multiple: int) -> Stack:
 
 
 def run(steps: int, count: int, held_out: int, kind: Kind = KIND, *, progress: Progress) -> dict[str, list[float]]:
-    """Gains over an empty volume of the held-out scenes that show something, dB, by variant."""
+    """Return gains over an empty volume for the held-out scenes that show something, dB, by variant."""
     stacks = [stack(0, number, kind) for number in progress.track(range(count), "Simulating captures")]
     judged = [_cut(stack(1, number, kind), 8) for number in progress.track(range(held_out), "Simulating others")]
     found = {}

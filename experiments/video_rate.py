@@ -1,4 +1,4 @@
-"""Recordings from the disk to OME-Zarr: frames per second by one and two workers, memory, killed runs, forecasts."""
+"""Recordings from disk to OME-Zarr: frames per second with one and two workers, memory, killed runs, forecasts."""
 
 import contextlib
 import json
@@ -27,14 +27,14 @@ from gs_jax.simulation.phantoms import random_points
 
 from .common import Report, main, table
 
-# Seconds between two looks at the process; frames whose parts are timed.
+# Seconds between two samples of the process; frames whose parts are timed.
 _EVERY, _TIMED = 0.2, 20
 _NEAR, _FAR, _DEPTHS = 18, 22, 13
 _SEED, _DIFFERENT = 0, 100
 
 
 def coarse_design(pixels: int) -> Design:
-    """The built-in microscope with a camera of so many pixels each way on the same sensor."""
+    """The built-in microscope with a camera of so many pixels in each direction on the same sensor."""
     data = geomscope().model_dump()
     across = data["sensor"]["shape"][0] * data["sensor"]["pixel_pitch_um"]
     data["sensor"] |= {"shape": (pixels, pixels), "pixel_pitch_um": across / pixels}
@@ -42,7 +42,7 @@ def coarse_design(pixels: int) -> Design:
 
 
 def write_recording(path: Path, design: Design, frames: int) -> None:
-    """Points with shot noise, 12 bits; a hundred different frames, in turn."""
+    """Write frames of points with shot noise, 12 bits; a hundred different frames are repeated."""
     rng = np.random.default_rng(_SEED)
     image = np.asarray(
         simulate(random_points(50, (8.0, 8.0), (18.0, 22.0), seed=_SEED), design.imager(), optics="near")
@@ -55,7 +55,7 @@ def write_recording(path: Path, design: Design, frames: int) -> None:
 
 
 def parts(path: Path, design: Design, depths: list[float], folder: Path, frames: int) -> dict[str, float]:
-    """Milliseconds a frame of reading, computing and writing, each alone; medians."""
+    """Median milliseconds per frame of reading, computing and writing, each alone."""
     imager = design.imager()
     grid = voxel_grid(imager, depths)
     volume_of, series = reconstructor(imager, grid), VolumeSeries(folder / "parts.zarr", frames, grid)
@@ -75,9 +75,9 @@ def parts(path: Path, design: Design, depths: list[float], folder: Path, frames:
 
 
 def watched(folder: Path, frames: int, output: str, *options: str, kill_at: int | None = None) -> dict:
-    """The command line as a process of its own, with how many frames were written and the memory by time.
+    """Run the command line as a process; return the number of written frames and the memory over time.
 
-    `kill_at`: after so many frames it is killed, with all of its workers.
+    `kill_at`: kill it, with all of its workers, after so many frames.
     """
     arguments = ["reconstruct", f"{frames}.tif", "design.toml", *_depths(), "-o", output, *options]
     if "--resume" not in options:
@@ -109,7 +109,7 @@ def _depths() -> tuple[str, str]:
 
 
 def _memory(process: psutil.Process) -> int:
-    """Resident bytes of the process and of its workers; 0 of one that is ending."""
+    """Resident bytes of a process and its workers; 0 for one that is ending."""
     total = 0
     for each in (process, *process.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -118,7 +118,7 @@ def _memory(process: psutil.Process) -> int:
 
 
 def survival(folder: Path, frames: int) -> dict:
-    """Whether a run by two workers that is killed and gone on with leaves the same files as one by itself."""
+    """Whether a run by two workers that is killed and resumed leaves the same files as an uninterrupted run."""
     workers = ("--workers", "2")
     killed = watched(folder, frames, "killed.zarr", *workers, kill_at=frames // 3)
     left = (folder / "killed.zarr" / JOURNAL).read_bytes().count(b"\n") - 1
@@ -135,20 +135,20 @@ def survival(folder: Path, frames: int) -> dict:
 
 
 def _voxels(path: Path) -> dict[str, bytes]:
-    """The files of the volumes: of all that a store holds but its journal and what it says of itself."""
+    """Files of the volumes: the content of a store without its journal and metadata."""
     named = {str(each.relative_to(path)): each for each in path.rglob("*") if each.is_file()}
     return {name: each.read_bytes() for name, each in named.items() if name not in (JOURNAL, "zarr.json")}
 
 
 def foretold(few: dict, many: dict) -> dict:
-    """Of many frames from a run of few: its seconds before the first, and its frames per second after."""
+    """Forecast for many frames from a run of few: its seconds before the first frame, and its frames per second."""
     start = few["seconds"] - few["frames"] / few["frames_per_s"]
     seconds = start + many["frames"] / few["frames_per_s"]
     return {"start_s": start, "seconds": seconds, "measured": many["seconds"], "ratio": seconds / many["seconds"]}
 
 
 def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 512, few: int = 100) -> dict:
-    """Frames per second at one size; memory, survival and forecast at a smaller one, of `many` and `few` frames."""
+    """Measure frames per second at one size, and memory, survival and the forecast at a smaller one."""
     found: dict = {"cores": psutil.cpu_count(), "load_before": psutil.getloadavg()}
     places = np.linspace(_NEAR, _FAR, _DEPTHS).round(6).tolist()
     here, by = {"here": ()}, {f"{n} workers": ("--workers", str(n)) for n in (1, 2)}
@@ -175,13 +175,13 @@ def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 5
 
 
 def picture(found: dict) -> Figure:
-    """Resident memory against frames written."""
+    """Plot resident memory against frames written."""
     figure = Figure(figsize=(7, 3.4), dpi=100, layout="constrained")
     axes = figure.subplots()
     most = 0
-    for key, label in (("long, here", "one process"), ("long, 2 workers", "two workers and who asks them")):
+    for key, label in (("long, here", "one process"), ("long, 2 workers", "two workers and the scheduling process")):
         _, done, memory = np.array(found[key]["seconds_frames_mib"]).T
-        running = done < found[key]["frames"]  # what is left is the end of the processes
+        running = done < found[key]["frames"]  # the rest is the end of the processes
         axes.plot(done[running], memory[running], label=label)
         most = max(most, memory.max())
     axes.set(xlabel="frames written", ylabel="resident memory, MiB", ylim=(0, 1.2 * most))
@@ -198,7 +198,7 @@ def grown(long: dict) -> tuple[float, float]:
 
 
 def bars(found: dict) -> list[tuple[str, str, str]]:
-    """What was to be shown, what was found, and whether it is met."""
+    """Targets, measured values, and whether they are met."""
     rows = []
     for key in ("long, here", "long, 2 workers"):
         early, late = grown(found[key])
