@@ -236,18 +236,18 @@ def run(
 ) -> dict:
     """Return the content of `speed.json`; units are in the keys."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-    found: dict[str, Any] = {"machine": describe() | {"load average before": f"{load:.1f}"}}
+    outcome: dict[str, Any] = {"machine": describe() | {"load average before": f"{load:.1f}"}}
     compile_s = {}
     once = cache(lambda job: race(job, IN_STUDY, max(3, rounds - 2), compile_s))
-    found["jobs"] = [race(job, names, rounds, compile_s) for job in progress.track(jobs, "Full scale")]
+    outcome["jobs"] = [race(job, names, rounds, compile_s) for job in progress.track(jobs, "Full scale")]
     for name in progress.track(memory_of, "Memory"):
-        found["jobs"][0]["contestants"][name] |= in_new_process(memory, name, jobs[0])
-    found["study"] = {axis: [once(job) for job in progress.track(study[axis], f"More {axis}")] for axis in study}
-    found["slopes"] = {
-        axis: {name: slope(axis, results, name) for name in IN_STUDY} for axis, results in found["study"].items()
+        outcome["jobs"][0]["contestants"][name] |= in_new_process(memory, name, jobs[0])
+    outcome["study"] = {axis: [once(job) for job in progress.track(study[axis], f"More {axis}")] for axis in study}
+    outcome["slopes"] = {
+        axis: {name: slope(axis, results, name) for name in IN_STUDY} for axis, results in outcome["study"].items()
     }
-    found["bars"] = [bar for job in found["jobs"] for bar in bars(job)]
-    return found
+    outcome["bars"] = [bar for job in outcome["jobs"] for bar in bars(job)]
+    return outcome
 
 
 def amount(axis: str, result: dict) -> int:
@@ -286,14 +286,14 @@ def bars(result: dict) -> list[dict]:
         {
             "job": result["job"],
             "what": what,
-            "found": float(found),
+            "found": float(outcome),
             "by_processor": None if processor is None else float(processor),
             "sign": sign,
             "bar": bar,
-            "met": bool(found >= bar if sign == ">=" else found <= bar),
+            "met": bool(outcome >= bar if sign == ">=" else outcome <= bar),
         }
-        for what, (found, processor), sign, bar in rows
-        if not np.isnan(found)  # memory is measured for the first problem only
+        for what, (outcome, processor), sign, bar in rows
+        if not np.isnan(outcome)  # memory is measured for the first problem only
     ]
 
 
@@ -317,7 +317,7 @@ def job_rows(result: dict) -> list[list[str]]:
     ]
 
 
-def bar_rows(found: dict) -> list[list[str]]:
+def bar_rows(outcome: dict) -> list[list[str]]:
     return [
         [
             b["job"],
@@ -327,23 +327,23 @@ def bar_rows(found: dict) -> list[list[str]]:
             f"{b['sign']} {b['bar']:.3g}",
             "yes" if b["met"] else "NO",
         ]
-        for b in found
+        for b in outcome
     ]
 
 
-def tables(found: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
+def tables(outcome: dict) -> list[tuple[str, Sequence[str], list[list[str]]]]:
     """Title, columns and rows of every table."""
-    jobs = [(f"{r['job']}: {r['pairs']:.3g} pairs", COLUMNS, job_rows(r)) for r in found["jobs"]]
-    slopes = [[axis, *(f"{s[name]:.2f}" for name in IN_STUDY)] for axis, s in found["slopes"].items()]
+    jobs = [(f"{r['job']}: {r['pairs']:.3g} pairs", COLUMNS, job_rows(r)) for r in outcome["jobs"]]
+    slopes = [[axis, *(f"{s[name]:.2f}" for name in IN_STUDY)] for axis, s in outcome["slopes"].items()]
     return [
         *jobs,
-        ("Against the bars", ("", "", "found", "in processor time", "bar", "met"), bar_rows(found["bars"])),
+        ("Against the bars", ("", "", "found", "in processor time", "bar", "met"), bar_rows(outcome["bars"])),
         ("Exponent of the cost between the two largest sizes", ("in", *IN_STUDY), slopes),
     ]
 
 
-def markdown(found: dict) -> str:
-    machine = ", ".join(f"{key} {value}" for key, value in found["machine"].items())
+def markdown(outcome: dict) -> str:
+    machine = ", ".join(f"{key} {value}" for key, value in outcome["machine"].items())
     parts = [
         "# Speed of back-projection",
         f"{machine}.",
@@ -351,7 +351,7 @@ def markdown(found: dict) -> str:
         "same round. A pair is a voxel and a lens that sees it. Memory: what a fresh process that has the inputs adds "
         "at its peak while it compiles and runs.",
     ]
-    parts += [f"## {title}\n\n{markdown_table(columns, rows)}" for title, columns, rows in tables(found)]
+    parts += [f"## {title}\n\n{markdown_table(columns, rows)}" for title, columns, rows in tables(outcome)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -371,9 +371,9 @@ def picture(study: Mapping[str, Sequence[dict]]) -> Figure:
 
 
 def report(progress: Progress, **sizes: Any) -> Report:
-    found = run(progress=progress, **sizes)
-    files = {"speed.json": found, "speed.md": markdown(found), "speed.png": picture(found["study"])}
-    return Report(files, [table(columns, rows, title) for title, columns, rows in tables(found)])
+    outcome = run(progress=progress, **sizes)
+    files = {"speed.json": outcome, "speed.md": markdown(outcome), "speed.png": picture(outcome["study"])}
+    return Report(files, [table(columns, rows, title) for title, columns, rows in tables(outcome)])
 
 
 if __name__ == "__main__":

@@ -64,8 +64,8 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     scene, truth = read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
     scores = {}
     for name, geometry in (("calibrated", whole.imager), ("design", imager)):
-        found = find_points(scene, geometry, voxel_grid(geometry, SCENE), progress=progress)
-        score = localization(found, truth, axial=0.6)
+        results = find_points(scene, geometry, voxel_grid(geometry, SCENE), progress=progress)
+        score = localization(results, truth, axial=0.6)
         scores[name] = {"f1": score.f1, "axial_um": 1000 * score.axial_rmse}
     turned = eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + TURN)
     alone = calibrate_by_scene(scene, turned, voxel_grid(turned, SCENE), progress=progress)
@@ -79,13 +79,13 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     }, whole
 
 
-def _said(found: Calibration) -> dict:
+def _said(results: Calibration) -> dict:
     return {
-        "values": found.values,
-        "deviations": found.deviations,
-        "rms_pixels": found.rms,
-        "spots": len(found.residuals),
-        "sources": len(found.sources.points),
+        "values": results.values,
+        "deviations": results.deviations,
+        "rms_pixels": results.rms,
+        "spots": len(results.residuals),
+        "sources": len(results.sources.points),
     }
 
 
@@ -120,34 +120,34 @@ def on_device(seed: int, progress: Progress) -> dict:
         light = full_image_of_points(np.append(point, 1.0)[None], actual, progress)
         key = jax.random.key(1000 * seed + number)
         images.append(np.asarray(expose(light, Camera(gain=1.0), key, peak_electrons=5000)))
-    found = calibrate(images, points, design, progress=progress)
+    results = calibrate(images, points, design, progress=progress)
     true = true_values(actual)
-    off = {name: value - true[name] for name, value in found.values.items()}
+    off = {name: value - true[name] for name, value in results.values.items()}
     off["rotation_deg"] = (off["rotation_deg"] + 180) % 360 - 180
-    in_sd = {name: off[name] / found.deviations[name] for name in NAMES}
-    return {"mirrored": found.mirrored == mirrored, "off": off, "in_sd": in_sd, "rms_pixels": found.rms}
+    in_sd = {name: off[name] / results.deviations[name] for name in NAMES}
+    return {"mirrored": results.mirrored == mirrored, "off": off, "in_sd": in_sd, "rms_pixels": results.rms}
 
 
 def run(data: Path | None, devices: int, *, progress: Progress) -> tuple[dict, Calibration | None]:
     """Return the content of `calibration.json`, and the calibration from the captures."""
     captures, whole = on_captures(data, progress) if data else ({}, None)
-    found = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
-    return {"captures": captures, "devices": found}, whole
+    results = {seed: on_device(seed, progress) for seed in progress.track(range(devices), "Devices")}
+    return {"captures": captures, "devices": results}, whole
 
 
 def report(data: Path | None, devices: int, progress: Progress) -> Report:
-    found, whole = run(data, devices, progress=progress)
+    results, whole = run(data, devices, progress=progress)
     columns = ("", "median deviation", "largest", "within 3 SD", "SD of the deviations, in SD")
     rows = []
     for name in NAMES if devices else ():
-        off = np.abs([each["off"][name] for each in found["devices"].values()])
-        in_sd = np.array([each["in_sd"][name] for each in found["devices"].values()])
+        off = np.abs([each["off"][name] for each in results["devices"].values()])
+        in_sd = np.array([each["in_sd"][name] for each in results["devices"].values()])
         within = f"{np.mean(np.abs(in_sd) < 3):.0%}"
         rows.append([name, f"{np.median(off):.2g}", f"{off.max():.2g}", within, f"{in_sd.std():.2f}"])
-    right = sum(each["mirrored"] for each in found["devices"].values())
+    right = sum(each["mirrored"] for each in results["devices"].values())
     text = f"# Calibration\n\n{markdown_table(columns, rows)}\n\nMirrored or not: {right} of {devices} right.\n"
-    text += f"\n```\n{json.dumps(found['captures'], indent=2)}\n```\n"
-    files: dict[str, dict | str | Figure] = {"calibration.json": found, "calibration.md": text}
+    text += f"\n```\n{json.dumps(results['captures'], indent=2)}\n```\n"
+    files: dict[str, dict | str | Figure] = {"calibration.json": results, "calibration.md": text}
     if whole:
         files["calibration.png"] = picture(whole)
     return Report(files, [table(columns, rows), text])

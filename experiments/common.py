@@ -67,11 +67,11 @@ def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | N
     try:
         out = make_folder(values.pop("out"))
         with Progress() as progress:
-            found = report(**values, progress=progress)
-        write(out, found)
+            results = report(**values, progress=progress)
+        write(out, results)
     except InputError as error:
         parser.error(str(error))
-    Console(width=160).print(*found.shown, sep="\n")
+    Console(width=160).print(*results.shown, sep="\n")
 
 
 def write(folder: Path, report: Report) -> None:

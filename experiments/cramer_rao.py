@@ -98,9 +98,9 @@ def errors(
 
         # Starts near the truth, within ten pixels of depth and one pixel: global search is not tested here.
         beside = jnp.array([pixel, pixel, 0.05, 0.2]) * jax.random.normal(start, (4,)) / 2
-        found, _ = jax.lax.scan(scoring, truth + beside, length=STEPS)
+        results, _ = jax.lax.scan(scoring, truth + beside, length=STEPS)
         bound = cramer_rao(truth[None, :3], camera, photons=photons, **OPTIONS)[0]
-        return (found - truth)[:3], bound
+        return (results - truth)[:3], bound
 
     return jax.lax.map(one, jax.random.split(key, draws), batch_size=50)
 
@@ -121,8 +121,8 @@ def run(
     for (name, centers), count in progress.track([(x, n) for x in layouts.items() for n in photons], "Locating"):
         wrong, bound = errors(imager(centers), jax.random.key(1), photons=jnp.array(float(count)), draws=draws)
         rms = lambda x: np.sqrt(np.mean(np.asarray(x) ** 2, axis=0))
-        found = {"bound_um": 1000 * rms(bound), "error_um": 1000 * rms(wrong), "ratio": rms(wrong) / rms(bound)}
-        rows.append({"layout": name, "photons": count} | {key: value.tolist() for key, value in found.items()})
+        results = {"bound_um": 1000 * rms(bound), "error_um": 1000 * rms(wrong), "ratio": rms(wrong) / rms(bound)}
+        rows.append({"layout": name, "photons": count} | {key: value.tolist() for key, value in results.items()})
     return {
         "draws": draws,
         "rows": rows,
@@ -131,19 +131,19 @@ def run(
     }
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot errors and bounds in x and z against photons, and the layouts."""
     figure = Figure(figsize=(11, 3.6), dpi=100, layout="constrained")
     *plots, right = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1))
-    for color, name in zip(("C0", "C3"), found["centers_mm"], strict=True):
-        rows = [row for row in found["rows"] if row["layout"] == name]
+    for color, name in zip(("C0", "C3"), results["centers_mm"], strict=True):
+        rows = [row for row in results["rows"] if row["layout"] == name]
         for axes, axis, label in zip(plots, (0, 2), "xz", strict=True):
             photons = [row["photons"] for row in rows]
             axes.loglog(photons, [row["bound_um"][axis] for row in rows], color=color, label=f"{name}, bound")
             axes.loglog(photons, [row["error_um"][axis] for row in rows], "o", color=color, label=f"{name}, found")
             axes.set(xlabel="photons of a lens on its axis", ylabel=f"error in {label}, RMS, um")
             axes.grid(which="both", alpha=0.25)
-        right.plot(*np.transpose(found["centers_mm"][name]), "o", color=color, label=name, fillstyle="none")
+        right.plot(*np.transpose(results["centers_mm"][name]), "o", color=color, label=name, fillstyle="none")
     plots[0].legend()
     right.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(-2.7, 2.7), ylim=(-2.7, 2.7))
     return figure
@@ -152,14 +152,14 @@ def picture(found: dict) -> Figure:
 def report(progress: Progress) -> Report:
     # The second derivatives of a bright point's likelihood span more than the range of float32.
     jax.config.update("jax_enable_x64", True)
-    found = run(progress=progress)
+    results = run(progress=progress)
     triple = lambda row, key: " ".join(f"{x:.3g}" for x in row[key])
     rows = [
         [row["layout"], str(row["photons"]), *(triple(row, key) for key in ("bound_um", "error_um", "ratio"))]
-        for row in found["rows"]
+        for row in results["rows"]
     ]
     shown = table(("layout", "photons", "bound x, y, z, um", "error x, y, z, um", "ratio x, y, z"), rows)
-    return Report({"cramer_rao.json": found, "cramer_rao.png": picture(found)}, [shown])
+    return Report({"cramer_rao.json": results, "cramer_rao.png": picture(results)}, [shown])
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def run(
     """Return the scale by source and depth, its value by Eq. (1), and the residuals of the line."""
     imager = design.imager()
     point = lambda depth: np.array([[0.0, 0.0, depth, 1e6]])
-    found = {
+    results = {
         "our tracer": [
             measured(traced(point(depth), imager, rays), imager, depth) for depth in progress.track(depths, "Tracing")
         ]
@@ -46,8 +46,8 @@ def run(
     if data is not None:
         captured = lambda name: read_capture(data / f"P1_{name}.tif", imager.sensor.shape).astype(np.float64)
         names = sorted(path.stem.removeprefix("P1_") for path in data.glob("P1_i_*_c.tif"))
-        found["another group's"] = [measured(captured(n), imager, float(points_of(data, n)[0, 2])) for n in names]
-    return found
+        results["another group's"] = [measured(captured(n), imager, float(points_of(data, n)[0, 2])) for n in names]
+    return results
 
 
 def measured(image: np.ndarray, imager: Imager, depth: float) -> dict:
@@ -69,18 +69,18 @@ def measured(image: np.ndarray, imager: Imager, depth: float) -> dict:
     return row | {"plate_left_out": thin, "rms_um": 1000 * float(np.sqrt((off**2).sum(1).mean()))}
 
 
-def picture(found: dict[str, list[dict]]) -> Figure:
+def picture(results: dict[str, list[dict]]) -> Figure:
     """Plot the scale against depth, and its difference from Eq. (1)."""
     figure = Figure(figsize=(9.5, 3.8), dpi=100, layout="constrained")
     left, right = figure.subplots(1, 2)
-    ours = next(iter(found.values()))
+    ours = next(iter(results.values()))
     column = lambda rows, key: np.array([row[key] for row in rows])
     depths = column(ours, "depth_mm")
     left.plot(depths, column(ours, "by_eq_1"), "-", color="black", label="Eq. (1), the plate as air")
     left.plot(depths, column(ours, "plate_left_out"), ":", color="black", label="Eq. (1), the plate left out")
     line = np.polynomial.Polynomial.fit(depths, column(ours, "by_eq_1"), 1)(depths)
     right.plot(depths, 1000 * (line - column(ours, "by_eq_1")), "--", color="0.5", label='a line ("scales linearly")')
-    for (source, rows), marker in zip(found.items(), "os", strict=False):
+    for (source, rows), marker in zip(results.items(), "os", strict=False):
         left.plot(column(rows, "depth_mm"), column(rows, "s_z"), marker, label=f"measured, {source}")
         error = 1000 * (column(rows, "s_z") - column(rows, "by_eq_1"))
         right.plot(column(rows, "depth_mm"), error, marker + "-", label=f"measured, {source}")
@@ -93,10 +93,10 @@ def picture(found: dict[str, list[dict]]) -> Figure:
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    found = run(design_of(data), data, progress=progress)
+    results = run(design_of(data), data, progress=progress)
     columns = ("captures", "depth, mm", "spots", "s_z", "by Eq. (1)", "without the plate", "off the line, um RMS")
-    rows = [[source, *(f"{x:.5g}" for x in row.values())] for source, each in found.items() for row in each]
-    return Report({"depth_scaling.json": found, "depth_scaling.png": picture(found)}, [table(columns, rows)])
+    rows = [[source, *(f"{x:.5g}" for x in row.values())] for source, each in results.items() for row in each]
+    return Report({"depth_scaling.json": results, "depth_scaling.png": picture(results)}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

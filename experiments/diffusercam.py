@@ -76,11 +76,11 @@ def ours(psf: np.ndarray, image: np.ndarray, method: str, steps: int):
 def theirs(python: str, psf: np.ndarray, image: np.ndarray, steps: int) -> tuple[float, np.ndarray]:
     """Run LenslessPiCam; return its seconds per step and its scene."""
     with tempfile.TemporaryDirectory() as folder:
-        given, found = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        given, results = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(given, psf=psf, image=image)
         script = str(Path(__file__).with_name("diffusercam_peer.py"))
-        subprocess.run([python, script, str(given), str(found), str(steps)], check=True, capture_output=True)
-        result = np.load(found)
+        subprocess.run([python, script, str(given), str(results), str(steps)], check=True, capture_output=True)
+        result = np.load(results)
         return float(result["seconds"]), result["scene"]
 
 
@@ -103,12 +103,12 @@ def run(
         for method in ("ADMM", "Richardson-Lucy", "FISTA"):
             with progress.step(f"{method}, 1/{factor}"):
                 compile_s, call = ours(psf, image, method, some)
-                spent, found = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
-            scene = np.asarray(found["gs_jax"][0])
+                spent, results = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
+            scene = np.asarray(results["gs_jax"][0])
             common = {"factor": factor, "pixels": image.size, "steps": some, "method": method}
             window = Convolution.of(psf[None], image.shape).window
             for name, seconds in spent.items():
-                x = scene if name == "gs_jax" else found[name]
+                x = scene if name == "gs_jax" else results[name]
                 cost = float(objective(*map(jnp.asarray, (psf, image, x)))) if method != "Richardson-Lucy" else None
                 times = {"ms_a_step": 1000 * float(np.median(seconds)), "fastest_ms_a_step": 1000 * min(seconds)}
                 rows.append(common | {"code": name, **times, "final_cost": cost})
@@ -121,14 +121,14 @@ def run(
 
 def _rounds(call, peer, psf, image, steps, count):
     """Seconds per step in each round, ours and theirs interleaved, and the results."""
-    found = {"gs_jax": call()}
+    results = {"gs_jax": call()}
     seconds: dict[str, list[float]] = {"gs_jax": []}
     for _ in range(count):
         seconds["gs_jax"].append(timed(call)[0] / steps)
         if peer:
-            spent, found["LenslessPiCam"] = theirs(peer, psf, image, steps)
+            spent, results["LenslessPiCam"] = theirs(peer, psf, image, steps)
             seconds.setdefault("LenslessPiCam", []).append(spent)
-    return seconds, found
+    return seconds, results
 
 
 def picture(pictures: dict[str, np.ndarray]) -> Figure:
@@ -147,14 +147,14 @@ def picture(pictures: dict[str, np.ndarray]) -> Figure:
 
 
 def report(data: Path, peer: str | None, progress: Progress) -> Report:
-    found, pictures = run(data, peer=peer, progress=progress)
+    results, pictures = run(data, peer=peer, progress=progress)
     rows = []
-    for row in found["rows"]:
+    for row in results["rows"]:
         cost = "" if row["final_cost"] is None else f"{row['final_cost']:.3e}"
         times = f"{row['ms_a_step']:.1f}", f"{row['fastest_ms_a_step']:.1f}"
         rows.append([str(row["factor"]), row["method"], row["code"], str(row["steps"]), *times, cost])
     shown = table(("factor", "method", "code", "steps", "ms a step", "fastest", "final cost"), rows)
-    return Report({"diffusercam.json": found, "diffusercam.png": picture(pictures)}, [shown])
+    return Report({"diffusercam.json": results, "diffusercam.png": picture(pictures)}, [shown])
 
 
 if __name__ == "__main__":

@@ -36,16 +36,16 @@ def run(design: Design, data: Path | None, *, progress: Progress) -> dict:
     images = {"gs_jax": lambda name: _simulated(SCENES[name], imager, progress)}
     if data is not None:
         images["ray-traced"] = lambda name: _captured(data / f"P1_{name}.tif", imager)
-    found = {}
+    results = {}
     for source, image in images.items():
         lines = {name: through_peak(*around_the_axis(image(name), imager, 20.0)) for name in SCENES}
-        found[source] = {"profiles": lines} | {
+        results[source] = {"profiles": lines} | {
             "lateral_fwhm_um": 1000 * max(fwhm(*lines["a"]["x"]), fwhm(*lines["a"]["y"])),
             "axial_fwhm_um": 1000 * fwhm(*lines["a"]["z"]),
             "lateral_dip": dip(*lines["b"]["x"]),
             "axial_dip": dip(*lines["c"]["z"]),
         }
-    return found
+    return results
 
 
 def _simulated(points, imager, progress):
@@ -56,13 +56,13 @@ def _captured(path, imager):
     return read_capture(path, imager.sensor.shape).astype(np.float32) - 16
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot the profiles of all sources."""
     panels = (("a", "x", "one point, laterally"), ("a", "z", "one point, axially"))
     panels += (("b", "x", "two points 40 um apart"), ("c", "z", "two points 300 um apart"))
     figure = Figure(figsize=(9, 6), dpi=100, layout="constrained")
     for axes, (scene, axis, title) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        for (source, result), style in zip(found.items(), ("-", "--"), strict=False):
+        for (source, result), style in zip(results.items(), ("-", "--"), strict=False):
             coordinate, profile = result["profiles"][scene][axis]
             axes.plot(coordinate * (1000 if axis == "x" else 1), profile, style, label=source)
         axes.axhline(0.5 if scene == "a" else 0.85, color="gray", lw=0.8, ls=":")
@@ -76,16 +76,16 @@ def picture(found: dict) -> Figure:
     return figure
 
 
-def numbers(found: dict) -> dict:
+def numbers(results: dict) -> dict:
     """Results without the profiles."""
-    return {source: {key: result[key] for key in BARS} for source, result in found.items()}
+    return {source: {key: result[key] for key in BARS} for source, result in results.items()}
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    found = run(design_of(data), data, progress=progress)
-    rows = [[key, f"{bar:g}", *(f"{result[key]:.3g}" for result in found.values())] for key, bar in BARS.items()]
-    shown = table(("", "at most", *found), rows, "Resolution of back-projection at 20 mm")
-    return Report({"fig3.json": numbers(found), "fig3.png": picture(found)}, [shown])
+    results = run(design_of(data), data, progress=progress)
+    rows = [[key, f"{bar:g}", *(f"{result[key]:.3g}" for result in results.values())] for key, bar in BARS.items()]
+    shown = table(("", "at most", *results), rows, "Resolution of back-projection at 20 mm")
+    return Report({"fig3.json": numbers(results), "fig3.png": picture(results)}, [shown])
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def _compare(truth, capture, design, grid, progress) -> dict:
     search = lambda: find_points(capture, imager, grid, progress=progress)
     (first, points["find_points"]), again = timed(search), [timed(search)[0] for _ in range(_ROUNDS)]
     expected = np.asarray(rasterize(truth, grid))
-    scores = {name: _scores(found, truth, expected, grid) for name, found in points.items()}
+    scores = {name: _scores(detections, truth, expected, grid) for name, detections in points.items()}
     scores["find_points"] |= {"first_s": first, "again_s": float(np.median(again))}
     scores["plain back-projection"] = quality(volume, expected)._asdict()
     stacks = {"back-projection": volume, "find_points": np.asarray(rasterize(points["find_points"], grid))}
@@ -76,7 +76,7 @@ def _compare(truth, capture, design, grid, progress) -> dict:
 
 
 def _best(method: Callable[[float], np.ndarray], truth: np.ndarray) -> np.ndarray:
-    return max(map(method, THRESHOLDS), key=lambda found: localization(found, truth).f1)
+    return max(map(method, THRESHOLDS), key=lambda detections: localization(detections, truth).f1)
 
 
 def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
@@ -85,14 +85,14 @@ def _peaks(volume: np.ndarray, grid: Grid, threshold: float) -> np.ndarray:
     return local_maxima(above, grid, threshold_rel=threshold)
 
 
-def _scores(found, truth, expected, grid) -> dict:
-    score = localization(found, truth)
-    stack = quality(np.asarray(rasterize(found, grid)), expected)
-    a, b = found[score.pairs[:, 0]], truth[score.pairs[:, 1]]
+def _scores(detections, truth, expected, grid) -> dict:
+    score = localization(detections, truth)
+    stack = quality(np.asarray(rasterize(detections, grid)), expected)
+    a, b = detections[score.pairs[:, 0]], truth[score.pairs[:, 1]]
     ratio = a[:, 3] / b[:, 3]
     paired = len(ratio) > 0
     return {
-        "found": len(found),
+        "found": len(detections),
         "precision": score.precision,
         "recall": score.recall,
         "f1": score.f1,

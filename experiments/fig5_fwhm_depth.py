@@ -31,11 +31,11 @@ def run(design: Design, data: Path | None, *, depths: Sequence[float] = DEPTHS, 
     """Return widths (um) against depth, and the depth ranges within the paper's 40 and 300 um."""
     imager = design.imager()
     images = {z: _simulated(z, imager, progress) for z in progress.track(depths, "Depths")}
-    found = {"gs_jax": [_widths(image, imager, z) for z, image in images.items()]}
+    results = {"gs_jax": [_widths(image, imager, z) for z, image in images.items()]}
     if data is not None:
         read = lambda name: read_capture(data / name, imager.sensor.shape).astype(np.float32) - 16
-        found["ray-traced"] = [_widths(read(name), imager, z) for z, name in CAPTURES.items()]
-    return found
+        results["ray-traced"] = [_widths(read(name), imager, z) for z, name in CAPTURES.items()]
+    return results
 
 
 def _simulated(depth, imager, progress):
@@ -53,11 +53,11 @@ def _widths(image: np.ndarray, imager: Imager, depth: float) -> dict[str, float]
     }
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot lateral and axial width against depth."""
     figure = Figure(figsize=(9, 3.6), dpi=100, layout="constrained")
     for axes, key, bar in zip(figure.subplots(1, 2), ("lateral_fwhm_um", "axial_fwhm_um"), (40, 300), strict=True):
-        for (source, rows), style in zip(found.items(), ("o-", "s"), strict=False):
+        for (source, rows), style in zip(results.items(), ("o-", "s"), strict=False):
             axes.plot([row["depth_mm"] for row in rows], [row[key] for row in rows], style, label=source)
         axes.axhline(bar, color="gray", ls=":", label="the paper's design")
         axes.set(xlabel="depth, mm", ylabel=f"{key.split('_')[0]} FWHM, um", ylim=(0, 2 * bar))
@@ -66,12 +66,12 @@ def picture(found: dict) -> Figure:
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    found = run(design_of(data), data, progress=progress)
+    results = run(design_of(data), data, progress=progress)
     shown = [
         table([key.replace("_", " ") for key in rows[0]], [[f"{x:.4g}" for x in row.values()] for row in rows], source)
-        for source, rows in found.items()
+        for source, rows in results.items()
     ]
-    return Report({"fig5.json": found, "fig5.png": picture(found)}, shown)
+    return Report({"fig5.json": results, "fig5.png": picture(results)}, shown)
 
 
 if __name__ == "__main__":

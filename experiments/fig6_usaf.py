@@ -115,31 +115,31 @@ def contrast(across: np.ndarray, values: np.ndarray) -> float:
     return float((bar - gap) / (bar + gap))
 
 
-def numbers(found: dict) -> list[dict]:
+def numbers(results: dict) -> list[dict]:
     """For each depth of the target: the sharpest plane, and the finest resolved element in the target's own plane."""
     elements, rows = target(), []
     number = next(i for i, e in enumerate(elements) if (e.group, e.number) == (3, 2))
-    for k, depth in enumerate(found["depths"]):
-        each, own = found["contrast"][k, :, number].mean(-1), found["contrast"][k, k]
+    for k, depth in enumerate(results["depths"]):
+        each, own = results["contrast"][k, :, number].mean(-1), results["contrast"][k, k]
         resolved = [e for e, both in zip(elements, own, strict=True) if both.min() >= RESOLVED]
         finest = max(resolved, key=lambda e: e.pairs, default=None)
-        row = {"target_mm": depth, "sharpest_mm": found["depths"][int(each.argmax())]}
+        row = {"target_mm": depth, "sharpest_mm": results["depths"][int(each.argmax())]}
         row |= {"vertical": float(own[number, 0]), "horizontal": float(own[number, 1])}
         rows.append(row | {"finest": f"group {finest.group}, element {finest.number}" if finest else "none"})
     return rows
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot a row per depth of the target and a column per plane, with lines of group 3, element 2 beside them."""
-    depths, grid, elements = found["depths"], found["grid"], target()
+    depths, grid, elements = results["depths"], results["grid"], target()
     extent, count = grid.extent, len(depths)
     figure = Figure(figsize=(13.5, 8.6), dpi=75, layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=(2, 1))
     planes, beside = halves
     for k, row in enumerate(planes.subplots(count, count, squeeze=False)):
-        high = float(np.quantile(found["volumes"][k], 0.9995))
+        high = float(np.quantile(results["volumes"][k], 0.9995))
         for j, axes in enumerate(row):
-            draw_image(axes, found["volumes"][k, j], extent, high=high, upward=True)
+            draw_image(axes, results["volumes"][k, j], extent, high=high, upward=True)
             if k == 0:
                 axes.set_title(f"{depths[j]:g} mm", fontsize=9)
             if j == k:
@@ -152,9 +152,9 @@ def picture(found: dict) -> Figure:
     )
     element = next(e for e in elements if (e.group, e.number) == (3, 2))
     image, lines, depth = beside.subplots(3, 1)
-    _draw_zoom(image, found["volumes"][0, 0], grid, element)
+    _draw_zoom(image, results["volumes"][0, 0], grid, element)
     for direction, name in enumerate(("vertical bars", "horizontal bars")):
-        across, values = profile(found["volumes"][0, 0], grid, element, direction)
+        across, values = profile(results["volumes"][0, 0], grid, element, direction)
         lines.plot(across * 1000 * element.width, values / values.max(), "-", label=name)
     for start in (0, 2, 4):
         lines.axvspan(1000 * start * element.width, 1000 * (start + 1) * element.width, color="0.9", zorder=0)
@@ -163,7 +163,7 @@ def picture(found: dict) -> Figure:
     lines.legend(loc="lower center", ncols=2, fontsize=8)
     for group, number, style in ((2, 2, "o-"), (3, 2, "s-"), (3, 4, "^-"), (3, 6, "v-")):
         at = next(i for i, e in enumerate(elements) if (e.group, e.number) == (group, number))
-        own = [found["contrast"][k, k, at].mean() for k in range(count)]
+        own = [results["contrast"][k, k, at].mean() for k in range(count)]
         depth.plot(depths, own, style, label=f"{elements[at].pairs:.1f} pairs/mm ({group}-{number})")
     depth.axhline(RESOLVED, color="gray", ls=":")
     depth.set(xlabel="depth of target and plane, mm", ylabel="contrast", ylim=(0, None))
@@ -189,11 +189,11 @@ def _draw_zoom(axes, plane: np.ndarray, grid: Grid, element: Element) -> None:
 
 
 def report(progress: Progress) -> Report:
-    found = run(geomscope(), progress=progress)
-    rows = numbers(found)
+    results = run(geomscope(), progress=progress)
+    rows = numbers(results)
     columns = ("target, mm", "sharpest plane, mm", "contrast of 3-2, vertical", "horizontal", "finest resolved")
     lines = [[f"{x:.3g}" if isinstance(x, float) else x for x in row.values()] for row in rows]
-    return Report({"fig6.json": rows, "fig6.png": picture(found)}, [table(columns, lines)])
+    return Report({"fig6.json": rows, "fig6.png": picture(results)}, [table(columns, lines)])
 
 
 if __name__ == "__main__":

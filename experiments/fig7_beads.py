@@ -43,9 +43,9 @@ def run(design: Design, data: Path | None, *, count=300, progress: Progress) -> 
     grid = Grid.over(design.imager().sensor, depths=np.arange(17, 23.001, 0.25), pitch=0.03)
     results = {}
     for name, (truth, capture) in scenes.items():
-        found = find_points(capture, design.imager(), grid, progress=progress)
-        score = {"points": len(truth), "found": len(found)} | scores([(found, truth)])
-        results[name] = {"truth": truth, "capture": capture, "found": found, "scores": score}
+        detections = find_points(capture, design.imager(), grid, progress=progress)
+        score = {"points": len(truth), "found": len(detections)} | scores([(detections, truth)])
+        results[name] = {"truth": truth, "capture": capture, "found": detections, "scores": score}
         results[name]["extent"] = design.imager().sensor.extent
     return results
 
@@ -67,7 +67,7 @@ def picture(results: dict) -> Figure:
     depths = np.concatenate([result["truth"][:, 2] for result in results.values()])
     shades: dict[str, Any] = {"cmap": "viridis", "vmin": depths.min(), "vmax": depths.max()}
     for axes, (name, result) in zip(rows, results.items(), strict=True):
-        capture, found, truth = result["capture"], result["found"], result["truth"]
+        capture, detections, truth = result["capture"], result["found"], result["truth"]
         brightest = block_reduce(capture, SHOWN, np.max)
         draw_image(
             axes[0], brightest, result["extent"], low=float(capture.min()), high=float(np.quantile(brightest, 0.99))
@@ -76,11 +76,11 @@ def picture(results: dict) -> Figure:
         for axis, (i, j) in zip(axes[1:], ((0, 1), (0, 2)), strict=True):
             rings = dict(facecolors="none", edgecolors="tab:gray", lw=0.7)
             axis.scatter(truth[:, i], truth[:, j], s=40, label="truth", **rings)
-            axis.scatter(found[:, i], found[:, j], s=7, c=found[:, 2], label="found", **shades)
+            axis.scatter(detections[:, i], detections[:, j], s=7, c=detections[:, 2], label="found", **shades)
             axis.set(xlabel="x, mm", ylabel="xyz"[j] + ", mm")
             axis.invert_yaxis()
         axes[1].set_aspect("equal")
-        axes[1].set_title(f"{len(found)} found of {len(truth)}, F1 {result['scores']['f1']:.3f}")
+        axes[1].set_title(f"{len(detections)} found of {len(truth)}, F1 {result['scores']['f1']:.3f}")
     figure.colorbar(rows[0, 2].collections[1], ax=rows[:, 2], label="depth, mm")
     handles, labels = rows[0, 2].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower right", ncols=2)

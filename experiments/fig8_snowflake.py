@@ -106,17 +106,17 @@ def _of_noise(imager: Imager, grid: Grid, progress: Progress) -> dict:
 
     The captures are dark with read noise, and uniformly lit with shot noise.
     """
-    found = {name: {} for name in ("dark", "evenly lit")}
-    for name, image in zip(found, (np.zeros, np.ones), strict=True):
+    results = {name: {} for name in ("dark", "evenly lit")}
+    for name, image in zip(results, (np.zeros, np.ones), strict=True):
         counts = expose(image(imager.sensor.shape, np.float32), Camera(), jax.random.key(1), peak_electrons=100)
         volume = _back_projected(np.asarray(counts), imager, grid, progress)
         for method in NETWORKS:
             made = METHODS[method](volume)
-            found[name][method] = {
+            results[name][method] = {
                 "largest_by_sd": float(made.max() / volume.std()),
                 "rms_by_rms": float(np.sqrt(np.mean(made**2) / np.mean(volume**2))),
             }
-    return found
+    return results
 
 
 def _seconds(rounds: int = 5) -> dict:
@@ -131,9 +131,9 @@ def _seconds(rounds: int = 5) -> dict:
     return {name: float(np.median(times[1:])) for name, times in taken.items()}
 
 
-def numbers(found: dict) -> dict:
+def numbers(results: dict) -> dict:
     """Results without the volumes."""
-    return found | {"scenes": {name: scene["scores"] for name, scene in found["scenes"].items()}}
+    return results | {"scenes": {name: scene["scores"] for name, scene in results["scenes"].items()}}
 
 
 def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upward: bool = False) -> Figure:
@@ -161,10 +161,10 @@ def picture(scene: dict, shown: tuple[float, ...] = (18.0, 20.0, 22.0), *, upwar
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    found = run(design_of(data), data, progress=progress)
-    files: dict[str, Any] = {"fig8.json": numbers(found)}
+    results = run(design_of(data), data, progress=progress)
+    files: dict[str, Any] = {"fig8.json": numbers(results)}
     tables = []
-    for name, scene in found["scenes"].items():
+    for name, scene in results["scenes"].items():
         shown = (18.0,) if "USAF" in name else (18.0, 20.0, 22.0)
         files[f"{name.replace(', ', '_').replace(' ', '_')}.png"] = picture(scene, shown, upward="ray-traced" in name)
         base = scene["scores"]["back-projection"]["mse"]
@@ -173,7 +173,7 @@ def report(data: Path | None, progress: Progress) -> Report:
             for method, s in scene["scores"].items()
         ]
         tables.append(table(("method", "PSNR, dB", "SSIM", "MSE", "MSE, of back-projection's"), rows, name))
-    return Report(files, [*tables, JSON.from_data({key: found[key] for key in ("noise", "seconds_per_slice")})])
+    return Report(files, [*tables, JSON.from_data({key: results[key] for key in ("noise", "seconds_per_slice")})])
 
 
 if __name__ == "__main__":

@@ -161,12 +161,12 @@ def best_f1(result: Result, s: Scene) -> float | None:
     """F1 of the number of brightest points that scores best."""
     if s.points is None:
         return None
-    found = result.points
-    if found is None:
-        found = local_maxima(result.volume, s.grid, min_distance=1, threshold_rel=DARKEST)
-    found = found[np.argsort(-found[:, 3], kind="stable")]
-    numbers = np.unique(np.geomspace(1, max(len(found), 1), 100).round().astype(int))
-    return max(localization(found[:n], s.points, axial=0.6).f1 for n in numbers)
+    results = result.points
+    if results is None:
+        results = local_maxima(result.volume, s.grid, min_distance=1, threshold_rel=DARKEST)
+    results = results[np.argsort(-results[:, 3], kind="stable")]
+    numbers = np.unique(np.geomspace(1, max(len(results), 1), 100).round().astype(int))
+    return max(localization(results[:n], s.points, axial=0.6).f1 for n in numbers)
 
 
 def run(
@@ -186,11 +186,11 @@ def run(
     return {"rows": rows}, pictures
 
 
-def markdown(found: dict) -> str:
+def markdown(results: dict) -> str:
     head = ("scene", "method", "s, with compilation", "PSNR, dB", "SSIM", "MSE", "F1", "imaged again")
     pretty = lambda value, form: "-" if value is None else format(value, form)
     forms = {"seconds": ".1f", "psnr_db": ".2f", "ssim": ".3f", "mse": ".2e", "f1": ".2f", "reprojection": ".3f"}
-    rows = [[r["scene"], r["method"], *(pretty(r[key], form) for key, form in forms.items())] for r in found["rows"]]
+    rows = [[r["scene"], r["method"], *(pretty(r[key], form) for key, form in forms.items())] for r in results["rows"]]
     return markdown_table(head, rows) + "\n"
 
 
@@ -218,9 +218,9 @@ def report(data: Path, scenes: str, weights: Path | None, progress: Progress) ->
     if unknown := [name for name in names if name not in SCENES]:
         raise InputError(f"--scenes: found {', '.join(unknown)}, allowed: {', '.join(SCENES)}.")
     networks = read_unrolled(weights) if weights else Unrolled.pretrained()
-    found, pictures = run(data, networks, names, progress=progress)
-    text = markdown(found)
-    return Report({"captures.json": found, "captures.md": text, "captures.png": picture(pictures)}, [text])
+    results, pictures = run(data, networks, names, progress=progress)
+    text = markdown(results)
+    return Report({"captures.json": results, "captures.md": text, "captures.png": picture(pictures)}, [text])
 
 
 if __name__ == "__main__":

@@ -105,29 +105,29 @@ def _psf(job: Job) -> jax.Array:
 
 
 def _in_turns(calls, rounds):
-    found, ready = {}, {}
+    results, ready = {}, {}
     for name, (function, arguments) in calls.items():
         compile_s, compiled = timed(lambda f=function, a=arguments: f.lower(*a).compile())
         ready[name] = lambda c=compiled, a=arguments: jax.block_until_ready(c(*a))
         ready[name]()
         memory = compiled.memory_analysis()
         mib = (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 2**20
-        found[name] = {"median_s": [], "compile_s": compile_s, "mib": mib}
+        results[name] = {"median_s": [], "compile_s": compile_s, "mib": mib}
     for _ in range(rounds):
         for name, call in ready.items():
-            found[name]["median_s"].append(timed(call)[0])
+            results[name]["median_s"].append(timed(call)[0])
     median = lambda values: {"median_s": float(np.median(values))}
     return {
         name: numbers | {"rounds_s": numbers["median_s"]} | median(numbers["median_s"])
-        for name, numbers in found.items()
+        for name, numbers in results.items()
     }
 
 
-def bars(found: Mapping[str, Mapping]) -> list[list[str]]:
+def bars(results: Mapping[str, Mapping]) -> list[list[str]]:
     """Compare Eq. (2) by tiles and by whole images with its targets, in interleaved rounds."""
     rows = []
     for what in ("", ", adjoint", ", Richardson-Lucy step"):
-        before, now = (found[model + what]["rounds_s"] for model in (WHOLE, "near"))
+        before, now = (results[model + what]["rounds_s"] for model in (WHOLE, "near"))
         ratio, bar = float(np.median(np.array(before) / np.array(now))), None if what else 2
         met = "" if bar is None else "yes" if ratio >= bar else "NO"
         rows.append(
@@ -168,10 +168,10 @@ def run(study: Mapping[str, Sequence[Job]] = STUDY, focused: Job = FOCUSED, *, p
     }
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot time against each size, with the other sizes at full scale."""
     figure = Figure(figsize=(10, 3.2), dpi=100, layout="constrained")
-    for axes, (axis, rows) in zip(figure.subplots(1, 3, sharey=True), found["cost"].items(), strict=True):
+    for axes, (axis, rows) in zip(figure.subplots(1, 3, sharey=True), results["cost"].items(), strict=True):
         axes.loglog([row[axis] for row in rows], [row["median_s"] for row in rows], "o-")
         axes.set_xlabel("pixels along a side" if axis == "pixels" else axis)
         axes.grid(which="both", alpha=0.25)
@@ -180,16 +180,16 @@ def picture(found: dict) -> Figure:
 
 
 def report(progress: Progress) -> Report:
-    found = run(progress=progress)
+    results = run(progress=progress)
     numbers = lambda row: (f"{row['median_s']:.2f}", f"{row['compile_s']:.1f}", f"{row['mib']:.0f}")
     shown = [
         table((axis, "time, s", "compile, s", "memory, MiB"), [[str(row[axis]), *numbers(row)] for row in rows])
-        for axis, rows in found["cost"].items()
+        for axis, rows in results["cost"].items()
     ]
     columns = ("model", "time, s", "compile, s", "memory, MiB")
-    shown.append(table(columns, [[name, *numbers(row)] for name, row in found["levels"].items()]))
-    shown.append(table(("", "found", "bar", "met"), bars(found["levels"]), "Against the bars"))
-    return Report({"forward.json": found, "forward.png": picture(found)}, [*shown, str(found["zones"])])
+    shown.append(table(columns, [[name, *numbers(row)] for name, row in results["levels"].items()]))
+    shown.append(table(("", "found", "bar", "met"), bars(results["levels"]), "Against the bars"))
+    return Report({"forward.json": results, "forward.png": picture(results)}, [*shown, str(results["zones"])])
 
 
 if __name__ == "__main__":

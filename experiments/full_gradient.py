@@ -53,8 +53,8 @@ def run(job: Job | None = None, rounds: int = 3, *, progress: Progress) -> dict:
 
 
 def report(rounds: int, progress: Progress) -> Report:
-    found = run(rounds=rounds, progress=progress)
-    return Report({"full_gradient.json": found}, [str({key: found[key] for key in ("seconds", "ratio", "mib")})])
+    results = run(rounds=rounds, progress=progress)
+    return Report({"full_gradient.json": results}, [str({key: results[key] for key in ("seconds", "ratio", "mib")})])
 
 
 if __name__ == "__main__":

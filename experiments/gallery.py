@@ -59,8 +59,8 @@ _SIDES = (32, 56, 100, 212)
 _EXPONENTS = {"backproject": 0.5, "richardson-lucy, dense": 1.0, "admm, dense": 1.0}
 
 
-def _met(found: bool, why: str) -> str:
-    return "yes" if found else f"no: {why}"
+def _met(results: bool, why: str) -> str:
+    return "yes" if results else f"no: {why}"
 
 
 def _is_within(ours: str, paper: str) -> bool:
@@ -90,8 +90,8 @@ def table_1(data: Path | None, progress: Progress) -> Page:
 
 
 def equation_1(data: Path | None, progress: Progress) -> Page:
-    found = depth_scaling.run(design_of(data), data, progress=progress)
-    rows = [row for each in found.values() for row in each]
+    results = depth_scaling.run(design_of(data), data, progress=progress)
+    rows = [row for each in results.values() for row in each]
     off = max(abs(row["s_z"] / row["by_eq_1"] - 1) for row in rows)
     z, s = np.array([(row["depth_mm"], row["by_eq_1"]) for row in rows]).T
     bent = np.abs(np.polynomial.Polynomial.fit(z, s, 1)(z) - s).max() / np.ptp(s)
@@ -108,13 +108,13 @@ def equation_1(data: Path | None, progress: Progress) -> Page:
             _met(bent < 0.01, "a hyperbola"),
         ),
     ]
-    return Page({"depth_scaling.png": depth_scaling.picture(found)}, claims)
+    return Page({"depth_scaling.png": depth_scaling.picture(results)}, claims)
 
 
 def strehl_ratio(data: Path | None, progress: Progress) -> Page:
     with progress.step("Rays"):
-        found = optics_check.run()
-    rows = found["field"] + found["depth"]
+        results = optics_check.run()
+    rows = results["field"] + results["depth"]
     least = min(row["wavefront_rms_waves"] for row in rows)
     off = max(abs(row["strehl"] - row["strehl_optiland"]) for row in rows)
     by_eq9 = [np.exp(-((2 * np.pi * row["wavefront_rms_waves"]) ** 2)) for row in rows]
@@ -128,29 +128,29 @@ def strehl_ratio(data: Path | None, progress: Progress) -> Page:
             _met(worst < 0.02, f"Eq. (9) holds below 0.1 waves, the lens has {least:.1f} at least"),
         )
     ]
-    return Page({"strehl.png": optics_check.curves(found)}, claims)
+    return Page({"strehl.png": optics_check.curves(results)}, claims)
 
 
 def figure_3(data: Path | None, progress: Progress) -> Page:
-    found = fig3_resolution.run(design_of(data), data, progress=progress)
-    best = found.get("ray-traced", found["gs_jax"])
+    results = fig3_resolution.run(design_of(data), data, progress=progress)
+    best = results.get("ray-traced", results["gs_jax"])
     claim = lambda what, paper, key, form: Claim(
-        "Fig. 3", what, paper, " / ".join(format(each[key], form) for each in found.values()),
+        "Fig. 3", what, paper, " / ".join(format(each[key], form) for each in results.values()),
         _met(best[key] <= fig3_resolution.BARS[key], "wider"),
     )  # fmt: skip
-    sources = " / ".join(found)
+    sources = " / ".join(results)
     claims = [
         claim(f"a point at 20 mm: lateral FWHM, um ({sources})", "~40", "lateral_fwhm_um", ".0f"),
         claim("axial FWHM, um", "~300", "axial_fwhm_um", ".0f"),
         claim("two points 40 um apart: the dip between them", "below ~0.85", "lateral_dip", ".2f"),
         claim("two points 300 um apart axially: the dip", "told apart", "axial_dip", ".2f"),
     ]
-    return Page({"fig3.png": fig3_resolution.picture(found)}, claims)
+    return Page({"fig3.png": fig3_resolution.picture(results)}, claims)
 
 
 def figure_4(data: Path | None, progress: Progress) -> Page:
-    found = list(fig4_suppression.run(design_of(data), data, progress=progress).values())[-1]
-    f1 = lambda method: found["scores"][method]["f1"]
+    results = list(fig4_suppression.run(design_of(data), data, progress=progress).values())[-1]
+    f1 = lambda method: results["scores"][method]["f1"]
     plain, best = f1("the paper's clustering"), f1("clustering, the best")
     said = f"F1 {plain:.2f}, with the best of thresholds {best:.2f}"
     claims = [
@@ -158,12 +158,12 @@ def figure_4(data: Path | None, progress: Progress) -> Page:
               _met(best > 0.95, "light of all lenses and haze reach its thresholds")),
         Claim("Fig. 4A", "the same by find_points", "-", f"F1 {f1('find_points'):.3f}", "ours"),
     ]  # fmt: skip
-    return Page({"fig4.png": fig4_suppression.picture(found)}, claims)
+    return Page({"fig4.png": fig4_suppression.picture(results)}, claims)
 
 
 def figure_5(data: Path | None, progress: Progress) -> Page:
-    found = fig5_fwhm_depth.run(design_of(data), data, depths=tuple(np.arange(17.0, 24.1, 1.0)), progress=progress)
-    rows = found["gs_jax"]
+    results = fig5_fwhm_depth.run(design_of(data), data, depths=tuple(np.arange(17.0, 24.1, 1.0)), progress=progress)
+    rows = results["gs_jax"]
     claims = []
     for key, bar, what in (("lateral_fwhm_um", 40, "lateral"), ("axial_fwhm_um", 300, "axial")):
         within = [row["depth_mm"] for row in rows if row[key] <= bar]
@@ -171,12 +171,12 @@ def figure_5(data: Path | None, progress: Progress) -> Page:
         stable = len(within) > 5
         why = "the sensor distance that is best at 20 mm; sharper there"
         claims.append(Claim("Fig. 5", f"{what} FWHM over ~5 mm of depth", "stable", said, _met(stable, why)))
-    return Page({"fig5.png": fig5_fwhm_depth.picture(found)}, claims)
+    return Page({"fig5.png": fig5_fwhm_depth.picture(results)}, claims)
 
 
 def figure_6(data: Path | None, progress: Progress) -> Page:
-    found = fig6_usaf.run(design_of(data), progress=progress)
-    rows = fig6_usaf.numbers(found)
+    results = fig6_usaf.run(design_of(data), progress=progress)
+    rows = fig6_usaf.numbers(results)
     right = sum(row["sharpest_mm"] == row["target_mm"] for row in rows)
     first = rows[0]
     both = min(first["vertical"], first["horizontal"])
@@ -188,17 +188,17 @@ def figure_6(data: Path | None, progress: Progress) -> Page:
         Claim("Fig. 6", "finest lines told apart, by depth", "-",
               "; ".join(f"{row['target_mm']:g} mm: {row['finest']}" for row in rows), "ours"),
     ]  # fmt: skip
-    return Page({"fig6.png": fig6_usaf.picture(found)}, claims)
+    return Page({"fig6.png": fig6_usaf.picture(results)}, claims)
 
 
 def figure_7(data: Path | None, progress: Progress) -> Page:
-    found = fig7_beads.run(design_of(data), data, progress=progress)
+    results = fig7_beads.run(design_of(data), data, progress=progress)
     claims = []
-    for name, result in found.items():
+    for name, result in results.items():
         score = result["scores"]
         said = f"{score['found']} of {score['points']}, F1 {score['f1']:.3f}, {score['axial_rmse_um']:.0f} um axially"
         claims.append(Claim("Fig. 7", name, "resolved at different depths", said, _met(score["f1"] > 0.95, "missed")))
-    return Page({"fig7.png": fig7_beads.picture(found)}, claims)
+    return Page({"fig7.png": fig7_beads.picture(results)}, claims)
 
 
 def figure_8(data: Path | None, progress: Progress) -> Page:
@@ -285,12 +285,12 @@ PAGES: dict[str, Callable[[Path | None, Progress], Page]] = {
 
 def run(data: Path | None, pages: list[str], *, progress: Progress) -> tuple[dict[str, Page], dict[str, float]]:
     """Return each page, and the seconds it took."""
-    found, seconds = {}, {}
+    results, seconds = {}, {}
     for title in progress.track(pages, "Figures"):
         begun = time.monotonic()
-        found[title] = PAGES[title](data, progress)
+        results[title] = PAGES[title](data, progress)
         seconds[title] = time.monotonic() - begun
-    return found, seconds
+    return results, seconds
 
 
 def markdown(pages: dict[str, Page], seconds: dict[str, float]) -> str:
@@ -310,10 +310,10 @@ def markdown(pages: dict[str, Page], seconds: dict[str, float]) -> str:
 
 def report(data: Path | None, only: str, progress: Progress) -> Report:
     pages = [title for title in PAGES if only.lower() in title.lower()]
-    found, seconds = run(data, pages, progress=progress)
-    pictures = {name: figure for page in found.values() for name, figure in page.pictures.items()}
-    claims = [claim for page in found.values() for claim in page.claims]
-    return Report({"gallery.md": markdown(found, seconds), **pictures}, [table(Claim._fields, claims)])
+    results, seconds = run(data, pages, progress=progress)
+    pictures = {name: figure for page in results.values() for name, figure in page.pictures.items()}
+    claims = [claim for page in results.values() for claim in page.claims]
+    return Report({"gallery.md": markdown(results, seconds), **pictures}, [table(Claim._fields, claims)])
 
 
 if __name__ == "__main__":

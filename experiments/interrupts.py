@@ -84,7 +84,7 @@ def interrupted(arguments: list[str], folder: Path, wait: float) -> dict:
 
 def run(commands: dict[str, str], rounds: int, *, progress: Progress, latest: float = LATEST) -> dict[str, list[dict]]:
     """Run `rounds` commands in total; return the results by command."""
-    rng, found = np.random.default_rng(0), {name: [] for name in commands}
+    rng, results = np.random.default_rng(0), {name: [] for name in commands}
     with tempfile.TemporaryDirectory() as place:
         inputs = Path(place) / "inputs"
         inputs.mkdir()
@@ -99,23 +99,23 @@ def run(commands: dict[str, str], rounds: int, *, progress: Progress, latest: fl
             folder = Path(place) / "run"
             shutil.copytree(inputs, folder)
             arguments = [name.partition(",")[0], *commands[name].split()]
-            found[name].append(interrupted(arguments, folder, float(rng.uniform(0.05, latest))))
+            results[name].append(interrupted(arguments, folder, float(rng.uniform(0.05, latest))))
             shutil.rmtree(folder)
-    return found
+    return results
 
 
 def report(rounds: int, progress: Progress) -> Report:
-    found = run(COMMANDS, rounds, progress=progress)
+    results = run(COMMANDS, rounds, progress=progress)
     columns = ("command", "runs", "interrupted", "as wanted", "longest, s", "other")
     rows = []
-    for name, runs in found.items():
+    for name, runs in results.items():
         ended = [each for each in runs if each["took_s"] > 0]
         bad = "; ".join(f"status {each['status']} after {each['took_s']:.1f} s" for each in runs if not each["good"])
         longest = max((each["took_s"] for each in ended), default=0.0)
         good = sum(each["good"] for each in runs)
         rows.append([name, str(len(runs)), str(len(ended)), str(good), f"{longest:.1f}", bad])
     text = "# Interrupts\n\n" + markdown_table(columns, rows) + "\n"
-    return Report({"interrupts.json": found, "interrupts.md": text}, [table(columns, rows)])
+    return Report({"interrupts.json": results, "interrupts.md": text}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ def candidates(study: Study, seed: int) -> Float[np.ndarray, "layout lens 2"]:
     layouts = lambda rng: map(draw, rng.integers(2**31, size=10**5))
     first = layouts(np.random.default_rng(0))
     number = int(stats.mode([len(next(first)) for _ in range(200)]).mode)
-    found = (layout for layout in layouts(np.random.default_rng(1000 + seed)) if len(layout) == number)
-    return np.stack([next(found) for _ in range(study.candidates)])
+    results = (layout for layout in layouts(np.random.default_rng(1000 + seed)) if len(layout) == number)
+    return np.stack([next(results) for _ in range(study.candidates)])
 
 
 def hexagonal(study: Study, seed: int, count: int, pitch: float) -> Float[np.ndarray, "lens 2"]:
@@ -176,12 +176,12 @@ def run(study: Study = Study(), seeds: int = 5, *, progress: Progress) -> dict:
 
 def gains(rows: list[dict]) -> dict[str, dict[str, float | list[float]]]:
     """Gains in PSNR by both methods: over the best of the random layouts, and of ours over the controls."""
-    found = {}
+    results = {}
     for method in METHODS:
         psnr = {name: [row["scores"][name][f"{method}_psnr_db"] for row in rows] for name in NAMES}
         for one, other in PAIRS:
-            found[f"{method}: {one} over {other}"] = gain(psnr[one], psnr[other])
-    return found
+            results[f"{method}: {one} over {other}"] = gain(psnr[one], psnr[other])
+    return results
 
 
 def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float | list[float]]:
@@ -198,13 +198,13 @@ def gain(ours: list[list[float]], others: list[list[float]]) -> dict[str, float 
     }
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot losses of the random layouts, the controls and the optimised layout; and one seed's layouts."""
     figure = Figure(figsize=(17, 3.8), dpi=100, layout="constrained")
     left, *right = figure.subplots(1, 6, width_ratios=(1.6, 1, 1, 1, 1, 1))
     colors = "C0", "C2", "C1", "#009e73", "C4"
     titles = "best of the random", "optimised", "best of uneven rows", "hexagonal", "hexagonal, spread"
-    for row in found["seeds"]:
+    for row in results["seeds"]:
         random, at = row["random_loss_db"], row["seed"]
         left.plot(random, np.full(len(random), at), "|", color="0.5")
         losses = min(random), row["ours_loss_db"], min(row["rows_loss_db"]), *row["hexagonal_loss_db"]
@@ -213,16 +213,16 @@ def picture(found: dict) -> Figure:
     left.set(
         xlabel="loss of the search, dB (better to the left)",
         ylabel="seed",
-        yticks=[row["seed"] for row in found["seeds"]],
+        yticks=[row["seed"] for row in results["seeds"]],
     )
-    left.set_ylim(-0.5, len(found["seeds"]) + 0.8)  # room for the legend
+    left.set_ylim(-0.5, len(results["seeds"]) + 0.8)  # room for the legend
     left.legend(*[x[:5] for x in left.get_legend_handles_labels()], loc="upper center", ncols=2, fontsize=8)
-    half, row = found["study"]["field"] / 2, found["seeds"][0]
+    half, row = results["study"]["field"] / 2, results["seeds"][0]
     for axes, name, color, title in zip(right, NAMES, colors, titles, strict=True):
         score = np.mean(row["scores"][name]["backproject_psnr_db"])
         axes.plot(*np.transpose(row["centers_mm"][name]), "o", color=color)
         axes.plot(*np.array([(-1, -1, 1, 1, -1), (-1, 1, 1, -1, -1)]) * half, "k:")
-        x, y = (side / 2 for side in found["study"]["plate"])
+        x, y = (side / 2 for side in results["study"]["plate"])
         axes.set(xlabel="x, mm", ylabel="y, mm", title=f"{title}\nPSNR {score:.2f} dB", aspect="equal")
         axes.set(xlim=(-1.05 * x, 1.05 * x), ylim=(-1.05 * y, 1.05 * y))
     said = "Layouts of the first seed, lenses as dots, the object dotted; PSNR of back-projection, mean over the scenes"
@@ -231,17 +231,17 @@ def picture(found: dict) -> Figure:
 
 
 def report(seeds: int, progress: Progress) -> Report:
-    found = run(seeds=seeds, progress=progress)
+    results = run(seeds=seeds, progress=progress)
     rows = []
-    for row in found["seeds"]:
+    for row in results["seeds"]:
         losses = row["random_loss_db"]
         numbers = [min(losses), row["ours_loss_db"], min(row["rows_loss_db"]), *row["hexagonal_loss_db"]]
         numbers += [np.mean(row["scores"][name]["backproject_psnr_db"]) for name in NAMES]
         spread = f"{np.mean(losses):.2f} +- {np.std(losses):.2f}"
         rows.append([str(row["seed"]), spread, *(f"{x:.2f}" for x in numbers)])
     columns = "seed", "random: loss, dB", *(f"{name}, dB" for name in NAMES), *(f"{n}: PSNR, dB" for n in NAMES)
-    files = {"layout_gain.json": found, "layout_gain.png": picture(found)}
-    return Report(files, [table(columns, rows), str(found["gains_db"])])
+    files = {"layout_gain.json": results, "layout_gain.png": picture(results)}
+    return Report(files, [table(columns, rows), str(results["gains_db"])])
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
     fine = in_float32(Grid(between, tuple(2 * n for n in grid.shape), KIND.pitch / 2))
     optics = lambda depths: tables(imager, depths, KIND) if level == "full" else optics_of(single, depths, "near")
     of_scene, of_volume = optics(between), optics(DEPTHS)
-    found = []
+    results = []
     for number in range(scenes):
         scene = random_scene(fine.shape, np.random.default_rng(number))
         image = jnp.maximum(forward(scene, single, fine, of_scene), 0)
@@ -89,16 +89,16 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
         light = np.asarray(electrons(counts, camera), np.float32)
         volume = reconstruct(light, single, grid, PinholeRichardsonLucy(steps, accelerate=True), optics=of_volume)
         truth = shared_out(scene, between, DEPTHS)
-        found.append(quality(volume, truth).psnr_db - quality(np.zeros_like(truth), truth).psnr_db)
-    return found
+        results.append(quality(volume, truth).psnr_db - quality(np.zeros_like(truth), truth).psnr_db)
+    return results
 
 
 def report(progress: Progress) -> Report:
-    found = run(progress=progress)
+    results = run(progress=progress)
     columns = ("layout", *(f"gain over empty, {level}, dB" for level in LEVELS))
-    rows = [[name, *(f"{np.mean(found['gain_db'][level][name]):.2f}" for level in LEVELS)] for name in layouts()]
-    text = markdown_table(columns, rows) + f"\nSpearman's rank correlation: {found['rank_correlation']:.2f}\n"
-    return Report({"layout_light.json": found, "layout_light.md": text}, [table(columns, rows), text])
+    rows = [[name, *(f"{np.mean(results['gain_db'][level][name]):.2f}" for level in LEVELS)] for name in layouts()]
+    text = markdown_table(columns, rows) + f"\nSpearman's rank correlation: {results['rank_correlation']:.2f}\n"
+    return Report({"layout_light.json": results, "layout_light.md": text}, [table(columns, rows), text])
 
 
 if __name__ == "__main__":

@@ -84,16 +84,16 @@ def imaged_noise(volume: np.ndarray, e: Example) -> float:
 def run(networks: Unrolled, scenes: int, kind: Kind = UNROLLED, *, progress: Progress) -> dict[str, dict]:
     """Return `gains` of the scenes with an object, dB, and `noise` of the others, by method."""
     by_name = methods(networks, progress)
-    found = {name: {"gains": [], "noise": []} for name in by_name}
+    results = {name: {"gains": [], "noise": []} for name in by_name}
     for number in progress.track(range(scenes), "Scenes"):
         e = example(SEED, number, kind)
         for name, method in by_name.items():
             volume = method(e)
             if e.truth.any():
-                found[name]["gains"].append(gain(volume, e))
+                results[name]["gains"].append(gain(volume, e))
             else:
-                found[name]["noise"].append(imaged_noise(volume, e))
-    return found
+                results[name]["noise"].append(imaged_noise(volume, e))
+    return results
 
 
 def interval(values: list[float]) -> tuple[float, float]:
@@ -107,15 +107,15 @@ def interval(values: list[float]) -> tuple[float, float]:
 def report(scenes: int, weights: Path | None, progress: Progress) -> Report:
     if scenes < 1:
         raise InputError(f"--scenes: found {scenes}, allowed: 1 or more.")
-    found = run(read_unrolled(weights) if weights else Unrolled.pretrained(), scenes, progress=progress)
+    results = run(read_unrolled(weights) if weights else Unrolled.pretrained(), scenes, progress=progress)
     columns = ("method", "gain, dB", "95 %", "worst, dB", "noise imaged again, of its SD")
     rows = []
-    for name, values in found.items():
+    for name, values in results.items():
         gains, low_high = values["gains"], "{:.1f} to {:.1f}".format(*interval(values["gains"]))
         noise = " ".join(f"{each:.2f}" for each in values["noise"])
         rows.append([name, f"{np.mean(gains):.1f}", low_high, f"{min(gains):.1f}", noise])
     text = "# Learned inversion, held-out simulated captures\n\n" + markdown_table(columns, rows) + "\n"
-    return Report({"learned.json": found, "learned.md": text}, [table(columns, rows)])
+    return Report({"learned.json": results, "learned.md": text}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

@@ -94,18 +94,18 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
     design, study = posed(kind, span, steps)
     sweep = sweep_of(design, study)
     search, judge = searcher(sweep), judge_of(design, study)
-    first, found = start_values(sweep.problem.imager, sweep.problem.at), []
+    first, results = start_values(sweep.problem.imager, sweep.problem.at), []
     for number, light in enumerate(lights):
         limits = limits_of(light, span, design)
-        start = found[-1]["values"] if found else first
+        start = results[-1]["values"] if results else first
         if followed:
             start = spread(followed[number]["values"], first)
         point = search((number, limits, start))
         (between, width), searched = judge(point.values), decibels(point.rows[0].high)
         errors = {"error_db": together(searched, between), "searched_db": searched, "between_db": between}
         record = {"light_percent": light, "off_target": off_target(point, sweep, limits), "values": point.values}
-        found.append(record | errors | {"width_um": width})
-    return found
+        results.append(record | errors | {"width_um": width})
+    return results
 
 
 def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, Study]:
@@ -168,20 +168,20 @@ def decibels(error: float) -> float:
 
 def run(spans=SPANS, lights=LIGHTS, kinds=tuple(KINDS), steps: int = STEPS, *, progress: Progress) -> list[dict]:
     """Return for each span the results by lens type, one record per share of the light."""
-    found = [{"span_mm": span, "fronts": {}} for span in spans]
-    cases = [(row, name) for row in found for name in kinds]
+    results = [{"span_mm": span, "fronts": {}} for span in spans]
+    cases = [(row, name) for row in results for name in kinds]
     for row, name in progress.track(cases, "Fronts"):
         kind = KINDS[name]
         followed = row["fronts"].get(kind.follows)
         row["fronts"][name] = front(kind, row["span_mm"], lights, followed, steps)
-    return found
+    return results
 
 
-def picture(found: list[dict]) -> Figure:
+def picture(results: list[dict]) -> Figure:
     """Plot the error against light, one panel per span."""
-    figure = Figure(figsize=(3.6 * len(found) + 0.6, 4.2), dpi=100, layout="constrained")
-    panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-    for axes, row in zip(panels, found, strict=True):
+    figure = Figure(figsize=(3.6 * len(results) + 0.6, 4.2), dpi=100, layout="constrained")
+    panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
+    for axes, row in zip(panels, results, strict=True):
         for (name, records), colour, marker in zip(row["fronts"].items(), PALETTE, "osDv^", strict=False):
             light = [record["light_percent"] for record in records]
             axes.plot(light, [record["error_db"] for record in records], color=colour, marker=marker, ms=5, label=name)
@@ -209,11 +209,11 @@ def report(progress: Progress) -> Report:
         return shown(run(progress=progress))
 
 
-def shown(found: list[dict]) -> Report:
+def shown(results: list[dict]) -> Report:
     """Table of errors and widths, and the picture; the file has all numbers."""
     plain = [
         row | {"fronts": {name: [numbers_of(record) for record in records] for name, records in row["fronts"].items()}}
-        for row in found
+        for row in results
     ]
     lights = [record["light_percent"] for record in next(iter(plain[0]["fronts"].values()))]
     columns = ("depths", "lens", *(f"{light:g} %" for light in lights))
@@ -222,7 +222,11 @@ def shown(found: list[dict]) -> Report:
         for row in plain
         for name, records in row["fronts"].items()
     ]
-    files = {"lens_front.json": plain, "lens_front.md": markdown_table(columns, rows), "lens_front.png": picture(found)}
+    files = {
+        "lens_front.json": plain,
+        "lens_front.md": markdown_table(columns, rows),
+        "lens_front.png": picture(results),
+    }
     return Report(files, [table(columns, rows, title="error, dB / width at the worst depth, um")])
 
 

@@ -91,24 +91,24 @@ def judged(design: Design) -> dict[str, Any]:
 
 def run(study: Study, start: Design, kinds=tuple(KINDS), *, progress: Progress) -> dict[str, list[dict[str, Any]]]:
     """Return for each lens type one record per share of the light, with its `design`."""
-    found = {}
+    results = {}
     for kind in kinds:
         design, question = initial_design(kind, study, start)
         front = trade_off(design, question, progress=progress)
         sweep = sweep_of(design, question)
-        found[kind] = []
+        results[kind] = []
         for limits, point, values in zip(question.pareto[0].targets, front.points, front.values, strict=True):
             made = new_design(design, sweep.problem.imager, sweep.problem.at, point.values)
             record = {"light_percent_at_least": limits, "light_percent": float(values[1]), "feasible": point.feasible}
             record |= {"width_um": float(values[0]), "design": made} | judged(made)
-            found[kind].append(record)
-    return found
+            results[kind].append(record)
+    return results
 
 
-def curves(found: dict[str, list[dict[str, Any]]]) -> Figure:
+def curves(results: dict[str, list[dict[str, Any]]]) -> Figure:
     """Plot the width at the worst depth against light."""
     axes = (figure := Figure(figsize=(6.4, 4.4), dpi=110, layout="constrained")).subplots()
-    for kind, rows in found.items():
+    for kind, rows in results.items():
         light = [row["light_percent"] for row in rows]
         axes.loglog(light, [max(row["optiland_width_um"]) for row in rows], "o-", label=kind)
     axes.set(xlabel="share of a point's light at 23 mm, %", ylabel="width at the worst of 18 to 23 mm, um")
@@ -124,10 +124,10 @@ def curves(found: dict[str, list[dict[str, Any]]]) -> Figure:
 def report(progress: Progress) -> Report:
     with jax.enable_x64(True):
         study = read_study(FOLDER / "studies" / "lens-kinds.toml")
-        found = run(study, read_design(FOLDER / "geomscope-optimized.toml"), progress=progress)
+        results = run(study, read_design(FOLDER / "geomscope-optimized.toml"), progress=progress)
     columns = ("lens", "light, %", "v, mm", "R, mm", "D, mm", "k", "width, um", "by Optiland", "half of the light, um")
     rows = []
-    for kind, records in found.items():
+    for kind, records in results.items():
         for record in records:
             design: Design = record["design"]
             lens = design.lens
@@ -135,8 +135,8 @@ def report(progress: Progress) -> Report:
             numbers += (lens.aperture_diameter_mm, lens.conic_constant, record["width_um"])
             numbers += (max(record["optiland_width_um"]), max(record["half_light_um"]))
             rows.append([kind, *(f"{number:.3g}" for number in numbers)])
-    files: dict[str, Any] = {"lens_kinds.md": markdown_table(columns, rows), "lens_kinds.png": curves(found)}
-    plain = {kind: [{**row, "design": design_text(row["design"])} for row in rows] for kind, rows in found.items()}
+    files: dict[str, Any] = {"lens_kinds.md": markdown_table(columns, rows), "lens_kinds.png": curves(results)}
+    plain = {kind: [{**row, "design": design_text(row["design"])} for row in rows] for kind, rows in results.items()}
     return Report(files | {"lens_kinds.json": plain}, [table(columns, rows)])
 
 

@@ -90,13 +90,13 @@ def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Pr
     count = round(FIELD / VOXEL) | 1
     grid = Grid(DEPTHS, (count, count), VOXEL)
     imagers = {name: cropped(read_design(FOLDER / f"{name}.toml").imager(), **sizes) for name in names}
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for scene, emitters in scenes().items():
         truth = np.asarray(rasterize(emitters, grid), np.float32)
         some = sampled(emitters, samples)
         each = progress.track(imagers.items(), f"Tracing {scene}")
         clean = {name: traced(some, imager, rays) for name, imager in each}
-        found[scene] = {"truth": truth, "empty": scores(np.zeros_like(truth), truth)}
+        results[scene] = {"truth": truth, "empty": scores(np.zeros_like(truth), truth)}
         for exposure in EXPOSURES:
             time = exposure / clean[names[0]].max()
             for name, imager in imagers.items():
@@ -104,8 +104,8 @@ def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Pr
                 image = rng.poisson(time * clean[name]) + rng.normal(0, READ_NOISE, clean[name].shape)
                 volume = reconstruct(image.astype(np.float32), imager, grid, RichardsonLucy(STEPS), progress=progress)
                 record = scores(np.asarray(volume), truth) | {"electrons": float(time * clean[name].sum())}
-                found[scene][f"{name}, {exposure}"] = record | {"volume": quality(volume, truth).gain * volume}
-    return found
+                results[scene][f"{name}, {exposure}"] = record | {"volume": quality(volume, truth).gain * volume}
+    return results
 
 
 def scores(volume: np.ndarray, truth: np.ndarray) -> dict[str, float]:
@@ -114,11 +114,11 @@ def scores(volume: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     return {"psnr_db": as_it_is.psnr_db, "ssim": as_it_is.ssim, "blurred_psnr_db": blurred.psnr_db}
 
 
-def pictures(found: dict[str, Any], names=DESIGNS) -> Figure:
+def pictures(results: dict[str, Any], names=DESIGNS) -> Figure:
     """Plot maxima over the depths of the truth and of each volume at the longer exposure, on one scale per scene."""
-    figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(found)), dpi=100, layout="constrained")
-    axes = figure.subplots(len(found), len(names) + 1, squeeze=False)
-    for row, parts in zip(axes, found.values(), strict=True):
+    figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(results)), dpi=100, layout="constrained")
+    axes = figure.subplots(len(results), len(names) + 1, squeeze=False)
+    for row, parts in zip(axes, results.values(), strict=True):
         shown = {"truth": parts["truth"]} | {name: parts[f"{name}, {EXPOSURES[0]}"]["volume"] for name in names}
         for axis, (name, volume) in zip(row, shown.items(), strict=True):
             extent = (-FIELD / 2, FIELD / 2, FIELD / 2, -FIELD / 2)
@@ -128,7 +128,7 @@ def pictures(found: dict[str, Any], names=DESIGNS) -> Figure:
             axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("x, mm", fontsize=8)
-    for axis, scene in zip(axes[:, 0], found, strict=True):
+    for axis, scene in zip(axes[:, 0], results, strict=True):
         axis.set_ylabel(f"{scene}\ny, mm", fontsize=8)
     return figure
 
@@ -138,10 +138,10 @@ def _cell(record: dict[str, float]) -> str:
 
 
 def report(progress: Progress) -> Report:
-    found = run(progress=progress)
+    results = run(progress=progress)
     columns = ("scene", "exposure, electrons", *DESIGNS, "empty")
     rows = []
-    for scene, parts in found.items():
+    for scene, parts in results.items():
         for exposure in EXPOSURES:
             cells = [_cell(parts[f"{name}, {exposure}"]) for name in DESIGNS]
             rows.append([scene, f"{exposure}", *cells, _cell(parts["empty"])])
@@ -151,10 +151,10 @@ def report(progress: Progress) -> Report:
             for key, part in parts.items()
             if key != "truth"
         }
-        for scene, parts in found.items()
+        for scene, parts in results.items()
     }
     files = {"lens_scenes.json": numbers, "lens_scenes.md": markdown_table(columns, rows)}
-    return Report(files | {"lens_scenes.png": pictures(found)}, [table(columns, rows)])
+    return Report(files | {"lens_scenes.png": pictures(results)}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

@@ -87,21 +87,21 @@ def run(
     layouts: int, *, spans=SPANS, kinds=KINDS, lenses: int = LENSES, steps: int = STEPS, progress: Progress
 ) -> dict:
     """Return for each span and number of types the results for each layout, and gains over one type."""
-    found: dict = {span: {k: [] for k in kinds} for span in spans}
+    results: dict = {span: {k: [] for k in kinds} for span in spans}
     cases = [(span, seed, k) for span in spans for seed in range(layouts) for k in kinds]
     for span, seed, k in progress.track(cases, "Searches"):
         # Several types also start from the result for one type, so a local minimum alone cannot make them worse.
-        starts = [start(seed, lenses), *(end["design"] for end in found[span][1][seed:])]
+        starts = [start(seed, lenses), *(end["design"] for end in results[span][1][seed:])]
         ends, planes = spans[span]
         tried = [best(design, study_of(ends, planes, k, steps)) for design in starts]
-        found[span][k].append(min(tried, key=lambda end: end["loss_db"]))
+        results[span][k].append(min(tried, key=lambda end: end["loss_db"]))
     gains = {
         span: {
             k: gain([row["loss_db"] for row in each[1]], [row["loss_db"] for row in each[k]]) for k in kinds if k > 1
         }
-        for span, each in found.items()
+        for span, each in results.items()
     }
-    return {"found": found, "gains_db": gains}
+    return {"found": results, "gains_db": gains}
 
 
 def judged(
@@ -130,11 +130,11 @@ def gain(alike: Sequence[float], several: Sequence[float]) -> dict:
     return {"mean": float(less.mean()), "interval": [float(less.mean() - half), float(less.mean() + half)]}
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot the error against the number of types, one line per layout."""
-    figure = Figure(figsize=(4.2 * len(found["found"]), 3.6), dpi=100, layout="constrained")
+    figure = Figure(figsize=(4.2 * len(results["found"]), 3.6), dpi=100, layout="constrained")
     for axes, (span, each) in zip(
-        figure.subplots(1, len(found["found"]), squeeze=False).flat, found["found"].items(), strict=True
+        figure.subplots(1, len(results["found"]), squeeze=False).flat, results["found"].items(), strict=True
     ):
         for rows in zip(*each.values(), strict=True):
             axes.plot(list(each), [row["loss_db"] for row in rows], "o-", color="C0", alpha=0.6)
@@ -153,13 +153,13 @@ def numbers_of(end: dict) -> dict[str, Any]:
 
 def report(layouts: int, progress: Progress) -> Report:
     with jax.enable_x64(True):
-        found = run(layouts, progress=progress)
-    found["letters"] = {
+        results = run(layouts, progress=progress)
+    results["letters"] = {
         span: {k: judged(each[k][0]["design"], SPANS[span][0], progress=progress) for k in KINDS}
-        for span, each in found["found"].items()
+        for span, each in results["found"].items()
     }
-    figure, rows = picture(found), []
-    for span, each in found["found"].items():
+    figure, rows = picture(results), []
+    for span, each in results["found"].items():
         for k, ends in each.items():
             each[k] = numbers = [numbers_of(end) for end in ends]
             radii = np.array([[least, most] for least, *_, most in (2 * end["radius_of_curvature"] for end in numbers)])
@@ -167,7 +167,7 @@ def report(layouts: int, progress: Progress) -> Report:
                 np.mean([np.mean(end[key]) for end in numbers]) for key in ("loss_db", "sensor_distance", *_OF_KINDS)
             ]
             means.append(np.mean(np.diff(radii) / radii.sum(1, keepdims=True)))
-            more = found["gains_db"][span].get(k)
+            more = results["gains_db"][span].get(k)
             said = "" if more is None else f"{more['mean']:.2f} [{more['interval'][0]:.2f}, {more['interval'][1]:.2f}]"
             rows.append([span, str(k), *(f"{mean:.3g}" for mean in means), said])
     columns = (
@@ -180,7 +180,7 @@ def report(layouts: int, progress: Progress) -> Report:
         "spread of R",
         "gain over one kind, dB [95 %]",
     )
-    return Report({"many_foci.json": found, "many_foci.png": figure}, [table(columns, rows)])
+    return Report({"many_foci.json": results, "many_foci.png": figure}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

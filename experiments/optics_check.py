@@ -272,12 +272,12 @@ def run(fields=FIELDS, depths=DEPTHS) -> dict:
 
 def shapes(fields=(0.0, 1.5, 3.0)) -> dict:
     """Compare aspheres with either side facing the object with Optiland, each with the sensor focused for 20 mm."""
-    found = {}
+    results = {}
     for name, lens in SHAPES.items():
         imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((3, 3), 0.0045), 5.8, 3.0)
         focused = eqx.tree_at(lambda i: i.sensor_distance, imager, best_focus(imager, 20.0, radius=RADIUS))
-        found[name] = [compare(focused, 20.0, field) for field in fields]
-    return found
+        results[name] = [compare(focused, 20.0, field) for field in fields]
+    return results
 
 
 def breakdown(radii=(0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0)) -> list[dict]:
@@ -350,10 +350,10 @@ def report(data: Path | None, progress: Progress) -> Report:
     files: dict[str, Any] = {"curves.png": curves(result), "result.json": result}
     shown = [table(columns, rows), table(("lens", *_OF_SHAPES.values()), shaped), table(limits, broken)]
     if data is not None:
-        found = {f"P1_{scene}": spots(data, scene) for scene in progress.track(SPOTS, "Captures")}
-        found["P2_a"] = spots(data, "a", "P2")
-        files |= {f"spots_{name}.png": gallery(found[name]) for name in ("P1_i_20_c", "P1_i_18_px", "P2_a")}
-        result["captures"] = {name: summary(rows) for name, rows in found.items()}
+        results = {f"P1_{scene}": spots(data, scene) for scene in progress.track(SPOTS, "Captures")}
+        results["P2_a"] = spots(data, "a", "P2")
+        files |= {f"spots_{name}.png": gallery(results[name]) for name in ("P1_i_20_c", "P1_i_18_px", "P2_a")}
+        result["captures"] = {name: summary(rows) for name, rows in results.items()}
         return Report(files, [*shown, JSON.from_data(result["captures"])])
     return Report(files, shown)
 

@@ -38,12 +38,12 @@ def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, ste
     grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0] - 1, DEPTHS[1] + 1.001, step), pitch=voxel)
     rows = []
     for count, seeds in (SCENES if scenes is None else scenes).items():
-        found = {"gs_jax": [], "brightest peaks": []}
+        detections = {"gs_jax": [], "brightest peaks": []}
         for seed in range(seeds):
             truth, capture = scene(count, seed, design, progress)
-            found["gs_jax"].append((find_points(capture, imager, grid, progress=progress), truth))
-            found["brightest peaks"].append((brightest_peaks(capture, imager, grid, count, progress), truth))
-        rows.append({"points": count, "captures": seeds} | {name: scores(pairs) for name, pairs in found.items()})
+            detections["gs_jax"].append((find_points(capture, imager, grid, progress=progress), truth))
+            detections["brightest peaks"].append((brightest_peaks(capture, imager, grid, count, progress), truth))
+        rows.append({"points": count, "captures": seeds} | {name: scores(pairs) for name, pairs in detections.items()})
     return rows
 
 
@@ -64,8 +64,8 @@ def brightest_peaks(capture: np.ndarray, imager: Imager, grid: Grid, count: int,
 def scores(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict:
     """Scores over several captures, whose points are placed side by side beyond the matching distance."""
     apart = [np.array([1000.0 * number, 0, 0, 0]) for number in range(len(pairs))]
-    found, truth = (np.concatenate([pair[i] + a for pair, a in zip(pairs, apart, strict=True)]) for i in (0, 1))
-    score = localization(found, truth)
+    detections, truth = (np.concatenate([pair[i] + a for pair, a in zip(pairs, apart, strict=True)]) for i in (0, 1))
+    score = localization(detections, truth)
     return {
         "f1": score.f1,
         "precision": score.precision,

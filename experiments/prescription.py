@@ -37,12 +37,12 @@ PIXELS, WINDOW = 2048, 161
 
 def run(names: Sequence[str] = DESIGNS, depths: Sequence[float] = DEPTHS, *, progress: Progress) -> dict[str, Any]:
     """Return for each design one record per depth; lengths in um, in the object."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in names:
         design = read_design(FOLDER / f"{name}.toml")
         imager = _cropped(design.imager())
-        found[name] = [_at(design, imager, z, progress) for z in progress.track(depths, name)]
-    return found
+        results[name] = [_at(design, imager, z, progress) for z in progress.track(depths, name)]
+    return results
 
 
 def _cropped(imager: Imager) -> Imager:
@@ -57,14 +57,14 @@ def _at(design: Design, imager: Imager, depth: float, progress: Progress) -> dic
     spot = np.asarray(backproject(image, imager, grid), np.float64)[0]
     axis = np.asarray(grid.x, np.float64)
     row, column = np.unravel_index(int(spot.argmax()), spot.shape)
-    found = {
+    results = {
         "depth_mm": depth,
         "fwhm_um": 500 * (fwhm(axis, spot[row]) + fwhm(axis, spot[:, column])),
         "half_of_light_um": 1000 * encircled(spot, VOXEL, 0.5),
         "most_of_light_um": 1000 * encircled(spot, VOXEL, 0.8),
         "contrast_of_40_um_lines": contrast(spot, axis),
     }
-    return found | {f"most_of_light_field_{h:g}_mm_um": _unit(imager, depth, h) for h in FIELDS}
+    return results | {f"most_of_light_field_{h:g}_mm_um": _unit(imager, depth, h) for h in FIELDS}
 
 
 def _unit(imager: Imager, depth: float, height: float) -> float:
@@ -92,7 +92,7 @@ def contrast(spot: np.ndarray, axis: np.ndarray) -> float:
     return float(np.abs(spot.sum(0) @ np.exp(2j * np.pi * LINES * axis)) / spot.sum())
 
 
-def picture(found: dict[str, Any]) -> Figure:
+def picture(results: dict[str, Any]) -> Figure:
     """Plot widths and contrast against depth, one colour per design."""
     figure = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     panels = {
@@ -101,7 +101,7 @@ def picture(found: dict[str, Any]) -> Figure:
         "contrast_of_40_um_lines": "contrast of 40 um lines",
     }
     for axes, (key, label) in zip(figure.subplots(1, 3), panels.items(), strict=True):
-        for number, (name, records) in enumerate(found.items()):
+        for number, (name, records) in enumerate(results.items()):
             depths = [record["depth_mm"] for record in records]
             axes.plot(depths, [record[key] for record in records], "o-", color=f"C{number}", label=name)
         axes.set(xlabel="depth, mm", ylabel=label, ylim=(0, None))
@@ -112,12 +112,12 @@ def picture(found: dict[str, Any]) -> Figure:
 
 
 def report(progress: Progress) -> Report:
-    found = run(progress=progress)
+    results = run(progress=progress)
     shown = [
         table(records[0], [[f"{value:.3g}" for value in record.values()] for record in records], name)
-        for name, records in found.items()
+        for name, records in results.items()
     ]
-    return Report({"prescription.json": found, "prescription.png": picture(found)}, shown)
+    return Report({"prescription.json": results, "prescription.png": picture(results)}, shown)
 
 
 if __name__ == "__main__":

@@ -43,39 +43,39 @@ def cases(s: Scene) -> dict[str, tuple[Scene, Method, str]]:
     planes = s.truth.any((1, 2))
     few = s._replace(grid=s.grid.at(np.asarray(s.grid.depths)[planes]), truth=s.truth[planes])
     bright = s._replace(image=s.image + glow(s.image).astype(np.float32))
-    found: dict[str, tuple[Scene, Method, str]] = {
+    results: dict[str, tuple[Scene, Method, str]] = {
         "three planes, Richardson-Lucy, 30 plain steps": (few, RichardsonLucy(steps=30), "full")
     }
     default: PinholeRichardsonLucy = METHODS["list-rl"](25)  # pyright: ignore[reportAssignmentType]
     for name, scene in (("as it is", s), ("under a glow", bright)):
-        found[f"{name}, list-RL, 25 steps"] = scene, default, "full"
-        found[f"{name}, list-RL, 25 steps, no fitted background"] = (
+        results[f"{name}, list-RL, 25 steps"] = scene, default, "full"
+        results[f"{name}, list-RL, 25 steps, no fitted background"] = (
             scene,
             dataclasses.replace(default, background_knots=0),
             "full",
         )
     for name in ("list-rl", "richardson-lucy"):
         method = METHODS[name](STEPS)
-        found[f"near, {name}"] = s, method, "near"
-        found[f"near, {name}, rims not held back"] = s, dataclasses.replace(method, min_sensitivity=0.0), "near"  # pyright: ignore[reportArgumentType]
+        results[f"near, {name}"] = s, method, "near"
+        results[f"near, {name}, rims not held back"] = s, dataclasses.replace(method, min_sensitivity=0.0), "near"  # pyright: ignore[reportArgumentType]
     networks = Unrolled.pretrained()
-    found["unrolled"] = s, networks, "full"
+    results["unrolled"] = s, networks, "full"
     without = dataclasses.replace(networks, last=0, steps=networks.steps - networks.last)
-    found["unrolled, no conjugate gradients"] = s, without, "full"
-    return found
+    results["unrolled, no conjugate gradients"] = s, without, "full"
+    return results
 
 
 def run(s: Scene, *, progress: Progress) -> dict:
     """Return by name the PSNR and that of an empty volume, dB, and how many lenses see the brightest voxel."""
-    found = {}
+    results = {}
     for name, (each, method, optics) in progress.track(cases(s).items(), "Options"):
         volume = reconstruct(each.image, each.imager, each.grid, method, optics=optics, progress=progress)
-        found[name] = {
+        results[name] = {
             "psnr_db": quality(volume, each.truth).psnr_db,
             "empty_db": quality(np.zeros_like(each.truth), each.truth).psnr_db,
             "lenses_of_the_brightest": _lenses(volume, each),
         }
-    return found
+    return results
 
 
 def _lenses(volume: np.ndarray, s: Scene) -> int:
@@ -87,14 +87,14 @@ def _lenses(volume: np.ndarray, s: Scene) -> int:
 
 
 def report(data: Path, progress: Progress) -> Report:
-    found = run(SCENES["letters"](data), progress=progress)
+    results = run(SCENES["letters"](data), progress=progress)
     columns = ("", "PSNR, dB", "empty, dB", "lenses that see the brightest voxel")
     rows = [
         [name, f"{r['psnr_db']:.1f}", f"{r['empty_db']:.1f}", str(r["lenses_of_the_brightest"])]
-        for name, r in found.items()
+        for name, r in results.items()
     ]
     text = markdown_table(columns, rows) + "\n"
-    return Report({"options.json": found, "options.md": text}, [table(columns, rows)])
+    return Report({"options.json": results, "options.md": text}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

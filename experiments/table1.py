@@ -95,8 +95,10 @@ def _depth_of_field(design: Design) -> list[tuple[str, ...]]:
     rows = []
     for what, diameter in _diameters(design).items():
         lens = _lens(design, diameter)
-        found = ", ".join(_depths_of_field(lens, circle_of_confusion) for circle_of_confusion in (0.009, 0.018, 0.036))
-        rows.append((f"depth of field at 20 mm, {what}", "~5 mm", found, found, "by confusion: Eq. 8 (Eq. 7)"))
+        results = ", ".join(
+            _depths_of_field(lens, circle_of_confusion) for circle_of_confusion in (0.009, 0.018, 0.036)
+        )
+        rows.append((f"depth of field at 20 mm, {what}", "~5 mm", results, results, "by confusion: Eq. 8 (Eq. 7)"))
     return rows
 
 
@@ -157,19 +159,19 @@ def _counted(design: Design) -> str:
     return f"{int(counts.min())}-{int(counts.max())}, mean {float(counts.mean()):.1f}"
 
 
-def markdown(found: dict[str, list[dict[str, str]]]) -> str:
+def markdown(results: dict[str, list[dict[str, str]]]) -> str:
     """Both tables in Markdown."""
     return (
-        "\n\n".join(markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in found.values())
+        "\n\n".join(markdown_table(list(rows[0]), [list(row.values()) for row in rows]) for rows in results.values())
         + "\n"
     )
 
 
 def report(progress: Progress) -> Report:
     with progress.step("Datasheets"):
-        found = run()
-    shown = [table(rows[0], [row.values() for row in rows]) for rows in found.values()]
-    return Report({"table1.json": found, "table1.md": markdown(found)}, shown)
+        results = run()
+    shown = [table(rows[0], [row.values() for row in rows]) for rows in results.values()]
+    return Report({"table1.json": results, "table1.md": markdown(results)}, shown)
 
 
 if __name__ == "__main__":

@@ -89,12 +89,12 @@ DEVICES = {
 def scores(model: np.ndarray, image: np.ndarray) -> dict:
     """Error, correlation and light, after the model's one gain."""
     gain = float(np.vdot(model, image) / np.vdot(model, model))
-    found: dict = {"gain": gain, "light": gain * float(model.sum() / image.sum())}
+    results: dict = {"gain": gain, "light": gain * float(model.sum() / image.sum())}
     for size in BINS:
         a, b = (_binned(part, size) for part in (gain * model, image))
         error = float(np.linalg.norm(a - b) / np.linalg.norm(b))
-        found[f"bin_{size}"] = {"error": error, "correlation": float(np.corrcoef(a.ravel(), b.ravel())[0, 1])}
-    return found
+        results[f"bin_{size}"] = {"error": error, "correlation": float(np.corrcoef(a.ravel(), b.ravel())[0, 1])}
+    return results
 
 
 def _binned(image, size):
@@ -109,11 +109,11 @@ def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndar
     volume = rasterize(emitters, grid)
     kernel = psf_of_depth(imager, depths, "geometric")
     near = forward(volume, imager, grid, jnp.stack([kernel(depth) for depth in depths]))
-    found = {"near": scores(np.asarray(near), image)}
+    results = {"near": scores(np.asarray(near), image)}
     for name, rings in (("full", RINGS), ("two rings", TWO_RINGS)):
         optics = field_varying_psf(imager, depths, rings=rings, progress=progress)
-        found[name] = scores(np.asarray(forward(volume, imager, grid, optics)), image)
-    return found
+        results[name] = scores(np.asarray(forward(volume, imager, grid, optics)), image)
+    return results
 
 
 def of_points(points: np.ndarray, imager: Imager, image: np.ndarray, progress: Progress) -> dict:
@@ -128,14 +128,14 @@ def on_captures(data: Path, rays: int, progress: Progress) -> dict:
     electrons = lambda s: GAIN * (read_capture(data / f"P1_{s}.tif", imager.sensor.shape).astype(np.float64) - BLACK)
     target = json.loads((data / "f.json").read_text())["elements"]
     words = json.loads((data / "h.json").read_text())["planes"]
-    found = {
+    results = {
         "letters": of_volume(np.concatenate([strokes(w) for w in words]), imager, 0.012, electrons("h"), progress),
         "USAF target": of_volume(bars(target), imager, 0.005, electrons("f"), progress),
         "120 points": of_points(points, imager, capture := electrons("d"), progress),
     }
     if rays:
-        found["120 points"]["own tracer"] = scores(traced(points, imager, rays), capture)
-    return found
+        results["120 points"]["own tracer"] = scores(traced(points, imager, rays), capture)
+    return results
 
 
 def strokes(plane: dict, pitch: float = 0.012) -> np.ndarray:
@@ -170,7 +170,7 @@ def on_device(device: Device, progress: Progress, *, points=25, samples=400_000,
     """Scores on our tracer's images of points and of three thick letters (none if there are no samples)."""
     imager, size = device.imager(), 0.8 * device.plate
     scene = random_points(points, (size, size), device.depths, seed=3)
-    found = {f"{points} points": of_points(scene, imager, traced(scene, imager, point_rays), progress)}
+    results = {f"{points} points": of_points(scene, imager, traced(scene, imager, point_rays), progress)}
     if samples:
         pitch = 0.6 * device.pixel / float(imager.magnification(device.depths[1]))
         place = zip("HTL", np.linspace(*device.depths, 3), ((-0.25, -0.2), (0, 0.2), (0.25, -0.1)), strict=True)
@@ -181,31 +181,31 @@ def on_device(device: Device, progress: Progress, *, points=25, samples=400_000,
         some = word[rng.choice(len(word), samples, p=word[:, 3] / word[:, 3].sum())]
         some[:, :2] += rng.uniform(-pitch / 2, pitch / 2, (samples, 2))
         some[:, 3] = word[:, 3].sum() / samples
-        found["three letters"] = of_volume(word, imager, pitch, traced(some, imager, rays), progress)
-    return found
+        results["three letters"] = of_volume(word, imager, pitch, traced(some, imager, rays), progress)
+    return results
 
 
 def run(
     data: Path | None, devices: dict[str, Device] | None = None, *, rays=50_000, progress: Progress, **sizes
 ) -> dict:
     """Return scores by image, scene and model; `rays` are for `on_captures`, `sizes` for `on_device`."""
-    found = {"the authors' array": on_captures(data, rays, progress)} if data else {}
+    results = {"the authors' array": on_captures(data, rays, progress)} if data else {}
     for name, device in (DEVICES if devices is None else devices).items():
-        found[name] = on_device(device, progress, **sizes)
-    return found
+        results[name] = on_device(device, progress, **sizes)
+    return results
 
 
 def report(data: Path | None, progress: Progress) -> Report:
-    found = run(data, progress=progress)
+    results = run(data, progress=progress)
     columns = ("image of", "scene", "by", *(f"error / correlation, {b} x {b}" for b in BINS), "light")
     rows = []
-    for name, scenes in found.items():
+    for name, scenes in results.items():
         for scene, models in scenes.items():
             for model, score in models.items():
                 cells = ("{error:.3f} / {correlation:.3f}".format(**score[f"bin_{b}"]) for b in BINS)
                 rows.append([name, scene, model, *cells, f"{score['light']:.3f}"])
     text = "# What the forward model explains\n\n" + markdown_table(columns, rows) + "\n"
-    return Report({"true_image.json": found, "true_image.md": text}, [table(columns, rows)])
+    return Report({"true_image.json": results, "true_image.md": text}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ def run(steps: int, count: int, held_out: int, kind: Kind = KIND, *, progress: P
     """Return gains over an empty volume for the held-out scenes that show something, dB, by variant."""
     stacks = [stack(0, number, kind) for number in progress.track(range(count), "Simulating captures")]
     judged = [_cut(stack(1, number, kind), 8) for number in progress.track(range(held_out), "Simulating others")]
-    found = {}
+    results = {}
     for name, (recipe, spread) in progress.track(variants(stacks).items(), "Variants"):
         with progress.counter(f"Training: {name}", steps) as advance:
             state = train(recipe, start(recipe, steps=steps, seed=0), each=lambda state: advance())  # noqa: B023
@@ -141,21 +141,21 @@ def run(steps: int, count: int, held_out: int, kind: Kind = KIND, *, progress: P
             quality(cleaned(network, one, spread), one.truth).psnr_db
             - quality(np.zeros_like(one.truth), one.truth).psnr_db
         )
-        found[name] = [gain(one) for one in judged if one.truth.any()]
-    return found
+        results[name] = [gain(one) for one in judged if one.truth.any()]
+    return results
 
 
 def report(steps: int, stacks: int, held_out: int, progress: Progress) -> Report:
-    found = run(steps, stacks, held_out, progress=progress)
-    first = np.array(next(iter(found.values())))
+    results = run(steps, stacks, held_out, progress=progress)
+    first = np.array(next(iter(results.values())))
     rows = []
-    for name, gains in found.items():
+    for name, gains in results.items():
         off = np.array(gains) - first
         low, high = interval(list(off))
         rows.append([name, f"{np.mean(gains):.2f}", f"{off.mean():+.2f}", f"{low:+.2f} to {high:+.2f}"])
     columns = ("network", "gain, dB", "over the first, dB", "95 %")
     text = "# Variants of the two-step network\n\n" + markdown_table(columns, rows) + "\n"
-    return Report({"variants.json": found, "variants.md": text}, [table(columns, rows)])
+    return Report({"variants.json": results, "variants.md": text}, [table(columns, rows)])
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def foretold(few: dict, many: dict) -> dict:
 
 def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 512, few: int = 100) -> dict:
     """Measure frames per second at one size, and memory, survival and the forecast at a smaller one."""
-    found: dict = {"cores": psutil.cpu_count(), "load_before": psutil.getloadavg()}
+    results: dict = {"cores": psutil.cpu_count(), "load_before": psutil.getloadavg()}
     places = np.linspace(_NEAR, _FAR, _DEPTHS).round(6).tolist()
     here, by = {"here": ()}, {f"{n} workers": ("--workers", str(n)) for n in (1, 2)}
     with tempfile.TemporaryDirectory() as name:
@@ -157,10 +157,10 @@ def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 5
         design = coarse_design(pixels)
         write_design(folder / "design.toml", design)
         write_recording(folder / f"{frames}.tif", design, frames)
-        found["rate"] = {key: watched(folder, frames, "v.zarr", *how) for key, how in (here | by).items()}
-        found["alone_ms"] = parts(folder / f"{frames}.tif", design, places, folder, min(frames, _TIMED))
-        found["written_mib"] = sum(len(each) for each in _voxels(folder / "v.zarr").values()) / 2**20
-        found["voxels_z_y_x"] = voxel_grid(design.imager(), places).volume_shape
+        results["rate"] = {key: watched(folder, frames, "v.zarr", *how) for key, how in (here | by).items()}
+        results["alone_ms"] = parts(folder / f"{frames}.tif", design, places, folder, min(frames, _TIMED))
+        results["written_mib"] = sum(len(each) for each in _voxels(folder / "v.zarr").values()) / 2**20
+        results["voxels_z_y_x"] = voxel_grid(design.imager(), places).volume_shape
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         design = coarse_design(coarse)
@@ -169,19 +169,19 @@ def run(frames: int = 500, pixels: int = 1024, many: int = 1000, coarse: int = 5
             write_recording(folder / f"{count}.tif", design, count)
         for key, how in (here | {"2 workers": by["2 workers"]}).items():
             short, long = (watched(folder, count, "v.zarr", *how) for count in (few, many))
-            found[f"long, {key}"] = long | {"foretold": foretold(short, long)}
-        found["survival"] = survival(folder, few)
-    return found | {"frames": frames, "pixels": pixels, "coarse": coarse, "load_after": psutil.getloadavg()}
+            results[f"long, {key}"] = long | {"foretold": foretold(short, long)}
+        results["survival"] = survival(folder, few)
+    return results | {"frames": frames, "pixels": pixels, "coarse": coarse, "load_after": psutil.getloadavg()}
 
 
-def picture(found: dict) -> Figure:
+def picture(results: dict) -> Figure:
     """Plot resident memory against frames written."""
     figure = Figure(figsize=(7, 3.4), dpi=100, layout="constrained")
     axes = figure.subplots()
     most = 0
     for key, label in (("long, here", "one process"), ("long, 2 workers", "two workers and the scheduling process")):
-        _, done, memory = np.array(found[key]["seconds_frames_mib"]).T
-        running = done < found[key]["frames"]  # the rest is the end of the processes
+        _, done, memory = np.array(results[key]["seconds_frames_mib"]).T
+        running = done < results[key]["frames"]  # the rest is the end of the processes
         axes.plot(done[running], memory[running], label=label)
         most = max(most, memory.max())
     axes.set(xlabel="frames written", ylabel="resident memory, MiB", ylim=(0, 1.2 * most))
@@ -197,20 +197,20 @@ def grown(long: dict) -> tuple[float, float]:
     return between(1, 2), between(9, 10)
 
 
-def bars(found: dict) -> list[tuple[str, str, str]]:
+def bars(results: dict) -> list[tuple[str, str, str]]:
     """Targets, measured values, and whether they are met."""
     rows = []
     for key in ("long, here", "long, 2 workers"):
-        early, late = grown(found[key])
-        what = f"memory flat over {found[key]['frames']} frames ({key.split(', ')[1]}; +5 % at most)"
+        early, late = grown(results[key])
+        what = f"memory flat over {results[key]['frames']} frames ({key.split(', ')[1]}; +5 % at most)"
         rows.append((what, f"{early:.0f} MiB, then {late:.0f}", "met" if late <= 1.05 * early else "missed"))
-    survival = found["survival"]
+    survival = results["survival"]
     what = f"killed and resumed as uninterrupted ({survival['frames']} frames, 2 workers)"
     was = f"killed at {survival['there_when_killed']}; every byte of the volumes, each frame once"
     rows.append((what, was, "met" if survival["equal"] and survival["each_once"] else "missed"))
     for key in ("long, here", "long, 2 workers"):
-        told = found[key]["foretold"]
-        what = f"{found[key]['frames']} frames foretold from few ({key.split(', ')[1]}; within 25 %)"
+        told = results[key]["foretold"]
+        what = f"{results[key]['frames']} frames foretold from few ({key.split(', ')[1]}; within 25 %)"
         was = f"{told['seconds']:.0f} s, measured {told['measured']:.0f} s"
         rows.append((what, was, "met" if 0.75 <= told["ratio"] <= 1.25 else "missed"))
     return rows
@@ -218,22 +218,22 @@ def bars(found: dict) -> list[tuple[str, str, str]]:
 
 def report(frames: int, pixels: int, many: int, coarse: int, progress: Progress) -> Report:
     with progress.step("Reconstructing"):
-        found = run(frames, pixels, many, coarse)
-    alone, rates = found["alone_ms"], found["rate"]
+        results = run(frames, pixels, many, coarse)
+    alone, rates = results["alone_ms"], results["rate"]
     rows = [
         *((f"frames/s, {key}", f"{rate['frames_per_s']:.1f}") for key, rate in rates.items()),
         *((f"s in all, start and compilation too, {key}", f"{rate['seconds']:.1f}") for key, rate in rates.items()),
         *((f"ms a frame, {name} alone", f"{value:.1f}") for name, value in alone.items()),
-        ("MiB written", f"{found['written_mib']:.0f}"),
-        ("load of the machine, before and after", f"{found['load_before'][0]:.1f}, {found['load_after'][0]:.1f}"),
+        ("MiB written", f"{results['written_mib']:.0f}"),
+        ("load of the machine, before and after", f"{results['load_before'][0]:.1f}, {results['load_after'][0]:.1f}"),
     ]
-    z, y, x = found["voxels_z_y_x"]
+    z, y, x = results["voxels_z_y_x"]
     title = f"{frames} frames of {pixels}^2 to {z} x {y} x {x} voxels"
-    checks = bars(found)
+    checks = bars(results)
     text = f"**{title}**\n\n|  |  |\n| --- | ---: |\n" + "".join(f"| {name} | {value} |\n" for name, value in rows)
     text += "\n| bar | found |  |\n| --- | --- | --- |\n" + "".join(f"| {' | '.join(row)} |\n" for row in checks)
     shown = [table(("", ""), rows, title), table(("bar", "found", ""), checks)]
-    return Report({"video_rate.json": found, "video_rate.md": text, "video_rate.png": picture(found)}, shown)
+    return Report({"video_rate.json": results, "video_rate.md": text, "video_rate.png": picture(results)}, shown)
 
 
 if __name__ == "__main__":
