@@ -1,4 +1,4 @@
-"""Drawings of these pages as SVG: `python docs/drawings.py` writes them anew."""
+"""Draw the SVG pictures of these pages: `python docs/drawings.py`."""
 
 import ast
 import itertools
@@ -9,12 +9,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 FOLDER = Path(__file__).parent / "drawings"
 INK, FAINT, LIGHT, GLASS, RAY = "#263238", "#90a4ae", "#eceff1", "#cfe8f3", "#e64a19"
-# What the drawing of imports leaves out: the version, and how the command is started.
+# Modules that the drawing of imports leaves out.
 _LEFT_OUT = {"_version", "__main__", "__init__"}
 
 
 def svg(width: float, height: float, parts: list[str]) -> str:
-    """A drawing on white."""
+    """Return an SVG drawing on a white background."""
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
         f'font-family="Helvetica, Arial, sans-serif" font-size="13" fill="{INK}">'
@@ -23,31 +23,28 @@ def svg(width: float, height: float, parts: list[str]) -> str:
 
 
 def text(x: float, y: float, words: str, *, anchor: str = "start", italic: bool = False, color: str = INK) -> str:
-    """Words at a place."""
     style = ' font-style="italic"' if italic else ""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}"{style}>{words}</text>'
 
 
 def line(x1: float, y1: float, x2: float, y2: float, color: str = INK, width: float = 1.2, dashes: str = "") -> str:
-    """A straight line."""
     more = f' stroke-dasharray="{dashes}"' if dashes else ""
     ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
     return f'<line {ends} stroke="{color}" stroke-width="{width:g}"{more}/>'
 
 
 def dot(x: float, y: float, radius: float = 4, color: str = RAY) -> str:
-    """A filled circle."""
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{color}"/>'
 
 
 def measure(x1: float, x2: float, y: float, words: str) -> list[str]:
-    """A length along x, with its name."""
+    """Return a dimension line along x, with its label."""
     ends = [line(x, y - 5, x, y + 5) for x in (x1, x2)]
     return [line(x1, y, x2, y), *ends, text((x1 + x2) / 2, y + 19, words, anchor="middle", italic=True)]
 
 
 def chief_ray() -> str:
-    """The side view, z to the right as on the page of keys: the sensor, the plate, an object, a lens's chief ray."""
+    """Side view, z to the right as in `design/KEYS.md`: sensor, plate, object, and the chief ray of a lens."""
     axis, sensor, vertex, front, point = 150.0, 80.0, 268.0, 310.0, 580.0
     lens, q = axis - 40, axis + 55
     m = (vertex - sensor) / (point - vertex)
@@ -81,9 +78,9 @@ def chief_ray() -> str:
 
 
 def field() -> str:
-    """A point from above: the lenses within the field radius, and its image: their pattern, s times as wide."""
+    """A point seen along the axis: the lenses within the field radius, and its image, their pattern magnified."""
     random, centers = 7, []
-    # A pattern that is the same everywhere, of no library: points of a lattice, moved.
+    # A displaced lattice by a generator of its own, so that the pattern is the same everywhere.
     for row, column in itertools.product(range(6), range(6)):
         random = (random * 1103515245 + 12345) % 2**31
         angle = 2 * math.pi * random / 2**31
@@ -113,7 +110,7 @@ def field() -> str:
 
 
 def core_halo() -> str:
-    """A spot: the chief ray's place, the core beside it, and the halo around and behind."""
+    """A spot: the position of the chief ray, the core beside it, and the halo around and behind the core."""
     x, y = 320.0, 120.0
     shades = [
         f'<ellipse cx="{x + 26 * s:.0f}" cy="{y}" rx="{100 * s:.0f}" ry="{78 * s:.0f}" fill="{GLASS}" opacity="0.45"/>'
@@ -138,13 +135,13 @@ def core_halo() -> str:
 
 
 def imports() -> dict[str, set[str]]:
-    """Which folder or module of the package imports which."""
-    found: dict[str, set[str]] = {}
+    """Return the imports between folders and modules of the package."""
+    graph: dict[str, set[str]] = {}
     for path in sorted((ROOT / "gs_jax").rglob("*.py")):
         parts = path.relative_to(ROOT / "gs_jax").with_suffix("").parts
         if parts[0] not in _LEFT_OUT:
-            found.setdefault(parts[0], set()).update(_imported(path, parts))
-    return {name: {other for other in others if other in found and other != name} for name, others in found.items()}
+            graph.setdefault(parts[0], set()).update(_imported(path, parts))
+    return {name: {other for other in others if other in graph and other != name} for name, others in graph.items()}
 
 
 def _imported(path: Path, parts: tuple[str, ...]) -> Iterator[str]:
@@ -154,7 +151,7 @@ def _imported(path: Path, parts: tuple[str, ...]) -> Iterator[str]:
 
 
 def layers(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Names in layers: each imports from those before it alone."""
+    """Sort names into layers such that each imports only from layers before it."""
     done: list[list[str]] = []
     while left := sorted(set(graph) - {name for layer in done for name in layer}):
         known = {name for layer in done for name in layer}
@@ -163,7 +160,7 @@ def layers(graph: dict[str, set[str]]) -> list[list[str]]:
 
 
 def imports_drawing() -> str:
-    """The direction of imports; an import that another one implies is not drawn."""
+    """Draw the direction of imports, without those that others imply."""
     graph = imports()
     rows, place = layers(graph), {}
     high, wide = 62, 720
@@ -196,7 +193,7 @@ DRAWINGS = {"chief-ray": chief_ray, "field": field, "core-halo": core_halo, "imp
 
 
 def main() -> None:
-    """Writes all of them."""
+    """Write all drawings."""
     FOLDER.mkdir(exist_ok=True)
     for name, draw in DRAWINGS.items():
         (FOLDER / f"{name}.svg").write_text(draw(), encoding="utf-8")

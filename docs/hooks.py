@@ -37,14 +37,15 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Publish files of the repository under their own paths, and generated pages beside them."""
     paths = [path for pattern in PUBLISHED for path in sorted(ROOT.glob(pattern))]
-    found: dict[str, bytes | str] = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in paths}
-    found |= {group.page: group.text for group in reference.groups()}
+    contents: dict[str, bytes | str] = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in paths}
+    contents |= {group.page: group.text for group in reference.groups()}
     for script in execute.scripts():
         try:
-            found |= {f"docs/tutorials/{name}": content for name, content in execute.executed(script).items()}
-        except execute.Failed as error:
+            pages = execute.page_and_pictures(script)
+        except execute.TutorialError as error:
             raise PluginError(f"{script.name}: {error}") from error
-    for path, content in found.items():
+        contents |= {f"docs/tutorials/{name}": content for name, content in pages.items()}
+    for path, content in contents.items():
         file = File.generated(config, path, content=content)
         file.dest_uri = file.dest_uri.removeprefix("docs/")
         files.append(file)

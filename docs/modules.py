@@ -1,13 +1,13 @@
-"""For griffe: an `eqx.Module` is made of its fields, and parameters that share their words have a type each."""
+"""Griffe extension: signatures of `eqx.Module`s from fields, and types of parameters with a shared description."""
 
 import griffe
 
 
 class Modules(griffe.Extension):
-    """Gives each `eqx.Module` the signature that it has when it runs."""
+    """Gives each `eqx.Module` the signature of its generated `__init__`."""
 
     def on_class_members(self, *, cls: griffe.Class, **_) -> None:
-        """Fields in their order, with their defaults."""
+        """Build `__init__` from the fields, in their order, with their defaults."""
         if "eqx.Module" not in map(str, cls.bases) or "__init__" in cls.members:
             return
         named = griffe.ParameterKind.positional_or_keyword
@@ -19,7 +19,7 @@ class Modules(griffe.Extension):
         cls.set_member("__init__", griffe.Function("__init__", parameters=griffe.Parameters(*fields)))
 
     def on_package(self, *, pkg: griffe.Module, **_) -> None:
-        """Of `image, imager, grid` griffe takes the first one's type for all."""
+        """Restore the types of parameters such as `image, imager, grid`, for which griffe uses that of the first."""
         left: list[griffe.Object | griffe.Alias] = [pkg]
         while left:
             each = left.pop()
@@ -27,14 +27,14 @@ class Modules(griffe.Extension):
                 continue
             left += each.members.values()
             if each.docstring and (each.is_function or each.is_class):
-                _own_types(each, each.docstring)
+                _restore_types(each, each.docstring)
 
 
-def _own_types(each: griffe.Object | griffe.Alias, words: griffe.Docstring) -> None:
+def _restore_types(each: griffe.Object | griffe.Alias, docstring: griffe.Docstring) -> None:
     types = {parameter.name: parameter for parameter in getattr(each, "parameters", ())}
-    # What has no words, `reference.missing` tells, of public names alone.
-    words.parser, words.parser_options = "numpy", {"warnings": False}
-    for section in words.parsed:
+    # `reference.missing` reports missing descriptions of public names, so griffe need not.
+    docstring.parser, docstring.parser_options = "numpy", {"warnings": False}
+    for section in docstring.parsed:
         for said in section.value if section.kind is griffe.DocstringSectionKind.parameters else ():
             if said.name in types:
                 said.annotation, said.default = types[said.name].annotation, types[said.name].default

@@ -33,8 +33,8 @@ class Group(NamedTuple):
 
 def groups() -> list[Group]:
     """Groups of public names, in the order of the package's docstring."""
-    found = _GROUP.findall(gs_jax.__doc__ or "")
-    return [Group(title, [line.split()[0] for line in lines.splitlines()]) for title, lines in found]
+    matches = _GROUP.findall(gs_jax.__doc__ or "")
+    return [Group(title, [line.split()[0] for line in lines.splitlines()]) for title, lines in matches]
 
 
 def public() -> Iterator[tuple[str, object]]:
@@ -61,10 +61,10 @@ def missing() -> Iterator[str]:
         if ">>> " not in text:
             yield f"{name} has no example."
         if "Parameters\n---" in text:
-            listed = re.findall(r"^([\w, ]+)$\n    ", text.split("Parameters\n")[1], re.MULTILINE)
-            said = {each.strip() for line in listed for each in line.split(",")}
+            entries = re.findall(r"^([\w, ]+)$\n    ", text.split("Parameters\n")[1], re.MULTILINE)
+            described = {each.strip() for line in entries for each in line.split(",")}
             for parameter in inspect.signature(value).parameters:  # type: ignore[arg-type]
-                if parameter not in said:
+                if parameter not in described:
                     yield f"{name} does not say what its parameter {parameter} is."
 
 
