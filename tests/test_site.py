@@ -1,52 +1,66 @@
-"""The pages of the site: their menu, their links, and what they say is to be typed."""
+"""Pages of the repository and the site: links, menu, commands, Python, generated pages and drawings."""
 
 import importlib.util
+import pkgutil
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import click
 import pytest
 
+from experiments.calibration_errors import run
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.codesign.study import Study
+from gs_jax.design.keys import design_keys
+
+from .helpers import design_and_capture
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.rglob("*.md"))
+DOCS, DESIGN = ROOT / "docs", ROOT / "design"
+TOP = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "gs_jax/weights/MODEL_CARD.md")]
+PAGES = [*TOP, *(path for folder in (DOCS, DESIGN, ROOT / "experiments") for path in sorted(folder.rglob("*.md")))]
 
 
-def module(name: str):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+def module(path: Path):
+    spec = importlib.util.spec_from_file_location(f"page_{path.stem}", path)
     assert spec and spec.loader
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)
-    return found
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
 
 
 def blocks(path: Path, language: str = "") -> list[str]:
     return re.findall(rf"^ *```{language}\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
-def named(path: Path) -> str:
-    return path.relative_to(DOCS).as_posix()
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
 
 
 def test_every_page_is_in_the_menu():
     menu = (DOCS / "mkdocs.yml").read_text(encoding="utf-8")
-    made = [path.with_suffix(".md") for path in (DOCS / "tutorials").glob("*.py")]
-    assert not [name for name in map(named, [*PAGES, *made]) if f"docs/{name}" not in menu]
+    tutorials = [path.with_suffix(".md") for path in (DOCS / "tutorials").glob("*.py")]
+    assert not [name for name in map(relative, [*PAGES[1:], *tutorials]) if f": {name}" not in menu]
 
 
-@pytest.mark.parametrize("path", PAGES, ids=named)
-def test_links_lead_somewhere(path):
-    """In the repository; on the site a strict build looks."""
+def test_start_page_leads_to_all_parts():
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    for name in ("design/KEYS", "design/LAB", "design/CLUSTER", "design/README", "CONTRIBUTING", "python", "gallery"):
+        assert f"{name}.md" in text, name
+
+
+@pytest.mark.parametrize("path", PAGES, ids=relative)
+def test_links_exist(path):
+    """In the repository; a strict build checks those of the site, with anchors."""
     for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text(encoding="utf-8")):
         assert (path.parent / link).exists(), link
 
 
-@pytest.mark.parametrize("path", PAGES, ids=named)
+@pytest.mark.parametrize("path", PAGES, ids=relative)
 def test_commands_exist_with_their_options(path):
     lines = [line.strip() for block in blocks(path) for line in block.replace("\\\n", " ").splitlines()]
     for line in lines:
@@ -56,41 +70,114 @@ def test_commands_exist_with_their_options(path):
         assert name in COMMANDS, line
         command = commands.get_command(click.Context(commands), name)
         assert command is not None
-        known = {option for param in command.params for option in param.opts} | {"--help"}
-        assert {word for word in rest if word.startswith("-")} <= known, line
+        options = {option for param in command.params for option in param.opts} | {"--help"}
+        assert {word for word in rest if word.startswith("-")} <= options, line
+
+
+@pytest.mark.parametrize("path", PAGES, ids=relative)
+def test_names_of_the_package_exist(path):
+    """Dotted names such as `gs_jax.optics.psf`, of modules or what is in them."""
+    for name in set(re.findall(r"`(gs_jax(?:\.\w+)+)", path.read_text(encoding="utf-8"))):
+        assert pkgutil.resolve_name(name) is not None, name
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ["frameworks", "gradients", "solver"])
-def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
+def test_python_of_a_page_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": name}
     for block in blocks(DOCS / "howto" / f"{name}.md", "python"):
         exec(compile(block, name, "exec"), names)
 
 
-def test_the_study_of_the_first_ten_minutes_is_one():
+@pytest.mark.integration
+def test_readme_is_short_and_its_python_runs(tmp_path):
+    """With a small microscope in place of the built-in one."""
+    (block,) = blocks(ROOT / "README.md", "python")
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 500
+    design_and_capture(tmp_path)
+    small = block.replace("gs.geomscope()", 'gs.read_design("design/geomscope.toml")')
+    assert small != block
+    check = "assert volume.shape == grid.volume_shape"
+    subprocess.run([sys.executable, "-c", f"{small}\n{check}"], cwd=tmp_path, check=True)
+    assert (tmp_path / "volume.png").exists()
+
+
+@pytest.mark.integration
+def test_python_of_the_python_page_runs(tmp_path):
+    """In a folder with a design and a capture, here of a small microscope."""
+    printed = blocks(DOCS / "howto" / "python.md", "python")
+    assert len(printed) == 3
+    design_and_capture(tmp_path)
+    checks = (
+        "assert volume.shape == clean.shape == grid.volume_shape and estimate.shape == (3, *grid.shape)",
+        "assert len(points) == 5 and jnp.isfinite(estimate).all()",
+        "assert jnp.abs(gradient.array.centers).max() > 0 and gradient.sensor_distance != 0",
+    )
+    subprocess.run([sys.executable, "-c", "\n".join([*printed, *checks])], cwd=tmp_path, check=True)
+    assert (tmp_path / "volume.png").exists()
+
+
+def test_study_of_the_first_ten_minutes_is_valid():
     (study,) = blocks(DOCS / "start.md", "toml")
     assert Study.model_validate(tomllib.loads(study)).name == "focused"
 
 
+def test_page_of_keys_is_up_to_date():
+    """`python design/keys.py` writes it."""
+    text = (DESIGN / "KEYS.md").read_text(encoding="utf-8")
+    assert text == module(DESIGN / "keys.py").page()
+    for key in design_keys().values():
+        assert f"`{key.name}`" in text or f"[{key.name}]" in text, key.path
+
+
+def test_drawing_of_keys_is_small(tmp_path, monkeypatch):
+    keys = module(DESIGN / "keys.py")
+    monkeypatch.setattr(keys, "DRAWING", tmp_path / "geometry.svg")
+    monkeypatch.setattr(keys, "PAGE", tmp_path / "KEYS.md")
+    keys.main()
+    for path in (tmp_path / "geometry.svg", DESIGN / "geometry.svg"):
+        assert 10_000 < path.stat().st_size < 200_000
+
+
 @pytest.mark.parametrize("name", ["chief-ray", "field", "core-halo", "imports"])
-def test_the_drawings_are_those_that_are_drawn(name):
-    """`python docs/drawings.py` draws them anew; that of imports is what the modules say."""
-    assert (DOCS / "drawings" / f"{name}.svg").read_text(encoding="utf-8") == module("drawings").DRAWINGS[name]()
+def test_drawings_are_up_to_date(name):
+    """`python docs/drawings.py` draws them; that of imports depends on the modules."""
+    drawing = (DOCS / "drawings" / f"{name}.svg").read_text(encoding="utf-8")
+    assert drawing == module(DOCS / "drawings.py").DRAWINGS[name]()
 
 
-def test_the_version_is_said_once():
+def test_residuals_of_calibration_mistakes():
+    """As the laboratory guide lists them, in pixels RMS."""
+    residuals = {name: rms for name, rms, _ in run()}
+    listed = {"nothing": 0.0, "each centre, 3 um": 1.2, "tilt, 0.5 degrees": 1.2, "all centres, 0.2 %": 0.8}
+    listed |= {"one place, 20 um sideways": 0.5, "one depth, 50 um": 0.3, "all depths, 200 um": 0.2}
+    assert {name: round(residuals[name], 1) for name in listed} == listed and residuals["two captures swapped"] > 40
+
+
+def test_contributing_names_what_exists():
+    """Files, folders, and words of the code."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    files = [path for folder in ("gs_jax", "tests", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    known = {path.name for path in files} | {path.parent.name for path in files} | {path.stem for path in files}
+    code = "\n".join(path.read_text(encoding="utf-8") for path in files)
+    words, paths = re.findall(r"`(\w+)`", text), re.findall(r"`([\w/-]+\.(?:py|yml|html|md))`", text)
+    assert len(words) > 20 and len(paths) > 10
+    assert not [path for path in paths if not (ROOT / path).exists() and path not in known]
+    assert not [word for word in words if word not in known and not re.search(rf"\b{word}\b", code)]
+
+
+def test_version_is_the_same_everywhere():
     from gs_jax import __version__
 
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
-def test_workflows_call_targets_that_there_are():
+def test_workflows_call_existing_targets():
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    called = {
+    calls = {
         path.stem: set(re.findall(r"run: make (\S+)", path.read_text(encoding="utf-8")))
         for path in (ROOT / ".github" / "workflows").glob("*.yml")
     }
-    assert set(called) == {"tests", "docs", "wheels"} and all(called.values())
-    assert set().union(*called.values()) <= targets
+    assert set(calls) == {"tests", "docs", "wheels"} and all(calls.values())
+    assert set().union(*calls.values()) <= targets
