@@ -95,7 +95,7 @@ def equation_1(data: Path | None, progress: Progress) -> Page:
     off = max(abs(row["s_z"] / row["by_eq_1"] - 1) for row in rows)
     z, s = np.array([(row["depth_mm"], row["by_eq_1"]) for row in rows]).T
     bent = np.abs(np.polynomial.Polynomial.fit(z, s, 1)(z) - s).max() / np.ptp(s)
-    why = "cores of spots are beside their chief rays; calibration takes that into account"
+    why = "cores of spots are off their chief rays; calibration accounts for it"
     claims = [
         Claim(
             "Eq. (1)", "scale of the pattern, s_z", "(z + v) / z", f"within {100 * off:.2f} %", _met(off < 1e-3, why)
@@ -143,7 +143,7 @@ def figure_3(data: Path | None, progress: Progress) -> Page:
         claim(f"a point at 20 mm: lateral FWHM, um ({sources})", "~40", "lateral_fwhm_um", ".0f"),
         claim("axial FWHM, um", "~300", "axial_fwhm_um", ".0f"),
         claim("two points 40 um apart: the dip between them", "below ~0.85", "lateral_dip", ".2f"),
-        claim("two points 300 um apart axially: the dip", "told apart", "axial_dip", ".2f"),
+        claim("two points 300 um apart axially: the dip", "resolved", "axial_dip", ".2f"),
     ]
     return Page({"fig3.png": fig3_resolution.picture(results)}, claims)
 
@@ -155,7 +155,7 @@ def figure_4(data: Path | None, progress: Progress) -> Page:
     said = f"F1 {plain:.2f}, with the best of thresholds {best:.2f}"
     claims = [
         Claim("Fig. 4A", "120 points, 18 to 22 mm, by clustering", "faithfully reconstructed", said,
-              _met(best > 0.95, "light of all lenses and haze reach its thresholds")),
+              _met(best > 0.95, "light of other lenses and haze exceed its thresholds")),
         Claim("Fig. 4A", "the same by find_points", "-", f"F1 {f1('find_points'):.3f}", "ours"),
     ]  # fmt: skip
     return Page({"fig4.png": fig4_suppression.picture(results)}, claims)
@@ -169,7 +169,7 @@ def figure_5(data: Path | None, progress: Progress) -> Page:
         within = [row["depth_mm"] for row in rows if row[key] <= bar]
         said = f"within {bar} um at {', '.join(f'{z:g}' for z in within)} mm"
         stable = len(within) > 5
-        why = "the sensor distance that is best at 20 mm; sharper there"
+        why = "the sensor distance is the best one for 20 mm; sharper there"
         claims.append(Claim("Fig. 5", f"{what} FWHM over ~5 mm of depth", "stable", said, _met(stable, why)))
     return Page({"fig5.png": fig5_fwhm_depth.picture(results)}, claims)
 
@@ -185,7 +185,7 @@ def figure_6(data: Path | None, progress: Progress) -> Page:
               _met(right == len(rows), "another plane is sharper")),
         Claim("Fig. 6", "group 3, element 2 at 18 mm", "clearly resolved", f"contrast {both:.2f}",
               _met(both >= fig6_usaf.RESOLVED, "contrast below 0.1")),
-        Claim("Fig. 6", "finest lines told apart, by depth", "-",
+        Claim("Fig. 6", "finest resolved lines, by depth", "-",
               "; ".join(f"{row['target_mm']:g} mm: {row['finest']}" for row in rows), "ours"),
     ]  # fmt: skip
     return Page({"fig6.png": fig6_usaf.picture(results)}, claims)
