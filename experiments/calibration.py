@@ -27,10 +27,9 @@ from experiments.common import OPTIONAL_PATH, Report, main, points_of, table
 from gs_jax import Camera, Imager, MicrolensArray, Sensor, expose, find_points, random_layout
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.fit import Calibration, calibrate, residuals_of
-from gs_jax.calibration.outcome import picture
-from gs_jax.calibration.scene import calibrate_by_scene
-from gs_jax.calibration.unknowns import FITTABLE
+from gs_jax.calibration.calibrated_design import plot_residuals
+from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate, spot_residuals
+from gs_jax.calibration.spot_model import FITTABLE
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
@@ -59,7 +58,7 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     for depth in DEPTHS:
         others, these = np.flatnonzero(points[:, 2] != depth), np.flatnonzero(points[:, 2] == depth)
         fitted = calibrate([images[k] for k in others], points[others], imager, progress=progress)
-        away = residuals_of(fitted, [images[k] for k in these], points[these])
+        away = spot_residuals(fitted, [images[k] for k in these], points[these])
         held_out[f"{depth:g} mm"] = float(np.sqrt((away**2).sum(1).mean()))
     scene, truth = read_capture(data / "P1_d.tif", imager.sensor.shape), points_of(data, "d")
     scores = {}
@@ -68,7 +67,7 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
         score = localization(results, truth, axial=0.6)
         scores[name] = {"f1": score.f1, "axial_um": 1000 * score.axial_rmse}
     turned = eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + TURN)
-    alone = calibrate_by_scene(scene, turned, voxel_grid(turned, SCENE), progress=progress)
+    alone = self_calibrate(scene, turned, voxel_grid(turned, SCENE), progress=progress)
     return {
         **_said(whole),
         "seconds": seconds,
@@ -149,7 +148,7 @@ def report(data: Path | None, devices: int, progress: Progress) -> Report:
     text += f"\n```\n{json.dumps(results['captures'], indent=2)}\n```\n"
     files: dict[str, dict | str | Figure] = {"calibration.json": results, "calibration.md": text}
     if whole:
-        files["calibration.png"] = picture(whole)
+        files["calibration.png"] = plot_residuals(whole)
     return Report(files, [table(columns, rows), text])
 
 

@@ -24,8 +24,8 @@ from gs_jax import Grid
 from gs_jax.apps.benchmark_measure import timed
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
-from gs_jax.detection.clustering import find_clusters
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.pictures.style import draw_image, label_of

@@ -22,7 +22,7 @@ from experiments.point_density import scores
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.pictures.style import draw_image
 from gs_jax.simulation.phantoms import beads

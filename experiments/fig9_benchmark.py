@@ -39,8 +39,8 @@ from gs_jax.apps.benchmark_scenes import spots
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
-from gs_jax.detection.clustering import find_clusters
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality

@@ -21,7 +21,7 @@ from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.point_finder import find_points
 from gs_jax.metrics import localization
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import random_points

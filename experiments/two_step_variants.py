@@ -32,7 +32,7 @@ from gs_jax.apps.training.simulated_captures import Kind, example
 from gs_jax.apps.training.training_loop import Recipe, start, train
 from gs_jax.apps.training.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
-from gs_jax.detection.unet import UNet, multislice_network, standardized
+from gs_jax.detection.unet import UNet, multislice_network, standardize
 from gs_jax.optics.psf_core import apparent_depths
 
 KIND = Kind(640, 0.009, 0.04, PLANES)
@@ -62,10 +62,10 @@ def stack(seed: int, number: int, kind: Kind = KIND) -> Stack:
     image, imager, grid, truth = example(seed, number, kind)
     seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
     mean = lambda image: np.asarray(backproject(image, imager, seen, normalize=True))
-    volume, unit = standardized(np.asarray(backproject(image, imager, seen)))
+    volume, unit = standardize(np.asarray(backproject(image, imager, seen)))
     level = np.float32(image.mean())
     variance = mean((image - level) ** 2) - mean(image - level) ** 2
-    spread, spread_unit = standardized(np.sqrt(np.maximum(variance, 0)))
+    spread, spread_unit = standardize(np.sqrt(np.maximum(variance, 0)))
     largest = max(float(truth.max()), 1e-30)
     truth = truth / largest
     power = float(truth.var())

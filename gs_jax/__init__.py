@@ -15,7 +15,7 @@ The microscope:
     write_design         Writes a design as TOML, its centres inside, whole or not at all; what is read back is equal
     geomscope            The paper's microscope (Table 1), with a random layout of our own of the same statistics
     random_layout        A random layout with a given pitch, without gaps between the lenses
-    calibrate            Finds a microscope's geometry in captures of point sources, from a design that is about right
+    calibrate            Estimate a microscope's geometry from captures of point sources, starting from its design
 
 From a capture to a volume:
 
@@ -34,8 +34,8 @@ From a capture to a volume:
 
 Without the background:
 
-    suppress             What of a back-projected volume is in focus, slice by slice; the rest becomes darker or zero
-    find_points          Finds the points that a capture shows: those that nearly all of their lenses see
+    suppress             Suppress what is out of focus in a back-projected volume, slice by slice, by a network
+    find_points          Find the points that a capture shows: those that nearly all of their lenses see
     write_points         Writes points `(x, y, z, intensity)`, mm, as CSV; what is read back is equal
     read_points          Points `(x, y, z, intensity)` from a CSV file with the header `x_mm,y_mm,z_mm,intensity`
 

@@ -8,7 +8,7 @@ from .codesign.search import run_study as run_study
 from .codesign.study import read_study as read_study
 from .design.builtin import geomscope as geomscope
 from .design.design import Design as Design, read_design as read_design, write_design as write_design
-from .detection.locate import find_points as find_points
+from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
 from .geometry import Imager as Imager, Sensor as Sensor
 from .grid import Grid as Grid

@@ -29,16 +29,14 @@ from gs_jax import (
 )
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.fit import Calibration, calibrate
-from gs_jax.calibration.matching import match, match_shift
-from gs_jax.calibration.outcome import calibrated, picture, scales
-from gs_jax.calibration.scene import calibrate_by_scene
-from gs_jax.calibration.sources import Sources, Spots
-from gs_jax.calibration.spots import core_offsets, find_spots
-from gs_jax.calibration.start import begin_without_lenses
-from gs_jax.calibration.unknowns import FITTABLE, FITTED
+from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
+from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
+from gs_jax.calibration.initial_guess import guess_without_lenses, match_pattern, match_shift
+from gs_jax.calibration.point_sources import Sources, Spots, find_spots
+from gs_jax.calibration.spot_model import FITTABLE, FITTED, core_offsets
 from gs_jax.cli.calibrate import _NAMES
 from gs_jax.design.builtin import geomscope
+from gs_jax.io.camera import Readout
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 
@@ -131,7 +129,7 @@ def test_lenses_beside_the_sensor_are_left_out(types):
     nothing = Spots(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     sources = Sources(POINTS, np.arange(3))
     found = Calibration(imager, False, {}, {}, sources, nothing, np.zeros((0, 2)))
-    new = calibrated(design, found._replace(residuals=np.ones((1, 2))))
+    new = apply_calibration(design, found._replace(residuals=np.ones((1, 2))))
     left, all_of_them = len(new.array.centers_mm), len(design.array.centers_mm)
     assert 0.5 * all_of_them < left < all_of_them
     assert new.provenance["lenses_beside_the_sensor"] == all_of_them - left
@@ -154,7 +152,7 @@ def test_a_pattern_is_matched_at_any_rotation_mirrored_or_not(seed, size):
     near = np.argsort(np.abs(c - complex(*rng.uniform(-2, 2, 2))))[:20]
     p = factor * (c.conj() if seed % 2 else c)[near] + shift + rng.normal(0, 0.003, (20, 2)) @ (1, 1j)
     p[[3, 7, 11]] = rng.uniform(-4, 4, (3, 2)) @ (1, 1j)
-    found = match(size * np.stack([p.real, p.imag], -1), size * centers, 1.27, 0.05)
+    found = match_pattern(size * np.stack([p.real, p.imag], -1), size * centers, 1.27, 0.05)
     assert found.mirrored == bool(seed % 2) and found.is_clear and found.on_lenses >= 17
     assert abs(found.factor - factor) < 0.005 and abs(found.shift / size - shift) < 0.02
 
@@ -163,7 +161,10 @@ def test_a_pattern_is_matched_at_any_rotation_mirrored_or_not(seed, size):
 def test_chance_is_no_pattern(size):
     centers = size * np.asarray(device(0)[1].array.centers)
     spots = size * np.random.default_rng(0).uniform(-4, 4, (20, 2))
-    assert not match(spots, centers, 1.28, 0.05).is_clear and not match(spots[:2], centers, 1.28, 0.05).is_clear
+    assert (
+        not match_pattern(spots, centers, 1.28, 0.05).is_clear
+        and not match_pattern(spots[:2], centers, 1.28, 0.05).is_clear
+    )
 
 
 @pytest.mark.integration
@@ -175,9 +176,29 @@ def test_geometry_is_found_from_a_poor_start(seed):
     check(found, actual)
     # Spots near to where they are due, though the image has others.
     assert len(found.residuals) > 20 and np.hypot(*found.residuals.T).max() < 1
-    depth, seen, fitted = scales(found).T
+    depth, seen, fitted = pattern_scales(found).T
     np.testing.assert_allclose(seen, fitted, atol=2e-4)
-    assert set(depth) <= {18.0, 20.0, 22.0} and len(picture(found).axes) == 3
+    assert set(depth) <= {18.0, 20.0, 22.0} and len(plot_residuals(found).axes) == 3
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_region_calibrates_the_whole(binning):
+    actual, design, _ = device(0)
+    row, column, rows, columns = 100, 50, 1200, 1400
+    region = Readout(roi=(row, column, rows, columns), binning=binning).sensor(design.sensor)
+    images = [
+        image[row : row + rows, column : column + columns]
+        .reshape(rows // binning, binning, columns // binning, binning)
+        .mean((1, 3))
+        for image in captures(actual)
+    ]
+    found = calibrate(images, POINTS, eqx.tree_at(lambda i: i.sensor, design, region))
+    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=4e-3)
+    assert float(found.imager.sensor_distance) == pytest.approx(float(actual.sensor_distance), abs=1e-2)
+    left, right, bottom, top = region.extent
+    axes = plot_residuals(found).axes[0]
+    assert (axes.get_xlim(), axes.get_ylim()) == (pytest.approx((left, right)), pytest.approx((bottom, top)))
 
 
 def smaller(imager: Imager) -> Imager:
@@ -192,20 +213,12 @@ def smaller(imager: Imager) -> Imager:
 
 @pytest.mark.integration
 def test_a_small_device_is_calibrated_as_a_large_one():
+    """By one capture."""
     actual, design, mirrored = device(0)
     found = calibrate(captures(actual)[1:2], POINTS[1:2] / 50, smaller(design))
     assert found.mirrored == mirrored and found.rms < 0.1
     np.testing.assert_allclose(50 * found.imager.centers, actual.centers, atol=2e-3)
     check(found, smaller(actual), NAMES[:1])
-
-
-@pytest.mark.integration
-def test_one_capture_does():
-    actual, design, mirrored = device(0)
-    found = calibrate(captures(actual)[1:2], POINTS[1:2], design)
-    assert found.mirrored == mirrored
-    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=2e-3)
-    check(found, actual, NAMES[:1])
 
 
 MANY = np.array([[x, y, z] for z in (18.0, 20.0, 22.0) for x, y in ((-1.2, 0.3), (1.1, 0.8), (0.1, -1.0))])
@@ -303,7 +316,7 @@ def test_lenses_of_no_list_are_where_they_are_without_the_designs_tilt():
     points = MANY[:3]
     found = [np.asarray(level.project(points[[k]]))[:, 0] for k in range(3)]
     tilted = eqx.tree_at(lambda i: i.tilt, design, jnp.array([0.03, -0.02]), is_leaf=lambda leaf: leaf is None)
-    start = begin_without_lenses(found, Sources(points, np.arange(3)), tilted).imager
+    start = guess_without_lenses(found, Sources(points, np.arange(3)), tilted).imager
     away = KDTree(np.asarray(level.centers)).query(np.asarray(start.centers))[0]
     # The sensor's distance is searched for in steps of a hundredth.
     assert start.tilt is None and np.max(away) < 0.01
@@ -317,33 +330,33 @@ def test_a_scene_that_nobody_knows():
     start = eqx.tree_at(lambda i: (i.rotation, i.tilt), actual, (actual.rotation + np.radians(2), None))
     image = captures(actual, MANY, np.zeros(9, int))[0]
     grid = Grid([17.0, 23.0], (121, 121), 0.05)
-    found = calibrate_by_scene(image, start, grid)
+    found = self_calibrate(image, start, grid)
     check(found, actual, [name for name in NAMES if "rotation" in name or "tilt" in name])
     assert len(found.sources.points) >= 7 and found.rms < 0.2
-    with pytest.raises(InputError, match="--from-scene: found shift to fit, allowed: rotation, tilt, lenses"):
-        calibrate_by_scene(image, start, grid, fit=["shift"])
+    with pytest.raises(InputError, match="--from-scene: only rotation, tilt and lenses can be fitted, got shift"):
+        self_calibrate(image, start, grid, fit=["shift"])
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
-    with pytest.raises(InputError, match="capture: found 0 points that the lenses agree on, allowed: 5 or more"):
-        calibrate_by_scene(blank, start, grid)
+    with pytest.raises(InputError, match="capture: a sparse scene in focus with 5 or more points is needed, got 0"):
+        self_calibrate(blank, start, grid)
 
 
 def test_what_cannot_be_calibrated_is_refused_in_words():
     _, design, _ = device(0)
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
-    with pytest.raises(InputError, match="captures: found 0 of 0 bright spots on lenses at best"):
+    with pytest.raises(InputError, match="got 0 of 0 bright spots on lenses at best"):
         calibrate([blank], POINTS[:1], design)
-    with pytest.raises(InputError, match="captures: found 0 of 0 spots on lenses that several captures show"):
+    with pytest.raises(InputError, match="captures: got 0 of 0 spots on lenses that several captures show"):
         calibrate([blank, blank], POINTS[:2], design, find_lenses=True)
-    with pytest.raises(InputError, match="positions: found 1 of 2 points unknown, allowed: known points, two or more"):
+    with pytest.raises(InputError, match="positions: two or more known points, .*, got 1 of 2 points unknown"):
         calibrate([blank, blank], POINTS[:2] * [[1, 1, np.nan], [1, 1, 1]], design, find_lenses=True)
     with pytest.raises(InputError, match="capture 2: found 1 of .* pixels NaN or infinite"):
         calibrate([blank, np.where(blank == blank.max(), np.nan, blank)], POINTS[:2], design)
     for points, of, message in (
-        (POINTS, None, "found a source in capture 2, allowed: 1 to 1"),
-        (POINTS[:0], None, "found 0 sources for 1 captures, none in capture 1, allowed: one or more in each"),
-        (np.array([[0.0, 0.0, -20.0]]), None, "found the depth -20 mm, allowed: above 0"),
-        (np.array([[0.0, 0.0, np.nan]]), None, "no known depth to fit sensor_distance by, allowed: the depth of"),
-        (np.array([[np.nan, 0.0, 20]]), None, "no source with known x and y to fit shift by, allowed: x and y of"),
+        (POINTS, None, "1 to 1, got a source in capture 2"),
+        (POINTS[:0], None, "one or more sources, got 0 sources for 1 captures, none in capture 1"),
+        (np.array([[0.0, 0.0, -20.0]]), None, "depths must be positive, got -20 mm"),
+        (np.array([[0.0, 0.0, np.nan]]), None, "no known depth to fit sensor_distance by; give the depth of"),
+        (np.array([[np.nan, 0.0, 20]]), None, "no source with known x and y to fit shift by; give x and y of"),
     ):
         with pytest.raises(InputError, match="positions: .*" + message):
             calibrate([blank], points, design, captures=of)
@@ -352,7 +365,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
 @pytest.mark.integration
 def test_numbers_that_the_spots_do_not_determine_are_refused():
     actual, design, _ = device(0)
-    with pytest.raises(InputError, match="spots that do not determine sensor_distance_mm.*depth_offset"):
+    with pytest.raises(InputError, match="spots do not determine sensor_distance_mm.*depth_offset"):
         calibrate(captures(actual)[1:2], POINTS[1:2], design, fit=FITTABLE[:-1])
 
 
@@ -430,7 +443,10 @@ def test_the_command(tmp_path):
     assert new.tilt is not None and "calibrated_values" in read_provenance(tmp_path / "new.toml")
     (tmp_path / "p.csv").write_text("x_mm,y_mm,z_mm\n0,0,20\n")
     for more, message in (
-        ([], "p.csv: positions: found 1 sources for 3 captures, none in capture 2, allowed: one or more in each"),
+        (
+            [],
+            "p.csv: positions: every capture needs one or more sources, got 1 sources for 3 captures",
+        ),
         (["--from-scene"], "calibrate needs --positions"),
         (["--fit", "focus"], "found 'focus', allowed: sensor-distance, rotation"),
     ):

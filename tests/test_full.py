@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Sensor, forward, optics_of, reconstruct
 from gs_jax.design.design import read_design
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.point_finder import find_points
 from gs_jax.geometry import falloff
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.field_varying import field_varying_psf

@@ -20,9 +20,8 @@ from gs_jax import (
     optics_of,
     reconstruct,
 )
-from gs_jax.detection.consistency import Signal, readings
-from gs_jax.detection.evidence import point_evidence
-from gs_jax.detection.type_views import LensType, readings_of
+from gs_jax.detection.background import DetectionImage
+from gs_jax.detection.view_samples import LensType, detection_stats, sample_views, sample_views_by_type
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type, type_weights
 from gs_jax.projection.backprojection import backproject
@@ -32,7 +31,7 @@ from gs_jax.simulation.synthetic import simulate
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 from .test_full import grid, imager, volume
-from .test_locate import small
+from .test_point_finder import small
 
 # Radii of two types: f of 4.65 and 5.1 mm.
 RADII = np.array([2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0, 2.2, 2.0])
@@ -123,21 +122,25 @@ def test_points_of_lenses_with_several_apertures():
     # Half a pixel in the object laterally. 0.1 mm axially moves no spot by more than a third of a pixel.
     near = (np.hypot(apart[..., 0], apart[..., 1]) < 0.016) & (np.abs(apart[..., 2]) < 0.1)
     assert len(found) == len(points) and (near.sum(0) == 1).all() and (near.sum(1) == 1).all()
-    evidence = point_evidence(found, image, scope, voxels)
+    evidence = detection_stats(found, image, scope, voxels)
     assert (evidence.lit >= 0.7 * evidence.lenses).all() and (evidence.lenses > 6).all()
 
 
 def test_only_kinds_that_are_sharp_read_points():
     scope, _ = small()
-    light = Signal(*np.ones((2, *scope.sensor.shape), np.float32))
+    light = DetectionImage(*np.ones((2, *scope.sensor.shape), np.float32))
     ends, flat = np.array([19.0, 21.0]), np.ones(2)
     one, other = split_by_type(scope, (tuple(range(20)), tuple(range(20, 49))))
     types = [LensType(one, ends, ends, flat), LensType(other, ends, ends + 0.1, np.array([1.0, 0.0]))]
     points = np.array([[0.1, 0.2, 19.2], [0.1, 0.2, 20.8]])
-    seen, all_, late = readings_of(points, light, types), readings(points, light, scope), points + [0, 0, 0.1]
+    seen, all_, late = (
+        sample_views_by_type(points, light, types),
+        sample_views(points, light, scope),
+        points + [0, 0, 0.1],
+    )
     assert seen.seen.sum(1).tolist()[0] == all_.seen.sum(1)[0] > seen.seen.sum(1)[1] > 0
     assert seen.lens_type is not None and set(seen.lens_type[1][seen.seen[1]]) == {0}
-    second = readings(late, light, other)
+    second = sample_views(late, light, other)
     np.testing.assert_allclose(
         seen.pixels[0][(seen.lens_type[0] == 1) & seen.seen[0]], second.pixels[0][second.seen[0]]
     )

@@ -245,8 +245,8 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
 }
 # What is refused, and by which words.
 REFUSED: dict[tuple[str, str], str] = {
-    ("one lens", "points"): "found 1 lens, allowed: 3 lenses",
-    ("one lens", "calibrate"): "found 0 of 1 bright spots",
+    ("one lens", "points"): "3 or more lenses must agree on a point, got 1 lens",
+    ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "tolerance"): "1 lenses see, allowed: 2 or more",
     ("geomscope-table1", "calibrate"): "of 20 bright spots on lenses",
 }

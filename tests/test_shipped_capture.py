@@ -6,7 +6,7 @@ import pytest
 from gs_jax import Grid, Imager, backproject, forward
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_points
 from gs_jax.metrics import localization

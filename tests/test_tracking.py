@@ -9,7 +9,7 @@ import tifffile
 
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.detection.tracking import MISSING, linked
+from gs_jax.detection.tracking import MEMORY, link_particles
 from gs_jax.io.point_tables import read_points
 
 from .test_cli import folder, run
@@ -29,7 +29,7 @@ def walks(frames=60, particles=30):
     unseen = np.zeros(particles, int)
     for _ in range(frames):
         at = at + drift + rng.normal(0, 0.005, at.shape)
-        gone = (rng.random(particles) < 0.1) & (unseen < MISSING)
+        gone = (rng.random(particles) < 0.1) & (unseen < MEMORY)
         unseen = np.where(gone, unseen + 1, 0)
         shown = rng.permutation(np.flatnonzero(~gone))
         yield at[shown], shown
@@ -39,7 +39,7 @@ def walks(frames=60, particles=30):
 def test_particles_are_those_that_moved():
     places, numbers = zip(*walks(), strict=True)
     assert any(len(shown) < 30 for shown in numbers)
-    found = list(linked(iter(places), 0.1))
+    found = list(link_particles(iter(places), 0.1))
     # One name for each, and each name for one.
     pairs = {pair for pair in zip(np.concatenate(found), np.concatenate(numbers), strict=True)}
     assert len(pairs) == 30 == len({name for name, _ in pairs}) == len({number for _, number in pairs})
@@ -48,17 +48,17 @@ def test_particles_are_those_that_moved():
 @needs_trackpy
 def test_who_is_gone_for_long_is_somebody_else():
     here, nobody = np.array([[0.0, 0, 20]]), np.zeros((0, 3))
-    for gone, same in ((MISSING, True), (MISSING + 1, False)):
-        first, *_, last = linked([here, *[nobody] * gone, here], 0.1)
+    for gone, same in ((MEMORY, True), (MEMORY + 1, False)):
+        first, *_, last = link_particles([here, *[nobody] * gone, here], 0.1)
         assert (first == last) is same
-    assert list(linked([nobody, nobody], 0.1)) == [[], []] and list(linked([], 0.1)) == []
+    assert list(link_particles([nobody, nobody], 0.1)) == [[], []] and list(link_particles([], 0.1)) == []
 
 
 @needs_trackpy
 def test_crowds_are_refused():
     crowd = np.random.default_rng(0).uniform(0, 0.1, (200, 3))
-    with pytest.raises(InputError, match="--track: found 1000 um, within which more particles are than"):
-        list(linked([crowd, crowd], 1.0))
+    with pytest.raises(InputError, match="--track: too many particles are within 1000 um"):
+        list(link_particles([crowd, crowd], 1.0))
 
 
 @needs_trackpy
@@ -94,5 +94,5 @@ def test_what_cannot_be_tracked_is_one_line(folder, monkeypatch, capsys):
     assert status == 2 and "--track must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "trackpy", None)
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100", "--points", "p.csv"))
-    assert (status, err) == (2, "gs-jax: --track: found no trackpy, allowed: after pip install 'gs-jax[track]'.\n")
+    assert (status, err) == (2, "gs-jax: --track needs trackpy; install it with pip install 'gs-jax[track]'.\n")
     assert not (folder / "v.zarr").exists()

@@ -17,7 +17,7 @@ from gs_jax.detection.unet import (
     paper_network,
     pretrained,
     read_weights,
-    standardized,
+    standardize,
     suppress,
     write_weights,
 )
@@ -59,7 +59,7 @@ def test_ours_is_smaller():
 
 
 def test_standardized_volumes_have_no_pedestal_and_one_unit():
-    above, unit = standardized(stack(3, 9, 30) + np.float32(5))
+    above, unit = standardize(stack(3, 9, 30) + np.float32(5))
     assert above.std() == pytest.approx(unit, rel=1e-2)  # their means are near, not at, their medians
     np.testing.assert_allclose(np.median(above, axis=(1, 2)), 0, atol=1e-6)
 
@@ -237,7 +237,7 @@ def test_a_file_that_would_fill_the_memory_is_refused(tmp_path):
 def test_missing_and_unknown_weights(tmp_path):
     with pytest.raises(InputError, match=r"none\.npz"):
         read_weights(tmp_path / "none.npz")
-    with pytest.raises(InputError, match="allowed: paper, multislice"):
+    with pytest.raises(InputError, match="one of paper, multislice"):
         pretrained("other")
     with pytest.raises(InputError, match=r"allowed: \.npz"):
         write_weights(tmp_path / "w.txt", small())

@@ -20,7 +20,7 @@ from ..design.builtin import geomscope
 from ..design.datasheets import datasheet
 from ..design.design import Design, write_design
 from ..design.diagnostics import findings
-from ..detection.locate import find_points
+from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
 from ..geometry import Sensor
 from ..grid import Grid

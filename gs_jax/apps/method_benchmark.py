@@ -26,8 +26,8 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..detection.clustering import find_clusters
-from ..detection.locate import find_points
+from ..detection.clusters import find_clusters
+from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
 from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import subtract_offset

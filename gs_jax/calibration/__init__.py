@@ -1,1 +1,1 @@
-"""The geometry of a real microscope from captures of point sources."""
+"""Calibration: estimates the geometry of a real microscope from captures of point sources."""

@@ -1,4 +1,4 @@
-"""The geometry of a microscope from captures of point sources whose places are known, at least in part."""
+"""Estimates the geometry of a microscope from captures of point sources, or of an unknown sparse scene."""
 
 import dataclasses
 import os
@@ -12,64 +12,72 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Float, Float64, Int
+from scipy.spatial import KDTree
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..detection.point_finder import find_points
 from ..geometry import Imager
+from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .matching import near_of
-from .sources import Sources, Spots, assigned
-from .spots import find_spots
-from .start import begin, begin_without_lenses
-from .uncertainty import check_known, deviations_of, noise_of, values_of
-from .unknowns import (
+from .initial_guess import guess_from_pattern, guess_without_lenses
+from .point_sources import Sources, SpotLists, Spots, assign_spots, find_spots_mm
+from .spot_model import (
     FITTABLE,
     FITTED,
     NOISE,
-    Known,
-    Offsets,
+    CoreOffsets,
+    Observations,
     Unknowns,
-    applied,
-    found_points,
-    guessed,
-    offsets_of,
+    apply_to_imager,
+    check_determined,
+    estimate_noise,
+    initial_unknowns,
+    match_radius,
+    named_values,
     residuals,
-    weighed,
+    source_points,
+    standard_errors,
+    trace_core_offsets,
+    weighted_residuals,
 )
 
-# Spots looked for in a capture, for each of its sources.
-_SPOTS = 60
-# How near a spot must be to where it is due, over `near_of`: wide, then narrow.
+# Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)
-# Standard deviation that lenses may have from their places: of a printed array, mm, whatever its pitch, as printers
-# have it; and of no list, over `near_of`.
-_PRINTED, _ANYWHERE = 0.01, 17.0
-# Captures that are looked at side by side, each with several times its memory.
+# Prior standard deviation of lenses: of a printed array, mm; and of unlisted lenses, over `match_radius`.
+_PRINTED, _UNLISTED = 0.01, 17.0
+# Captures in which spots are searched for at once, each with several times its memory.
 _THREADS = 2
-# Steps of the solver at most.
-_MOST_STEPS = 300
-# Spots in an array of them: a multiple, so that few shapes are compiled.
+_MAX_STEPS = 300
+# Numbers of spots are padded to a multiple of this, so that few shapes are compiled.
 _MULTIPLE = 256
+# What self-calibration fits: an unknown scene determines neither sensor distance nor shift.
+SELF_FITTED = ("rotation", "tilt")
+# Most and fewest points that self-calibration uses.
+_MOST_POINTS, _MIN_POINTS = 60, 5
+# Range on either side and step of the search for the rotation, radians, and number of bright sources that it uses.
+_ROTATION, _ROTATION_STEP, _ROTATION_SOURCES = np.radians(5.0), np.radians(0.4), 5
+# Distance on the sensor within which rays meet in a point, over `match_radius`.
+_MEETING = 0.5
 
 
 class Calibration(NamedTuple):
-    """What was found.
+    """Result of a calibration.
 
     Parameters
     ----------
     imager
-        The microscope; its array's centres are mirrored, y against -y, if `mirrored`, and moved if they were fitted.
+        The microscope. The array's centers are mirrored, y to -y, if `mirrored`, and moved if lenses were fitted.
     mirrored
         Whether the array is the other way round than in the design.
     values, deviations
-        What was fitted, in the units of its names, and the standard deviations from the Gauss-Newton covariance. Of
-        `lenses` only the deviation, the median of all, mm.
+        Fitted values and their standard errors, by names with units. Of `lenses` only the median error of all, mm.
     sources
-        The points with what was found of them, mm, and the capture of each.
+        The points with their fitted coordinates, mm, and the capture of each.
     spots, residuals
-        The spots, and how far each is from where it should be, `(x, y)`, pixels.
+        The spots, and their predicted less their observed positions, `(x, y)`, pixels.
     """
 
     imager: Imager
@@ -82,7 +90,7 @@ class Calibration(NamedTuple):
 
     @property
     def rms(self) -> float:
-        """Of the distances, pixels."""
+        """Root mean square of the residuals' lengths, pixels."""
         return float(np.sqrt((self.residuals**2).sum(1).mean()))
 
 
@@ -96,38 +104,39 @@ def calibrate(
     find_lenses: bool = False,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Finds a microscope's geometry in captures of point sources, from a design that is about right.
+    """Estimate a microscope's geometry from captures of point sources, starting from its design.
 
     *Host.*
 
     The spots of each capture are matched to the lenses at any rotation, mirrored or not, with a sensor distance within
     a quarter of the design's. Then what `fit` names is fitted by Levenberg-Marquardt to the spots within the field
-    radius, with a robust loss. Where spots are is predicted by exact rays: what aberrations do is not fitted away.
+    radius, with a robust loss. Spots are predicted by exact rays, so that aberrations bias nothing.
 
     Parameters
     ----------
     images
         Captures, in pixels of any unit.
     points
-        `(x, y, z)` of the sources, mm, in the sensor's frame; NaN is not known and is fitted, too.
+        `(x, y, z)` of the sources, mm, in the sensor's frame; NaN is unknown and fitted, too.
     imager
         The microscope as designed.
     captures
-        Which image each source is in, from 0; by default one a source, in their order.
+        Image of each source, from 0; by default one source in each, in their order.
     fit
         Of `sensor_distance`, `rotation`, `shift`, `tilt`, `scale` of the array, `depth_offset` of all sources, and
-        `lenses`, each of which is within about 10 um of where it is listed.
+        `lenses`, each of which is within about 10 um of its listed position.
     find_lenses
-        Finds the lenses themselves, whatever the design lists, and of `fit` only the sensor's distance and the depths'
-        offset: rotation, shift, scale and tilt are in the lenses' places. Needs known points.
+        Find the lenses themselves, whatever positions the design lists, and fit only sensor distance and depth offset
+        of `fit`: the lenses' positions contain rotation, shift, scale and tilt. Needs known points. If the design has
+        lenses of several types, the type of each is estimated from the light of its spots.
     progress
-        Shows how far it is.
+        Shows how far the work is.
 
     Raises
     ------
     InputError
-        If points and captures do not fit together, a pixel is not finite, no pattern of lenses is seen, or the spots do
-        not determine what is to be fitted.
+        If points and captures do not fit together, a pixel is not finite, no pattern of lenses is found, or the spots
+        do not determine what is to be fitted.
 
     Examples
     --------
@@ -149,128 +158,162 @@ def calibrate(
     sources.check_fit(fit)
     for number, image in enumerate(images, 1):
         check_finite(f"capture {number}", image)
-    many = [int((sources.captures == number).sum()) for number in range(len(images))]
-    # Filters of SciPy, which run beside each other.
+    counts = [int((sources.captures == number).sum()) for number in range(len(images))]
+    # SciPy's filters release the GIL.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:
-        spots = threads.map(spots_in, images, [imager] * len(images), many)
-        found = [each for each, _ in zip(spots, progress.track(images, "Finding spots"), strict=True)]
+        results = threads.map(find_spots_mm, images, [imager] * len(images), counts)
+        spots = [found for found, _ in zip(results, progress.track(images, "Finding spots"), strict=True)]
+    unknown = np.isnan(sources.points)
     with progress.step("Matching lenses"):
         if find_lenses:
-            start = begin_without_lenses(found, sources, imager, images)
+            guess = guess_without_lenses(spots, sources, imager, images)
         else:
-            start = begin(found, sources, imager)
-    if find_lenses:
-        fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
-    loose = _ANYWHERE * near_of(start.imager.array.centers) if find_lenses else _PRINTED
-    result = refine(found, start.imager, start.sources, np.isnan(sources.points), fit, loose, progress)
-    return _seen_alone(result) if find_lenses else result._replace(mirrored=start.mirrored)
+            guess = guess_from_pattern(spots, sources, imager)
+    if not find_lenses:
+        result = refine(spots, guess.imager, guess.sources, unknown, fit, progress=progress)
+        return result._replace(mirrored=guess.mirrored)
+    fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
+    lens_sd = _UNLISTED * match_radius(guess.imager.array.centers)
+    return _drop_unseen_lenses(refine(spots, guess.imager, guess.sources, unknown, fit, lens_sd, progress))
 
 
-def _seen_alone(found: Calibration) -> Calibration:
-    """With the lenses that have spots."""
-    seen, lenses = np.unique(found.spots.lenses, return_inverse=True)
-    array = found.imager.array
+def _drop_unseen_lenses(result: Calibration) -> Calibration:
+    seen, lenses = np.unique(result.spots.lenses, return_inverse=True)
+    array = result.imager.array
     numbers = {name: value[seen] if (value := getattr(array, name)).ndim else value for name in EACH}
     array = dataclasses.replace(array, centers=array.centers[seen], **numbers)
-    imager = eqx.tree_at(lambda i: i.array, found.imager, array)
-    return found._replace(imager=imager, spots=found.spots._replace(lenses=lenses))
+    imager = eqx.tree_at(lambda i: i.array, result.imager, array)
+    return result._replace(imager=imager, spots=result.spots._replace(lenses=lenses))
 
 
 def refine(
-    found: Sequence[Float64[np.ndarray, "_ 2"]],
+    spots: SpotLists,
     imager: Imager,
     sources: Sources,
     unknown: np.ndarray,
     fit: Sequence[str],
-    loose: float = _PRINTED,
+    lens_sd: float = _PRINTED,
     progress: Progress | None = None,
 ) -> Calibration:
-    """The fit, from a geometry and sources that put spots within a twentieth of the pitch of where they are.
+    """Fit from an initial guess that predicts spots, mm, within a twentieth of the pitch.
+
+    `unknown` `(source, 3)` says which coordinates of the sources are fitted, `fit` what else; `lens_sd` is the prior
+    standard deviation of lenses, mm. `InputError` if the spots do not determine what is to be fitted.
+    """
+    fit = [name for name in FITTABLE if name in fit]
+    radius, solver = match_radius(imager.array.centers), optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    current, points, state = imager, sources.points, None
+    assigned = data = None
+    for within in (progress or Progress()).track(_WITHIN, "Fitting"):
+        offsets = trace_core_offsets(current, points[:, 2])
+        assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
+        data = _observations(imager, sources.points, unknown, assigned, offsets)
+        state = state or initial_unknowns(fit, data)
+        if not jax.tree.leaves(state):
+            raise InputError(f"calibration: fit one or more of {', '.join(FITTABLE)}, got nothing to fit.")
+        check_determined(standard_errors(state, data, lens_sd, NOISE), radius)
+        args = data, jnp.asarray(lens_sd, data.positions.dtype)
+        state = optx.least_squares(weighted_residuals, solver, state, args, throw=False, max_steps=_MAX_STEPS).value
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
+            raise InputError("captures: no geometry explains the spots; are they those of the given sources?")
+        current, points = apply_to_imager(state, imager), np.asarray(source_points(state, data), np.float64)
+    assert state is not None and assigned is not None and data is not None
+    off = np.asarray(residuals(state, data), np.float64)[: len(assigned.lenses)]
+    errors = standard_errors(state, data, lens_sd, estimate_noise(off, state, assigned.lenses))
+    check_determined(errors, radius)
+    sources = sources._replace(points=points)
+    return Calibration(current, False, named_values(state), errors, sources, assigned, off)
+
+
+def spot_residuals(
+    result: Calibration, images: Sequence[Image], points: Float[np.ndarray, "image 3"]
+) -> Float64[np.ndarray, "spot 2"]:
+    """Residuals of captures of other points under a calibration, `(x, y)`, pixels."""
+    imager, sources = result.imager, Sources(points, np.arange(len(points)))
+    offsets, spots = trace_core_offsets(imager, points[:, 2]), [find_spots_mm(image, imager) for image in images]
+    assigned = assign_spots(spots, sources, imager, offsets, match_radius(imager.array.centers))
+    data = _observations(imager, points, np.zeros_like(points, bool), assigned, offsets)
+    return np.asarray(residuals(Unknowns(), data), np.float64)[: len(assigned.lenses)]
+
+
+def _observations(imager: Imager, points, unknown, spots: Spots, offsets: CoreOffsets) -> Observations:
+    size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
+    dtype = imager.sensor_distance.dtype
+    sources, lenses, positions = (
+        jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)])) for part in spots
+    )
+    valid, unknown = jnp.arange(size) < len(spots.lenses), jnp.asarray(np.argwhere(unknown))
+    points = jnp.asarray(points, dtype)
+    return Observations(imager, points, unknown, sources, lenses, positions.astype(dtype), valid, offsets)
+
+
+def self_calibrate(
+    image: Image,
+    imager: Imager,
+    grid: Grid,
+    *,
+    fit: Sequence[str] = SELF_FITTED,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Find rotation and tilt in a capture of unknown points, from a design that is right to some degrees.
+
+    The rotation at which most rays of several lenses meet is searched for. `find_points` finds points with it, then
+    their positions and the geometry are fitted to the spots together (bundle adjustment). Sensor distance, shift and
+    scale are the design's, as any others explain the same capture by another scene.
 
     Parameters
     ----------
-    found
-        Spots of each capture, `(x, y)`, mm.
-    imager, sources
-        The start.
-    unknown
-        `(source, 3)`: which coordinates of the sources are fitted.
-    fit, loose
-        What else is, and how far lenses may be from their places (a standard deviation), mm.
+    image, imager
+        A capture of a sparse scene (points, beads, cells), and the microscope as designed.
+    grid
+        The box of these voxels contains the scene.
+    fit
+        Of `rotation`, `tilt` and `lenses`.
     progress
-        Shows how far it is.
+        Shows how far the work is.
 
     Raises
     ------
     InputError
-        If the spots do not determine what is to be fitted.
+        If fewer than five points are found, or something else is to be fitted.
     """
-    fit = [name for name in FITTABLE if name in fit]
-    done, near = None, near_of(imager.array.centers)
-    for within in (progress or Progress()).track(_WITHIN, "Fitting"):
-        done = _fitted(found, imager, sources, unknown, fit, loose, within * near, done)
-    assert done is not None
-    state, known, spots = done
-    off = np.asarray(residuals(state, known), np.float64)[: len(spots.lenses)]
-    deviations = deviations_of(state, known, loose, noise_of(off, state, spots))
-    check_known(deviations, near)
-    sources = sources._replace(points=np.asarray(found_points(state, known), np.float64))
-    return Calibration(applied(state, imager), False, values_of(state), deviations, sources, spots, off)
+    progress = progress or Progress()
+    if other := [name for name in fit if name not in (*SELF_FITTED, "lenses")]:
+        raise InputError(f"--from-scene: only rotation, tilt and lenses can be fitted, got {', '.join(other)}.")
+    depths = np.asarray(grid.depths, np.float64)
+    with progress.step("Searching for the rotation"):
+        spots = find_spots_mm(image, imager, _ROTATION_SOURCES)
+        rotated = _search_rotation(spots, imager, (depths.min(), depths.max()))
+    points = find_points(image, rotated, grid, progress=progress)[:_MOST_POINTS, :3]
+    if len(points) < _MIN_POINTS:
+        needs = f"a sparse scene in focus with {_MIN_POINTS} or more points is needed"
+        raise InputError(f"capture: {needs}, got {len(points)} on which the lenses agree.")
+    spots = find_spots_mm(image, imager, len(points))
+    sources = Sources(points, np.zeros(len(points), int))
+    return refine([spots], rotated, sources, np.ones(points.shape, bool), fit, progress=progress)
 
 
-class _Fitted(NamedTuple):
-    """A round of the fit."""
-
-    state: Unknowns
-    known: Known
-    spots: Spots
-
-
-def _fitted(found, imager: Imager, sources: Sources, unknown, fit, loose, within, before: _Fitted | None) -> _Fitted:
-    """With the spots that are near to where the round before puts them."""
-    here, points = imager, sources.points
-    if before:
-        here, points = applied(before.state, imager), np.asarray(found_points(before.state, before.known), np.float64)
-    offsets = offsets_of(here, points[:, 2])
-    spots = assigned(found, sources._replace(points=points), here, offsets, within)
-    known = _known(imager, sources.points, unknown, spots, offsets)
-    start = before.state if before else guessed(fit, known)
-    if not jax.tree.leaves(start):
-        raise InputError(f"calibration: found nothing to fit, allowed: some of {', '.join(FITTABLE)}.")
-    check_known(deviations_of(start, known, loose, NOISE), near_of(imager.array.centers))
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    given = known, jnp.asarray(loose, known.places.dtype)
-    state = optx.least_squares(weighed, solver, start, given, throw=False, max_steps=_MOST_STEPS).value
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
-        raise InputError("captures: found no geometry that explains the spots, allowed: spots of the given sources.")
-    return _Fitted(state, known, spots)
+def _search_rotation(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths: tuple[float, float]) -> Imager:
+    """The imager at the rotation at which most rays through spots and lenses meet."""
+    near, far = (float(imager.magnification(depth)) for depth in depths)
+    within = _MEETING * match_radius(imager.array.centers)
+    step = within / imager.field_radius
+    magnifications = np.linspace(far, near, max(int(np.ceil((near - far) / step)) + 1, 2))
+    steps = np.floor(_ROTATION / _ROTATION_STEP)
+    rotated = [_rotate(imager, turn) for turn in np.arange(-steps, steps + 1) * _ROTATION_STEP]
+    return max(rotated, key=lambda one: max(_concentration(spots, one, m, within) for m in magnifications))
 
 
-def spots_in(image, imager: Imager, sources: int = 1) -> Float64[np.ndarray, "spot 2"]:
-    """Places of the brightest spots on the sensor, mm."""
-    return np.asarray(imager.sensor.to_mm(find_spots(image, _SPOTS * sources)), np.float64)
+def _rotate(imager: Imager, angle: float) -> Imager:
+    return eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + jnp.asarray(angle, imager.rotation.dtype))
 
 
-def residuals_of(
-    found: Calibration, images: Sequence[Image], points: Float[np.ndarray, "image 3"]
-) -> Float64[np.ndarray, "spot 2"]:
-    """How far the spots of captures of other points are from where a calibration puts them, `(x, y)`, pixels."""
-    imager, sources = found.imager, Sources(points, np.arange(len(points)))
-    offsets = offsets_of(imager, points[:, 2])
-    spots = assigned(
-        [spots_in(image, imager) for image in images], sources, imager, offsets, near_of(imager.array.centers)
-    )
-    known = _known(imager, points, np.zeros_like(points, bool), spots, offsets)
-    return np.asarray(residuals(Unknowns(), known), np.float64)[: len(spots.lenses)]
-
-
-def _known(imager: Imager, points, unknown, spots: Spots, offsets: Offsets) -> Known:
-    size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
-    dtype = imager.sensor_distance.dtype
-    padded = lambda part: jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)]))
-    are = jnp.arange(size) < len(spots.lenses)
-    indices = jnp.asarray(np.argwhere(unknown))
-    places = padded(spots.places).astype(dtype)
-    return Known(
-        imager, jnp.asarray(points, dtype), indices, padded(spots.sources), padded(spots.lenses), places, are, offsets
-    )
+def _concentration(spots, imager: Imager, magnification: float, within: float) -> float:
+    """How clearly rays meet in a plane: the sum of cubes of the number of rays near each."""
+    centers = np.asarray(imager.centers, np.float64)
+    points = ((1 + magnification) * centers - spots[:, None]) / magnification
+    points = points[np.linalg.norm(points - centers, axis=-1) < imager.field_radius]
+    if not len(points):
+        return 0.0
+    count = KDTree(points).query_ball_point(points, within / magnification, return_length=True)
+    return float((np.asarray(count, float) ** 3).sum())

@@ -72,11 +72,10 @@ def calibrate_command(
     """
     from rich.console import Console
 
-    from ..calibration.fit import calibrate
-    from ..calibration.outcome import calibrated, picture, table
-    from ..calibration.scene import FITTED as OF_SCENES, calibrate_by_scene
-    from ..calibration.sources import Sources
-    from ..calibration.unknowns import FITTED
+    from ..calibration.calibrated_design import apply_calibration, plot_residuals, summary_table
+    from ..calibration.fit import SELF_FITTED, calibrate, self_calibrate
+    from ..calibration.point_sources import Sources
+    from ..calibration.spot_model import FITTED
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
@@ -92,14 +91,14 @@ def calibrate_command(
     check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
-    names = [name for name in (*(OF_SCENES if from_scene else FITTED), *fit) if name not in hold]
+    names = [name for name in (*(SELF_FITTED if from_scene else FITTED), *fit) if name not in hold]
     with Progress() as progress:
         if positions is None:
             capture = next(iter(captures))
             image = camera.read(capture)
             grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
             with errors_name_file(capture):
-                outcome = calibrate_by_scene(image, imager, grid, fit=names, progress=progress)
+                outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
         else:
             points, of = read_positions(positions, captures)
             sources = Sources(points, of)
@@ -109,10 +108,10 @@ def calibrate_command(
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             options = {"captures": of, "fit": names, "find_lenses": find_lenses}
             outcome = calibrate(images, points, imager, **options, progress=progress)
-    write_design(output, calibrated(microscope, outcome, camera.recorded(provenance_of(*inputs))))
-    write_figure(drawing, picture(outcome))
+    write_design(output, apply_calibration(microscope, outcome, camera.recorded(provenance_of(*inputs))))
+    write_figure(drawing, plot_residuals(outcome))
     camera.print_corrections()
-    Console().print(table(microscope, outcome))
+    Console().print(summary_table(microscope, outcome))
     mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
     lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
     click.echo(f"{output}: {len(outcome.residuals)} spots, {outcome.rms:.3f} pixels RMS{mirrored}{lenses}")

@@ -126,11 +126,11 @@ def reconstruct_command(
     if points:
         check_output(points, [".csv"])
     if track:
-        from ..detection.tracking import linker
+        from ..detection.tracking import import_linker
 
         if not points:
             raise InputError("--track must be used with --points POINTS.csv, which has the particles.")
-        linker()
+        import_linker()
     check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")

@@ -192,7 +192,7 @@ def _request(names, provenance) -> dict[str, str]:
 
 def _write_points(path, series, track, provenance) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
-    from ..detection.tracking import tracked
+    from ..detection.tracking import track as track_particles
     from ..io.point_tables import write_points_in_time
 
     points, particles = 0, 0
@@ -205,7 +205,9 @@ def _write_points(path, series, track, provenance) -> str:
             yield frame, columns
 
     frames = ((frame, note["points"]) for frame, note in series.notes())
-    write_points_in_time(path, count(tracked(frames, track / 1000) if track else frames), provenance=provenance)
+    if track:
+        frames = track_particles(frames, track / 1000)
+    write_points_in_time(path, count(frames), provenance=provenance)
     words = f"{points} point{'s' * (points != 1)}"
     return f"{words} of {particles} particle{'s' * (particles != 1)}" if track else words
 

@@ -1,1 +1,1 @@
-"""What takes the background out of a back-projection: points that lenses agree on, and networks."""
+"""Finds points in captures and volumes, and suppresses the background of back-projections."""

@@ -1,29 +1,58 @@
-"""Smoothing of an image, and its background and noise, square by square. Host code, in bands that stay in the cache."""
+"""Background, noise and smoothing of an image. Host code that works on bands of rows, which fit into the CPU cache."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
+from ..base.arrays import check_finite
 from ..base.machine import in_threads
+from ..typing import Image
 
-# Side of the squares that have one background and one noise, pixels: wider than a spot, narrower than haze. As many
-# rows are in a band.
-_SQUARE = 32
-# How far a Gaussian goes, in standard deviations.
+# Side of a tile with one background and one noise level, pixels: wider than a spot, narrower than haze. A band has as
+# many rows.
+_TILE = 32
+# Half width of the Gaussian kernel in standard deviations.
 _TRUNCATE = 4
+# Smoothing before points are looked for, pixels: spots 2.5 pixels apart still have two maxima.
+_SMOOTHING = 0.7
+# Least noise, relative to the brightest spot: for images without noise, and for the steps of the camera's counts.
+_DYNAMIC_RANGE = 1000
+
+Pixels = Float32[np.ndarray, "row column"]
+Tiles = Float32[np.ndarray, "tile_row tile"]
 
 
-def in_bands(rows: int, work: Callable[[slice], object]) -> None:
-    """Does some work for every band of rows, on all cores."""
-    list(in_threads(work, [slice(start, min(start + _SQUARE, rows)) for start in range(0, rows, _SQUARE)]))
+class DetectionImage(NamedTuple):
+    """An image less its background, slightly smoothed, and the standard deviation of the noise of each pixel."""
+
+    light: Pixels
+    noise: Pixels
 
 
-def smoothed(image: Shaped[np.ndarray, "row column"], deviation: float) -> Float32[np.ndarray, "row column"]:
-    """An image after a Gaussian of this standard deviation, pixels; at the edges it is mirrored.
+def subtract_background(image: Image) -> DetectionImage:
+    """Smooth an image slightly and subtract its background; `InputError` if a pixel is not finite."""
+    check_finite("image", image)
+    light = gaussian_smooth(np.asarray(image), _SMOOTHING)
+    background, noise = (interpolate_tiles(tiles, light.shape) for tiles in background_tiles(light))
+    light -= background
+    least = max(float(np.median(subsample(noise))), float(light.max()) / _DYNAMIC_RANGE)
+    return DetectionImage(light, np.maximum(noise, least, out=noise))
 
-    What `scipy.ndimage.gaussian_filter` does, in float32 and in a tenth of the time.
-    """
+
+def subsample(image: Pixels) -> Float32[np.ndarray, " pixel"]:
+    """Every tenth pixel of a large image, enough for quantiles; all pixels of a small one."""
+    return image.ravel()[:: max(1, min(10, image.size // 10**6))]
+
+
+def for_each_band(rows: int, work: Callable[[slice], object]) -> None:
+    """Call `work` for every band of rows, on all cores."""
+    list(in_threads(work, [slice(start, min(start + _TILE, rows)) for start in range(0, rows, _TILE)]))
+
+
+def gaussian_smooth(image: Shaped[np.ndarray, "row column"], deviation: float) -> Pixels:
+    """`scipy.ndimage.gaussian_filter` with mirrored edges, in float32 and ten times as fast; `deviation` in pixels."""
     reach = int(_TRUNCATE * deviation + 0.5)
     weights = np.exp(-((np.arange(reach + 1) / deviation) ** 2) / 2)
     weights = (weights / (2 * weights.sum() - weights[0])).astype(np.float32)
@@ -31,28 +60,23 @@ def smoothed(image: Shaped[np.ndarray, "row column"], deviation: float) -> Float
     result = np.empty(image.shape, np.float32)
 
     def smooth(band):
-        tall = _extended(image, band, rows, reach)
+        first, last = band.start - reach, band.stop + reach
+        inside = first >= 0 and last <= rows
+        tall = image[first:last] if inside else image[mirror_indices(np.arange(first, last), rows)]
         wide = np.empty((len(tall) - 2 * reach, columns + 2 * reach), np.float32)
-        _weighed(tall, weights, wide[:, reach : reach + columns])
+        _convolve_rows(tall, weights, wide[:, reach : reach + columns])
         for ends in (np.arange(reach), np.arange(-reach, 0)):
-            wide[:, ends] = wide[:, reach + mirrored((ends % wide.shape[1]) - reach, columns)]
-        _weighed(wide.T, weights, result[band].T)
+            wide[:, ends] = wide[:, reach + mirror_indices((ends % wide.shape[1]) - reach, columns)]
+        _convolve_rows(wide.T, weights, result[band].T)
 
-    in_bands(rows, smooth)
+    for_each_band(rows, smooth)
     return result
 
 
-def _extended(image, band: slice, rows: int, reach: int):
-    """A band of an image with the rows beside it."""
-    first, last = band.start - reach, band.stop + reach
-    inside = first >= 0 and last <= rows
-    return image[first:last] if inside else image[mirrored(np.arange(first, last), rows)]
-
-
-def _weighed(wide, weights, total):
-    """Into `total`, the sum of rows of `wide` that are shifted up and down, with a weight for each distance."""
+def _convolve_rows(rows, weights, total):
+    """Write the convolution of `rows` with a symmetric kernel, given from its middle on, into `total`."""
     reach = len(weights) - 1
-    shifted = lambda by: wide[reach + by : reach + by + len(total)]
+    shifted = lambda by: rows[reach + by : reach + by + len(total)]
     np.multiply(shifted(0), weights[0], out=total)
     pair = np.empty_like(total)
     for distance in range(1, reach + 1):
@@ -61,52 +85,48 @@ def _weighed(wide, weights, total):
         total += pair
 
 
-def mirrored(index: np.ndarray, size: int) -> np.ndarray:
-    """Indices from beyond an axis of this size, mirrored at its ends; the outermost element is there twice."""
+def mirror_indices(index: np.ndarray, size: int) -> np.ndarray:
+    """Mirror indices beyond an axis of this size at its ends, as `mode="symmetric"` of `numpy.pad`."""
     index = index % (2 * size)
     return np.minimum(index, 2 * size - 1 - index)
 
 
-def square_levels(
-    image: Float[np.ndarray, "row column"],
-) -> tuple[Float32[np.ndarray, "square_row square"], Float32[np.ndarray, "square_row square"]]:
-    """Background and noise of each square of 32 pixels; the last go on as the image's edge.
+def background_tiles(image: Float[np.ndarray, "row column"]) -> tuple[Tiles, Tiles]:
+    """Background and noise of each tile of 32 pixels; incomplete tiles repeat the image's edge.
 
-    The background is the median; the noise is the root mean square of what is darker, which no spot adds to.
+    The background is the median, the noise the root mean square of the darker pixels, to which no spot contributes.
     """
     rows, columns = image.shape
-    median, noise = np.empty((2, -(-rows // _SQUARE), -(-columns // _SQUARE)), np.float32)
+    median, noise = np.empty((2, -(-rows // _TILE), -(-columns // _TILE)), np.float32)
 
     def measure(band):
-        padding = ((0, -(band.stop - band.start) % _SQUARE), (0, -columns % _SQUARE))
-        pixels = np.pad(image[band], padding, mode="edge").reshape(_SQUARE, -1, _SQUARE)
-        # A third of the pixels says the same.
-        pixels = pixels.swapaxes(0, 1).reshape(-1, _SQUARE**2)[:, ::3]
+        padding = ((0, -(band.stop - band.start) % _TILE), (0, -columns % _TILE))
+        pixels = np.pad(image[band], padding, mode="edge").reshape(_TILE, -1, _TILE)
+        # Every third pixel is enough.
+        pixels = pixels.swapaxes(0, 1).reshape(-1, _TILE**2)[:, ::3]
         # Sorting is faster than NumPy's median.
         middle = np.sort(pixels, axis=1)[:, [(pixels.shape[1] - 1) // 2, pixels.shape[1] // 2]].mean(1)
-        row = band.start // _SQUARE
+        row = band.start // _TILE
         median[row] = middle
         noise[row] = np.sqrt(2 * np.mean(np.minimum(pixels - middle[:, None], 0) ** 2, axis=1))
 
-    in_bands(rows, measure)
+    for_each_band(rows, measure)
     return median, noise
 
 
-def between(
-    levels: Float32[np.ndarray, "square_row square"], shape: tuple[int, int]
-) -> Float32[np.ndarray, "row column"]:
-    """Levels of squares, linear between their middles, at each pixel of an image of this shape."""
-    place = (np.arange(_SQUARE) + 0.5) / _SQUARE - 0.5
-    # Of the square before, of the pixel's own, and of the next.
-    weights = np.stack([np.maximum(-place, 0), 1 - np.abs(place), np.maximum(place, 0)], 1).astype(np.float32)
-    around = np.pad(levels, 1, mode="edge")
+def interpolate_tiles(tiles: Tiles, shape: tuple[int, int]) -> Pixels:
+    """Interpolate the levels of tiles linearly between their centers, at each pixel of an image of this shape."""
+    offset = (np.arange(_TILE) + 0.5) / _TILE - 0.5
+    # Weights of the previous tile, the pixel's own tile and the next.
+    weights = np.stack([np.maximum(-offset, 0), 1 - np.abs(offset), np.maximum(offset, 0)], 1).astype(np.float32)
+    around = np.pad(tiles, 1, mode="edge")
     neighbours = np.stack([around[:, :-2], around[:, 1:-1], around[:, 2:]], -1)
     wide = (neighbours @ weights.T).reshape(len(around), -1)[:, : shape[1]]
     result = np.empty(shape, np.float32)
 
     def interpolate(band):
-        row, count = band.start // _SQUARE, band.stop - band.start
+        row, count = band.start // _TILE, band.stop - band.start
         np.matmul(weights[:count], wide[row : row + 3], out=result[band])
 
-    in_bands(shape[0], interpolate)
+    for_each_band(shape[0], interpolate)
     return result

@@ -1,5 +1,5 @@
-"""Points of successive frames as particles, by trackpy (J. C. Crocker and D. G. Grier, J. Colloid Interface Sci. 179,
-298, 1996): the links of the least sum of squared distances."""
+"""Links points of successive frames to particles with trackpy (Crocker and Grier, J. Colloid Interface Sci. 179, 298,
+1996), which minimises the sum of squared displacements."""
 
 import itertools
 from collections import deque
@@ -10,69 +10,70 @@ from jaxtyping import Float
 
 from ..base.errors import InputError
 
-# Frames that a particle may be missing from, and be the same when it is back.
-MISSING = 2
+# Frames that a particle may be missing from and still keep its number; trackpy's term.
+MEMORY = 2
 
 
-def linker() -> Callable[..., Iterator[tuple[int, list[int]]]]:
-    """`trackpy.link_iter`, which then says nothing; `InputError` if trackpy is not installed."""
+def import_linker() -> Callable[..., Iterator[tuple[int, list[int]]]]:
+    """Import `trackpy.link_iter` and silence its log; `InputError` if trackpy is not installed."""
     try:
         import trackpy
     except ImportError as error:
-        raise InputError("--track: found no trackpy, allowed: after pip install 'gs-jax[track]'.") from error
+        raise InputError("--track needs trackpy; install it with pip install 'gs-jax[track]'.") from error
     trackpy.quiet()
     return trackpy.link_iter
 
 
-def linked(frames: Iterable[Float[np.ndarray, "_ 3"]], farthest: float) -> Iterator[list[int]]:
-    """The particle that each point is, frame by frame; particles are counted from 0, as they appear.
+def link_particles(frames: Iterable[Float[np.ndarray, "_ 3"]], search_range: float) -> Iterator[list[int]]:
+    """Number the particle of each point, frame by frame; particles are counted from 0 in order of appearance.
 
     Parameters
     ----------
     frames
-        Places of the points, mm: of all frames in their order, those without points too. One is held at a time.
-    farthest
-        That a particle moves from a frame to the next, mm; less than how far particles are apart. One that was missing
-        from `MISSING` frames at most is looked for as near to where it was.
+        Positions of the points of every frame in order, mm, also of frames without points. One frame is held at a time.
+    search_range
+        Largest displacement between frames, mm, smaller than the distance of particles. Particles that were missing
+        from up to `MEMORY` frames are searched for within the same distance.
 
     Raises
     ------
     InputError
-        If trackpy is not installed, or too many particles are nearer to each other than `farthest`.
+        If trackpy is not installed, or too many particles are closer than `search_range`.
     """
-    link = linker()
+    link = import_linker()
     from trackpy.linking import SubnetOversizeException
 
     frames = iter(frames)
-    # None at all are too few for trackpy.
     try:
+        # trackpy fails on an empty sequence.
         for first in itertools.islice(frames, 1):
-            for _, particles in link(itertools.chain([first], frames), farthest, memory=MISSING):
+            for _, particles in link(itertools.chain([first], frames), search_range, memory=MEMORY):
                 yield particles
     except SubnetOversizeException as error:
-        found = f"{farthest * 1000:g} um, within which more particles are than can be told apart"
-        raise InputError(f"--track: found {found}, allowed: less.") from error
+        distance = f"{search_range * 1000:g} um"
+        raise InputError(f"--track: too many particles are within {distance} to tell them apart; reduce it.") from error
 
 
-def tracked(frames: Iterable[tuple[int, dict[str, list]]], farthest: float) -> Iterator[tuple[int, dict[str, list]]]:
-    """Frames, ascending, and the columns of their points, with the column `particle` after the first four.
+def track(frames: Iterable[tuple[int, dict[str, list]]], search_range: float) -> Iterator[tuple[int, dict[str, list]]]:
+    """Insert the column `particle` after the first four columns of each frame's points.
 
-    Frames that are left out have no points. `farthest` and errors as of `linked`.
+    Frames ascend; those left out have no points. `search_range` and errors as in `link_particles`.
     """
-    read, names = deque(), ("x_mm", "y_mm", "z_mm")
+    pending = deque()
 
-    def places():
-        number = 0
+    def positions():
+        following = 0
         for frame, columns in frames:
-            for _ in range(number, frame):
-                read.append(None)
+            for _ in range(following, frame):
+                pending.append(None)
                 yield np.zeros((0, 3))
-            read.append((frame, columns))
-            yield np.array([columns[name] for name in names], float).T
-            number = frame + 1
+            pending.append((frame, columns))
+            yield np.array([columns[name] for name in ("x_mm", "y_mm", "z_mm")], float).T
+            following = frame + 1
 
-    for particles in linked(places(), farthest):
-        if (found := read.popleft()) is not None:
-            frame, columns = found
-            first, rest = dict(list(columns.items())[:4]), dict(list(columns.items())[4:])
-            yield frame, first | {"particle": particles} | rest
+    for particles in link_particles(positions(), search_range):
+        if (item := pending.popleft()) is not None:
+            frame, columns = item
+            names = list(columns)
+            before, after = ({name: columns[name] for name in part} for part in (names[:4], names[4:]))
+            yield frame, before | {"particle": particles} | after

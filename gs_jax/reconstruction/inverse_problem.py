@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import check_finite
 from ..base.progress import Progress
-from ..detection.background import between, square_levels
+from ..detection.background import background_tiles, interpolate_tiles
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
@@ -73,7 +73,7 @@ def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y 
     (rows, columns), side = model.imager.sensor.shape, model.binning
     light = subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype))
     light = light[: rows * side, : columns * side].reshape(rows, side, columns, side).sum((1, 3))
-    return light, np.maximum(between(square_levels(light)[0], light.shape), 0) if model.is_partial else 0.0
+    return light, np.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0) if model.is_partial else 0.0
 
 
 def subtract_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:

@@ -101,7 +101,7 @@ class Plan:
                 points, statistics, warning = self._find_points(image, sharp(), progress)
             volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
             if self.suppress == "clusters":
-                from ..detection.clustering import find_clusters
+                from ..detection.clusters import find_clusters
 
                 with progress.step("Clustering"):
                     points = find_clusters(volume, self.grid)
@@ -122,14 +122,14 @@ class Plan:
         return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
 
     def _find_points(self, image: Image, sharp: Any, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
-        from ..detection.consistency import signal
-        from ..detection.evidence import point_evidence
-        from ..detection.locate import NOT_TRUSTED, find_points
+        from ..detection.background import subtract_background
+        from ..detection.point_finder import NOT_TRUSTED, find_points
+        from ..detection.view_samples import detection_stats
 
-        light = signal(image)
+        light = subtract_background(image)
         points = find_points(light, self.imager, self.grid, progress=progress)
         warning = blur_warning(sharp, "points", NOT_TRUSTED)
-        statistics = point_evidence(points, light, self.imager, self.grid)._asdict()
+        statistics = detection_stats(points, light, self.imager, self.grid)._asdict()
         return points, statistics | {"confident": np.full(len(points), int(warning is None))}, warning
 
     def _volume_of_points(self, points: Any) -> Volume:

@@ -25,16 +25,16 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Float64, Int, Key
 
 from ...base.errors import InputError
-from ...calibration.unknowns import (
+from ...calibration.spot_model import (
     FITTED,
-    Known,
-    Offsets,
+    CoreOffsets,
+    Observations,
     Unknowns,
-    applied,
-    core_powers,
-    guessed,
-    offsets_of,
+    apply_to_imager,
+    core_polynomials,
+    initial_unknowns,
     residuals,
+    trace_core_offsets,
 )
 from ...geometry import Imager
 from ...lenses import MicrolensArray
@@ -214,7 +214,7 @@ class VisiblePoints(NamedTuple):
 class CoreModel(NamedTuple):
     """Core positions of the design, and their derivatives by radius, conic constant and index."""
 
-    offsets: Offsets
+    offsets: CoreOffsets
     slopes: Float[Array, "change type depth power"]
 
 
@@ -244,11 +244,11 @@ def depth_arguments(
     near, far = min(near, sources[:, 2].min()), max(far, sources[:, 2].max())
     beyond = min(0.1 * (far - near), near / 2)
     traced = np.linspace(near - beyond, far + beyond, _CORE_DEPTHS)
-    offsets, perfect, slopes = offsets_of(imager, traced), no_errors(len(centers)), []
-    here = np.asarray(offsets.here, np.float64)
+    offsets, perfect, slopes = trace_core_offsets(imager, traced), no_errors(len(centers)), []
+    here = np.asarray(offsets.offset, np.float64)
     for name, step in _STEPS.items():
         changed = perturb(imager, dataclasses.replace(perfect, **{name: jnp.asarray(step)}))
-        slopes.append(jnp.asarray((core_powers(changed, traced) - here) / step))
+        slopes.append(jnp.asarray((core_polynomials(changed, traced) - here) / step))
     cores = CoreModel(offsets, jnp.stack(slopes))
     return imager, cores, _visible(imager, sources), _visible(imager, points)
 
@@ -278,10 +278,10 @@ def depth_errors(
     """
     device = perturb(imager, errors)
     change = jnp.tensordot(jnp.stack([errors.radius, errors.conic, errors.index]), cores.slopes, 1)
-    offsets = cores.offsets._replace(here=cores.offsets.here + change)
+    offsets = cores.offsets._replace(offset=cores.offsets.offset + change)
     photographed = _photograph(device, offsets, sources, imager, cores.offsets)
-    fitted = _least_squares(lambda unknowns: residuals(unknowns, photographed), guessed(FITTED, photographed))
-    assumed = jax.tree.map(lambda *two: jnp.stack(two), imager, applied(fitted, imager))
+    fitted = _least_squares(lambda unknowns: residuals(unknowns, photographed), initial_unknowns(FITTED, photographed))
+    assumed = jax.tree.map(lambda *two: jnp.stack(two), imager, apply_to_imager(fitted, imager))
 
     def error(assumed, point):
         one = VisiblePoints(*(part[None] for part in point))
@@ -296,14 +296,16 @@ def depth_errors(
     return designed, calibrated
 
 
-def _photograph(device: Imager, offsets: Offsets, points: VisiblePoints, assumed: Imager, known: Offsets) -> Known:
+def _photograph(
+    device: Imager, offsets: CoreOffsets, points: VisiblePoints, assumed: Imager, known: CoreOffsets
+) -> Observations:
     """The device's spots of points, as a calibration that assumes another imager takes them."""
     count, most = points.lenses.shape
     sources, lenses, seen = jnp.repeat(jnp.arange(count), most), points.lenses.ravel(), points.seen.ravel()
     nowhere = jnp.zeros((count * most, 2), points.points.dtype)
-    spots = Known(device, points.points, jnp.zeros((0, 2), int), sources, lenses, nowhere, seen, offsets)
+    spots = Observations(device, points.points, jnp.zeros((0, 2), int), sources, lenses, nowhere, seen, offsets)
     places = residuals(Unknowns(), spots) * device.sensor.pixel_pitch
-    return spots._replace(places=places, imager=assumed, offsets=known)
+    return spots._replace(positions=places, imager=assumed, offsets=known)
 
 
 def _least_squares(residual: Callable[[Unknowns], Array], start: Unknowns) -> Unknowns:

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from ...base.progress import Progress
 from ...base.workers import Workers
-from ...detection.unet import standardized
+from ...detection.unet import standardize
 from ...io.files import atomic_write, decoding, make_folder
 from ...optics.psf_core import apparent_depths
 from ...projection.backprojection import backproject
@@ -81,12 +81,12 @@ def simulated_stack(seed: int, number: int, kinds: Sequence[Kind] = KINDS) -> St
     Returns
     -------
     Stack
-        In the unit of `unet.standardized`. The truth is the scene, shared out to the nearest planes and blurred
+        In the unit of `unet.standardize`. The truth is the scene, shared out to the nearest planes and blurred
         by `TRUTH_BLUR`, times the slope of the volume's voxels by it: what is in focus keeps its brightness.
     """
     image, imager, grid, truth = example(seed, number, kinds[number // SCENES % len(kinds)])
     seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
-    volume, unit = standardized(np.asarray(backproject(image, imager, seen)))
+    volume, unit = standardize(np.asarray(backproject(image, imager, seen)))
     truth = gaussian_filter(truth, (0, TRUTH_BLUR, TRUTH_BLUR))
     # In a unit of its own: a capture's is far from what half precision holds.
     truth = truth / max(float(truth.max()), 1e-30)
@@ -147,7 +147,7 @@ def patches(
 ) -> Batch:
     """Random pieces of stacks, turned and mirrored; three in four are chosen for showing something.
 
-    Stacks are in the network's unit (`unet.standardized`). Errors count relative to what a piece shows, so that dim
+    Stacks are in the network's unit (`unet.standardize`). Errors count relative to what a piece shows, so that dim
     objects count as bright ones do; where it shows nothing, to a part of the ghosts in it.
     """
     pieces = [_patch(stacks[rng.integers(len(stacks))], offsets, rng, size, bool(i % 4)) for i in range(count)]

@@ -16,9 +16,9 @@ from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
-from gs_jax.detection.clustering import find_clusters
-from gs_jax.detection.evidence import point_evidence
-from gs_jax.detection.locate import find_points
+from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.point_finder import find_points
+from gs_jax.detection.view_samples import detection_stats
 from gs_jax.metrics import localization
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.lens_types import interleave
@@ -108,11 +108,10 @@ def test_an_uneven_haze_does_not_matter():
     capture = np.asarray(expose(hazy, Camera(), jax.random.key(0), peak_electrons=3000))
     score = localization(find(capture), truth)
     assert score.f1 == 1 and score.lateral_rmse < LATERAL and score.axial_rmse < AXIAL
-
-
-def test_without_noise_too():
-    truth = many()
-    assert localization(find(image_of(truth)), truth).f1 == 1
+    # Without haze and noise, and the same each time.
+    found = find(image)
+    assert localization(found, truth).f1 == 1
+    np.testing.assert_array_equal(found, find(image))
 
 
 @pytest.mark.parametrize(
@@ -212,6 +211,7 @@ def test_the_voxels_do_not_matter_and_the_box_does():
     capture, truth = capture_of(many()), many()
     _, grid = small()
     fine = find(capture)
+    np.testing.assert_array_equal(fine, find(capture, grid.at(grid.depths[::-1])))
     coarse = find(capture, Grid([19.0, 21.0], (45, 45), 0.12))
     assert localization(coarse, fine, lateral=0.01, axial=0.05).f1 == 1
     half = find(capture, Grid(grid.depths, (91, 181), 0.03))
@@ -219,21 +219,8 @@ def test_the_voxels_do_not_matter_and_the_box_does():
     deep = find(capture, Grid([20.0, 21.0], grid.shape, grid.pitch))
     assert localization(deep, fine[fine[:, 2] > 20.1], axial=0.1).recall == 1
     assert (deep[:, 2] > 19.8).all()
-
-
-@pytest.mark.integration
-def test_depths_may_be_one_or_in_any_order():
-    truth = many()
-    capture = capture_of(truth)
-    _, grid = small()
-    np.testing.assert_array_equal(find(capture), find(capture, grid.at(grid.depths[::-1])))
     plane = np.array([[0.5, 0.5, 20.0, 1.0], [-0.5, 0.0, 20.0, 1.0]])
     assert localization(find(capture_of(plane), Grid([20.0], grid.shape, grid.pitch)), plane).f1 == 1
-
-
-def test_it_says_the_same_each_time():
-    capture = capture_of(many())
-    np.testing.assert_array_equal(find(capture), find(capture))
 
 
 def test_without_a_lens_in_reach_nothing_is_found():
@@ -247,7 +234,7 @@ def test_a_wrong_image_is_named():
         find(np.zeros((4, 5)))
     spoilt = np.ones((896, 960))
     spoilt[:2, 0] = np.nan, np.inf
-    for search in (find, lambda image: point_evidence(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
+    for search in (find, lambda image: detection_stats(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
         with pytest.raises(
             InputError, match="image: found 2 of 860160 pixels NaN or infinite, allowed: finite numbers"
         ):

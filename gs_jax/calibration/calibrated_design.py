@@ -1,0 +1,137 @@
+"""Results of a calibration for files and people: the calibrated design, a table and a figure."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from matplotlib.figure import Figure
+from pydantic import ValidationError
+from rich.table import Table
+
+from ..base.errors import InputError
+from ..design.centers import LENS_KEYS
+from ..design.design import Design
+from ..design.tables import CalibrationTable
+from ..design.validation import reach
+from ..io.provenance import Provenance
+from ..io.toml import one_line
+from ..lenses import EACH, MicrolensArray
+from .fit import Calibration
+
+# Length of the longest arrow in the figure, in sides of the sensor.
+_LONGEST = 0.08
+
+
+def apply_calibration(design: Design, result: Calibration, provenance: Provenance | None = None) -> Design:
+    """The design with the calibrated values, which its provenance lists, too; `InputError` if it is not valid.
+
+    Lenses that turn out to be imaged beside the sensor are left out.
+    """
+    imager = result.imager
+    one = lambda value: float(f"{float(value):.9g}")
+
+    def pair(values) -> tuple[float, float]:
+        x, y = np.asarray(values, np.float64)
+        return one(x), one(y)
+
+    centers = np.asarray(imager.array.centers, np.float64)
+    # The plate may be larger than designed, or lenses found beyond it.
+    size = np.maximum(design.array.size_mm, 2 * np.abs(centers).max(0) * (1 + 1e-9))
+    pairs = tuple(map(pair, centers))
+    array = design.array.model_copy(update={"centers_mm": pairs, "size_mm": pair(size)})
+    lens = design.lens.model_copy(update=_lens_lists(imager.array))
+    tilt = (0.0, 0.0) if imager.tilt is None else np.degrees(np.arctan(imager.tilt))
+    pose = CalibrationTable(
+        rotation_deg=one(np.degrees(imager.rotation)), shift_mm=pair(imager.shift), tilt_deg=pair(tilt)
+    )
+    record: dict[str, Any] = {
+        **(provenance or {}),
+        "calibrated_rms_pixels": round(result.rms, 4),
+        "calibrated_spots": len(result.residuals),
+        "calibrated_captures": len(np.unique(result.sources.captures[result.spots.sources])),
+        "mirrored": result.mirrored,
+        "calibrated_values": {name: float(f"{value:.9g}") for name, value in result.values.items()},
+        "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in result.deviations.items()},
+    }
+    imaging = design.imaging.model_copy(update={"sensor_distance_mm": one(imager.sensor_distance)})
+    tables = {"array": array, "lens": lens, "imaging": imaging, "calibration": pose}
+    new = design.model_copy(update=tables | {"provenance": {**design.provenance, **record}})
+    distance, radius = reach(new)
+    if new.sensor.origin_mm is None and (distance > radius).any():
+        on = np.flatnonzero(distance <= radius)
+        lists = {key: tuple(values[k] for k in on) for key, values in _lens_lists(imager.array).items()}
+        array = array.model_copy(update={"centers_mm": tuple(pairs[k] for k in on)})
+        new = new.model_copy(update={"array": array, "lens": lens.model_copy(update=lists)})
+        new.provenance["lenses_beside_the_sensor"] = len(pairs) - len(on)
+    try:
+        return Design.model_validate(new.model_dump())
+    except ValidationError as error:
+        raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
+
+
+def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
+    """Keys of `[lens]` with a number for each lens, by the fewest decimals that give the array's numbers."""
+    numbers = {key: np.asarray(getattr(array, name)) for key, name in zip(LENS_KEYS, EACH, strict=True)}
+    return {key: tuple(float(str(one)) for one in value) for key, value in numbers.items() if value.ndim}
+
+
+def summary_table(design: Design, result: Calibration) -> Table:
+    """Designed and calibrated values, with standard errors."""
+    table = Table("", "design", "found", "SD", box=None, pad_edge=False)
+    pose = design.calibration
+    before = {
+        "sensor_distance_mm": design.imaging.sensor_distance_mm,
+        "rotation_deg": pose.rotation_deg,
+        **dict(zip(("shift_x_mm", "shift_y_mm"), pose.shift_mm, strict=True)),
+        **dict(zip(("tilt_x_deg", "tilt_y_deg"), pose.tilt_deg, strict=True)),
+        "scale": 1.0,
+        "depth_offset_mm": 0.0,
+    }
+    for name, value in result.values.items():
+        table.add_row(name, f"{before[name]:.6g}", f"{value:.6g}", f"{result.deviations[name]:.2g}")
+    return table
+
+
+def pattern_scales(result: Calibration) -> Float64[np.ndarray, "source 3"]:
+    """Depth, mm, and scale `s_z` of the lenses' pattern (Eq. 1), observed and fitted, of each source.
+
+    Sources with fewer than four spots are left out. Predicted aberrations are subtracted.
+    """
+    centers, rows = np.asarray(result.imager.centers, np.float64), []
+    for source in np.unique(result.spots.sources):
+        mine = result.spots.sources == source
+        beside = centers[result.spots.lenses[mine]]
+        beside = beside - beside.mean(0)
+        if len(beside) >= 4:
+            depth = float(result.sources.points[source, 2])
+            fitted = float(result.imager.scale(depth))
+            off = result.residuals[mine] * result.imager.sensor.pixel_pitch
+            rows.append((depth, fitted - (beside * off).sum() / (beside**2).sum(), fitted))
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def plot_residuals(result: Calibration) -> Figure:
+    """Residuals of all spots on the sensor, a histogram of their lengths, and the pattern's scale by depth."""
+    sensor, distance = result.imager.sensor, np.hypot(*result.residuals.T)
+    figure = Figure(figsize=(12, 4), dpi=100, layout="constrained")
+    arrows, counts, lines = figure.subplots(1, 3)
+    side = max(sensor.shape) * sensor.pixel_pitch
+    scale = max(float(distance.max()), 1e-12) / (_LONGEST * side)
+    colours = result.sources.captures[result.spots.sources]
+    positions = result.spots.positions.T
+    arrows.quiver(*positions, *result.residuals.T, colours, angles="xy", scale_units="xy", scale=scale)
+    arrows.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    arrows.set_title(f"residuals, longest {distance.max():.2f} pixels; colour: capture", fontsize=9)
+    counts.hist(distance, bins=30)
+    counts.set(xlabel="distance, pixels", ylabel="spots")
+    counts.set_title(f"{len(distance)} spots, {result.rms:.3f} pixels RMS", fontsize=9)
+    depth, seen, fitted = pattern_scales(result).T
+    inverse = 1 / (depth + float(result.imager.reduced_depth(0.0)))
+    order = np.argsort(inverse)
+    lines.plot(inverse[order], fitted[order], color="0.6", label="1 + v/z'")
+    lines.plot(inverse, seen, ".", label="spots of a source")
+    lines.set(xlabel="1/z', 1/mm", ylabel="scale of the pattern, s_z")
+    worst = float(np.abs(seen - fitted).max()) if len(seen) else 0.0
+    lines.set_title(f"s_z by depth (Eq. 1), off by up to {worst:.1e}", fontsize=9)
+    lines.legend(fontsize=8)
+    return figure

@@ -1,0 +1,304 @@
+"""The least-squares problem of a calibration: unknowns, predicted spots, residuals, and standard errors.
+
+Spots are predicted on chief rays, with the offsets of their bright cores by exact rays.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Float64, Int
+
+from ..base.errors import InputError
+from ..geometry import Imager
+from ..layouts import nearest_neighbour_distances
+from ..lenses import MicrolensArray, lenses_by_type, type_of_lens
+from ..optics.lens_types import split_by_type
+from ..optics.psf_core import PupilSamples, aperture_profile, sample_pupil
+
+# Fields at which exact rays are traced, degree of the polynomial through them, and number of depths at most.
+_FIELDS, _DEGREE, _DEPTHS = 13, 7, 5
+# Relative step of the sensor distance for the derivative of core offsets.
+_STEP = 1e-2
+# Rays of a spot, and distance from its chief ray within which its core lies, pixels.
+_RAYS, _REACH = 8192, 40
+# Gaussian window of the mean shift that defines the middle of a spot: standard deviation, pixels; steps; tolerance.
+WINDOW, MAX_MOVES, MOVE_TOLERANCE = 1.5, 300, 1e-4
+# Residual beyond which the loss is linear (Huber), and noise by which deviations of lenses are weighted, pixels.
+OUTLIER, NOISE = 0.5, 0.1
+# Least noise of a spot, pixels.
+_MIN_NOISE = 0.01
+# Relative singular value below which a direction is undetermined, and its least component that counts.
+_SINGULAR, _COMPONENT = 1e-6, 1e-2
+# Names and units in files of the fields of `Unknowns`, and the standard error beyond which a value is undetermined;
+# lengths are relative to `match_radius`.
+_NAMES = {
+    "sensor_distance": {"sensor_distance_mm": 3.33},
+    "rotation": {"rotation_deg": 1.0},
+    "shift": {"shift_x_mm": 3.33, "shift_y_mm": 3.33},
+    "tilt": {"tilt_x_deg": 0.5, "tilt_y_deg": 0.5},
+    "scale": {"scale": 0.02},
+    "depth_offset": {"depth_offset_mm": 8.33},
+}
+# A spot is at a lens within this distance, in pitches of the array: 0.06 mm on the paper's plate.
+_MATCH_RADIUS = 0.0488
+
+FITTED = ("sensor_distance", "rotation", "shift", "tilt")
+FITTABLE = (*FITTED, "scale", "depth_offset", "lenses")
+
+
+class Unknowns(eqx.Module):
+    """The unknowns of a fit; None is held.
+
+    `scale` is that of the array about its center, `depth_offset` is added to the depths of all sources, mm, `lenses`
+    are deviations of the centers in the array's frame, mm, and `coordinates` the unknown ones of the sources, mm.
+    """
+
+    sensor_distance: Float[Array, ""] | None = None
+    rotation: Float[Array, ""] | None = None
+    shift: Float[Array, "2"] | None = None
+    tilt: Float[Array, "2"] | None = None
+    scale: Float[Array, ""] | None = None
+    depth_offset: Float[Array, ""] | None = None
+    lenses: Float[Array, "lens 2"] | None = None
+    coordinates: Float[Array, " unknown"] | None = None
+
+
+class CoreOffsets(NamedTuple):
+    """Distance of cores from chief rays at some depths: coefficients of odd powers of the field, mm.
+
+    `slope` is the derivative by the sensor distance at `sensor_distance`. `type_of` is each lens's type.
+    """
+
+    depths: Float[Array, " depth"]
+    offset: Float[Array, "type depth power"]
+    slope: Float[Array, "type depth power"]
+    sensor_distance: Float[Array, ""]
+    type_of: Int[Array, " lens"]
+
+
+class Observations(NamedTuple):
+    """What a fit is given: the initial imager, sources, and spots of known lenses.
+
+    `points` `(source, 3)` hold initial guesses of the coordinates that `unknown` `(unknown, 2)` lists by source and
+    axis. Spots are padded to one size, so that one shape is compiled; `valid` marks the actual ones.
+    """
+
+    imager: Imager
+    points: Float[Array, "source 3"]
+    unknown: Int[Array, "unknown 2"]
+    sources: Int[Array, " spot"]
+    lenses: Int[Array, " spot"]
+    positions: Float[Array, "spot 2"]
+    valid: Bool[Array, " spot"]
+    offsets: CoreOffsets
+
+
+def match_radius(centers: Float[Array | np.ndarray, "lens 2"]) -> float:
+    """Distance within which a spot is at a lens of an array, mm: a twentieth of the pitch."""
+    return _MATCH_RADIUS * float(nearest_neighbour_distances(np.asarray(centers, np.float64)).mean())
+
+
+def initial_unknowns(names: Sequence[str], data: Observations) -> Unknowns:
+    imager, dtype = data.imager, data.positions.dtype
+    zero = jnp.zeros((), dtype)
+    values = {
+        "sensor_distance": imager.sensor_distance,
+        "rotation": imager.rotation,
+        "shift": imager.shift,
+        "tilt": jnp.zeros(2, dtype) if imager.tilt is None else imager.tilt,
+        "scale": zero + 1,
+        "depth_offset": zero,
+        "lenses": jnp.zeros(imager.array.centers.shape, dtype),
+    }
+    coordinates = data.points[data.unknown[:, 0], data.unknown[:, 1]] if len(data.unknown) else None
+    return Unknowns(**{name: values[name].astype(dtype) for name in names}, coordinates=coordinates)
+
+
+def apply_to_imager(unknowns: Unknowns, imager: Imager) -> Imager:
+    """The imager with the fitted values."""
+    array = imager.array
+    if unknowns.scale is not None or unknowns.lenses is not None:
+        centers = array.centers if unknowns.scale is None else array.centers * unknowns.scale
+        array = with_centers(array, centers if unknowns.lenses is None else centers + unknowns.lenses)
+    values = {name: value for name in FITTED if (value := getattr(unknowns, name)) is not None}
+    where = lambda i: (i.array, *(getattr(i, name) for name in values))
+    return eqx.tree_at(where, imager, (array, *values.values()), is_leaf=lambda leaf: leaf is None)
+
+
+def with_centers(array: MicrolensArray, centers) -> MicrolensArray:
+    """The array with other centers `(lens, 2)`, mm; alike lenses may be of another number."""
+    return eqx.tree_at(lambda a: a.centers, array, jnp.asarray(centers, array.centers.dtype))
+
+
+def source_points(unknowns: Unknowns, data: Observations) -> Float[Array, "source 3"]:
+    """Positions of the sources with the fitted values."""
+    points = data.points
+    if unknowns.coordinates is not None:
+        points = points.at[data.unknown[:, 0], data.unknown[:, 1]].set(unknowns.coordinates)
+    return points if unknowns.depth_offset is None else points.at[:, 2].add(unknowns.depth_offset)
+
+
+@jax.jit
+def residuals(unknowns: Unknowns, data: Observations) -> Float[Array, "spot 2"]:
+    """Predicted less observed spots, pixels; 0 for padding."""
+    imager, points = apply_to_imager(unknowns, data.imager), source_points(unknowns, data)[data.sources]
+    off = (_predict(imager, points, data.lenses, data.offsets) - data.positions) / imager.sensor.pixel_pitch
+    return jnp.where(data.valid[:, None], off, 0)
+
+
+def weighted_residuals(unknowns: Unknowns, args: tuple[Observations, Float[Array, ""]]):
+    """Residuals of Huber's loss, and deviations of lenses over their prior standard deviation, the second argument."""
+    data, lens_sd = args
+    off = residuals(unknowns, data)
+    squared = jnp.sum(off**2, -1, keepdims=True)
+    large = squared > OUTLIER**2
+    distance = jnp.sqrt(jnp.where(large, squared, 1.0))
+    off = off * jnp.where(large, jnp.sqrt(2 * OUTLIER * distance - OUTLIER**2) / distance, 1.0)
+    return off, None if unknowns.lenses is None else unknowns.lenses * (NOISE / lens_sd)
+
+
+def _predict(imager: Imager, points, lenses, offsets: CoreOffsets) -> Float[Array, "spot 2"]:
+    views = imager.views(points, lenses)
+    field2 = jnp.sum(views.offset**2, -1) / imager.field_radius**2
+    of_type = jax.vmap(lambda column: jnp.interp(points[:, 2], offsets.depths, column))
+    at = lambda columns: of_type(columns)[offsets.type_of[lenses], jnp.arange(len(lenses))]
+    radial = jnp.zeros_like(field2)
+    for power in reversed(range(offsets.offset.shape[2])):
+        offset, slope = at(offsets.offset[..., power]), at(offsets.slope[..., power])
+        radial = radial * field2 + offset + (imager.sensor_distance - offsets.sensor_distance) * slope
+    return views.spot + views.offset / imager.field_radius * radial[:, None]
+
+
+@jax.jit
+def predict_spots(
+    imager: Imager, points: Float[Array | np.ndarray, "source 3"], offsets: CoreOffsets
+) -> Float[Array, "source lens 2"]:
+    """Predict the spots of sources under every lens, mm."""
+    lenses, dtype = jnp.arange(len(imager.array.centers)), imager.sensor_distance.dtype
+    of_source = lambda point: _predict(imager, jnp.tile(point, (len(lenses), 1)), lenses, offsets)
+    return jax.lax.map(of_source, jnp.asarray(points, dtype))
+
+
+def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"]) -> CoreOffsets:
+    """Trace core offsets at these depths, or at a few that span them."""
+    nodes = np.unique(depths)
+    if len(nodes) > _DEPTHS:
+        nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
+    v = float(imager.sensor_distance)
+    farther = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
+    offset, beyond = (core_polynomials(each, nodes) for each in (imager, farther))
+    tables = nodes, offset, (beyond - offset) / (v * _STEP), v
+    tables = (jnp.asarray(table, imager.sensor_distance.dtype) for table in tables)
+    return CoreOffsets(*tables, jnp.asarray(type_of_lens(imager.array)))
+
+
+def core_polynomials(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:
+    """Coefficients of `CoreOffsets` for each type of lens. The polynomial averages the noise of the rays."""
+    fields = np.linspace(0, imager.field_radius, _FIELDS)
+    # A tilt changes the field a little, but not the lens.
+    level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
+    powers = (fields / imager.field_radius)[:, None] ** np.arange(1, _DEGREE + 1, 2)
+    fit = lambda one: np.linalg.lstsq(powers, core_offsets(one, depths, fields).T)[0].T
+    return np.stack([fit(one) for one in split_by_type(level, lenses_by_type(level.array))])
+
+
+def core_offsets(
+    imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"]
+) -> Float64[np.ndarray, "depth field"]:
+    """Trace the distance of the middle of spots from their chief rays, toward the point's side, mm.
+
+    A point `field` beside a lens's axis is imaged at `-M_z field` from the axis, plus this.
+    """
+    aperture, pixel = aperture_profile(imager.array), imager.sensor.pixel_pitch
+    offsets = np.empty((len(depths), len(fields)))
+    for row, depth in zip(offsets, depths, strict=True):
+        rays = sample_pupil(imager, float(depth), fields, aperture, _RAYS)
+        chief = float(imager.magnification(depth)) * fields
+        row[:] = [_middle_of_rays(rays, k, chief[k], pixel) for k in range(len(fields))]
+    return offsets
+
+
+def _middle_of_rays(rays: PupilSamples, field: int, chief: float, pixel: float) -> float:
+    """Where the mean shift of `find_spots` comes to rest, from the densest pixel along the radius."""
+    along, across, light = rays.landing[field, :, 0] + chief, rays.landing[field, :, 1], rays.light[field]
+    near = np.hypot(along, across) < _REACH * pixel
+    if not light[near].sum() > 0:
+        return 0.0
+    edges = pixel * np.arange(-_REACH, _REACH + 1)
+    line = np.histogram(along, edges, weights=light * (np.abs(across) < pixel))[0]
+    middle, width = (edges[line.argmax()] + pixel / 2), WINDOW * pixel
+    for _ in range(MAX_MOVES):
+        weight = light * np.exp(-((along - middle) ** 2 + across**2) / (2 * width**2))
+        last, middle = middle, float(weight @ along / weight.sum())
+        if abs(middle - last) < MOVE_TOLERANCE * pixel:
+            break
+    return middle
+
+
+def named_values(unknowns: Unknowns) -> dict[str, float]:
+    """Values by their names in files, in the unit of the name."""
+    values = {}
+    for field, names in _NAMES.items():
+        if (value := getattr(unknowns, field)) is not None:
+            value = np.asarray(value, np.float64)
+            degrees = {"rotation": np.degrees, "tilt": lambda slope: np.degrees(np.arctan(slope))}
+            values |= zip(names, np.ravel(degrees.get(field, np.asarray)(value)).tolist(), strict=True)
+    return values
+
+
+def estimate_noise(off: Float64[np.ndarray, "spot 2"], unknowns: Unknowns, lenses: Int[np.ndarray, " spot"]) -> float:
+    """Standard deviation of the spots' coordinates, pixels, from their residuals, robust to outliers."""
+    distance = np.linalg.norm(off, axis=-1)
+    near = off[distance < max(3 * np.median(distance), OUTLIER)]
+    noise = max(np.median(np.abs(off)) / 0.6745, np.sqrt((near**2).mean()))
+    numbers = sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+    if unknowns.lenses is not None:
+        numbers -= unknowns.lenses.size - 2 * len(np.unique(lenses))
+    return max(noise * math.sqrt(off.size / max(off.size - numbers, 1)), _MIN_NOISE)
+
+
+def standard_errors(unknowns: Unknowns, data: Observations, lens_sd: float, noise: float) -> dict[str, float]:
+    """Standard errors by name, from the Gauss-Newton covariance; infinite where undetermined."""
+    # Lenses are weighted relative to the actual noise of the spots.
+    args = data, jnp.asarray(lens_sd * NOISE / noise, data.positions.dtype)
+    jacobian = np.asarray(_jacobian(unknowns, args), np.float64)
+    lengths = np.linalg.norm(jacobian, axis=0)
+    # Each unknown in steps that move spots equally, so that singular values can be compared.
+    _, values, directions = np.linalg.svd(jacobian / np.where(lengths > 0, lengths, 1), full_matrices=False)
+    singular = values <= _SINGULAR * values[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spreads = np.where(singular, np.inf, noise / values)[:, None]
+        counts = np.abs(directions) > np.where(singular, _COMPONENT, 0)[:, None]
+        components = np.where(counts, np.abs(directions) * spreads, 0)
+        errors = np.where(lengths > 0, np.sqrt((components**2).sum(0)) / lengths, np.inf)
+    flat, unravel = ravel_pytree(unknowns)
+    tree = unravel(jnp.asarray(errors, flat.dtype))
+    named = named_values(tree)
+    if tree.lenses is not None:
+        named["lenses_mm"] = float(np.median(tree.lenses[np.unique(np.asarray(data.lenses)[data.valid])]))
+    return named
+
+
+@jax.jit
+def _jacobian(unknowns, args):
+    flat, unravel = ravel_pytree(unknowns)
+    return jax.jacfwd(lambda flat: ravel_pytree(weighted_residuals(unravel(flat), args))[0])(flat)
+
+
+def check_determined(errors: dict[str, float], radius: float) -> None:
+    """`InputError` if a standard error is too large to be useful, with the array's `match_radius`, mm."""
+    limits = {name: limit for names in _NAMES.values() for name, limit in names.items()}
+    unknown = [
+        f"{name} to {sd:.2g}" if sd < 100 else name
+        for name, sd in errors.items()
+        if sd > limits.get(name, math.inf) * (radius if name.endswith("_mm") else 1)
+    ]
+    if unknown:
+        remedy = "use sources at more depths and positions, or known ones, or hold some of these"
+        raise InputError(f"captures: the spots do not determine {', '.join(unknown)}; {remedy}.")

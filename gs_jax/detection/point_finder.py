@@ -1,0 +1,338 @@
+"""Finds points in a capture: positions at which nearly all lenses see one. Host code, but for the back-projection.
+
+The paper's particle clustering (`gs_jax.detection.clusters`) needs a volume alone, and finds fewer. Points are rows
+`(x, y, z, intensity)`, mm; `gs_jax.rasterize` makes a volume of them.
+"""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
+
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..geometry import Imager
+from ..grid import Grid
+from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
+from ..optics.psf_core import apparent_depths, ensquared_light
+from ..projection.backprojection import backproject
+from ..typing import Image
+from .background import DetectionImage, Pixels, for_each_band, subtract_background
+from .view_samples import (
+    COARSE,
+    REACH,
+    THRESHOLD_SNR,
+    VIEW_SHARE,
+    LensType,
+    ViewSamples,
+    lens_types_of,
+    log_false_alarms,
+    num_hypotheses,
+    sample_views_by_type,
+    search_grid,
+    spot_profile,
+    subtract_spots,
+    survival_function,
+    view_quantile,
+)
+
+Points = Float64[np.ndarray, "_ 4"]
+Positions = Float64[np.ndarray, "_ 3"]
+
+# Fewest lenses that determine three coordinates with redundancy.
+_MIN_LENSES = 3
+# Part of its light that a point must keep when the points that were found before it are subtracted.
+_OWN_LIGHT = 0.5
+# Expected number of false alarms in a capture: one in ten captures.
+_FALSE_ALARMS = 0.1
+# A candidate's neighbourhood is searched so often, each time half as wide: to 1/128 of a voxel, 0.3 um.
+_REFINEMENTS = 7
+# Planes that are back-projected at once.
+_PLANES = 32
+# Depths at which the light in a core is traced.
+_DEPTHS = 5
+# Depths at which cores are traced, and margin beyond the grid, relative to the depth.
+_TRACED, _MARGIN = 9, 0.05
+# Consequence, in warnings, where spots are not sharp.
+NOT_TRUSTED = "no point is to be trusted"
+# The second search, on what the points of the first do not explain, finds points close to brighter ones.
+_SEARCHES = 2
+
+
+def find_points(
+    image: Image | DetectionImage, imager: Imager, grid: Grid, *, progress: Progress | None = None
+) -> Points:
+    """Find the points that a capture shows: those that nearly all of their lenses see.
+
+    *Host.*
+
+    1. The image's background is subtracted (`subtract_background`).
+    2. The logarithms of what exceeds the noise are back-projected onto voxels of two pixels: their sum is high where
+       all lenses are lit, not where one is bright. Its local maxima, refined between the voxels, are candidates.
+    3. In order of brightness, a candidate is a point if 7 of 10 of its lenses are lit above the noise, more than chance
+       would light anywhere in the volume (`log_false_alarms`), and mostly not by points before it. The light of each
+       point is subtracted from the views of the others, by the shape of spots in this image.
+    4. The search is repeated on what the image holds beside the points, for those near brighter ones.
+
+    No threshold depends on the scene, and nothing is random. Points are searched for where the bright cores of the
+    spots land, by exact rays (`gs_jax.optics.psf_core.apparent_depths`); lenses of several types are read at depths
+    where they are sharp.
+
+    Parameters
+    ----------
+    image
+        `sensor.shape`, linear, in any unit, on any offset; or the result of `subtract_background`.
+    imager
+        The microscope.
+    grid
+        The box of these voxels is searched, at most as large as the sensor. Their size has no effect.
+    progress
+        Shows how far the search is.
+
+    Returns
+    -------
+    ndarray
+        `(point, 4)`, brightest first. The intensity is all that the point emits, in every direction, in the image's
+        unit: the light in the cores of its spots over the share that exact rays bring there.
+
+    Raises
+    ------
+    ValueError
+        If the image is not `sensor.shape`.
+    InputError
+        If a pixel is not finite, or there are fewer than three lenses, which cannot agree on a point.
+
+    Warns
+    -----
+    InputWarning
+        If the microscope is out of focus at the grid's depths (`gs_jax.optics.lens_types`). Not for a
+        `DetectionImage`, as of the frames of a recording.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> array = gs.MicrolensArray(gs.random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
+    >>> scope = gs.Imager(array, gs.Sensor((900, 900), 0.009), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> truth = np.array([[0.5, -0.4, 19.5, 1.0], [-0.7, 0.2, 20.5, 0.8]])
+    >>> image = gs.simulate(truth, scope, optics="near", psf="geometric")
+    >>> found = gs.find_points(image, scope, grid)
+    >>> gs.localization(found, truth).f1
+    1.0
+    """
+    progress = progress or Progress()
+    detection = image if isinstance(image, DetectionImage) else subtract_background(image)
+    if (lenses := len(imager.array.centers)) < _MIN_LENSES:
+        number = f"{lenses} lens" if lenses == 1 else f"{lenses} lenses"
+        raise InputError(f"points: {_MIN_LENSES} or more lenses must agree on a point, got {number}.")
+    if detection.light.shape != imager.sensor.shape:
+        raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {detection.light.shape}.")
+    if not isinstance(image, DetectionImage):
+        warn_if_blurred(imager, grid, "points", NOT_TRUSTED)
+    depths = _depths_around(grid)
+    lens_types = lens_types_of(imager, depths)
+    # Alike lenses are read where chief rays of apparent depths land, which become depths at the end.
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
+    voxels = search_grid(imager, grid.at(np.interp(np.asarray(grid.depths), depths, apparent)))
+    least = THRESHOLD_SNR * float(detection.noise.min())
+    survival = survival_function(detection.light, least)
+    points, samples, own = _accept(np.zeros((0, 3)), detection, survival, lens_types, voxels)
+    for _ in range(_SEARCHES):
+        rest = detection._replace(light=subtract_spots(detection.light, samples, own))
+        # A spot between two voxels must not be missed.
+        dilated = rest._replace(light=_dilate(rest.light))
+        new = _candidates(dilated, lens_types, voxels, progress)
+        with progress.step("Comparing lenses"):
+            views = sample_views_by_type(new, dilated, lens_types)
+            lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
+            new = _refine(new[lit], voxels, rest, lens_types)
+            points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
+    points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
+    points = np.column_stack([points, _intensity(points, samples, own, detection, lens_types)])
+    points = points[_inside(points, grid, float(voxels.depths[1] - voxels.depths[0]) / COARSE)]
+    return points[np.argsort(-points[:, 3], kind="stable")]
+
+
+def _depths_around(grid: Grid) -> Float64[np.ndarray, " depth"]:
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    margin = max(_MARGIN * far, (far - near) / 4)
+    return np.linspace(near - min(margin, near / 2), far + margin, _TRACED)
+
+
+def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point"]:
+    """Which points lie in the grid's voxels, whose outer planes are a step thick."""
+    x, y, z = points[:, :3].T
+    left, right, bottom, top = grid.extent
+    lateral = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    return lateral & (near - step / 2 <= z) & (z <= far + step / 2)
+
+
+def _log_snr(light: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Logarithm of the signal-to-noise ratio over half the threshold, so that no lens outweighs the others."""
+    return np.log(np.maximum(light / np.where(noise > 0, noise, np.inf) / (THRESHOLD_SNR / 2), 1))
+
+
+def _dilate(light: Pixels) -> Pixels:
+    """Maximum of 3 x 3 pixels, a fast `scipy.ndimage.maximum_filter`."""
+    result = np.empty_like(light)
+
+    def dilate(band):
+        tall = light[np.clip(np.arange(band.start - 1, band.stop + 1), 0, len(light) - 1)]
+        most = np.maximum(np.maximum(tall[:-2], tall[1:-1]), tall[2:])
+        wide = result[band]
+        wide[:, -1] = most[:, -1]
+        np.maximum(most[:, :-1], most[:, 1:], out=wide[:, :-1])
+        np.maximum(wide[:, 1:], most[:, :-1], out=wide[:, 1:])
+
+    for_each_band(len(light), dilate)
+    return result
+
+
+def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Grid, progress: Progress) -> Positions:
+    """Local maxima of the back-projected logarithms, at voxels."""
+    bright = np.empty_like(rest.light)
+
+    def brighten(band):
+        bright[band] = _log_snr(rest.light[band], rest.noise[band])
+
+    for_each_band(len(bright), brighten)
+    image, last = jax.device_put(bright), voxels.depths.size - 1
+    # Parts are equally long, for one compilation: each has a plane of its neighbours, and the last plane repeats.
+    parts = math.ceil((last - 1) / _PLANES)
+    inner = math.ceil((last - 1) / parts)
+    found = [np.zeros((0, 3))]
+    for first in progress.track(range(0, last - 1, inner), "Searching for points"):
+        planes = np.minimum(first + np.arange(inner + 2), last)
+        volume = _backproject_sharp(image, lens_types, voxels.at(voxels.depths[planes]))
+        is_maximum = np.asarray(_is_maximum(volume))
+        # Faster than `np.argwhere` in three dimensions.
+        maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
+        found.append(voxels.to_mm(maxima[maxima[:, 0] < last]))
+    return np.concatenate(found)
+
+
+def _backproject_sharp(image, lens_types: Sequence[LensType], voxels: Grid) -> Float[Array, "depth y x"]:
+    """`backproject` by the lenses that are sharp in each plane."""
+    if len(lens_types) == 1:
+        return backproject(image, lens_types[0].imager, voxels)
+    depths, parts = np.asarray(voxels.depths, np.float64), []
+    for lens_type in lens_types:
+        volume = backproject(image, lens_type.imager, voxels.at(lens_type.apparent_depth(depths)))
+        parts.append(jnp.where(lens_type.sees(depths)[:, None, None], volume, 0))
+    return sum(parts[1:], parts[0])
+
+
+@jax.jit
+def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
+    """Which inner voxels exceed what three lenses would read, and all 26 neighbours; the last of equal neighbours."""
+    inner = volume[1:-1, 1:-1, 1:-1]
+    highest = inner > _MIN_LENSES * VIEW_SHARE * math.log(2)
+    for step in np.ndindex(3, 3, 3):
+        neighbour = volume[tuple(slice(at, at + n) for at, n in zip(step, inner.shape, strict=True))]
+        highest &= inner >= neighbour if step <= (1, 1, 1) else inner > neighbour
+    return highest
+
+
+def _voxel_size(voxels: Grid) -> tuple:
+    return voxels.pitch, voxels.pitch, float(voxels.depths[1] - voxels.depths[0])
+
+
+def _refine(points: Positions, voxels: Grid, rest: DetectionImage, lens_types: Sequence[LensType]) -> Positions:
+    """Move points uphill between the voxels, to the best of 27 positions, twice as close each time."""
+    around = (np.array(list(np.ndindex(3, 3, 3))) - 1) * _voxel_size(voxels)
+    for part in 0.5 ** np.arange(1, _REFINEMENTS + 1):
+        positions = points[:, None] + part * around
+        samples = sample_views_by_type(positions.reshape(-1, 3), rest, lens_types)
+        brightness = _log_snr(samples.light, samples.noise).sum(1).reshape(positions.shape[:2])
+        points = positions[np.arange(len(points)), brightness.argmax(1)]
+    return points
+
+
+def _lit(samples: ViewSamples, survival, tests: int) -> Bool[np.ndarray, " point"]:
+    """Which points enough of their lenses see, and more than by chance."""
+    count, noise = samples.seen.sum(1), samples.noise.max(1, initial=0)
+    level = view_quantile(samples.light, samples.seen)
+    log_alarms = log_false_alarms(level, count, survival, tests)
+    return (level > THRESHOLD_SNR * noise) & (log_alarms <= np.log(_FALSE_ALARMS)) & (count >= _MIN_LENSES)
+
+
+def _accept(
+    candidates: Positions, image: DetectionImage, survival, lens_types: Sequence[LensType], voxels: Grid
+) -> tuple[Positions, ViewSamples, Float64[np.ndarray, "point lens"]]:
+    """The points among the candidates, their samples, and their own part of each.
+
+    In order of brightness; the light of each point is subtracted from the views of those after it. Within a coarse
+    voxel of a point there is no other, only the rim of its spot.
+    """
+    samples = sample_views_by_type(candidates, image, lens_types)
+    order = np.argsort(-view_quantile(samples.light, samples.seen), kind="stable")
+    candidates, samples = candidates[order], samples.select(order)
+    tests, profile = num_hypotheses(voxels), spot_profile(samples, image.light)
+    spots, owner = samples.pixels[samples.seen], np.argwhere(samples.seen)
+    tree = KDTree(spots)
+    left, height = samples.light.copy(), np.zeros_like(samples.light)
+    accepted, scaled = np.zeros(len(candidates), bool), candidates / _voxel_size(voxels)
+    for number, seen in enumerate(samples.seen):
+        if (np.linalg.norm(scaled[accepted] - scaled[number], axis=1) < 1).any():
+            continue
+        this = slice(number, number + 1)
+        own = left[this] - _OWN_LIGHT * _median_of_type(samples, samples.light, number)
+        lit = _lit(samples.select(this)._replace(light=left[this].copy()), survival, tests)
+        if not (lit[0] and view_quantile(own, samples.seen[this])[0] >= 0):
+            continue
+        accepted[number] = True
+        height[number] = np.maximum(_median_of_type(samples, left, number), 0)
+        pixels, heights = samples.pixels[number, seen], height[number, seen]
+        for pixel, its_height, others in zip(pixels, heights, tree.query_ball_point(pixels, REACH), strict=True):
+            distance = np.hypot(*(spots[others] - pixel).T)
+            left[tuple(owner[others].T)] -= its_height * np.interp(distance, np.arange(REACH + 1), profile)
+    return candidates[accepted], samples.select(accepted), (left + height)[accepted]
+
+
+def _median_of_type(samples: ViewSamples, light: np.ndarray, point: int) -> Float64[np.ndarray, " lens"]:
+    """Median light of one point over the lenses of each lens's type, as types differ in sharpness; 0 where unseen."""
+    seen, median = samples.seen[point], np.zeros(light.shape[1])
+    of_lens = np.zeros(len(median), int) if samples.lens_type is None else samples.lens_type[point]
+    for number in np.unique(of_lens[seen]):
+        same = seen & (of_lens == number)
+        median[same] = np.median(light[point, same])
+    return median
+
+
+def _intensity(
+    points: Positions, samples: ViewSamples, own: np.ndarray, image: DetectionImage, lens_types: Sequence[LensType]
+) -> Float64[np.ndarray, " point"]:
+    """What the points emit, the median over the lenses.
+
+    The light in a square about each spot, times the point's own part of the middle, over the expected share of the
+    point's light in the square.
+    """
+    side = np.arange(-HALF_SIDE, HALF_SIDE + 1)
+    middle = np.floor(samples.pixels + 0.5).astype(int)
+    row, column = (np.clip(middle[..., axis, None] + side, 0, n - 1) for axis, n in enumerate(image.light.shape))
+    total = image.light[row[..., :, None], column[..., None, :]].sum((-2, -1))
+    expected = _expected_share(points, samples, lens_types[0].imager)
+    for number, lens_type in enumerate(lens_types[1:], 1):
+        of_type = _expected_share(points, samples, lens_type.imager)
+        expected = np.where(samples.lens_type == number, of_type, expected)
+    use = samples.seen & (samples.light > 0) & (expected > 0)
+    ratio = np.where(use, total * own / np.where(use, samples.light * expected, 1), 0)
+    return np.array([np.median(views[which]) if which.any() else 0.0 for views, which in zip(ratio, use, strict=True)])
+
+
+def _expected_share(points: Positions, samples: ViewSamples, imager: Imager) -> Float64[np.ndarray, "point lens"]:
+    """Share of a point's light in the square about the core of each view, by exact rays."""
+    if not len(points):
+        return np.zeros_like(samples.light)
+    depths = np.linspace(points[:, 2].min(), points[:, 2].max(), _DEPTHS if np.ptp(points[:, 2]) > 0 else 1)
+    fields = np.linspace(0, imager.field_radius, FIELDS)
+    shares = ensquared_light(imager, depths, fields, core_width(imager))
+    index = np.interp(points[:, 2], depths, np.arange(len(depths)))[:, None]
+    at = np.stack(np.broadcast_arrays(index, samples.field / fields[1]))
+    return map_coordinates(shares, at.reshape(2, -1), order=1, mode="nearest").reshape(samples.field.shape)

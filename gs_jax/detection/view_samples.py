@@ -1,0 +1,251 @@
+"""Samples of an image where each lens sees a point, and detection statistics of whether the lenses agree.
+
+Back-projection sums over the lenses and cannot tell one bright pixel from many lit ones; here the views of a point stay
+apart. Pixels are compared with the background and noise of the image itself, so that offset and gain of the camera do
+not matter. Host code; images are `[row, column]`, lengths are in mm.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, Shaped
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
+from scipy.special import bdtrc
+
+from ..geometry import Imager
+from ..grid import Grid
+from ..lenses import lenses_by_type
+from ..optics.lens_types import core_width, split_by_type, type_weights
+from ..optics.psf_core import apparent_depths
+from ..optics.raytrace import to_numpy
+from ..typing import Image
+from .background import DetectionImage, Pixels, subsample, subtract_background
+
+# Share of its lenses that must see a point; the others may be blocked, scratched, or under a brighter point.
+VIEW_SHARE = 0.7
+# A view is lit where it exceeds the noise this many times.
+THRESHOLD_SNR = 5.0
+# Half width of the square in which the light of a spot is followed, pixels, and number of spots that show their shape.
+REACH, _EXAMPLES = 24, 500
+# Lenses of a type see points at depths where they bring this part of the light into the core that the best type does.
+_MIN_SHARPNESS = 0.5
+# Depths at which sharpness is traced for statistics.
+_DEPTHS = 9
+# Width of the voxels that are searched first, pixels.
+COARSE = 2
+# Stands in files for the logarithm of 0.
+_LOWEST_LOG = -999.0
+
+
+class ViewSamples(NamedTuple):
+    """Samples of an image at the views of points, a row for each point; where `seen` is false the others are 0.
+
+    `pixels` are fractional `(row, column)`, `field` is the distance of the point from the lens's axis, mm, `lens_type`
+    is None if all lenses are alike.
+    """
+
+    pixels: Float64[np.ndarray, "point lens 2"]
+    light: Float64[np.ndarray, "point lens"]
+    noise: Float64[np.ndarray, "point lens"]
+    field: Float64[np.ndarray, "point lens"]
+    seen: Bool[np.ndarray, "point lens"]
+    lens_type: Int[np.ndarray, "point lens"] | None = None
+
+    def select(self, which) -> "ViewSamples":
+        """Samples of some points, by index, slice or mask."""
+        return ViewSamples(**{name: part[which] for name, part in self._asdict().items() if part is not None})
+
+
+class LensType(NamedTuple):
+    """Lenses of one type, and how sharply they image points at `depths`.
+
+    `apparent`: depths at which their chief rays meet the cores of spots. `sharpness`: light in a core relative to the
+    sharpest type. Both are None if all lenses are alike; points then lie at the depths of chief rays.
+    """
+
+    imager: Imager
+    depths: Float64[np.ndarray, " depth"]
+    apparent: Float64[np.ndarray, " depth"] | None = None
+    sharpness: Float64[np.ndarray, " depth"] | None = None
+
+    def apparent_depth(self, depth: Float[np.ndarray, " point"]) -> Float[np.ndarray, " point"]:
+        return depth if self.apparent is None else np.interp(depth, self.depths, self.apparent)
+
+    def sees(self, depth: Float[np.ndarray, " point"]) -> Bool[np.ndarray, " point"]:
+        """Whether these lenses are among the sharp ones at each depth."""
+        if self.sharpness is None:
+            return np.ones(len(depth), bool)
+        return np.interp(depth, self.depths, self.sharpness) >= _MIN_SHARPNESS
+
+
+def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> list[LensType]:
+    """Split an imager by the types of its lenses, with the sharpness of each type by exact rays."""
+    if imager.array.alike:
+        return [LensType(imager, depths)]
+    each = split_by_type(imager, lenses_by_type(imager.array))
+    weights = type_weights(each, depths, core_width(imager))
+    apparent = [np.asarray(apparent_depths(one, depths), np.float64) for one in each]
+    return [LensType(one, depths, *parts) for one, *parts in zip(each, apparent, weights / weights.max(0), strict=True)]
+
+
+def sample_views(points: Float[np.ndarray, "point 3"], image: DetectionImage, imager: Imager) -> ViewSamples:
+    """Interpolate an image where each lens within the field radius images each point `(x, y, z)`.
+
+    Lenses that image a point beyond the sensor do not see it.
+    """
+    # NumPy: another number of points would compile another program.
+    host = to_numpy(imager)
+    from_axis = points[:, :2] - host.axis_offset(points[:, 2])
+    tree = KDTree(host.centers)
+    most = max(tree.query_ball_point(from_axis, imager.field_radius, return_length=True), default=0)
+    # k = 1 would drop the axis of lenses.
+    distance, lens = tree.query(from_axis, k=max(most, 2), distance_upper_bound=imager.field_radius)
+    seen = np.isfinite(distance)
+    distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
+    pixels = np.asarray(imager.sensor.to_pixels(host.views(points[:, None], lens).spot))
+    seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
+    pixels = np.where(seen[..., None], pixels, 0)
+    row, column = np.moveaxis(np.floor(pixels + 0.5).astype(int), -1, 0)
+    interpolated = map_coordinates(image.light, np.moveaxis(pixels, -1, 0), np.float64, order=1, mode="nearest")
+    light, noise = (np.where(seen, part, 0) for part in (interpolated, image.noise[row, column].astype(np.float64)))
+    return ViewSamples(pixels, light, noise, distance, seen)
+
+
+def sample_views_by_type(
+    points: Float[np.ndarray, "point 3"], image: DetectionImage, lens_types: Sequence[LensType]
+) -> ViewSamples:
+    """Concatenate the samples by all types of lenses that are sharp at the depth of each point."""
+    if len(lens_types) == 1:
+        return sample_views(points, image, lens_types[0].imager)
+    parts = []
+    for number, lens_type in enumerate(lens_types):
+        apparent = np.column_stack([points[:, :2], lens_type.apparent_depth(points[:, 2])])
+        samples = sample_views(apparent, image, lens_type.imager)
+        seen = samples.seen & lens_type.sees(points[:, 2])[:, None]
+        light, noise = (np.where(seen, part, 0) for part in (samples.light, samples.noise))
+        own_type = np.full(seen.shape, number)
+        parts.append(samples._replace(light=light, noise=noise, seen=seen, lens_type=own_type))
+    return ViewSamples(*(np.concatenate(columns, 1) for columns in zip(*parts, strict=True)))
+
+
+def view_quantile(
+    light: Float[np.ndarray, "point lens"], seen: Bool[np.ndarray, "point lens"], share: float = VIEW_SHARE
+) -> Float64[np.ndarray, " point"]:
+    """Largest level that at least this share of a point's views reaches, `0 < share <= 1`; -inf without a view."""
+    descending = -np.sort(np.where(seen, -light, np.inf), axis=1)
+    order = np.maximum(_rounded_up(share, seen.sum(1)), 1) - 1
+    return np.take_along_axis(descending, order[:, None], axis=1)[:, 0].astype(np.float64)
+
+
+def log_false_alarms(
+    level: Float[np.ndarray, " point"],
+    count: Shaped[np.ndarray, " point"],
+    survival: Callable,
+    tests: int,
+    share: float = VIEW_SHARE,
+) -> Float64[np.ndarray, " point"]:
+    """Natural logarithm of the expected number of false alarms, the a-contrario rule.
+
+    Desolneux, Moisan and Morel, Int. J. Comput. Vis. 40, 7, 2000: if `count` lenses looked at random pixels, a share of
+    them would reach `level` (`view_quantile`) with the tail probability of a binomial distribution. `tests` is the
+    number of hypotheses.
+    """
+    with np.errstate(divide="ignore"):  # a probability below the smallest number
+        chance = np.log(bdtrc(_rounded_up(share, count) - 1, count, survival(level)))
+    return np.where(count > 0, math.log(tests) + chance, np.inf)
+
+
+def survival_function(light: Pixels, least: float = -math.inf) -> Callable:
+    """Function from levels, `least` or higher, to the share of pixels that reach them: at least one pixel's share."""
+    pixels = subsample(light)
+    # float64 as levels are: otherwise each call would convert the whole array.
+    bright = np.sort(pixels[pixels >= least]).astype(np.float64)
+    return lambda level: np.maximum(bright.size - np.searchsorted(bright, level), 1) / pixels.size
+
+
+def spot_profile(samples: ViewSamples, light: Pixels) -> Float64[np.ndarray, " radius"]:
+    """Radial profile of the spots in an image at 0, 1, 2, ... pixels, from 1 down to 0.
+
+    The median over the pixels of the first 500 views, so that neighbours on one side do not count.
+    """
+    offset = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1).T
+    middle = np.floor(samples.pixels + 0.5).astype(int)
+    whole = ((middle >= REACH) & (middle < np.array(light.shape) - REACH)).all(-1)
+    use = samples.seen & whole & (samples.light > 0)
+    pixel = middle[use][:_EXAMPLES, None] + offset
+    values = light[pixel[..., 0], pixel[..., 1]] / samples.light[use][:_EXAMPLES, None]
+    radius = np.hypot(*np.moveaxis(pixel - samples.pixels[use][:_EXAMPLES, None], -1, 0)).round().astype(np.int8)
+    profile = [np.median(ring) if (ring := values[radius == r]).size else 0.0 for r in range(1, REACH)]
+    return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
+
+
+def subtract_spots(light: Pixels, samples: ViewSamples, height: Float64[np.ndarray, "point lens"]) -> Pixels:
+    """Subtract from an image each view's height times the profile of these spots."""
+    profile = spot_profile(samples, light)
+    side = np.arange(-REACH, REACH + 1)
+    rest = light.copy()
+    for pixel, own in zip(samples.pixels[samples.seen], height[samples.seen], strict=True):
+        around = [at + side for at in np.floor(pixel + 0.5).astype(int)]
+        row, column = (at[(at >= 0) & (at < size)] for at, size in zip(around, light.shape, strict=True))
+        distance = np.hypot((row - pixel[0])[:, None], column - pixel[1])
+        square = rest[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
+        square -= (max(own, 0) * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
+    return rest
+
+
+def _rounded_up(share: float, count: Shaped[np.ndarray, " point"]) -> Shaped[np.ndarray, " point"]:
+    return np.ceil(share * count - 1e-9).astype(int)
+
+
+def search_grid(imager: Imager, grid: Grid) -> Grid:
+    """Coarse voxels over the sensor and the grid's depths, with a plane beyond both ends, as maxima need neighbours."""
+    near, far = float(grid.depths.min()), float(grid.depths.max())
+    middle = (near + far) / 2
+    pitch = COARSE * imager.sensor.pixel_pitch / float(imager.magnification(middle))
+    # A lens at the field radius sees a point move from plane to plane as from voxel to voxel.
+    step = pitch * float(imager.reduced_depth(middle)) / imager.field_radius
+    planes = near + step * np.arange(-1, math.ceil((far - near) / step) + 2)
+    # `at`, as the outer planes may lie behind the array's front.
+    return Grid.over(imager.sensor, depths=[middle], pitch=pitch).at(planes)
+
+
+def num_hypotheses(voxels: Grid) -> int:
+    """Number of positions that are told apart: voxels of one pixel."""
+    return voxels.depths.size * math.prod(voxels.shape) * COARSE**3
+
+
+class DetectionStats(NamedTuple):
+    """Detection statistics, one entry for each point.
+
+    `lit`, `lenses`: number of lenses that see the point above the noise, and that could. `log10_false_alarms`: expected
+    number of chance points as good as this one in such a capture. `signal_to_noise`: light that 7 in 10 of the lenses
+    reach, over the noise there.
+    """
+
+    lit: Int[np.ndarray, " point"]
+    lenses: Int[np.ndarray, " point"]
+    log10_false_alarms: Float64[np.ndarray, " point"]
+    signal_to_noise: Float64[np.ndarray, " point"]
+
+
+def detection_stats(
+    points: Float[np.ndarray, "point 4"], image: Image | DetectionImage, imager: Imager, grid: Grid
+) -> DetectionStats:
+    """Compute the statistics of points that `find_points` found, with the same arguments and errors."""
+    image = image if isinstance(image, DetectionImage) else subtract_background(image)
+    ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
+    depths = np.concatenate([ends, points[:, 2]])
+    lens_types = lens_types_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS))
+    # Alike lenses are read where chief rays of apparent depths land.
+    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
+    samples = sample_views_by_type(np.column_stack([points[:, :2], apparent[2:]]), image, lens_types)
+    lenses, noise = samples.seen.sum(1), samples.noise.max(1, initial=0)
+    level = view_quantile(samples.light, samples.seen)
+    tests = num_hypotheses(search_grid(imager, grid.at(apparent[:2])))
+    log = log_false_alarms(level, lenses, survival_function(image.light), tests) / math.log(10)
+    lit = (samples.seen & (samples.light > THRESHOLD_SNR * samples.noise)).sum(1)
+    signal_to_noise = np.divide(level, noise, out=np.zeros_like(level), where=noise > 0)
+    return DetectionStats(lit, lenses, np.clip(log, _LOWEST_LOG, -_LOWEST_LOG), signal_to_noise)
