@@ -9,7 +9,7 @@ TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # About a minute of what other versions of Python, JAX and the libraries may break, compiled as users compile it.
 # Libraries older or newer than the others warn of each other.
 SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -m "not slow" \
-	$(addprefix tests/test_,imports.py primitive.py native.py operators.py shipped_capture.py solve.py files.py \
+	$(addprefix tests/test_,imports.py linear_map.py cpu_kernels.py operators.py shipped_capture.py solve.py files.py \
 	mold_files.py solvers.py::test_it_finds_two_bright_voxels)
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
 LOWEST := .venv-lowest/bin/python

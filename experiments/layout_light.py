@@ -33,7 +33,7 @@ from gs_jax.apps.training.simulated_captures import FIELD_RADIUS, Kind, tables
 from gs_jax.base.arrays import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
-from gs_jax.projection.levels import optics_of
+from gs_jax.projection.forward_model import make_psf_model
 from gs_jax.simulation.synthetic import electrons
 
 KIND = Kind(288, 0.018, 0.064, 7, binning=4)
@@ -78,7 +78,7 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
     single = in_float32(imager)
     grid = in_float32(Grid.over(sensor, depths=DEPTHS, pitch=KIND.pitch))
     fine = in_float32(Grid(between, tuple(2 * n for n in grid.shape), KIND.pitch / 2))
-    optics = lambda depths: tables(imager, depths, KIND) if level == "full" else optics_of(single, depths, "near")
+    optics = lambda depths: tables(imager, depths, KIND) if level == "full" else make_psf_model(single, depths, "near")
     of_scene, of_volume = optics(between), optics(DEPTHS)
     results = []
     for number in range(scenes):

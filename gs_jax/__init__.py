@@ -54,7 +54,7 @@ The operators themselves, differentiable:
     forward              The image of a volume, summed lens by lens: Eq. (2), or with all of the light
     ImagingOperator      The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
     BackprojectionOperator  The paper's back-projection as a `lineax` operator, image to volume
-    optics_of            What `forward` takes to image planes at some depths, as true as is wanted
+    make_psf_model       The PSF model of a microscope at some depths, for `forward` and the solvers
     solve                Run a solver on an image, for all its steps or until its tolerance is met
 
 Better designs, and their molds:

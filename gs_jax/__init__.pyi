@@ -21,8 +21,7 @@ from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .pictures.volume_pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
-from .projection.forward_model import forward as forward
-from .projection.levels import optics_of as optics_of
+from .projection.forward_model import forward as forward, make_psf_model as make_psf_model
 from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,
     ImagingOperator as ImagingOperator,

@@ -1,6 +1,6 @@
-"""Operators of this package for other frameworks: SciPy (and PyLops, pyproximal), SCICO and deepinv.
+"""Operators for other frameworks: SciPy (and PyLops, pyproximal), SCICO and deepinv.
 
-None of these is installed with the package; each function imports its own when it is called.
+The package does not install these; each function imports its framework when it is called.
 """
 
 import math
@@ -14,14 +14,14 @@ import numpy as np
 
 
 def as_scipy(A: lx.AbstractLinearOperator) -> Any:
-    """An operator for `scipy.sparse.linalg`, between flat arrays; *host*.
+    """A `scipy.sparse.linalg.LinearOperator` between flat arrays; *host*.
 
-    Its solvers (`lsmr`, `cg`, `svds`, ...) take it, and so do PyLops and pyproximal (`pylops.aslinearoperator`).
+    For SciPy's solvers (`lsmr`, `cg`, `svds`, ...), PyLops and pyproximal (`pylops.aslinearoperator`).
 
     Parameters
     ----------
     A
-        `gs_jax.ImagingOperator`, or another from one array to one array.
+        `gs_jax.ImagingOperator`, or another operator from one array to one array.
 
     Examples
     --------
@@ -35,45 +35,45 @@ def as_scipy(A: lx.AbstractLinearOperator) -> Any:
     """
     from scipy.sparse.linalg import LinearOperator
 
-    there, back, into, out = _both_ways(A)
-    to_numpy = lambda function, shape: lambda flat: np.asarray(function(flat.reshape(shape).astype(into.dtype))).ravel()
-    matvec, rmatvec = to_numpy(there, into.shape), to_numpy(back, out.shape)
-    # SciPy's stubs know the class that is subclassed, not the call that makes one of functions.
-    of_functions: Any = LinearOperator
-    return of_functions((_size(out), _size(into)), matvec=matvec, rmatvec=rmatvec, dtype=np.dtype(into.dtype))
+    forward, adjoint, domain, image = _compile(A)
+    to_numpy = lambda function, shape: lambda x: np.asarray(function(x.reshape(shape).astype(domain.dtype))).ravel()
+    functions = {"matvec": to_numpy(forward, domain.shape), "rmatvec": to_numpy(adjoint, image.shape)}
+    shape = math.prod(image.shape), math.prod(domain.shape)
+    make: Any = LinearOperator  # SciPy's stubs only know its subclasses
+    return make(shape, **functions, dtype=np.dtype(domain.dtype))
 
 
 def as_scico(A: lx.AbstractLinearOperator) -> Any:
-    """An operator for SCICO, whose arrays are JAX's; *differentiable*. Parameters as of `as_scipy`."""
+    """A `scico.linop.LinearOperator`, on JAX arrays; *differentiable*. Parameters as for `as_scipy`."""
     from scico.linop import LinearOperator  # pyright: ignore[reportMissingImports]
 
-    there, back, into, out = _both_ways(A)
-    types = {"input_dtype": into.dtype, "output_dtype": out.dtype}
-    return LinearOperator(into.shape, out.shape, eval_fn=there, adj_fn=back, jit=False, **types)
+    forward, adjoint, domain, image = _compile(A)
+    types = {"input_dtype": domain.dtype, "output_dtype": image.dtype}
+    return LinearOperator(domain.shape, image.shape, eval_fn=forward, adj_fn=adjoint, jit=False, **types)
 
 
 def as_deepinv(A: lx.AbstractLinearOperator) -> Any:
-    """A `LinearPhysics` of deepinv, between batches `(batch, channel, ...)` of PyTorch's tensors.
+    """A `deepinv.physics.LinearPhysics` between batches `(batch, channel, ...)` of PyTorch tensors.
 
-    Tensors and arrays share their memory (DLPack). PyTorch's gradients by `x` and `y` are those by the adjoint and the
-    operator; there are none by the geometry. Parameters as of `as_scipy`.
+    Tensors and arrays share their memory (DLPack). PyTorch's gradients by `x` and `y` use the adjoint and the operator;
+    there are none by the geometry. Parameters as for `as_scipy`.
     """
     import torch  # pyright: ignore[reportMissingImports]
     from deepinv.physics import LinearPhysics  # pyright: ignore[reportMissingImports]
 
-    there, back, into, out = _both_ways(A)
+    apply, apply_adjoint, domain, image = _compile(A)
 
     def batched(function, shape):
         over = jax.jit(jax.vmap(function))
 
         def call(tensor):
             flat = tensor.detach().contiguous().reshape(-1, *shape)
-            found = torch.from_dlpack(over(jnp.from_dlpack(flat).astype(into.dtype)))
-            return found.reshape(*tensor.shape[: tensor.ndim - len(shape)], *found.shape[1:]).to(tensor.dtype)
+            result = torch.from_dlpack(over(jnp.from_dlpack(flat).astype(domain.dtype)))
+            return result.reshape(*tensor.shape[: tensor.ndim - len(shape)], *result.shape[1:]).to(tensor.dtype)
 
         return call
 
-    forward, adjoint = batched(there, into.shape), batched(back, out.shape)
+    forward, adjoint = batched(apply, domain.shape), batched(apply_adjoint, image.shape)
 
     def differentiable(function, transposed):
         class Linear(torch.autograd.Function):
@@ -90,11 +90,7 @@ def as_deepinv(A: lx.AbstractLinearOperator) -> Any:
     return LinearPhysics(A=differentiable(forward, adjoint), A_adjoint=differentiable(adjoint, forward))
 
 
-def _both_ways(A):
-    """Compiled functions there and back, and what they take; the operator's numbers are no constants in them."""
-    there, back = eqx.filter_jit(lambda A, x: A.mv(x)), eqx.filter_jit(lambda A, y: A.T.mv(y))
-    return (lambda x: there(A, x)), (lambda y: back(A, y)), A.in_structure(), A.out_structure()
-
-
-def _size(structure: jax.ShapeDtypeStruct) -> int:
-    return math.prod(structure.shape)
+def _compile(A):
+    """Compiled functions `mv` and `T.mv`, with the operator as an argument, not a constant; input and output."""
+    forward, adjoint = eqx.filter_jit(lambda A, x: A.mv(x)), eqx.filter_jit(lambda A, y: A.T.mv(y))
+    return (lambda x: forward(A, x)), (lambda y: adjoint(A, y)), A.in_structure(), A.out_structure()

@@ -1,7 +1,6 @@
-"""Sums of convolutions: by tiles in numba and by large transforms, against SciPy's; their derivatives."""
+"""Sums of convolutions: by tiles in numba and by FFTs of whole images, against SciPy's; their derivatives."""
 
 from functools import partial
-from inspect import unwrap
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +9,8 @@ import pytest
 from jax.test_util import check_grads
 from scipy.signal import fftconvolve
 
-from gs_jax.projection import convolution as convolve
-from gs_jax.projection.convolution import convolved, doubled
-from gs_jax.projection.cpu import dispatch as native
+from gs_jax.projection.convolution import sum_of_convolutions, upsample_by_two
+from gs_jax.projection.linear_map import cpu_kernel
 
 
 def problem(shape=(170, 205), size=9, count=2, dtype=jnp.float32, *, symmetric=False):
@@ -26,7 +24,7 @@ def problem(shape=(170, 205), size=9, count=2, dtype=jnp.float32, *, symmetric=F
 
 
 def expected(sharp, kernels, *, whole):
-    """What is on the sensor is beyond the margin, half a kernel and one line."""
+    """The sensor ends half a kernel and one line before the sharp images."""
     fit, mode = ((lambda a: a), "full") if whole else ((lambda a: a[1:-1, 1:-1]), "valid")
     pairs = zip(sharp, kernels, strict=True)
     return sum(fftconvolve(fit(np.asarray(a, float)), np.asarray(k, float), mode=mode) for a, k in pairs)
@@ -41,12 +39,11 @@ SIZES = [((170, 205), 9, 2), ((30, 41), 3, 1), ((260, 300), 65, 3), ((301, 333),
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_the_sum_is_scipys(shape, size, count, whole, dtype):
     sharp, kernels = problem(shape, size, count, dtype, symmetric=whole)
-    function = jax.jit(partial(convolved, whole=whole, symmetric=whole))
-    has_kernels = native.kernel_number("overlap_save") is not None
-    text = function.lower(sharp, kernels).as_text()
-    assert (native.TARGET in text) == (dtype == jnp.float32 and has_kernels)
+    function = jax.jit(partial(sum_of_convolutions, whole=whole, symmetric=whole))
+    by_kernel = dtype == jnp.float32 and cpu_kernel("convolve") is not None
+    assert ("gs_jax_cpu" in function.lower(sharp, kernels).as_text()) == by_kernel
     right = expected(sharp, kernels, whole=whole)
-    # As an FFT rounds: against the largest.
+    # As an FFT rounds: relative to the largest.
     tolerance = 2e-6 if dtype == jnp.float32 else 1e-13
     np.testing.assert_allclose(function(sharp, kernels), right, atol=tolerance * np.abs(right).max())
 
@@ -54,43 +51,49 @@ def test_the_sum_is_scipys(shape, size, count, whole, dtype):
 @pytest.mark.parametrize("whole", [False, True])
 def test_adjoint(whole):
     sharp, kernels = problem()
-    image = convolved(sharp, kernels, whole=whole)
+    image = sum_of_convolutions(sharp, kernels, whole=whole)
     other = jnp.cos(jnp.arange(image.size, dtype=jnp.float32)).reshape(image.shape)
-    (back,) = jax.linear_transpose(lambda sharp: convolved(sharp, kernels, whole=whole), sharp)(other)
-    forth = jnp.vdot(image, other)
-    scale = jnp.linalg.norm(image) * jnp.linalg.norm(other)
+
+    def adjoint(dtype):
+        function = lambda sharp: sum_of_convolutions(sharp, kernels.astype(dtype), whole=whole)
+        return jax.linear_transpose(function, tuple(a.astype(dtype) for a in sharp))(other.astype(dtype))[0]
+
+    back, forth = adjoint(jnp.float32), jnp.vdot(image, other)
     total = sum(jnp.vdot(a, b) for a, b in zip(sharp, back, strict=True))
-    assert abs(total - forth) < 1e-6 * scale
-    (rows, columns), (tall, wide) = image.shape, sharp[0].shape
-    sizes = convolve.Sizes((rows, columns), (tall, wide), whole, symmetric=False)
-    for ours, plain in zip(back, unwrap(convolve._correlate)(sizes, kernels, other), strict=True):
+    assert abs(total - forth) < 1e-6 * jnp.linalg.norm(image) * jnp.linalg.norm(other)
+    for ours, plain in zip(back, adjoint(jnp.float64), strict=True):
         np.testing.assert_allclose(ours, plain, atol=2e-6 * float(jnp.abs(plain).max()))
 
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_derivatives(whole):
     sharp, kernels = problem((20, 23), 5, 2, jnp.float64)
-    check_grads(jax.jit(partial(convolved, whole=whole)), (sharp, kernels), order=1, eps=1e-3, atol=1e-9, rtol=1e-9)
-    single = problem((20, 23), 5, 2)
-    by_kernels = jax.grad(lambda sharp, kernels: (convolved(sharp, kernels) ** 2).sum(), argnums=1)
-    np.testing.assert_allclose(by_kernels(*single), by_kernels(sharp, kernels), rtol=1e-4)
+    function = jax.jit(partial(sum_of_convolutions, whole=whole))
+    check_grads(function, (sharp, kernels), order=1, eps=1e-3, atol=1e-9, rtol=1e-9)
+    by_kernels = jax.grad(lambda sharp, kernels: (sum_of_convolutions(sharp, kernels) ** 2).sum(), argnums=1)
+    np.testing.assert_allclose(by_kernels(*problem((20, 23), 5, 2)), by_kernels(sharp, kernels), rtol=1e-4)
 
 
-def test_tiles_in_the_dark_are_left_out():
+def test_dark_tiles_are_skipped():
     sharp, kernels = problem((600, 400), 9, 2)
     lit = sharp[0].at[200:].set(0)
-    found = convolved((lit, jnp.zeros_like(lit)), kernels)
+    image = sum_of_convolutions((lit, jnp.zeros_like(lit)), kernels)
     right = expected((lit,), kernels[:1], whole=False)
-    np.testing.assert_allclose(found, right, atol=2e-6 * np.abs(right).max())
+    np.testing.assert_allclose(image, right, atol=2e-6 * np.abs(right).max())
     # Exactly: tiles keep 240 lines.
-    assert not np.any(found[240:])
-    assert np.isnan(convolved((sharp[0].at[300, 100].set(jnp.nan), lit), kernels)).any()
+    assert not np.any(image[240:])
+    assert np.isnan(sum_of_convolutions((sharp[0].at[300, 100].set(jnp.nan), lit), kernels)).any()
 
 
-def test_doubled_is_a_sinc():
+def comparisons():
+    test_the_sum_is_scipys(*SIZES[1], whole=False, dtype=jnp.float32)
+    test_adjoint(whole=False)
+
+
+def test_upsampling_is_a_sinc():
     n, fine = np.arange(64), np.arange(100)
     wave = lambda place: np.cos(2 * np.pi * 5 * place / 64)
     coarse = jnp.asarray(wave(n)[:, None] * wave(n)[None])
     # The middle of the first fine pixel is a quarter of a large one before that of its large one.
     place = wave(6 - 0.25 + fine / 2)
-    np.testing.assert_allclose(doubled(coarse, 6, (100, 100)), place[:, None] * place[None] / 4, atol=1e-12)
+    np.testing.assert_allclose(upsample_by_two(coarse, 6, (100, 100)), place[:, None] * place[None] / 4, atol=1e-12)

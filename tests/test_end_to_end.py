@@ -18,7 +18,7 @@ from gs_jax.codesign.end_to_end import (
     reconstruction_loss,
 )
 from gs_jax.metrics import quality
-from gs_jax.projection.subfields import subfield
+from gs_jax.projection.rays import crop_field
 
 from .helpers import scene
 
@@ -86,7 +86,7 @@ def test_reconstruct_is_back_projection_less_its_mean():
 def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
     """A volume beside the axis, in the frame of the part and in that of the whole."""
     whole, _ = scene()
-    part, lit = subfield(whole, jnp.array([0.13, -0.21]), shape)
+    part, lit = crop_field(whole, jnp.array([0.13, -0.21]), shape)
     place = whole.shift - part.shift
     np.testing.assert_allclose(place, [0.13, -0.21], atol=0.0101)
     volume = jax.random.uniform(KEY, (1, 5, 5))

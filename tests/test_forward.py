@@ -1,3 +1,7 @@
+import subprocess
+import sys
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +11,7 @@ from jax.test_util import check_grads
 from scipy.signal import fftconvolve
 from scipy.special import erf
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject_adjoint, forward
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
 from gs_jax.apps.benchmark_measure import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.projection.point_sources import STEPS, forward_points, stamps
@@ -36,9 +40,33 @@ def test_without_a_psf_it_is_the_adjoint_of_back_projection():
     expected = backproject_adjoint(volume, imager, grid)
     np.testing.assert_array_equal(forward(volume, imager, grid), expected)
     point = jnp.zeros((3, 5, 5)).at[:, 2, 2].set(1.0)
-    # But for the edge, which shares the light of rays up to a pixel beyond it.
-    found, inner = forward(volume, imager, grid, point), np.s_[1:-1, 1:-1]
-    np.testing.assert_allclose(found[inner], expected[inner], atol=1e-13 * expected.max())
+    # Except at the edge, which shares the light of rays up to a pixel beyond it.
+    inner = np.s_[1:-1, 1:-1]
+    image = forward(volume, imager, grid, point)[inner]
+    np.testing.assert_allclose(image, expected[inner], atol=1e-13 * expected.max())
+    integers = jax.random.randint(jax.random.key(2), grid.volume_shape, 0, 9)
+    for psf in (None, point):
+        floats = forward(integers.astype(float), imager, grid, psf)
+        np.testing.assert_array_equal(forward(integers, imager, grid, psf), floats)
+
+
+def volume_and_image():
+    imager, grid = scene(jnp.float32)
+    volume = backproject(jax.random.uniform(jax.random.key(0), imager.sensor.shape, jnp.float32), imager, grid)
+    return volume, forward(volume, imager, grid, psfs(3, dtype=jnp.float32))
+
+
+@pytest.mark.integration
+def test_without_cpu_kernels_xla_computes_the_same(tmp_path):
+    """With one warning, where their folder cannot be imported."""
+    code = "import sys; sys.modules['gs_jax.projection.cpu'] = None; from tests import test_forward as t; "
+    code += "t.np.savez(sys.argv[1], *t.volume_and_image())"
+    call = [sys.executable, "-c", code, str(tmp_path / "results.npz")]
+    done = subprocess.run(call, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr.count("XLA is used instead") == 1, done.stderr
+    with np.load(tmp_path / "results.npz") as results:
+        for ours, plain in zip(volume_and_image(), results.values(), strict=True):
+            np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=2e-6 * float(ours.max()))
 
 
 @pytest.mark.integration
@@ -68,15 +96,6 @@ def test_light_of_chief_rays_beside_the_sensor():
     point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, stamps(np.array([20.0]), fine))
     kernel = jnp.asarray(fine.reshape(1, 11, 5, 11, 5).sum((2, 4)))
     np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
-
-
-@pytest.mark.integration
-def test_voxels_may_be_integers():
-    imager, grid = scene()
-    volume = jax.random.randint(jax.random.key(2), grid.volume_shape, 0, 9)
-    for kernels in (None, psfs(3)):
-        expected = forward(volume.astype(float), imager, grid, kernels)
-        np.testing.assert_array_equal(forward(volume, imager, grid, kernels), expected)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 1e-5)])
@@ -121,7 +140,7 @@ def test_the_energy_is_the_envelope_times_the_object():
 @pytest.mark.parametrize("shape", [(2, 5, 5), (3, 4, 4), (3, 5, 3)])
 def test_wrong_psfs_are_refused(shape):
     imager, grid = scene()
-    with pytest.raises(ValueError, match=r"`psf` must be \(3, size, size\) with an odd size"):
+    with pytest.raises(ValueError, match=r"`optics` must be \(3, size, size\) with an odd size"):
         forward(volume_of(grid), imager, grid, jnp.ones(shape))
 
 
@@ -164,22 +183,16 @@ def zone_scene(field_radius):
     return imager, Grid([10.0], (23, 23), 0.04)
 
 
-@pytest.mark.integration
-def test_equation_2_as_printed_where_each_voxel_is_a_zone():
+@pytest.mark.parametrize("zones", [pytest.param("voxels", marks=pytest.mark.integration), "lenses"])
+def test_equation_2_as_printed_where_voxels_are_at_the_middle_of_zones(zones):
     imager, grid = zone_scene(0.4)
-    volume, kernels = volume_of(grid), psfs(1)
-    zone = np.arange(23 * 23).reshape(23, 23)
-    expected = equation_2(volume, imager, grid, kernels, zone)
-    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
-
-
-def test_equation_2_as_printed_at_the_middle_of_its_zones():
-    imager, grid = zone_scene(0.4)
-    zone = zones_of_lenses(grid, np.asarray(imager.centers))
-    volume = np.zeros((1, 23, 23))
-    for i in np.unique(zone):
-        r, c = np.nonzero(zone == i)
-        volume[0, round(r.mean()), round(c.mean())] = 1
+    if zones == "voxels":
+        zone, volume = np.arange(23 * 23).reshape(23, 23), volume_of(grid)
+    else:
+        zone, volume = zones_of_lenses(grid, np.asarray(imager.centers)), np.zeros((1, 23, 23))
+        for i in np.unique(zone):
+            r, c = np.nonzero(zone == i)
+            volume[0, round(r.mean()), round(c.mean())] = 1
     expected = equation_2(volume, imager, grid, psfs(1), zone)
     np.testing.assert_allclose(forward(volume, imager, grid, psfs(1)), expected, atol=1e-12 * expected.max())
 
@@ -206,15 +219,11 @@ def line(pixels, middle, width, pitch=0.02):
     return np.diff(erf(edges / (width * 2**0.5))) / 2
 
 
-def gaussian(width, size, pitch):
-    return np.outer(*2 * [line(size, (size - 1) / 2, width, pitch)])
-
-
 def test_points_are_gaussians_where_the_chief_rays_land():
     imager = Imager(MicrolensArray([[0.1, 0.0], [-0.33, 0.21], [1.9, 0.3]]), Sensor((120, 100), 0.02), 5.8, 0.6)
     points = np.array([[0.03, 0.01, 20.0, 2.0], [-0.11, 0.12, 21.0, 1.0], [1.45, 0.3, 20.5, 1.0]])
-    width = np.array([0.03, 0.05])
-    fine = np.stack([gaussian(w, 25 * STEPS, 0.02 / STEPS) for w in width])
+    width, size = np.array([0.03, 0.05]), 25 * STEPS
+    fine = np.stack([np.outer(*2 * [line(size, (size - 1) / 2, w, 0.02 / STEPS)]) for w in width])
     image = forward_points(points, imager, stamps(np.array([20.0, 22.0]), fine))
     expected = np.zeros((120, 100))
     pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
@@ -284,17 +293,14 @@ def test_many_points_take_little_memory():
 
 def test_no_points_give_a_dark_image():
     imager, _ = scene()
-    kernels = stamps(np.array([20.0]), gaussian(0.03, 3 * STEPS, 0.004)[None])
-    image = forward_points(np.zeros((0, 4)), imager, kernels)
+    image = forward_points(np.zeros((0, 4)), imager, stamps(np.array([20.0]), np.ones((1, 15, 15))))
     assert image.shape == imager.sensor.shape and not image.any()
 
 
-@pytest.mark.parametrize("size", [10, 14])
-def test_stamps_of_even_size_are_refused(size):
-    with pytest.raises(ValueError, match="`fine` must be"):
-        stamps(np.array([20.0]), np.ones((1, size, size)))
-
-
-def test_stamps_of_depths_that_do_not_ascend_are_refused():
-    with pytest.raises(ValueError, match="`depths` must ascend"):
-        stamps(np.array([20.0, 19.0]), np.ones((2, 15, 15)))
+@pytest.mark.parametrize(
+    ("depths", "size", "words"),
+    [([20.0], 10, "`fine` must be"), ([20.0], 14, "`fine` must be"), ([20.0, 19.0], 15, "`depths` must ascend")],
+)
+def test_wrong_stamps_are_refused(depths, size, words):
+    with pytest.raises(ValueError, match=words):
+        stamps(np.array(depths), np.ones((len(depths), size, size)))

@@ -12,12 +12,22 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gs_jax import Grid, Imager, ImagingOperator, InputError, MicrolensArray, Sensor, forward, optics_of, reconstruct
+from gs_jax import (
+    Grid,
+    Imager,
+    ImagingOperator,
+    InputError,
+    MicrolensArray,
+    Sensor,
+    forward,
+    make_psf_model,
+    reconstruct,
+)
 from gs_jax.design.design import read_design
 from gs_jax.detection.point_finder import find_points
 from gs_jax.geometry import falloff
 from gs_jax.optics.apertures import clear_area
-from gs_jax.optics.field_varying import field_varying_psf
+from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
 from gs_jax.optics.psf_core import (
     aperture_profile,
     apparent_depths,
@@ -245,29 +255,26 @@ def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():
 
 
 @pytest.mark.integration
-def test_levels_have_names():
-    scope, voxels = imager(), grid()
-    assert optics_of(scope, DEPTHS, "pinhole") is None
-    near = optics_of(scope, DEPTHS, "near")
-    assert isinstance(near, jax.Array) and near.shape[0] == 2
-    image = forward(volume(voxels.volume_shape), scope, voxels, optics_of(scope, DEPTHS))
-    assert image.shape == scope.sensor.shape
-    with pytest.raises(InputError, match="optics: found 'exact', allowed: full, near, pinhole"):
-        optics_of(scope, DEPTHS, "exact")
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("level", ["full", "near", "pinhole"])
-def test_every_level_reconstructs(level):
-    """A bright voxel is the brightest, whatever the method knows of the light."""
+@pytest.mark.parametrize("fidelity", ["full", "near", "pinhole"])
+def test_every_fidelity_reconstructs(fidelity):
+    """A bright voxel is the brightest, whatever the PSF model."""
     scope, voxels = imager(pixels=(160, 160), pitch=0.03), Grid([18.0, 20.0, 22.0], (21, 21), 0.12)
     truth = np.zeros(voxels.volume_shape, np.float32)
     truth[1, 8, 13] = 1
     place = voxels.to_mm(np.array([[1, 8, 13]]))
     image = full_image_of_points(np.column_stack([place, [1e6]]), scope)
-    found = reconstruct(image, scope, voxels, RichardsonLucy(steps=10), optics=level)
-    at = np.unravel_index(found.argmax(), found.shape)
-    assert np.abs(np.array(at[1:]) - (8, 13)).max() <= 1 and np.isfinite(found).all()
+    volume = reconstruct(image, scope, voxels, RichardsonLucy(steps=10), optics=fidelity)
+    at = np.unravel_index(volume.argmax(), volume.shape)
+    assert np.abs(np.array(at[1:]) - (8, 13)).max() <= 1 and np.isfinite(volume).all()
+    psf = make_psf_model(scope, DEPTHS, fidelity)
+    assert (
+        psf is None if fidelity == "pinhole" else isinstance(psf, FieldVaryingPsf if fidelity == "full" else jax.Array)
+    )
+
+
+def test_an_unknown_fidelity_is_refused():
+    with pytest.raises(InputError, match="optics must be one of full, near, pinhole, got 'exact'"):
+        make_psf_model(imager(), DEPTHS, "exact")
 
 
 @pytest.mark.integration

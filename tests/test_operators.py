@@ -8,19 +8,27 @@ from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import lsmr
 
-from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, optics_of
+from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, make_psf_model
+from gs_jax.interop import as_deepinv, as_scico, as_scipy
 
 from .helpers import scene
 
 
+def random_pair(A):
+    """A random input and a random output."""
+    return (
+        jax.random.normal(jax.random.key(n), s.shape, s.dtype)
+        for n, s in enumerate((A.in_structure(), A.out_structure()))
+    )
+
+
 def test_transpose_is_backprojection():
     imager, grid = scene()
-    image = jax.random.normal(jax.random.key(0), imager.sensor.shape)
-    volume = jax.random.normal(jax.random.key(1), (3, *grid.shape))
-    operator = ImagingOperator(imager, grid)
-    np.testing.assert_array_equal(operator.mv(volume), backproject_adjoint(volume, imager, grid))
-    np.testing.assert_array_equal(operator.T.mv(image), backproject(image, imager, grid))
-    np.testing.assert_array_equal(operator.T.T.mv(volume), operator.mv(volume))
+    A = ImagingOperator(imager, grid)
+    volume, image = random_pair(A)
+    np.testing.assert_array_equal(A.mv(volume), backproject_adjoint(volume, imager, grid))
+    np.testing.assert_array_equal(A.T.mv(image), backproject(image, imager, grid))
+    np.testing.assert_array_equal(A.T.T.mv(volume), A.mv(volume))
 
 
 @pytest.mark.integration
@@ -50,8 +58,8 @@ def test_it_composes_and_solves():
 
 OPERATORS = {
     "pinholes": lambda *scene: ImagingOperator(*scene),
-    "near": lambda imager, grid: ImagingOperator(imager, grid, optics_of(imager, grid.depths, "near")),
-    "full": lambda imager, grid: ImagingOperator(imager, grid, optics_of(imager, grid.depths, "full")),
+    "near": lambda imager, grid: ImagingOperator(imager, grid, make_psf_model(imager, grid.depths, "near")),
+    "full": lambda imager, grid: ImagingOperator(imager, grid, make_psf_model(imager, grid.depths, "full")),
     "back-projection": lambda *scene: BackprojectionOperator(*scene),
     "normalized": lambda *scene: BackprojectionOperator(*scene, normalize=True),
 }
@@ -61,7 +69,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.integration) for name in OPERATORS 
 @pytest.mark.parametrize("name", ["pinholes", *SLOW])
 def test_the_transpose_is_the_adjoint_and_maps_over_batches(name):
     A = OPERATORS[name](*scene())
-    x, y = (jax.random.normal(jax.random.key(n), s.shape) for n, s in enumerate((A.in_structure(), A.out_structure())))
+    x, y = random_pair(A)
     assert A.T.in_structure() == A.out_structure() and A.T.T.out_structure() == A.out_structure()
     np.testing.assert_allclose(jnp.vdot(A.mv(x), y), jnp.vdot(x, A.T.mv(y)), rtol=1e-9)
     both = jnp.stack([x, 2 * x])
@@ -70,7 +78,7 @@ def test_the_transpose_is_the_adjoint_and_maps_over_batches(name):
 
 def test_materialised_it_still_takes_volumes():
     A = ImagingOperator(*scene(voxels=(5, 4), pitch=0.2, depths=(20.0,)))
-    x, y = (jax.random.normal(jax.random.key(n), s.shape) for n, s in enumerate((A.in_structure(), A.out_structure())))
+    x, y = random_pair(A)
     dense = lx.materialise(A)
     np.testing.assert_allclose(dense.mv(x), A.mv(x), atol=1e-12)
     np.testing.assert_allclose(dense.T.mv(y), A.T.mv(y), atol=1e-12)
@@ -128,34 +136,25 @@ def test_second_derivatives_are_those_of_reverse_passes_too():
 
 
 def test_scipy_solves_with_it():
-    from gs_jax.interop import as_scipy
-
     A = ImagingOperator(*scene(voxels=(5, 4), pitch=0.2, depths=(20.0,)))
-    bridge, rng = as_scipy(A), np.random.default_rng(0)
-    x, y = (rng.normal(size=n) for n in bridge.shape[::-1])
-    assert np.vdot(bridge @ x, y) == pytest.approx(np.vdot(x, bridge.T @ y), rel=1e-12)
+    B, (x, y) = as_scipy(A), (np.ravel(a) for a in random_pair(A))
+    assert np.vdot(B @ x, y) == pytest.approx(np.vdot(x, B.T @ y), rel=1e-12)
     # Some voxels are seen by no lens.
     seen = np.asarray(A.T.mv(jnp.ones(A.out_structure().shape))).ravel() > 0
-    np.testing.assert_allclose(lsmr(bridge, bridge @ x, atol=1e-13, btol=1e-13)[0][seen], x[seen], rtol=1e-8)
+    np.testing.assert_allclose(lsmr(B, B @ x, atol=1e-13, btol=1e-13)[0][seen], x[seen], rtol=1e-8)
 
 
 @pytest.mark.integration
 def test_pylops_takes_it():
     pylops = pytest.importorskip("pylops", reason="no pylops: pip install pylops")
-    from gs_jax.interop import as_scipy
-
     assert pylops.utils.dottest(pylops.aslinearoperator(as_scipy(ImagingOperator(*scene()))))
 
 
 @pytest.mark.integration
 def test_scico_takes_it():
     pytest.importorskip("scico", reason="no scico: pip install scico")
-    from gs_jax.interop import as_scico
-
-    A = as_scico(ImagingOperator(*scene(jnp.float32)))
-    x, y = (
-        jax.random.normal(jax.random.key(n), shape, A.dtype) for n, shape in enumerate((A.input_shape, A.output_shape))
-    )
+    A = ImagingOperator(*scene(jnp.float32))
+    (x, y), A = random_pair(A), as_scico(A)
     np.testing.assert_allclose(jnp.vdot(A(x), y), jnp.vdot(x, A.adj(y)), rtol=1e-4)
 
 
@@ -163,8 +162,6 @@ def test_scico_takes_it():
 def test_deepinv_takes_it():
     torch = pytest.importorskip("torch", reason="no PyTorch: pip install deepinv")
     pytest.importorskip("deepinv", reason="no deepinv: pip install deepinv")
-    from gs_jax.interop import as_deepinv
-
     A = ImagingOperator(*scene(jnp.float32))
     physics, volume = as_deepinv(A), torch.rand(2, 1, *A.in_structure().shape, requires_grad=True)
     image = torch.rand(2, 1, *A.out_structure().shape)

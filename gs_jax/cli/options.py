@@ -20,7 +20,7 @@ _NEAREST = 1e-6
 
 METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
 SUPPRESSIONS = ("none", "points", "clusters", "unet")
-LEVELS = ("full", "near", "pinhole")
+FIDELITIES = ("full", "near", "pinhole")
 SIMULATED = ("full", "near")
 PSFS = ("diffraction", "geometric", "gaussian")
 CHANNELS = ("red", "green", "blue")

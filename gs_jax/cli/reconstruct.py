@@ -13,7 +13,7 @@ from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
 from .options import (
     DESIGN,
-    LEVELS,
+    FIDELITIES,
     METHODS,
     SUPPRESSIONS,
     UM,
@@ -51,7 +51,7 @@ from .recording_command import check_recording, reconstruct_recording, recording
 )
 @click.option(
     "--optics",
-    type=click.Choice(LEVELS),
+    type=click.Choice(FIDELITIES),
     default="full",
     help="Model of the light: all of it, one PSF for all lenses near a point, or chief rays alone.",
 )
@@ -119,7 +119,7 @@ def reconstruct_command(
     from ..io.point_tables import write_points
     from ..io.recordings import opened_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
-    from ..projection.cpu.dispatch import once
+    from ..projection.linear_map import xla_only
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
@@ -153,7 +153,7 @@ def reconstruct_command(
         reconstruct = plan.prepare(progress)
         # Back-projection alone runs its kernels once; iterative methods and points run them many times.
         is_single_pass = method_options["method"] == "backproject" and plan.suppress != "points" and not points
-        with once() if is_single_pass else nullcontext():
+        with xla_only() if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
         with progress.step("Writing"):

@@ -18,7 +18,7 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..projection.backprojection import backproject
 from ..projection.forward_model import forward
-from ..projection.subfields import subfield
+from ..projection.rays import crop_field
 from ..typing import Real
 
 Volume = Float[Array | np.ndarray, "depth y x"]
@@ -220,7 +220,7 @@ def reconstruction_loss(
         scene_key, noise_key, place_key = jax.random.split(key, 3)
         place = jax.random.uniform(place_key, (2,), dtype, -0.5, 0.5) * jnp.asarray(field, dtype)
         place = place + jnp.asarray(imager.sensor.origin, dtype)
-        local, lit = (imager, None) if window is None else subfield(imager, place, window)
+        local, lit = (imager, None) if window is None else crop_field(imager, place, window)
         truth = random_scene(scene_key, grid, density=density, width=width)
         image = noisy(noise_key, electrons * forward(truth, local, grid, images), read_noise)
         estimate = reconstruct(image, local, grid, background_width=background_width, lit=lit)

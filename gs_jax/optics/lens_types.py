@@ -28,7 +28,7 @@ HALF_SIDE, FIELDS = 3, 17
 
 
 class PerTypePsf(eqx.Module):
-    """PSFs of each lens type; `gs_jax.optics_of` makes it.
+    """PSFs of each lens type; `gs_jax.make_psf_model` makes it.
 
     `lenses`: indices of each type's lenses. `optics`: for each type, its PSF at each depth, with the sum of its light
     over that of the mean lens; or all of its light.

@@ -14,7 +14,7 @@ from ..typing import Image
 from .bilinear import Shapes, image_to_volume, volume_to_image
 from .rays import Envelope, Rays, trace
 
-# Depths that are handled at once. More would be no faster, and patches would grow with the volume.
+# Depths computed at once. More are not faster, and patches would grow with the volume.
 _DEPTHS = 16
 
 
@@ -31,31 +31,30 @@ def backproject(
 
     *Differentiable.*
 
-    Differentiable once, in both modes, with respect to the image, the imager and the grid's depths and
-    origin.
+    Differentiable with respect to the image, the imager and the grid's depths and origin.
 
     Parameters
     ----------
     image
-        `sensor.shape`, of any real type; integers are read as they are, without a copy.
+        `sensor.shape`, of any real type; integers are read without a copy.
     imager, grid
-        What took the image, and the voxels wanted.
+        The microscope that took the image, and the voxels.
     method
-        `"linear"` interpolates between the four pixels around the chief ray, so that lens positions have
-        gradients; `"nearest"` takes the nearest pixel, as the paper does, and has no gradient there.
+        `"linear"` interpolates between the four pixels around the chief ray, so that lens positions have gradients;
+        `"nearest"` takes the nearest pixel, as the paper does, without these gradients.
     normalize
-        Divide by the summed weights, so that a uniform image gives a uniform volume; voxels that no lens sees
-        stay zero.
+        Divide by the sum of the weights, so that a uniform image gives a uniform volume; voxels that no lens sees are
+        zero.
 
     Returns
     -------
     Array
-        `grid.volume_shape`, of the image's type if it is floating, else of the imager's.
+        `grid.volume_shape`, of the image's type if that is floating, else of the imager's.
 
     Raises
     ------
     ValueError
-        If the image is not `sensor.shape`, or `method` is neither of the two.
+        If the image is not `sensor.shape`, or `method` is unknown.
 
     Examples
     --------
@@ -75,7 +74,7 @@ def backproject(
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
     dtype = _type_of(image, imager)
 
-    def some_depths(depths):
+    def backproject_group(depths):
         shapes, rays = _prepare(imager, grid.at(depths), method, dtype)
         volume = image_to_volume(shapes, rays, image)
         if not normalize:
@@ -84,7 +83,7 @@ def backproject(
         seen = total > 0
         return jnp.where(seen, volume / jnp.where(seen, total, 1), 0)
 
-    volume = lax.map(some_depths, _in_groups(grid.depths))
+    volume = lax.map(backproject_group, _in_groups(grid.depths))
     return volume.reshape(-1, *grid.shape)[: grid.depths.size]
 
 
@@ -96,14 +95,13 @@ def backproject_adjoint(
 
     *Differentiable.*
 
-    Its linear version is the image of a volume by pinholes: Eq. (2) with a point for PSF_o.
-    Differentiable once, in both modes, with respect to the volume, the imager and the grid's depths and
-    origin.
+    With `method="linear"` it is the image of a volume by pinholes: Eq. (2) with a point for PSF_o. Differentiable with
+    respect to the volume, the imager and the grid's depths and origin.
 
     Parameters
     ----------
     volume
-        `grid.volume_shape`; integers count as the imager's type.
+        `grid.volume_shape`; integers are converted to the imager's type.
     imager, grid, method
         As for `backproject`.
 
@@ -115,7 +113,7 @@ def backproject_adjoint(
     Raises
     ------
     ValueError
-        If the volume is not of the grid's shape, or `method` is neither of the two.
+        If the volume is not of the grid's shape, or `method` is unknown.
 
     Examples
     --------
@@ -147,7 +145,7 @@ def backproject_adjoint(
 
 
 def as_volume(volume: Num[Array | np.ndarray, "*shape"], imager: Imager) -> Float[Array, "*shape"]:
-    """The volume as floats: its own, or the imager's if it is of integers."""
+    """The volume in its own floating type, or as the imager's if it has integers."""
     return jnp.asarray(volume, _type_of(volume, imager))
 
 
@@ -155,8 +153,8 @@ def _type_of(array, imager):
     return array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else imager.sensor_distance.dtype
 
 
-def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group some"]:
-    """Depths in groups of at most `_DEPTHS`, of one size: the last depth is repeated where they do not divide."""
+def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group size"]:
+    """Depths in groups of one size, at most `_DEPTHS`; the last group is filled up with the last depth."""
     groups = -(-depths.size // _DEPTHS)
     size = -(-depths.size // groups)
     return jnp.pad(depths, (0, groups * size - depths.size), mode="edge").reshape(groups, size)

@@ -4,15 +4,14 @@ Back-projection, its adjoint and its gradient are derivatives of one bilinear fo
 
     B(volume, image, rays) = sum_j sum_q C_j(q) volume(q) image(p_j(q)),
 
-the sum over lenses j and voxels q of the lenses' weight, times the voxel, times the image at the chief ray's pixel:
-back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image), and the gradient with respect
-to the geometry is dB/d(rays), which JAX carries on to lens positions, distances and depths. Each is written out
-because the transpose that JAX would derive of a gather is a scatter, twenty times slower on a processor.
+the sum over lenses j and voxels q of the lens weight, the voxel and the image at the pixel p_j(q) of the chief ray:
+back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image), and dB/d(rays) is the gradient by the
+geometry, which JAX propagates to lens positions, distances and depths. Each is written out because JAX would transpose
+the gather to a scatter, which is twenty times slower on a CPU.
 
-Each runs over the lenses, one patch of voxels at a time and all depths at once, so that the memory is image +
-volume + one patch. `lax.cond` on "this lens sees a voxel" skips the others, and has a second use: XLA on a
-processor fuses a loop body into one in-place update on one core, and what a branch returns is computed apart
-from it, on all cores.
+Each scans the lenses, one patch of voxels at a time and all depths at once, so that the memory is image + volume + one
+patch. `lax.cond` skips lenses that see no voxel. It also stops XLA from fusing the loop body into one in-place update
+on one core: what a branch returns is computed separately, on all cores.
 """
 
 from typing import NamedTuple
@@ -23,60 +22,43 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .cpu import dispatch as native
-from .cpu.dispatch import native_on_cpu
-from .linear_map import linear_call
+from .linear_map import LinearMap
 from .rays import Axis, Envelope, Rays, RingLight
 
-# Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache, and the number of
-# squares, not their size, follows the magnification, which may be traced.
+# Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache. The magnification, which
+# may be traced, changes the number of squares and not their size.
 _BLOCK = 160
 
 
-Weight = Envelope | RingLight
-
-
 class Shapes(NamedTuple):
-    """What has to be known before tracing."""
+    """What must be known before tracing."""
 
     image: tuple[int, int]
     volume: tuple[int, int, int]
-    weight: Weight
+    weight: Envelope | RingLight
 
 
-def image_to_volume(shapes: Shapes, rays: Rays, image):
-    """dB/d(volume), differentiable by rays and image; of an image of ones, but cheaper, if `image` is None."""
-    return linear_call(_gather, _scatter, _rays_bar, shapes, rays, image)
-
-
-def volume_to_image(shapes: Shapes, rays: Rays, volume):
-    """dB/d(image), differentiable by rays and volume."""
-    return linear_call(_scatter, _gather, _rays_bar_by_volume, shapes, rays, volume)
-
-
-@native_on_cpu("gather", native.gather)
 def _gather(shapes: Shapes, rays: Rays, image):
-    """dB/d(volume); of an image of ones, but cheaper, if `image` is None."""
+    """dB/d(volume). None is an image of ones, which costs less."""
 
     def add_lens(volume, lens):
         y, x, y_pair, x_pair = lens
 
         def patch():
             weight = _weights(shapes, y, x, rays.parameters)
-            return (
-                weight if image is None else weight * _interpolate(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
-            )
+            if image is None:
+                return weight
+            return weight * _interpolate(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
 
         new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
-        return _put(volume, new, y, x), None
+        return _update_patch(volume, new, y, x), None
 
     volume = jnp.zeros(shapes.volume, rays.parameters.dtype)
     return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
 
 
-@native_on_cpu("scatter", native.scatter)
 def _scatter(shapes: Shapes, rays: Rays, volume):
-    """By gathering: each pixel looks for the voxels that reach it, along x and then along y."""
+    """dB/d(image), by gathers: each pixel looks up the voxels that reach it, along x and then along y."""
     # Neighbouring rays are `spacing` apart, and a pixel is reached from less than one pixel on either side.
     taps = jnp.floor(2 / rays.spacing.min() + 1e-3).astype(jnp.int32) + 1
 
@@ -84,27 +66,31 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
         y, x, spacing = lens
         weighted = lambda: _weights(shapes, y, x, rays.parameters) * _patch(volume, y, x)
         patch = _if_seen(shapes, y, x, weighted)
-        columns_of, rows_of = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
+        column_blocks, row_blocks = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
 
         def add_columns(block, image):
-            left, columns, fresh = columns_of.block(block)
+            left, columns, fresh = column_blocks.block(block)
             spread = _spread_columns(patch, x, spacing, columns, fresh, taps)
 
             def add_rows(block, image):
-                top, rows, fresh = rows_of.block(block)
+                top, rows, fresh = row_blocks.block(block)
                 return _add_rows(image, spread, y, spacing, rows, fresh, taps, (top, left))
 
-            return lax.fori_loop(0, rows_of.blocks, add_rows, image)
+            return lax.fori_loop(0, row_blocks.blocks, add_rows, image)
 
-        return lax.fori_loop(0, columns_of.blocks, add_columns, image), None
+        return lax.fori_loop(0, column_blocks.blocks, add_columns, image), None
 
     image = jnp.zeros(shapes.image, volume.dtype)
     return lax.scan(add_lens, image, (rays.y, rays.x, rays.spacing))[0]
 
 
-@native_on_cpu("rays_bar", native.rays_bar)
-def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:
-    """dB/d(rays): sums over one axis of what a ray and its envelope change on the other."""
+def _continuous(rays: Rays):
+    return rays.y.fraction, rays.y.distance2, rays.x.fraction, rays.x.distance2, rays.parameters
+
+
+def _rays_vjp(shapes: Shapes, constants, volume):
+    """dB/d(rays), of the `_continuous` ones: sums over one axis of the derivatives along the other."""
+    rays, image = constants
 
     def add_lens(total, lens):
         y, x, y_pair, x_pair = lens
@@ -116,24 +102,36 @@ def _rays_bar(shapes: Shapes, rays: Rays, image, volume) -> Rays:
         else:
             corners = _if_seen(shapes, y, x, lambda: _corners(image, y_pair, x_pair))
             sample, along_y, along_x = _interpolate(corners, y_pair, x_pair)
-        distance2_bar, parameters_bar = weight_vjp(patch * sample)
+        by_distance2, by_parameters = weight_vjp(patch * sample)
         by_y, by_x = patch * weight * along_y, patch * weight * along_x
-        bars = by_y.sum(2), distance2_bar.sum(2), by_x.sum(1), distance2_bar.sum(1)
-        return total + parameters_bar[:, 0, 0], bars
+        return total + by_parameters[:, 0, 0], (by_y.sum(2), by_distance2.sum(2), by_x.sum(1), by_distance2.sum(1))
 
     total = jnp.zeros_like(rays.parameters)
-    parameters_bar, bars = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
-    constant = jax.tree.map(jnp.zeros_like, rays)
-    continuous = lambda r: (r.y.fraction, r.y.distance2, r.x.fraction, r.x.distance2, r.parameters)
-    return eqx.tree_at(continuous, constant, (*bars, parameters_bar))
+    by_parameters, by_axes = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
+    return *by_axes, by_parameters
 
 
-def _rays_bar_by_volume(shapes: Shapes, rays: Rays, volume, image) -> Rays:
-    return _rays_bar(shapes, rays, image, volume)
+def _rays_vjp_transpose(shapes: Shapes, constants, cotangents):
+    volume = jax.ShapeDtypeStruct(shapes.volume, cotangents[0].dtype)
+    return jax.linear_transpose(lambda volume: _rays_vjp(shapes, constants, volume), volume)(cotangents)[0]
+
+
+_continuous_vjp = LinearMap(_rays_vjp, _rays_vjp_transpose, kernels=("rays_vjp", None))
+
+
+def rays_vjp(shapes: Shapes, rays: Rays, image, volume) -> Rays:
+    """dB/d(rays), zero for integers and for what follows from others."""
+    gradient = _continuous_vjp(shapes, (rays, image), volume)
+    return eqx.tree_at(_continuous, jax.tree.map(jnp.zeros_like, rays), gradient)
+
+
+# `(shapes, rays, image)` to dB/d(volume), `(shapes, rays, volume)` to dB/d(image); both differentiable.
+image_to_volume = LinearMap(_gather, _scatter, rays_vjp, ("gather", "scatter"))
+volume_to_image = image_to_volume.T
 
 
 class _Pair(NamedTuple):
-    """The two pixels that a ray is interpolated from: always on the sensor, and harmless where the ray is not."""
+    """The two pixels between which a ray is interpolated; always on the sensor, even if the ray is not."""
 
     low: Int[Array, "... depth voxel"]
     fraction: Float[Array, "... depth voxel"]
@@ -155,8 +153,7 @@ def _patch(volume, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
     return jax.vmap(lambda plane, row, column: lax.dynamic_slice(plane, (row, column), size))(volume, y.start, x.start)
 
 
-def _put(volume, patch, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
-    """The volume with the voxels that one lens may see replaced."""
+def _update_patch(volume, patch, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
     if y.start.size == 1:
         return lax.dynamic_update_slice(volume, patch, _corner(y, x))
     put = lambda plane, new, row, column: lax.dynamic_update_slice(plane, new, (row, column))
@@ -164,7 +161,6 @@ def _put(volume, patch, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
 
 
 def _corner(y: Axis, x: Axis):
-    """Of the patch that is the same at all depths."""
     return jnp.zeros_like(y.start[0]), y.start[0], x.start[0]
 
 
@@ -200,14 +196,14 @@ def _interpolate(corners, y: _Pair, x: _Pair):
 
 
 class _Blocks(NamedTuple):
-    """Consecutive blocks of pixels that cover all that a lens's rays reach along one axis."""
+    """Consecutive blocks of pixels that cover all rays of a lens along one axis."""
 
     first: Int[Array, ""]
     blocks: Int[Array, ""]
     pixels: int
 
     def block(self, number):
-        """First pixel, pixels `(block,)` and whether no earlier block had them (at the sensor's end some did)."""
+        """First pixel, pixels `(block,)` and whether they are in no earlier block (the last one ends at the sensor)."""
         size = min(_BLOCK, self.pixels)
         wanted = self.first + number * size
         start = jnp.minimum(wanted, self.pixels - size)
@@ -222,9 +218,9 @@ def _blocks(axis: Axis, pixels: int) -> _Blocks:
 
 
 def _taps(axis: Axis, spacing, pixels, fresh):
-    """A function of a count, and its first value: the count-th voxel that reaches each pixel, and how much of it.
+    """A function from n to the n-th voxel that reaches each pixel, and its share there: `(depth, pixel)` both.
 
-    Both are `(depth, pixel)`. The rays' pixels fall with the voxel's number: those that reach a pixel are neighbours.
+    The rays' pixels fall with the voxel's number: those that reach a pixel are neighbours.
     """
     reach = pixels[None, :]
     last = axis.pixel.shape[1] - 1
@@ -250,7 +246,7 @@ def _spread_columns(patch, x: Axis, spacing, columns, fresh, taps):
 
     def add(count, state):
         spread, voxel, part = state
-        return spread + part[:, None, :] * _pick(patch, voxel, axis=2), *tap(count + 1)
+        return spread + part[:, None, :] * _take(patch, voxel, axis=2), *tap(count + 1)
 
     # The next tap is carried, so that it is computed once and not for every row.
     empty = jnp.zeros((*patch.shape[:2], columns.size), patch.dtype)
@@ -258,21 +254,21 @@ def _spread_columns(patch, x: Axis, spacing, columns, fresh, taps):
 
 
 def _add_rows(image, spread, y: Axis, spacing, rows, fresh, taps, start):
-    """Add what `_spread_columns` returned to a block of the image, spread over pixel rows and summed over depths."""
+    """Adds the result of `_spread_columns` to a block of the image, spread over pixel rows and summed over depths."""
     tap = _taps(y, spacing, rows, fresh)
 
     def add(count, state):
         image, voxel, part = state
         block = lax.dynamic_slice(image, start, (rows.size, spread.shape[2]))
-        picked = _pick(spread, voxel, axis=1)
-        for depth in range(spread.shape[0]):  # written out: one pass over the block
-            block = block + part[depth, :, None] * picked[depth]
+        voxels = _take(spread, voxel, axis=1)
+        for depth in range(spread.shape[0]):  # unrolled: one pass over the block
+            block = block + part[depth, :, None] * voxels[depth]
         return lax.dynamic_update_slice(image, block, start), *tap(count + 1)
 
     return lax.fori_loop(0, taps, add, (image, *tap(0)))[0]
 
 
-def _pick(array: Float[Array, "depth y x"], index: Int[Array, "depth new"], *, axis: int):
+def _take(array: Float[Array, "depth y x"], index: Int[Array, "depth new"], *, axis: int):
     """`array[d].take(index[d], axis - 1)` for each depth, in a form that keeps whole rows together."""
     dimensions = lax.GatherDimensionNumbers(
         offset_dims=(3 - axis,),

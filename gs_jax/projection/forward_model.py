@@ -1,22 +1,94 @@
-"""The forward model, Eq. (2): what the sensor sees of a volume or of points."""
+"""The forward model, Eq. (2): the image of a volume, with PSF models of three fidelities."""
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from ..base.errors import InputError, short_repr
+from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..optics.field_varying import FieldVaryingPsf
-from ..optics.lens_types import PerTypePsf, split_by_type
+from ..lenses import lenses_by_type
+from ..optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid
+from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type
+from ..optics.psf import psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
-from .convolution import convolved, image_in_groups, with_margin
+from .convolution import scan_in_groups, sum_of_convolutions, with_margin
 from .field_varying_model import full_image
 
-# Depths that share a transform back, for the memory of as many sharp images.
-_TOGETHER = 2
+FIDELITIES = ("full", "near", "pinhole")
+# Depths that share an inverse FFT, which takes the memory of as many sharp images.
+_DEPTHS = 2
 
-Optics = Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | PerTypePsf | None
+PsfModel = Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | PerTypePsf | None
+
+
+def make_psf_model(
+    imager: Imager,
+    depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
+    fidelity: str = "full",
+    *,
+    progress: Progress | None = None,
+) -> PsfModel:
+    """The PSF model of a microscope at some depths, for `forward` and the solvers.
+
+    *Host.*
+
+    Parameters
+    ----------
+    imager, depths
+        The microscope, and the depths of the object, mm.
+    fidelity
+        `"pinhole"`: chief rays within the field radius, no PSF. `"near"`: Eq. (2), field-constant: within the field
+        radius all lenses have the PSF of a point on the axis. `"full"`: field-varying: all the light of every lens, by
+        exact rays.
+    progress
+        Shows how many depths are done.
+
+    Returns
+    -------
+    None, Array, FieldVaryingPsf or PerTypePsf
+        Tables for these depths in this order; per type if there are several types of lenses.
+
+    Raises
+    ------
+    InputError
+        If `fidelity` is none of the three, or the PSF of a depth is wider than 128 pixels ("near").
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> psf = gs.make_psf_model(scope, grid.depths, "near")
+    >>> print(psf.shape[0], gs.make_psf_model(scope, grid.depths, "pinhole"))
+    3 None
+    """
+    if fidelity not in FIDELITIES:
+        raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(fidelity)}.")
+    if fidelity == "pinhole":
+        return None
+    depths = np.asarray(depths)
+
+    def field_constant_psf(imager):
+        kernel = psf_of_depth(imager, depths, "geometric")
+        return jnp.stack([kernel(z) for z in (progress or Progress()).track(depths, "Point spread functions")])
+
+    if imager.array.alike and fidelity == "full":
+        return field_varying_psf(imager, depths, progress=progress)
+    if imager.array.alike:
+        return field_constant_psf(imager)
+    types = split_by_type(imager, lenses := lenses_by_type(imager.array))
+    if fidelity == "full":
+        nodes = make_polar_grid(imager, depths)
+        psfs = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in types]
+    else:
+        psfs = [area * field_constant_psf(one) for one, area in zip(types, relative_areas(types).tolist(), strict=True)]
+    return PerTypePsf(lenses, tuple(psfs))
 
 
 @jax.jit
@@ -24,7 +96,7 @@ def forward(
     volume: Num[Array | np.ndarray, "depth y x"],
     imager: Imager,
     grid: Grid,
-    optics: Optics = None,
+    optics: PsfModel = None,
 ) -> Float[Array, "row column"]:
     """The image of a volume, summed lens by lens: Eq. (2), or with all of the light.
 
@@ -32,32 +104,31 @@ def forward(
 
     Each voxel is a point at its centre. With a PSF this is Eq. (2) without its zones: every lens images a voxel at the
     chief ray's pixel (scale `s_z`, magnification `M_z`), weighted by the envelope C, and spread by PSF_o of its depth.
-    The paper takes C from the centre of the voxel's zone instead of from the voxel, which is the only difference. As in
+    The paper takes C at the centre of the voxel's zone instead of at the voxel, which is the only difference. As in
     Eq. (2) a voxel counts the same at every depth. Chief rays that miss the sensor by less than half a PSF count with
-    what spreads onto it.
+    the light that the PSF spreads onto it.
 
-    With `FieldVaryingPsf` each lens's spot is where exact rays put it, at every distance from the lens's axis, and a
-    voxel is the light that it sends out in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
+    With a `FieldVaryingPsf` exact rays place the spot of each lens at every distance from its axis, and a voxel is the
+    light that it emits in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
 
-    Linear in the volume and in the PSF; differentiable with respect to everything that is continuous.
+    The image is linear in the volume and in the PSF, and differentiable with respect to every continuous quantity.
 
     Parameters
     ----------
     volume
-        `grid.volume_shape`; integers count as the imager's type.
+        `grid.volume_shape`; integers are converted to the imager's type.
     imager, grid
         As for `backproject`.
     optics
-        `gs_jax.optics_of` makes it by name. None: points, which makes this the adjoint of `backproject`. An array:
-        PSF_o at each depth on the sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size.
-        `FieldVaryingPsf`: all light, by tables for these depths. `PerTypePsf`: either of these for each type of lens.
+        From `gs_jax.make_psf_model`. None: points, the adjoint of `backproject`. An array: PSF_o at each depth on the
+        sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size. `FieldVaryingPsf`: tables of
+        all light at these depths. `PerTypePsf`: either of these for each type of lens.
 
     Returns
     -------
     Array
-        `sensor.shape`, of the volume's type. With a PSF it is as exact as an FFT of that type, so dark pixels may
-        be about 1e-7 of the brightest below zero in float32; with `FieldVaryingPsf`, a few percent of the light's mean,
-        as the halo ripples.
+        `sensor.shape`, of the volume's type. With a PSF it is as exact as an FFT of that type: in float32, dark pixels
+        may be about -1e-7 of the brightest. With a `FieldVaryingPsf` they may be negative by a few percent of the mean.
 
     Raises
     ------
@@ -74,7 +145,7 @@ def forward(
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 20, 20] = 1.0
     >>> image = gs.forward(scene, scope, grid)  # by pinholes
-    >>> sharp = gs.forward(scene, scope, grid, gs.optics_of(scope, grid.depths, "near"))  # Eq. (2)
+    >>> sharp = gs.forward(scene, scope, grid, gs.make_psf_model(scope, grid.depths, "near"))  # Eq. (2)
     >>> image.shape, sharp.shape
     ((200, 200), (200, 200))
     """
@@ -82,8 +153,8 @@ def forward(
     if optics is None:
         return backproject_adjoint(volume, imager, grid)
     if isinstance(optics, PerTypePsf):
-        each = zip(split_by_type(imager, optics.lenses), optics.optics, strict=True)
-        images = [forward(volume, one, grid, its) for one, its in each]
+        types = zip(split_by_type(imager, optics.lenses), optics.optics, strict=True)
+        images = [forward(volume, one, grid, psf) for one, psf in types]
         return sum(images[1:], images[0])
     if isinstance(optics, FieldVaryingPsf):
         if len(optics.kernel) != grid.depths.size:
@@ -91,21 +162,18 @@ def forward(
                 f"`optics` must be of {grid.depths.size} depths, as the grid is, got {len(optics.kernel)}."
             )
         return full_image(volume, imager, grid, optics)
-    psf = optics
-    size = psf.shape[-1]
-    if psf.shape != (grid.depths.size, size, size) or size % 2 == 0:
-        raise ValueError(f"`psf` must be ({grid.depths.size}, size, size) with an odd size, got {psf.shape}.")
+    size = optics.shape[-1]
+    if optics.shape != (grid.depths.size, size, size) or size % 2 == 0:
+        raise ValueError(f"`optics` must be ({grid.depths.size}, size, size) with an odd size, got {optics.shape}.")
     wide = with_margin(imager, size)
 
-    # Not kept for the gradient: sharp images of all depths are more than the volume.
+    # Not kept for the gradient: the sharp images of all depths are larger than the volume.
     @jax.checkpoint
     def add_depths(image, planes):
         depths, volume, kernels = planes
-        sharp = [
-            backproject_adjoint(volume[one], wide, grid.at(depths[one]))
-            for one in (slice(n, n + 1) for n in range(depths.size))
-        ]
-        return image + convolved(sharp, kernels)
+        slices = [slice(n, n + 1) for n in range(depths.size)]
+        sharp = [backproject_adjoint(volume[one], wide, grid.at(depths[one])) for one in slices]
+        return image + sum_of_convolutions(sharp, kernels)
 
-    planes = grid.depths, volume, jnp.asarray(psf, volume.dtype)
-    return image_in_groups(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), planes, _TOGETHER)
+    planes = grid.depths, volume, jnp.asarray(optics, volume.dtype)
+    return scan_in_groups(add_depths, jnp.zeros(imager.sensor.shape, volume.dtype), planes, _DEPTHS)

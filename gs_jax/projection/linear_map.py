@@ -1,7 +1,13 @@
-"""Linear functions whose derivatives are written by hand."""
+"""Linear maps with hand-written transposes and derivatives: a JAX primitive, which CPUs run by compiled kernels."""
 
-from collections.abc import Callable, Hashable
+import warnings
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from threading import Lock
 from typing import Any
 
 import jax
@@ -12,94 +18,88 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
+# Kernels read sixteen pixels of a row at once.
+_LEAST_COLUMNS = 16
 
-def linear_call(
-    function: Callable,
-    transpose: Callable,
-    constants_bar: Callable | None,
-    static: Hashable,
-    constants: PyTree,
-    x: PyTree,
-) -> PyTree:
-    """`function(static, constants, x)`, linear in `x`, with derivatives that are given instead of derived.
 
-    It works under `jit`, `vmap`, `jvp`, `grad` and `jax.linear_transpose`, hence as a `lineax` operator and through its
-    solvers. First derivatives are the given functions; of second ones by the constants, the part that these do not give
-    is what JAX derives of them. `jax.custom_vjp` has neither `jvp` nor a transpose,
-    `jax.custom_derivatives.linear_call` neither `vmap` nor derivatives by the constants; so this is a primitive.
+@dataclass(frozen=True)
+class LinearMap:
+    """A function that is linear in its last argument, with a given transpose and given derivatives.
+
+    It works under `jit`, `vmap`, `jvp`, `grad` and `jax.linear_transpose`, hence in `lineax` operators and solvers.
+    JAX derives second derivatives from the given functions. This is a primitive because `jax.custom_vjp` has neither
+    `jvp` nor a transpose, and `jax.custom_derivatives.linear_call` neither `vmap` nor derivatives by the constants.
 
     Parameters
     ----------
     function
-        Linear in its last argument.
+        `function(static, constants, x)`: `static` is hashable (shapes), `constants` and `x` are pytrees of arrays.
     transpose
-        `transpose(static, constants, y)`, with `y` like what `function` returns, returns what is like `x`.
-    constants_bar
-        `constants_bar(static, constants, x, y)`: the derivative of `<y, function(static, constants, x)>` by the
-        constants, like them; what stands at integers is ignored. If None, JAX derives it.
-    static
-        Hashable; shapes and the like.
-    constants, x
-        Pytrees of arrays.
+        `transpose(static, constants, y)`, with `y` like the function's result, returns a pytree like `x`.
+    constants_vjp
+        `constants_vjp(static, constants, x, y)`: the gradient of `<y, function(static, constants, x)>` with respect to
+        the constants. Its leaves at integer constants are ignored. None: JAX derives it.
+    kernels
+        Names in `cpu.dispatch` of the functions that replace `function` and `transpose` on a CPU in float32.
     """
-    flat_constants, constants_tree = tree.flatten(constants)
-    flat_x, x_tree = tree.flatten(x)
-    y_tree = tree.structure(jax.eval_shape(lambda c, x: function(static, c, x), constants, x))
-    call = _Call(function, transpose, constants_bar, static, constants_tree, x_tree, y_tree)
-    return y_tree.unflatten(_linear.bind(*flat_constants, *flat_x, call=call))
+
+    function: Callable
+    transpose: Callable
+    constants_vjp: Callable | None = None
+    kernels: tuple[str | None, str | None] = (None, None)
+
+    def __call__(self, static: Hashable, constants: PyTree, x: PyTree) -> PyTree:
+        flat_constants, constants_tree = tree.flatten(constants)
+        flat_x, x_tree = tree.flatten(x)
+        y_tree = tree.structure(jax.eval_shape(lambda c, x: self.function(static, c, x), constants, x))
+        call = _Call(self, static, constants_tree, x_tree, y_tree)
+        return y_tree.unflatten(_linear.bind(*flat_constants, *flat_x, call=call))
+
+    @property
+    def T(self) -> "LinearMap":
+        """The transpose."""
+        vjp = self.constants_vjp and _Swapped(self.constants_vjp)
+        return LinearMap(self.transpose, self.function, vjp, (self.kernels[1], self.kernels[0]))
+
+
+@dataclass(frozen=True)
+class _Swapped:
+    """`constants_vjp` of the transpose: `<y, A x>` is `<A' y, x>`."""
+
+    constants_vjp: Callable
+
+    def __call__(self, static, constants, y, x):
+        return self.constants_vjp(static, constants, x, y)
 
 
 @dataclass(frozen=True)
 class _Call:
-    """All of a call but its arrays, which are `(*constants, *x)`, flat."""
+    """A map and all its arguments but the arrays, which are the flat `(*constants, *x)`."""
 
-    function: Callable
-    transpose: Callable
-    constants_bar: Callable | None
+    map: LinearMap
     static: Hashable
     constants_tree: Any
     x_tree: Any
     y_tree: Any
 
-    def __call__(self, *arrays):
+    def __call__(self, *arrays, function=None):
         constants, x = self.split(arrays)
-        return tree.leaves(
-            self.function(self.static, self.constants_tree.unflatten(constants), self.x_tree.unflatten(x))
-        )
+        arguments = self.constants_tree.unflatten(constants), self.x_tree.unflatten(x)
+        return tree.leaves((function or self.map.function)(self.static, *arguments))
 
     def split(self, arrays):
         count = self.constants_tree.num_leaves
         return arrays[:count], arrays[count:]
 
-    def transposed(self):
-        bar = self.constants_bar and _Swapped(self.constants_bar)
-        return replace(
-            self,
-            function=self.transpose,
-            transpose=self.function,
-            constants_bar=bar,
-            x_tree=self.y_tree,
-            y_tree=self.x_tree,
-        )
-
-
-@dataclass(frozen=True)
-class _Swapped:
-    """`constants_bar` of the transpose: `<y, A x>` is `<A' y, x>`."""
-
-    constants_bar: Callable
-
-    def __call__(self, static, constants, y, x):
-        return self.constants_bar(static, constants, x, y)
-
 
 _linear = Primitive("gs_jax_linear")
 _linear.multiple_results = True
+_run = jax.jit(lambda call, *arrays: _linear.bind(*arrays, call=call), static_argnums=0)
 
 
 @_linear.def_impl
-def _run(*arrays, call):
-    return jax.jit(call)(*arrays)
+def _run_eagerly(*arrays, call):
+    return _run(call, *arrays)
 
 
 @_linear.def_abstract_eval
@@ -118,10 +118,8 @@ def _jvp(primals, tangents, *, call):
     moving = tuple(i for i, t in enumerate(constants_dot) if type(t) is not ad.Zero)
     if moving:
         dots = [constants_dot[i] for i in moving]
-        if call.constants_bar is None:
-            terms.append(_by_constants((call, moving), primals, dots))
-        else:
-            terms.append(linear_call(_by_constants, _by_constants_transpose, None, (call, moving), primals, dots))
+        derivative = LinearMap(_by_constants, _by_constants_transpose) if call.map.constants_vjp else _by_constants
+        terms.append(derivative((call, moving), primals, dots))
     return y, [sum(term[1:], term[0]) for term in zip(*terms, strict=True)]
 
 
@@ -140,16 +138,16 @@ def _by_constants(static, primals, dots):
 def _by_constants_transpose(static, primals, y):
     call, moving = static
     constants, x = call.split(primals)
-    bar = call.constants_bar(
+    gradient = call.map.constants_vjp(
         call.static, call.constants_tree.unflatten(constants), call.x_tree.unflatten(x), call.y_tree.unflatten(y)
     )
-    return [tree.leaves(bar)[i] for i in moving]
+    return [tree.leaves(gradient)[i] for i in moving]
 
 
 def _transpose(y, *arrays, call):
     constants, _ = call.split(arrays)
-    x = _linear.bind(*constants, *map(ad.instantiate_zeros, y), call=call.transposed())
-    return [None] * len(constants) + x
+    transposed = replace(call, map=call.map.T, x_tree=call.y_tree, y_tree=call.x_tree)
+    return [None] * len(constants) + _linear.bind(*constants, *map(ad.instantiate_zeros, y), call=transposed)
 
 
 def _batch(arrays, axes, *, call):
@@ -159,12 +157,63 @@ def _batch(arrays, axes, *, call):
         rest = iter(mapped)
         return _linear.bind(*(a if x is None else next(rest) for a, x in zip(arrays, axes, strict=True)), call=call)
 
-    # One after the other: each call fills the machine, and a batch of them would need a batch of buffers.
+    # One after the other: each call uses the whole machine, and a batch of calls would need a batch of buffers.
     y = jax.lax.map(one, mapped)
     return y, [0] * len(y)
 
 
+def _run_on_cpu(*arrays, call):
+    """Uses a compiled kernel in float32; float64 is for comparisons."""
+    name = None if _xla_only.get() or jax.default_backend() != "cpu" else call.map.kernels[0]
+    if name is None:
+        return call(*arrays)
+    _, x = call.split(arrays)
+    single = {y.dtype for y in jax.eval_shape(call, *arrays)} == {jnp.dtype(jnp.float32)}
+    suitable = single and all(a.dtype != jnp.float64 for a in x) and call.static.image[1] >= _LEAST_COLUMNS
+    return call(*arrays, function=cpu_kernel(name) if suitable else None)
+
+
 mlir.register_lowering(_linear, mlir.lower_fun(lambda *arrays, call: call(*arrays), multiple_results=True))
+mlir.register_lowering(_linear, mlir.lower_fun(_run_on_cpu, multiple_results=True), platform="cpu")
 ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batch
+
+_lock = Lock()
+_xla_only = ContextVar("xla_only", default=False)
+
+
+@contextmanager
+def xla_only() -> Iterator[None]:
+    """Compile without kernels within this context. For a single call XLA is faster than to import numba."""
+    token = _xla_only.set(True)
+    try:
+        yield
+    finally:
+        _xla_only.reset(token)
+
+
+def cpu_kernel(name: str) -> Callable | None:
+    """The function of this name in `cpu.dispatch`; None without numba, or, with a warning, if its kernel fails."""
+    with _lock:
+        return _load(name)
+
+
+@cache
+def _load(name):
+    if find_spec("numba") is None:  # there is none for the newest Python
+        return None
+    try:
+        from .cpu import dispatch
+
+        return dispatch.load(name)
+    # Versions of numba, llvmlite or XLA that are too new, or no writable folder for numba's cache.
+    except Exception as error:
+        _warn(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
+        return None
+
+
+@cache
+def _warn(reason):
+    text = f"numba's kernels do not work, XLA is used instead, which is slower: {reason}"
+    warnings.warn(text, RuntimeWarning, stacklevel=2)

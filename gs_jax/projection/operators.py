@@ -1,4 +1,4 @@
-"""The imaging system, and back-projection, as linear operators."""
+"""The imaging system, and back-projection, as `lineax` operators."""
 
 import equinox as eqx
 import jax
@@ -9,25 +9,48 @@ from jaxtyping import Array, Float
 from ..geometry import Imager
 from ..grid import Grid
 from .backprojection import backproject
-from .forward_model import Optics, forward
+from .forward_model import PsfModel, forward
+
+
+def _volume_structure(self) -> jax.ShapeDtypeStruct:
+    """Shape and type of volumes."""
+    return jax.ShapeDtypeStruct(self.grid.volume_shape, self.imager.sensor_distance.dtype)
+
+
+def _image_structure(self) -> jax.ShapeDtypeStruct:
+    """Shape and type of images."""
+    return jax.ShapeDtypeStruct(self.imager.sensor.shape, self.imager.sensor_distance.dtype)
+
+
+def _transpose(self) -> "Transposed":
+    """The exact adjoint, as `.T`."""
+    return Transposed(self)
+
+
+def _as_matrix(self) -> Float[Array, "out in"]:
+    """The dense matrix, for small systems."""
+    return _as_function(self).as_matrix()
+
+
+def _as_function(operator):
+    return lx.FunctionLinearOperator(operator.mv, operator.in_structure())
 
 
 class ImagingOperator(lx.AbstractLinearOperator):
     """The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint.
 
-    *Differentiable*. It is a pytree whose leaves are the numbers of the imager, the grid and the optics: as an argument
-    of a compiled function it does not compile anew when they change. Matrix-free; `lx.linear_solve`, `gs_jax.solve`,
-    `jax.vmap` and `jax.grad` take it.
+    *Differentiable*. It is a pytree whose leaves are the numbers of the imager, the grid and the optics: a compiled
+    function that takes it as an argument is not compiled again when they change. Matrix-free; `lx.linear_solve`,
+    `gs_jax.solve`, `jax.vmap` and `jax.grad` take it.
 
     Parameters
     ----------
     imager, grid
-        What images, and the voxels.
+        The microscope and the voxels.
     optics
-        As for `forward`. With None each lens is a pinhole, and the transpose is `backproject`. A PSF at each depth, or
-        `FieldVaryingPsf`, is a table that `gs_jax.optics_of` makes beforehand: it stays what it is when the imager
-        changes, and no derivative by the shape of the lenses passes through it. Chief rays, and with `FieldVaryingPsf`
-        the clear areas, are computed from the imager at each use and differentiated.
+        As for `forward`. With None each lens is a pinhole, and the transpose is `backproject`. Other models are tables,
+        which do not follow changes of the imager and pass no derivative to the shape of the lenses. Chief rays, and
+        with a `FieldVaryingPsf` the clear areas, are computed from the imager at each use and differentiated.
 
     Examples
     --------
@@ -42,33 +65,19 @@ class ImagingOperator(lx.AbstractLinearOperator):
 
     imager: Imager
     grid: Grid
-    optics: Optics = None
+    optics: PsfModel = None
+    in_structure, out_structure = _volume_structure, _image_structure
+    transpose, as_matrix = _transpose, _as_matrix
 
     def mv(self, vector: Float[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume."""
         return forward(vector, self.imager, self.grid, self.optics)
 
-    def in_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of volumes."""
-        return _volume_of(self)
-
-    def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of images."""
-        return _image_of(self)
-
-    def transpose(self) -> "Transposed":
-        """The exact adjoint, as `.T`."""
-        return Transposed(self)
-
-    def as_matrix(self) -> Float[Array, "pixel voxel"]:
-        """All of it in memory: of small systems."""
-        return _function(self).as_matrix()
-
 
 class BackprojectionOperator(lx.AbstractLinearOperator):
     """The paper's back-projection as a `lineax` operator, image to volume.
 
-    *Differentiable*; a pytree as `ImagingOperator`; of pinholes it is that operator's transpose.
+    *Differentiable*; a pytree like `ImagingOperator`, whose transpose it is for pinholes.
 
     Parameters
     ----------
@@ -89,26 +98,12 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     grid: Grid
     method: str = eqx.field(static=True, default="linear")
     normalize: bool = eqx.field(static=True, default=False)
+    in_structure, out_structure = _image_structure, _volume_structure
+    transpose, as_matrix = _transpose, _as_matrix
 
     def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
         return backproject(vector, self.imager, self.grid, method=self.method, normalize=self.normalize)
-
-    def in_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of images."""
-        return _image_of(self)
-
-    def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and type of volumes."""
-        return _volume_of(self)
-
-    def transpose(self) -> "Transposed":
-        """The exact adjoint, as `.T`."""
-        return Transposed(self)
-
-    def as_matrix(self) -> Float[Array, "voxel pixel"]:
-        """All of it in memory: of small systems."""
-        return _function(self).as_matrix()
 
 
 class Transposed(lx.AbstractLinearOperator):
@@ -117,8 +112,7 @@ class Transposed(lx.AbstractLinearOperator):
     operator: ImagingOperator | BackprojectionOperator
 
     def mv(self, vector: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-        (found,) = jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)
-        return found
+        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)[0]
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.operator.out_structure()
@@ -133,25 +127,9 @@ class Transposed(lx.AbstractLinearOperator):
         return self.operator.as_matrix().T
 
 
-def _volume_of(operator):
-    return jax.ShapeDtypeStruct(operator.grid.volume_shape, operator.imager.sensor_distance.dtype)
-
-
-def _image_of(operator):
-    return jax.ShapeDtypeStruct(operator.imager.sensor.shape, operator.imager.sensor_distance.dtype)
-
-
-def _function(operator):
-    return lx.FunctionLinearOperator(operator.mv, operator.in_structure())
-
-
-def _no(_) -> bool:
-    return False
-
-
-# What lineax asks of an operator, by dispatch on its class.
-for _kind in (ImagingOperator, BackprojectionOperator, Transposed):
-    for _asks in (
+# Lineax dispatches these on the operator's class.
+for _class in (ImagingOperator, BackprojectionOperator, Transposed):
+    for _property in (
         lx.is_symmetric,
         lx.is_diagonal,
         lx.is_tridiagonal,
@@ -161,7 +139,7 @@ for _kind in (ImagingOperator, BackprojectionOperator, Transposed):
         lx.is_negative_semidefinite,
         lx.has_unit_diagonal,
     ):
-        _asks.register(_kind)(_no)
+        _property.register(_class)(lambda _: False)
     for _same in (lx.linearise, lx.conj):
-        _same.register(_kind)(lambda operator: operator)
-    lx.materialise.register(_kind)(lambda operator: lx.materialise(_function(operator)))
+        _same.register(_class)(lambda operator: operator)
+    lx.materialise.register(_class)(lambda operator: lx.materialise(_as_function(operator)))

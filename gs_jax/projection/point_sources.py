@@ -1,4 +1,4 @@
-"""The image of points that lie anywhere: one stamp of PSF_o for each lens that sees a point, a spot. Host code."""
+"""Images of point sources, on the host: each lens that sees a point adds a spot, a stamp of its PSF."""
 
 import math
 from functools import partial
@@ -18,38 +18,34 @@ from ..optics.field_varying import CORE_REACH, kernel_size, make_polar_grid, tra
 from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
 from ..typing import Points
-from .field_varying_model import halo_image
+from .field_varying_model import stray_light_image
 from .rays import Envelope, RingLight
 
-# Places of a stamp within a pixel, along each axis: it is at most a tenth of a pixel off.
+# Positions of a stamp within a pixel, along each axis: the error is at most a tenth of a pixel.
 STEPS = 5
-# Points and spots at a time (the built-in design has 13 spots for a point), which bounds the memory.
+# Points and spots computed at once, which bounds the memory (the built-in design has 13 spots per point).
 _POINTS, _SPOTS = 2048, 32768
-# The image is added up in square tiles of so many pixels, which stay in the processor's cache.
+# Side, in pixels, of the tiles in which the image is summed; they stay in the CPU's cache.
 _TILE = 512
-# Distance of depths for all of the light, mm: of the halo; cores are computed half-way, too.
+# Distance of the depths of stray light, mm; cores are computed half-way, too.
 _STEP = 0.5
-# Ends of the rings that have a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
+# Edges of the rings with a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
 _RINGS = tuple(np.arange(1, 29) / 8)
 
 
 class Ring(NamedTuple):
-    """The ring of the field whose cores stamps are of.
+    """A ring of the field, with the distortion and light of its cores (`gs_jax.optics.psf_core.PsfCores`)."""
 
-    `ends`: inner and outer, mm. `distortion`, `light`: of `gs_jax.optics.psf_core.PsfCores`, at each depth of the
-    stamps.
-    """
-
-    ends: tuple[float, float]
+    edges: tuple[float, float]  # mm
     distortion: Float[np.ndarray, " depth"]
     light: Float[np.ndarray, "depth coefficient"]
 
 
 class Stamps(NamedTuple):
-    """PSF_o at some depths, or the cores of a ring, moved by every fifth of a pixel.
+    """PSF_o at some depths, or the cores of a ring, shifted by fifths of a pixel.
 
-    `kernels[d, i, j]` is on the sensor's pixels, and its chief ray (or core) lands `(i - 2, j - 2)` fifths of a pixel
-    (row, column) from the middle of the central one.
+    `kernels[d, i, j]` is on the sensor's pixels, with its chief ray (or core) `(i - 2, j - 2)` fifths of a pixel (row,
+    column) from the middle of the central one.
     """
 
     depths: Float[np.ndarray, " depth"]
@@ -84,20 +80,19 @@ def stamps(
 def forward_points(
     points: Points, imager: Imager, stamps: Stamps, progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
-    """The image of points, Eq. (2): what `forward` does for voxels, without a grid.
+    """The image of points, Eq. (2), as `forward` computes it for voxels.
 
-    The PSF is interpolated linearly between the depths of `stamps` and moved by fifths of a pixel. The memory that it
-    takes is three images and one more copy of the stamps, however many points there are.
+    The PSF is interpolated linearly between the depths of `stamps` and shifted by fifths of a pixel. This takes the
+    memory of three images and one more copy of the stamps, for any number of points.
 
     Parameters
     ----------
     points
-        `(x, y, z, intensity)`, mm. Each lens's image of a point adds `intensity` times the envelope C, or the light of
-        the core.
+        `(x, y, z, intensity)`, mm. Each lens adds `intensity` times the envelope C, or times the light of the core.
     imager
-        What sees them.
+        The microscope.
     stamps
-        PSF_o, or cores. A point beyond its depths takes the nearest.
+        PSF_o, or cores. Points beyond its depths take the nearest.
     progress
         Shows how many points are done.
 
@@ -106,10 +101,10 @@ def forward_points(
     ndarray
         `sensor.shape`, of the type of the stamps.
     """
-    # In the order of depth, so that few stamps at a time are in use.
+    # In order of depth, so that few stamps at a time are in use.
     points = np.asarray(points, np.float64)
     points = points[np.argsort(points[:, 2])]
-    # One spot after the other is work for a processor, whatever else there is.
+    # Spots are added one after the other, which suits a CPU, also beside a GPU.
     imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), jax.devices("cpu")[0])
     size = kernels.shape[-1]
     rows, columns = _tiles(imager.sensor.shape, size)
@@ -118,16 +113,16 @@ def forward_points(
     lenses, weight = KDTree(np.asarray(imager.centers)), _weight(imager, stamps)
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
-        some = points[start : start + _POINTS]
-        beside = some[:, :2] - to_numpy(imager).axis_offset(some[:, 2])
-        pairs = KDTree(beside).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
+        batch = points[start : start + _POINTS]
+        lateral = batch[:, :2] - to_numpy(imager).axis_offset(batch[:, 2])
+        pairs = KDTree(lateral).sparse_distance_matrix(lenses, weight.limit, output_type="ndarray")
         for first in range(0, len(pairs), _SPOTS):
-            # Always as many, so that one shape is compiled; the last are repetitions, which are not counted.
+            # Always as many, so that one shape is compiled; repetitions at the end are not added.
             spots = np.resize(pairs[first : first + _SPOTS], _SPOTS)
             count = min(_SPOTS, len(pairs) - first)
-            core = _core(some[:, 2], imager, stamps)
-            seen = (some[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
-            tiles = _add_spots(tiles, count, *seen, imager, depths, kernels, weight)
+            core = _core(batch[:, 2], imager, stamps)
+            spot_arguments = (batch[spots["i"]], spots["j"], *(part[spots["i"]] for part in core))
+            tiles = _add_spots(tiles, count, *spot_arguments, imager, depths, kernels, weight)
     image = np.zeros((rows * _TILE + size - 1, columns * _TILE + size - 1), stamps.kernels.dtype)
     for tile, (row, column) in zip(np.asarray(tiles), np.ndindex(rows, columns), strict=True):
         image[row * _TILE :, column * _TILE :][:side, :side] += tile
@@ -135,13 +130,13 @@ def forward_points(
 
 
 def _tiles(shape: tuple[int, int], size: int) -> tuple[int, int]:
-    """Rows and columns of tiles. The first begins `size - 1` before the sensor, where the first stamps do."""
+    """Rows and columns of tiles. The first begins `size - 1` pixels before the sensor, as the first stamps do."""
     rows, columns = (-(-(n + size - 1) // _TILE) for n in shape)
     return rows, columns
 
 
 def _weight(imager: Imager, stamps: Stamps) -> Envelope | RingLight:
-    return RingLight(*stamps.ring.ends) if stamps.ring else Envelope(imager.field_radius)
+    return RingLight(*stamps.ring.edges) if stamps.ring else Envelope(imager.field_radius)
 
 
 def _core(depth, imager, stamps):
@@ -165,7 +160,7 @@ def _add_spots(
     kernels: Float[Array, "depth 5 5 size size"],
     weight: Envelope | RingLight,
 ) -> Float[Array, "tile side side"]:
-    """Adds the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
+    """Add the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
     size, dtype = kernels.shape[-1], imager.sensor_distance.dtype
     points, distortion, parameters = (jnp.asarray(part, dtype) for part in (points, distortion, parameters))
     views = imager.views(points[:, :3], lenses, distortion=distortion)
@@ -180,7 +175,7 @@ def _add_spots(
     lit = (jnp.arange(len(points)) < count) & jnp.all((corner >= 0) & (corner <= last[None]), -1)
     tile = corner // _TILE @ jnp.array([_tiles(imager.sensor.shape, size)[1], 1])
     row, column = (corner % _TILE).T
-    # Those of a tile together, and after all those that do not reach the sensor.
+    # Sorted by tile; spots off the sensor last.
     order = jnp.argsort(jnp.where(lit, tile, len(tiles)))
 
     def add(number, tiles):
@@ -196,19 +191,19 @@ def _add_spots(
 def full_image_of_points(
     points: Float[np.ndarray, "point 4"], imager: Imager, progress: Progress | None = None
 ) -> Float[np.ndarray, "row column"]:
-    """The image of points with all of their light: what `forward` does with `FieldVaryingPsf`, without a grid.
+    """The image of points with the field-varying PSF, as `forward` computes it for voxels.
 
-    Cores are stamps in narrow rings of the field, interpolated between depths that are 0.25 mm apart; the halo is
-    interpolated between depths that are 0.5 mm apart. On the ray-traced 120 points nearer depths change nothing.
+    Cores are stamps in narrow rings of the field, interpolated between depths that are 0.25 mm apart; stray light is
+    interpolated between depths that are 0.5 mm apart. Nearer depths do not change the image of 120 ray-traced points.
 
     Parameters
     ----------
     points
-        `(x, y, z, intensity)`, mm: the intensity is all that a point sends out, in every direction.
+        `(x, y, z, intensity)`, mm: the intensity is the light that a point emits in all directions.
     imager
-        What sees them.
+        The microscope.
     progress
-        Shows how far it is.
+        Shows how much is done.
     """
     depths = np.unique(points[:, 2])
     steps = math.ceil((depths[-1] - depths[0]) / _STEP)
@@ -218,28 +213,28 @@ def full_image_of_points(
     grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
     tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
-    halo = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
-    nodes = jnp.asarray(_shared(points, coarse, grid), imager.sensor_distance.dtype)
-    image = np.array(jax.jit(halo_image)(nodes, imager, halo, jnp.zeros(2, nodes.dtype)))
-    size = kernel_size(imager, halo.grid)
+    stray_light = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
+    nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
+    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, jnp.zeros(2, nodes.dtype)))
+    size = kernel_size(imager, stray_light.grid)
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
-    for ends, *parts, profiles in rings:
+    for edges, *parts, profiles in rings:
         kernels = np.stack([render_kernel(profile, STEPS * size, STEPS) for profile in profiles])
-        spots = stamps(fine, kernels.astype(np.float32), Ring(ends, *parts))
+        spots = stamps(fine, kernels.astype(np.float32), Ring(edges, *parts))
         image += forward_points(points, imager, spots, progress)
-    # The halo's ripple goes below zero in places. Without it there would be more light than there is.
+    # The stray light ripples below zero in places; clipping adds light, which scaling removes.
     clipped = np.maximum(image, 0)
     return clipped * (image.sum() / max(clipped.sum(), np.finfo(image.dtype).tiny))
 
 
-def _shared(points, depths, halo):
-    """Light of points, shared linearly by the halo's coarse nodes and depths: `(depth, y, x)`."""
-    count = 2 * math.ceil(np.abs(points[:, :2]).max() / halo.step + 1) + 1
+def _to_nodes(points, depths, polar_grid):
+    """Light of points, shared linearly by coarse nodes and depths: `(depth, y, x)`."""
+    count = 2 * math.ceil(np.abs(points[:, :2]).max() / polar_grid.step + 1) + 1
     place = np.column_stack(
         [
             np.interp(points[:, 2], depths, np.arange(len(depths))),
-            points[:, 1] / halo.step + count // 2,
-            points[:, 0] / halo.step + count // 2,
+            points[:, 1] / polar_grid.step + count // 2,
+            points[:, 0] / polar_grid.step + count // 2,
         ]
     )
     whole = np.floor(place).astype(int)

@@ -1,24 +1,25 @@
-"""The chief rays of a grid of voxels through every lens, as short tables: one row per axis, lens and depth.
+"""Chief rays of a grid of voxels through every lens, as short tables: one row per axis, lens and depth.
 
-The map of `geometry.chief_ray` acts on x and y apart, so the pixel that a lens gives to a voxel needs a row
-number and a column number only: per lens `2 x depths x patch` of them instead of `depths x patch^2`.
+The map of `geometry.chief_ray` acts on x and y separately, so the pixel that a lens gives to a voxel needs only a row
+number and a column number: per lens `2 x depths x patch` of them instead of `depths x patch^2`.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry import Imager, chief_ray, envelope, field_limit
+from ..geometry import Imager, Sensor, chief_ray, envelope, field_limit
 from ..grid import Grid
 from ..optics.psf_core import ring_light
 
-# Added to the squared distance of what falls off the sensor, mm^2: it lands outside the field of every lens,
-# where the envelope and all its derivatives vanish.
+# Squared distance, mm^2, added for rays off the sensor: outside the field of every lens, where the envelope and all
+# its derivatives vanish.
 _OUTSIDE = 1e8
-# Neighbouring lenses read neighbouring pixels: in bands of this height (in field radii) the cache is used best.
+# Neighbouring lenses read neighbouring pixels: an order in bands of this height, in field radii, suits the cache best.
 _BAND = 0.5
 
 
@@ -38,17 +39,17 @@ class Rays(NamedTuple):
     y: Axis
     x: Axis
     spacing: Float[Array, "lens depth"]  # of neighbouring voxels on the sensor, pixels
-    parameters: Float[Array, "depth parameter"]  # of the lenses' weight at each depth
+    parameters: Float[Array, "depth parameter"]  # of the lens weight at each depth
 
 
 class Envelope(NamedTuple):
-    """What a lens gives to a point's image: the envelope C. Its parameter is the reduced depth."""
+    """The lens weight of Eq. (2), the envelope C. Its parameter is the reduced depth."""
 
     field_radius: float
 
     @property
     def limit(self) -> float:
-        """Lateral distance from a lens's axis from which on the weight is zero, mm."""
+        """Lateral distance from a lens's axis, mm, beyond which the weight is zero."""
         return field_limit(self.field_radius)
 
     def __call__(self, distance2, parameters):
@@ -56,7 +57,7 @@ class Envelope(NamedTuple):
 
 
 class RingLight(NamedTuple):
-    """What the core of a spot holds of a point's light, in a ring of the field; see `gs_jax.optics.psf_core`."""
+    """The share of a point's light in the core of a spot, in a ring of the field; see `gs_jax.optics.psf_core`."""
 
     inner: float
     outer: float
@@ -80,9 +81,9 @@ def trace(
 ) -> Rays:
     """The rays of every voxel through every lens that sees it, in a cache-friendly order of lenses.
 
-    With `nearest` they are moved to the nearest pixel centre, as in the paper. `dtype` is the type of the
-    tables; the coordinates are computed in the geometry's own. A lens sees what is nearer to its axis than `limit`, mm;
-    that and the `parameters` of its weight are by default those of the envelope.
+    With `nearest` they are moved to the nearest pixel centre, as in the paper. `dtype` is the type of the tables; the
+    coordinates are computed in that of the geometry. `limit` is the radius of a lens's field, mm; by default, it and
+    the `parameters` of the lens weight are those of the envelope.
     """
     if parameters is None:
         parameters = jnp.asarray(imager.reduced_depth(grid.depths))[:, None]
@@ -90,12 +91,12 @@ def trace(
     magnification = imager.magnifications(grid.depths)
     magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
-    (x, y), (x_lean, y_lean) = imager.centers[order].T, imager.axis_offset(grid.depths).T
+    (x, y), (x_offset, y_offset) = imager.centers[order].T, imager.axis_offset(grid.depths).T
 
-    def axis(center, origin, voxels, pixels, middle, lean):
+    def axis(center, origin, voxels, pixels, middle, axis_offset):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
-        # The axes of a tilted array lean, and what a lens sees moves with the depth.
-        axis = center[:, None] if imager.tilt is None else center[:, None] + lean[None, :]
+        # The axes of a tilted array are tilted, and a lens's field moves with the depth.
+        axis = center[:, None] if imager.tilt is None else center[:, None] + axis_offset[None, :]
         first = jnp.ceil((axis - origin - reach) / grid.pitch + (voxels - 1) / 2).astype(jnp.int32)
         start = jnp.clip(first, 0, voxels - size)
         voxel = start[..., None] + jnp.arange(size, dtype=jnp.int32)[None, None]
@@ -106,13 +107,13 @@ def trace(
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
-        distance2 = jnp.where(on_sensor, (offset + lean[None, :, None]) ** 2, _OUTSIDE)
+        distance2 = jnp.where(on_sensor, (offset + axis_offset[None, :, None]) ** 2, _OUTSIDE)
         first_coordinate = jax.lax.stop_gradient(coordinate[..., 0])
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
     return Rays(
-        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1], y_lean),
-        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0], x_lean),
+        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1], y_offset),
+        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0], x_offset),
         spacing=jax.lax.stop_gradient(
             jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
         ),
@@ -123,12 +124,11 @@ def trace(
 def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
     """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, patch, voxel)` to the vertex.
 
-    `index` is `(lens, patch, voxel)`: one patch for all depths, or one for each. `center` is the lens's as seen from
-    the middle of the sensor's pixels, `from_origin` as seen from the grid's origin, where voxels are counted from.
-    `magnification` is `(lens, depth)`.
+    `index` is `(lens, patch, voxel)`: one patch for all depths, or one for each. The lens is at `center` from the
+    middle of the sensor's pixels, and at `from_origin` from the grid's origin. `magnification` is `(lens, depth)`.
     """
-    # Counted from the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over
-    # 5,000 pixels would be 2e-4 of a pixel off. The map does not mind where the origin is.
+    # Relative to the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over 5,000
+    # pixels would be 2e-4 of a pixel off. The map is the same for any origin.
     whole = jax.lax.stop_gradient(jnp.round(center / pixel_pitch))
     center_here = _minus_multiple(center, whole, pixel_pitch)[:, None, None]
     offset = _minus_multiple(from_origin[:, None, None], index, voxel_pitch)
@@ -142,14 +142,54 @@ def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch
 
 
 def _minus_multiple(x: Float[Array, "..."], count: Float[Array, "..."], step: float) -> Float[Array, "..."]:
-    """`x - count * step` without the rounding of the product, for whole or half counts below 2^13."""
+    """`x - count * step` without rounding the product, for multiples of 1/2 below 2^13."""
     mantissa, exponent = np.frexp(step)
     high = float(np.ldexp(np.round(mantissa * 2**10), exponent - 10))  # so few digits that count * high is exact
     return (x - count * high) - count * (step - high)
 
 
 def _snake(centers: Float[Array, "lens 2"], height: float) -> Int[Array, " lens"]:
-    """Order that runs through the lenses band by band of a height, mm, to and fro."""
+    """An order of the lenses band by band of a height, mm, to and fro."""
     x, y = jax.lax.stop_gradient(centers).T
     band = jnp.floor(y / height)
     return jnp.lexsort((jnp.where(band % 2 == 0, x, -x), band))
+
+
+def crop_field(
+    imager: Imager, place: Float[Array | np.ndarray, "2"], shape: tuple[int, int]
+) -> tuple[Imager, Bool[Array, "row column"]]:
+    """An imager of a part of the field, for what does not fit into memory at once.
+
+    Its origin is at `place`, so that a centred grid lies around the place; lenses and sensor are moved by `-place`,
+    rounded to whole pixels (half of one if the shapes differ by an odd number). A voxel at `q` from the place is imaged
+    up to `|q| + (1 + M) field_radius` from it; light beyond the new sensor is lost.
+
+    Parameters
+    ----------
+    imager
+        The whole.
+    place
+        `(x, y)`, mm.
+    shape
+        `(rows, columns)` of the new sensor.
+
+    Returns
+    -------
+    tuple
+        The imager, and which of its pixels are on the sensor of the whole.
+    """
+    sensor = imager.sensor
+    whole = jnp.array(sensor.shape, place.dtype)
+    origin = jnp.array(sensor.origin, place.dtype)
+    margin = (whole - jnp.array(shape, place.dtype)) / 2
+    # The new sensor's first pixel on the whole sensor.
+    corner = jax.lax.stop_gradient(jnp.round((place - origin)[::-1] / sensor.pixel_pitch + margin))
+    moved = origin + (corner - margin)[::-1] * sensor.pixel_pitch
+    rows, columns = (
+        (first + jnp.arange(size) >= 0) & (first + jnp.arange(size) < total)
+        for first, size, total in zip(corner.astype(int), shape, sensor.shape, strict=True)
+    )
+    local = eqx.tree_at(
+        lambda i: (i.sensor, i.shift), imager, (Sensor(shape, sensor.pixel_pitch), imager.shift - moved)
+    )
+    return local, rows[:, None] & columns[None]

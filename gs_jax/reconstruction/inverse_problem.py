@@ -18,8 +18,7 @@ from ..lenses import lenses_by_type
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.lens_types import PerTypePsf, split_by_type, type_weights
 from ..optics.psf_core import apparent_depths
-from ..projection.forward_model import Optics
-from ..projection.levels import optics_of
+from ..projection.forward_model import PsfModel, make_psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.base import Operator, UnmatchedAdjointOperator
 from ..typing import Image
@@ -45,12 +44,12 @@ class ImageModel(NamedTuple):
     """
 
     imager: Imager
-    optics: Optics
+    optics: PsfModel
     binning: int = 1
     is_partial: bool = False
 
 
-def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> ImageModel:
+def prepare_model(imager: Imager, grid: Grid, optics: PsfModel | str, progress: Progress) -> ImageModel:
     """Make the forward model of a microscope for a grid; `optics` as for `reconstruct`."""
     if not isinstance(optics, str):
         return ImageModel(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
@@ -58,7 +57,7 @@ def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Pr
     voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
     binning = max(1, min(int(voxel + _ROUNDING), min(imager.sensor.shape) // 2))
     imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
-    return ImageModel(imager, optics_of(imager, grid.depths, optics, progress=progress), binning, optics != "full")
+    return ImageModel(imager, make_psf_model(imager, grid.depths, optics, progress=progress), binning, optics != "full")
 
 
 def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
@@ -119,7 +118,7 @@ class InverseProblem(eqx.Module):
 
     imager: Imager
     grid: Grid
-    optics: Optics
+    optics: PsfModel
     back_projections: tuple[LensTypeGeometry, ...] | None = None
     detrend_modes: int = eqx.field(static=True, default=0)
 
@@ -154,7 +153,7 @@ def _cosine_modes(size, count, dtype):
     return jnp.asarray(modes / np.linalg.norm(modes, axis=0), dtype)
 
 
-def num_detrend_modes(imager: Imager, optics: Optics) -> int:
+def num_detrend_modes(imager: Imager, optics: PsfModel) -> int:
     """Number of cosine modes per axis that are smoother than a spot's halo; 0 for optics without a halo."""
     if isinstance(optics, PerTypePsf):
         optics = optics.optics[0]

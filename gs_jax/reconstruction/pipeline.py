@@ -19,8 +19,7 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject
-from ..projection.forward_model import Optics
-from ..projection.levels import LEVELS
+from ..projection.forward_model import FIDELITIES, PsfModel
 from ..solvers.base import Solver
 from ..solvers.convolution import ConvolutionADMM
 from ..solvers.richardson_lucy import RichardsonLucy
@@ -85,7 +84,7 @@ def reconstruct(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    optics: Optics | str = "full",
+    optics: PsfModel | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
@@ -109,8 +108,8 @@ def reconstruct(
         `BackProjection()`, `PinholeRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
         `Unrolled.pretrained()`.
     optics
-        As for `forward`, or a name as for `optics_of`. With "full" and "near", back-projection reads the bright cores
-        of the spots; otherwise it follows the chief rays, as the paper does.
+        As for `forward`, or a `fidelity` of `make_psf_model`. With "full" and "near", back-projection reads the bright
+        cores of the spots; otherwise it follows the chief rays, as the paper does.
     stop_at_discrepancy
         Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle).
         `BackProjection` and `Unrolled` ignore it.
@@ -154,7 +153,7 @@ def reconstructor(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    optics: Optics | str = "full",
+    optics: PsfModel | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Callable[[Image, Progress], Volume]:
@@ -210,8 +209,8 @@ def _check(method, optics, *arguments):
     # A class has the attributes of the protocol, too.
     if isinstance(method, type) or not isinstance(method, BackProjection | PinholeRichardsonLucy | Solver):
         raise InputError(f"method must be an object such as BackProjection() or FISTA(), got {short_repr(method)}.")
-    if isinstance(optics, str) and optics not in LEVELS:
-        raise InputError(f"optics must be one of {', '.join(LEVELS)}, got {short_repr(optics)}.")
+    if isinstance(optics, str) and optics not in FIDELITIES:
+        raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(optics)}.")
 
 
 def _backproject_views(views, method, image, progress):

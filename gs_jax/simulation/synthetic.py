@@ -23,15 +23,14 @@ from ..lenses import lenses_by_type
 from ..optics.field_varying import field_varying_psf, make_polar_grid
 from ..optics.lens_types import relative_areas, split_by_type
 from ..optics.psf import PSFS, psf_of_depth
-from ..projection.forward_model import forward
-from ..projection.levels import LEVELS
+from ..projection.forward_model import FIDELITIES, forward
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
 from ..typing import Number, PathLike
 
 Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]
 
 # Chief rays alone make no image of a point.
-OPTICS = tuple(level for level in LEVELS if level != "pinhole")
+OPTICS = tuple(level for level in FIDELITIES if level != "pinhole")
 # Spacing of the depths at which the PSF of points is computed, mm: between, it changes by less than a pixel's width;
 # and the number of these depths held in memory at once.
 _STEP, _SLAB = 0.1, 48

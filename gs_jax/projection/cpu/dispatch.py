@@ -1,134 +1,113 @@
-"""On a processor by compiled kernels, where these are at hand; by XLA everywhere else."""
+"""Calls of numba kernels through XLA's FFI, which replace functions of `bilinear` and `convolution` on a CPU."""
 
+import ctypes
 import os
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from functools import cache, partial, wraps
-from importlib.util import find_spec
-from threading import Lock
+import sys
+from functools import cache
+from inspect import unwrap
+from pathlib import Path
+from typing import Any
+from zlib import crc32
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import ShapeDtypeStruct, lax
+from jax import ShapeDtypeStruct
+from numba import cfunc, types
 
 from ...geometry import FALLOFF, field_limit
+from ..convolution import spectrum
 from ..rays import Envelope, Rays
+from . import ffi, fftconv, kernels
+from .simd import FAST, WIDTH
 
-# Parts of a kernel's work, for threads to share: the more, the more evenly, and the more is done twice at their edges.
+# The handler's name for XLA, and the version of the structures that it reads. XLA refuses one that it does not support.
+TARGET = "gs_jax_cpu"
+VERSION = 0, 3
+# Parts of a kernel's work for threads to share: more parts are more even, but their edges are computed twice.
 _PARTS = min(max(8 * (os.cpu_count() or 1), 16), 64)
-# Numbers that kernels handle at once.
-WIDTH = 16
-# As which XLA knows the handler.
-TARGET = "gs_jax_native"
-_lock = Lock()
-_once = ContextVar("once", default=False)
+KERNELS = {
+    "gather": kernels.gather,
+    "scatter": kernels.scatter,
+    "rays_vjp": kernels.rays_vjp,
+    "convolve": fftconv.overlap_save,
+    "correlate": fftconv.overlap_save,
+}
+_table = np.zeros(ffi.FIRST_KERNEL + len(KERNELS), np.int64)
 
 
-@contextmanager
-def once() -> Iterator[None]:
-    """Around a program that back-projects a single time: XLA is done with it before Numba is loaded."""
-    token = _once.set(True)
-    try:
-        yield
-    finally:
-        _once.reset(token)
+def load(name: str):
+    """The function of this name, with its kernel compiled.
 
-
-def native_on_cpu(kernel: str, native: Callable) -> Callable[[Callable], Callable]:
-    """Let `native`, which calls a kernel, do on processors what the decorated function does, if it can.
-
-    Both take static shapes and pytrees of arrays. Derivatives are those of the decorated function, `__wrapped__`.
+    Raises
+    ------
+    RuntimeError
+        If XLA does not support the handler's version.
     """
+    _register()
+    _table[ffi.FIRST_KERNEL + _number(name)] = _compile(KERNELS[name], types.void, 2).address
+    return globals()[name]
 
-    def decorate(function):
-        @partial(jax.custom_jvp, nondiff_argnums=(0,))
-        def fast(shapes, *arrays):
-            return lax.platform_dependent(*arrays, cpu=partial(native, shapes), default=partial(function, shapes))
 
-        @fast.defjvp
-        def _(shapes, arrays, tangents):
-            return jax.jvp(partial(function, shapes), arrays, tangents)
+def _number(name):
+    return list(KERNELS).index(name)
 
-        @wraps(function)
-        def either(shapes, *arrays):
-            use = _suits(shapes, arrays) and kernel_number(kernel) is not None
-            return (fast if use else function)(shapes, *arrays)
 
-        return either
+@cache
+def _register():
+    idle = ctypes.windll.kernel32.SwitchToThread if sys.platform == "win32" else ctypes.CDLL(None).sched_yield
+    functions = (ctypes.pythonapi.PyMem_RawMalloc, ctypes.pythonapi.PyMem_RawFree, idle)
+    for place, function in zip((ffi.ALLOCATE, ffi.FREE, ffi.YIELD), functions, strict=True):
+        _table[place] = ctypes.cast(function, ctypes.c_void_p).value or 0
+    if sys.platform == "linux":
+        _table[ffi.ADVISE] = ctypes.cast(ctypes.CDLL(None).madvise, ctypes.c_void_p).value or 0
+    (_table[ffi.MAJOR], _table[ffi.MINOR]), _table[ffi.TASK] = VERSION, _compile(ffi.task, types.int64, 1).address
+    handler = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(_compile(ffi.handle, types.int64, 1).address)
+    extension, frame = np.array([32, ffi.TABLE, 0, _table.ctypes.data], np.int64), np.zeros(21, np.int64)
+    frame[ffi.EXTENSION] = extension.ctypes.data
+    handler(frame.ctypes.data)
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler), platform="cpu")
 
-    return decorate
+
+@cache
+def _compile(function, result, arguments) -> Any:
+    """A C function, compiled or read from numba's cache."""
+    # Numba checks only the function's own file for changes; the hash of all files is part of the signature instead.
+    signature = result(*[types.int64] * arguments, types.literal(_sources_hash()))
+    return cfunc(signature, cache=True, **FAST)(unwrap(function))
+
+
+@cache
+def _sources_hash() -> int:
+    return crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+
+
+def _call(kernel: str, results, *buffers):
+    """A kernel's results. Buffers and results have at most three axes."""
+    attributes = {"kernel": np.int64(_number(kernel)), "parts": np.int64(_PARTS)}
+    return jax.ffi.ffi_call(TARGET, results)(*buffers, **attributes)
 
 
 def gather(shapes, rays: Rays, image):
-    """`bilinear._gather`."""
-    volume = ShapeDtypeStruct(shapes.volume, jnp.float32)
-    return _call("gather", volume, shapes, rays, _pixels(image))
+    return _call("gather", ShapeDtypeStruct(shapes.volume, jnp.float32), *_tables(shapes, rays), _pixels(image))
 
 
 def scatter(shapes, rays: Rays, volume):
-    """`bilinear._scatter`."""
-    return _call("scatter", ShapeDtypeStruct(shapes.image, jnp.float32), shapes, rays, volume)
+    return _call("scatter", ShapeDtypeStruct(shapes.image, jnp.float32), *_tables(shapes, rays), volume)
 
 
-def rays_bar(shapes, rays: Rays, image, volume) -> Rays:
-    """`bilinear._rays_bar`."""
-    like = lambda array: ShapeDtypeStruct(array.shape, jnp.float32)
-    of_lens = ShapeDtypeStruct((len(rays.y.start), *rays.parameters.shape), jnp.float32)
-    results = [like(rays.y.pixel), like(rays.y.pixel), like(rays.x.pixel), like(rays.x.pixel), of_lens]
-    *bars, parameters_bar = _call("rays_bar", results, shapes, rays, _pixels(image), volume)
-    zero = jax.tree.map(jnp.zeros_like, rays)
-    return zero._replace(
-        y=zero.y._replace(fraction=bars[0], distance2=bars[1]),
-        x=zero.x._replace(fraction=bars[2], distance2=bars[3]),
-        parameters=parameters_bar.sum(0),
-    )
+def rays_vjp(shapes, constants, volume):
+    rays, image = constants
+    like = lambda *shape: ShapeDtypeStruct(shape, jnp.float32)
+    y, x, of_lens = rays.y.pixel.shape, rays.x.pixel.shape, (len(rays.y.start), *rays.parameters.shape)
+    results = [like(*y), like(*y), like(*x), like(*x), like(*of_lens)]
+    *by_axes, by_parameters = _call("rays_vjp", results, *_tables(shapes, rays), _pixels(image), volume)
+    return *by_axes, by_parameters.sum(0)
 
 
-def _suits(shapes, arrays) -> bool:
-    # Float64 is for those who compare.
-    first = arrays[0].parameters if isinstance(arrays[0], Rays) else arrays[0]
-    single = first.dtype == jnp.float32 and all(a.dtype != jnp.float64 for a in jax.tree.leaves(arrays[1:]))
-    return jax.default_backend() == "cpu" and single and shapes.image[1] >= WIDTH and not _once.get()
-
-
-def kernel_number(name: str) -> int | None:
-    """By which the handler knows a kernel; None where there is no numba, or where it does not work, with a warning."""
-    with _lock:
-        return _load(name)
-
-
-@cache
-def _load(name):
-    if find_spec("numba") is None:  # as for a Python that is too new for it
-        return None
-    try:
-        from . import ffi as bridge
-
-        return bridge.number(name)
-    # Of numba, llvmlite or XLA, which may be too new, or nowhere to keep what is compiled: XLA does without all that.
-    except Exception as error:
-        _warn(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
-        return None
-
-
-@cache
-def _warn(reason):
-    text = f"numba's kernels do not work, XLA is used instead, which is slower: {reason}"
-    warnings.warn(text, RuntimeWarning, stacklevel=2)
-
-
-def call(kernel: str, results, *buffers):
-    """A kernel's results, each of at most three axes as the buffers are."""
-    number = np.array(kernel_number(kernel), np.int64)[()]
-    return jax.ffi.ffi_call(TARGET, results)(*buffers, kernel=number, parts=np.int64(_PARTS))
-
-
-def _call(kernel, results, shapes, rays: Rays, *arrays):
+def _tables(shapes, rays: Rays):
     axes = [part for axis in (rays.y, rays.x) for part in (axis.start, axis.pixel, axis.fraction, axis.distance2)]
-    return call(kernel, results, _numbers(shapes.weight), rays.parameters, *axes, *arrays)
+    return weight_numbers(shapes.weight), rays.parameters, *axes
 
 
 def _pixels(image):
@@ -138,7 +117,7 @@ def _pixels(image):
     return image if image.dtype in (jnp.uint8, jnp.uint16) else image.astype(jnp.float32)
 
 
-def _numbers(weight):
+def weight_numbers(weight):
     """The kind of a weight, its limit and the slope of its falloff, those of its hole (or zero), and its scale."""
     falloff = lambda radius: (field_limit(radius) ** 2, 1 / (2 * FALLOFF * radius**2)) if radius else (0, 0)
     if isinstance(weight, Envelope):
@@ -146,3 +125,39 @@ def _numbers(weight):
     else:
         numbers = (1, *falloff(weight.outer), *falloff(weight.inner), 1 / weight.outer**2)
     return jnp.asarray(numbers, jnp.float32)
+
+
+def convolve(sizes, kernels, sharp):
+    size = kernels.shape[-1]
+    shift = 1 - size if sizes.whole else 1
+    return _overlap_save("convolve", kernels[:, ::-1, ::-1], sharp, [sizes.image], shift)[0]
+
+
+def correlate(sizes, kernels, image):
+    shift = 0 if sizes.whole else -kernels.shape[-1]
+    return tuple(_overlap_save("correlate", kernels, (image,), [sizes.sharp] * len(kernels), shift))
+
+
+def _overlap_save(name, kernels, images, shapes, shift):
+    """Sums of such shapes, of the images from `shift` on, correlated with the kernels."""
+    size = kernels.shape[-1]
+    side = 256  # of the tiles: larger ones waste less at their edges, and outgrow the cache
+    while side < 3 * size:
+        side *= 2
+    turns = -_frequencies(side)[:, None] * np.arange(size) / side
+    real, imaginary = jax.vmap(lambda kernel: spectrum(kernel, turns, turns))(kernels)
+    strips = lambda part: part.reshape(len(kernels), -1, WIDTH, side).swapaxes(2, 3)
+    spectra = jnp.stack([strips(real), strips(imaginary)], 2).reshape(len(kernels), 2 * side, side) / side**2
+    angles = 2 * np.pi * np.arange(side) / side
+    plan = np.array([len(images), len(shapes), shift, (side - size + 1) // WIDTH * WIDTH], np.int32)
+    results = [ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    table = np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
+    return _call(name, results, plan, table, spectra, *images)
+
+
+@cache
+def _frequencies(side: int) -> np.ndarray:
+    """The order of frequencies after radix-4 transforms."""
+    if side <= 2:
+        return np.arange(side)
+    return (4 * _frequencies(side // 4)[None] + np.arange(4)[:, None]).ravel()

@@ -1,18 +1,16 @@
-"""Sums of convolutions on a processor, in numba: tiles of the images are transformed in the cache (overlap-save).
+"""Sums of convolutions in numba, by overlap-save: tiles of the images are transformed in the cache.
 
-A kernel `(job, part)` as in `kernels`. Two tiles are transformed at once, as the real and the imaginary part of one:
-what they are convolved with is real, so they stay apart. A tile is kept in strips of sixteen columns, real parts before
-imaginary ones, so that sixteen columns are transformed at once. Rows become columns in between, which leaves the
-spectrum so; and frequencies stay in the order in which the transform leaves them (`order`). Both do not matter to a
-product with a spectrum that is given alike.
+A kernel `(job, part)` as in `kernels`. Two tiles are transformed at once, as the real and the imaginary part of one
+complex tile: the kernels are real, so the two stay apart. A tile is kept in strips of sixteen columns, real parts
+before imaginary ones, so that sixteen columns are transformed at once. Rows become columns in between, and the spectrum
+stays transposed; its frequencies stay in the order in which the transform leaves them. So do the kernels' spectra.
 """
 
 import numpy as np
 
-from . import rows as r, simd as v
+from . import rows, simd
 from .rows import BUFFERS, PARTS, PER_BUFFER, ZERO
-from .shuffles import transpose
-from .simd import WIDTH, carray, function, inline
+from .simd import WIDTH, function, inline
 
 # Buffers: a plan, cosines and sines, spectra; images follow, and sums of them.
 _PLAN, _TURNS, _SPECTRA, _IMAGES = range(4)
@@ -22,11 +20,11 @@ _STEP = 4 * WIDTH
 
 def overlap_save(job_address, part, _):
     """Images to sums of their convolutions, or one image to its convolutions; a part is some of the pairs of tiles."""
-    job = carray(v.pointer(job_address), 256, np.int64)
+    job = rows.job_at(job_address)
     # A sum's pixel i starts to read an image at i + shift; a tile gives `kept` pixels each way.
-    plan = r.integers(job, _PLAN)[:, 0, 0]
+    plan = rows.integers(job, _PLAN)[:, 0, 0]
     images, sums, shift, kept = np.int64(plan[0]), np.int64(plan[1]), np.int64(plan[2]), np.int64(plan[3])
-    turns, side = r.address(job, _TURNS), r.size(job, _TURNS, 0)
+    turns, side = rows.address(job, _TURNS), rows.size(job, _TURNS, 0)
     strip = 2 * _plane(side)
     tile = strip * (side // WIDTH)
     scratch = np.empty(3 * tile // 4 + WIDTH, np.float32)
@@ -34,7 +32,7 @@ def overlap_save(job_address, part, _):
     at_edge = np.int64(edge.ctypes.data)
     at_tile = (np.int64(scratch.ctypes.data) + _STEP - 1) // _STEP * _STEP
     at_sum, at_last = at_tile + tile, at_tile + 2 * tile
-    tall, wide = r.size(job, _IMAGES + images, 0), r.size(job, _IMAGES + images, 1)
+    tall, wide = rows.size(job, _IMAGES + images, 0), rows.size(job, _IMAGES + images, 1)
     across = (wide + kept - 1) // kept
     tiles = (tall + kept - 1) // kept * across
     pairs = (tiles + 1) // 2
@@ -55,24 +53,24 @@ def overlap_save(job_address, part, _):
                     if lit:
                         for s in range(side // WIDTH):
                             _transform(at_last + strip * s, side, turns)
-                            _turn(at_last + strip * s, at_tile, s, side)
+                            _transpose(at_last + strip * s, at_tile, s, side)
                         for s in range(side // WIDTH):
                             _transform(at_tile + strip * s, side, turns)
                 if lit:
-                    factors = r.address(job, _SPECTRA) + 8 * side * side * (result if images == 1 else number)
+                    factors = rows.address(job, _SPECTRA) + 8 * side * side * (result if images == 1 else number)
                     _multiply(at_tile, factors, at_sum, side, fresh)
                     fresh = False
             if not fresh:
                 for s in range(side // WIDTH):
                     _transform_back(at_sum + strip * s, side, turns)
-                    _turn(at_sum + strip * s, at_last, s, side)
+                    _transpose(at_sum + strip * s, at_last, s, side)
             place = BUFFERS + PER_BUFFER * (_IMAGES + images + result)
             if not fresh:
                 for s in range((kept + WIDTH - 1) // WIDTH):
                     _transform_back(at_last + strip * s, side, turns)
             _write(job, place, row1, column1, at_last, side, kept, fresh, at_edge)
             _write(job, place, row2, column2, at_last + _plane(side), side, kept, fresh, at_edge)
-    r.keep((scratch, edge))
+    rows.keep_alive((scratch, edge))
 
 
 @inline
@@ -83,128 +81,126 @@ def _plane(side):
 
 @function
 def _read(job, place, row, column, at, side, at_edge):
-    """A tile of an image, zero where the image ends, to one plane of the strips; returns whether there is light."""
+    """Copy a tile of an image, zero beyond it, to one plane of the strips; returns whether any pixel is not zero."""
     tall, wide, strip = job[place + 2], job[place + 3], 2 * _plane(side)
-    inside, seen = column >= 0 and column + side <= wide, v.zeros()
+    inside, seen = column >= 0 and column + side <= wide, simd.zeros()
     for y in range(side):
-        there = row + y >= 0 and row + y < tall
+        exists = row + y >= 0 and row + y < tall
         source, target = job[place] + 4 * ((row + y) * wide + column), at + _STEP * y
         for s in range(side // WIDTH):
-            value = v.zeros()
-            if there and inside:
-                value = v.load(source + _STEP * s)
-            elif there:
-                value = _window(source + _STEP * s, column + WIDTH * s, wide, at_edge)
-            seen = v.either(seen, value)
-            v.store(target + strip * s, value)
-    return v.any_light(seen)
+            value = simd.zeros()
+            if exists and inside:
+                value = simd.load(source + _STEP * s)
+            elif exists:
+                value = _load_some(source + _STEP * s, column + WIDTH * s, wide, at_edge)
+            seen = simd.bitwise_or(seen, value)
+            simd.store(target + strip * s, value)
+    return simd.any_nonzero(seen)
 
 
 @inline
-def _window(here, column, wide, at_edge):
+def _load_some(address, column, wide, at_edge):
     """Sixteen pixels, some of which may lie beyond the image."""
-    for rest in range(WIDTH):
-        there = column + rest >= 0 and column + rest < wide
-        v.store_one(at_edge + 4 * rest, v.load_one(here + 4 * rest) if there else ZERO)
-    return v.load(at_edge)
+    for n in range(WIDTH):
+        exists = column + n >= 0 and column + n < wide
+        simd.store_one(at_edge + 4 * n, simd.load_one(address + 4 * n) if exists else ZERO)
+    return simd.load(at_edge)
 
 
 @function
 def _write(job, place, row, column, at, side, kept, dark, at_edge):
-    """What is kept of a tile, of one plane of the strips, to an image."""
+    """Copy what is kept of a tile from one plane of the strips to an image."""
     tall, wide, strip = job[place + 2], job[place + 3], 2 * _plane(side)
     for y in range(min(kept, tall - row)):
         source, target = at + _STEP * y, job[place] + 4 * ((row + y) * wide + column)
         for s in range(kept // WIDTH):
-            value = v.zeros() if dark else v.load(source + strip * s)
+            value = simd.zeros() if dark else simd.load(source + strip * s)
             left = wide - column - WIDTH * s
             if left >= WIDTH:
-                v.store(target + _STEP * s, value)
+                simd.store(target + _STEP * s, value)
             elif left > 0:
-                v.store(at_edge, value)
-                for rest in range(left):
-                    v.store_one(target + _STEP * s + 4 * rest, v.load_one(at_edge + 4 * rest))
+                simd.store(at_edge, value)
+                for n in range(left):
+                    simd.store_one(target + _STEP * s + 4 * n, simd.load_one(at_edge + 4 * n))
 
 
 @function
-def _turn(at_strip, at_tile, number, side):
-    """A strip's rows to columns of a tile."""
+def _transpose(at_strip, at_tile, number, side):
+    """Copy a strip's rows to columns of a tile."""
     plane = _plane(side)
     for block in range(side // WIDTH):
         source, target = at_strip + _STEP * WIDTH * block, at_tile + 2 * plane * block + _STEP * WIDTH * number
-        transpose(source, target)
-        transpose(source + plane, target + plane)
+        simd.transpose(source, target)
+        simd.transpose(source + plane, target + plane)
 
 
 @function
 def _multiply(at_tile, at_factors, at_sum, side, fresh):
-    """Add a tile's product with a spectrum, or make it the sum."""
+    """Add the product of a tile and a spectrum to the sum, or begin it."""
     plane, place, factor = _plane(side), 0, at_factors
     for _ in range(side // WIDTH):
         for _ in range(side):
-            a, b = v.load(at_tile + place), v.load(at_tile + place + plane)
-            c, d = v.load(factor), v.load(factor + _STEP * side)
+            a, b = simd.load(at_tile + place), simd.load(at_tile + place + plane)
+            c, d = simd.load(factor), simd.load(factor + _STEP * side)
             x, y = a * c - b * d, a * d + b * c
             if not fresh:
-                x, y = x + v.load(at_sum + place), y + v.load(at_sum + place + plane)
-            v.store(at_sum + place, x)
-            v.store(at_sum + place + plane, y)
+                x, y = x + simd.load(at_sum + place), y + simd.load(at_sum + place + plane)
+            simd.store(at_sum + place, x)
+            simd.store(at_sum + place + plane, y)
             place, factor = place + _STEP, factor + _STEP
         place, factor = place + 2 * plane - _STEP * side, factor + _STEP * side
 
 
 @inline
-def _cosine(turns, number):
-    return v.load_one(turns + 8 * number)
+def _turn(turns, number):
+    return simd.load_one(turns + 8 * number), simd.load_one(turns + 8 * number + 4)
 
 
 @inline
-def _sine(turns, number):
-    return v.load_one(turns + 8 * number + 4)
+def _load_four(at, step):
+    return simd.load(at), simd.load(at + step), simd.load(at + 2 * step), simd.load(at + 3 * step)
+
+
+@inline
+def _store_four(at, step, a, b, c, d):
+    simd.store(at, a)
+    simd.store(at + step, b)
+    simd.store(at + 2 * step, c)
+    simd.store(at + 3 * step, d)
 
 
 @function
 def _transform(at, side, turns):
-    """The columns of a strip, in place: four rows at a time, at the end two if it must be."""
+    """FFT of the columns of a strip, in place: radix 4, and radix 2 at the end where it is needed."""
     plane, span = _plane(side), side
     while span > 2:
         quarter, stride = span // 4, side // span
         q = _STEP * quarter
         for k in range(quarter):
-            c1, s1 = _cosine(turns, k * stride), _sine(turns, k * stride)
-            c2, s2 = _cosine(turns, 2 * k * stride), _sine(turns, 2 * k * stride)
-            c3, s3 = _cosine(turns, 3 * k * stride), _sine(turns, 3 * k * stride)
+            (c1, s1), (c2, s2) = _turn(turns, k * stride), _turn(turns, 2 * k * stride)
+            c3, s3 = _turn(turns, 3 * k * stride)
             for base in range(k, side, span):
                 x = at + _STEP * base
-                y = x + plane
-                ar, br, cr, dr = v.load(x), v.load(x + q), v.load(x + 2 * q), v.load(x + 3 * q)
-                ai, bi, ci, di = v.load(y), v.load(y + q), v.load(y + 2 * q), v.load(y + 3 * q)
+                ar, br, cr, dr = _load_four(x, q)
+                ai, bi, ci, di = _load_four(x + plane, q)
                 sr, si, tr, ti = ar + cr, ai + ci, ar - cr, ai - ci
                 ur, ui, wr, wi = br + dr, bi + di, bi - di, dr - br
-                v.store(x, sr + ur)
-                v.store(y, si + ui)
-                er, ei = tr + wr, ti + wi
-                v.store(x + q, er * c1 + ei * s1)
-                v.store(y + q, ei * c1 - er * s1)
-                fr, fi = sr - ur, si - ui
-                v.store(x + 2 * q, fr * c2 + fi * s2)
-                v.store(y + 2 * q, fi * c2 - fr * s2)
-                gr, gi = tr - wr, ti - wi
-                v.store(x + 3 * q, gr * c3 + gi * s3)
-                v.store(y + 3 * q, gi * c3 - gr * s3)
+                er, ei, fr, fi, gr, gi = tr + wr, ti + wi, sr - ur, si - ui, tr - wr, ti - wi
+                _store_four(x, q, sr + ur, er * c1 + ei * s1, fr * c2 + fi * s2, gr * c3 + gi * s3)
+                _store_four(x + plane, q, si + ui, ei * c1 - er * s1, fi * c2 - fr * s2, gi * c3 - gr * s3)
         span = quarter
     if span == 2:
-        _by_two(at, side)
+        _radix_2(at, side)
 
 
 @function
 def _transform_back(at, side, turns):
-    """`_transform` from its end to its start; the numbers come out `side` times as large."""
+    """The inverse of `_transform`, times `side`."""
     plane, span = _plane(side), 4
     while span < side:
         span *= 4
     if span > side:
-        _by_two(at, side)
+        _radix_2(at, side)
         span = 8
     else:
         span = 4
@@ -212,34 +208,26 @@ def _transform_back(at, side, turns):
         quarter, stride = span // 4, side // span
         q = _STEP * quarter
         for k in range(quarter):
-            c1, s1 = _cosine(turns, k * stride), _sine(turns, k * stride)
-            c2, s2 = _cosine(turns, 2 * k * stride), _sine(turns, 2 * k * stride)
-            c3, s3 = _cosine(turns, 3 * k * stride), _sine(turns, 3 * k * stride)
+            (c1, s1), (c2, s2) = _turn(turns, k * stride), _turn(turns, 2 * k * stride)
+            c3, s3 = _turn(turns, 3 * k * stride)
             for base in range(k, side, span):
                 x = at + _STEP * base
-                y = x + plane
-                ar, br, cr, dr = v.load(x), v.load(x + q), v.load(x + 2 * q), v.load(x + 3 * q)
-                ai, bi, ci, di = v.load(y), v.load(y + q), v.load(y + 2 * q), v.load(y + 3 * q)
+                ar, br, cr, dr = _load_four(x, q)
+                ai, bi, ci, di = _load_four(x + plane, q)
                 er, ei = br * c1 - bi * s1, bi * c1 + br * s1
                 fr, fi = cr * c2 - ci * s2, ci * c2 + cr * s2
                 gr, gi = dr * c3 - di * s3, di * c3 + dr * s3
                 sr, si, ur, ui = ar + fr, ai + fi, ar - fr, ai - fi
                 tr, ti, wr, wi = er + gr, ei + gi, gi - ei, er - gr
-                v.store(x, sr + tr)
-                v.store(y, si + ti)
-                v.store(x + q, ur + wr)
-                v.store(y + q, ui + wi)
-                v.store(x + 2 * q, sr - tr)
-                v.store(y + 2 * q, si - ti)
-                v.store(x + 3 * q, ur - wr)
-                v.store(y + 3 * q, ui - wi)
+                _store_four(x, q, sr + tr, ur + wr, sr - tr, ur - wr)
+                _store_four(x + plane, q, si + ti, ui + wi, si - ti, ui - wi)
         span *= 4
 
 
 @inline
-def _by_two(at, side):
+def _radix_2(at, side):
     for plane in (at, at + _plane(side)):
         for x in range(plane, plane + _STEP * side, 2 * _STEP):
-            a, b = v.load(x), v.load(x + _STEP)
-            v.store(x, a + b)
-            v.store(x + _STEP, a - b)
+            a, b = simd.load(x), simd.load(x + _STEP)
+            simd.store(x, a + b)
+            simd.store(x + _STEP, a - b)

@@ -1,21 +1,21 @@
-"""What the kernels do along a row of voxels: buffers, weights, the row's ends, and the rows of pixels that it meets."""
+"""Rows of voxels in kernels: buffers, lens weights, the ends of a row, and the rows of pixels that it meets."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from . import simd as v
+from . import simd
 from .simd import WIDTH, carray, inline
 
 # A job is a list of 64-bit numbers: eight of its own, then address, type and three sizes of each buffer.
-PARTS, BUFFERS, PER_BUFFER = 3, 8, 5
+PARTS, BUFFERS, PER_BUFFER, JOB_LENGTH = 3, 8, 5, 256
 # Buffers: numbers of the weight, its parameters, start, pixel, fraction and distance2 of y and of x, and what follows.
 FIRST = 10
 ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3, 6, 1e8))
 
 
 class Tables(NamedTuple):
-    """`rays.Rays`, and the numbers of `native`'s weight."""
+    """`rays.Rays`, and the numbers of the weight (`dispatch.weight_numbers`)."""
 
     numbers: np.ndarray
     parameters: np.ndarray
@@ -29,40 +29,23 @@ class Tables(NamedTuple):
     x_distance2: np.ndarray
 
 
-@inline
-def address(job, buffer):
-    return job[BUFFERS + PER_BUFFER * buffer]
+job_at = inline(lambda address: carray(simd.pointer(address), JOB_LENGTH, np.int64))
+address = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer])
+pixel_type = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer + 1])
+size = inline(lambda job, buffer, axis: job[BUFFERS + PER_BUFFER * buffer + 2 + axis])
+shape = inline(lambda job, buffer: (size(job, buffer, 0), size(job, buffer, 1), size(job, buffer, 2)))
+floats = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), shape(job, buffer), np.float32))
+integers = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), shape(job, buffer), np.int32))
+padded = inline(lambda count: (count + WIDTH - 1) // WIDTH * WIDTH)
+pixel_bytes = inline(lambda kind: 1 if kind == simd.UINT8 else 2 if kind == simd.UINT16 else 4)
 
 
 @inline
-def size(job, buffer, axis):
-    return job[BUFFERS + PER_BUFFER * buffer + 2 + axis]
-
-
-@inline
-def numbers(job, buffer):
-    shape = (size(job, buffer, 0), size(job, buffer, 1), size(job, buffer, 2))
-    return carray(v.pointer(address(job, buffer)), shape, np.float32)
-
-
-@inline
-def integers(job, buffer):
-    shape = (size(job, buffer, 0), size(job, buffer, 1), size(job, buffer, 2))
-    return carray(v.pointer(address(job, buffer)), shape, np.int32)
-
-
-@inline
-def tables_of_columns(job):
-    """Addresses of the pixels, fractions and squared distances of x."""
-    return address(job, 7), address(job, 8), address(job, 9)
-
-
-@inline
-def tables(job):
+def read_tables(job):
     return Tables(
-        numbers(job, 0)[:, 0, 0], numbers(job, 1)[:, :, 0],
-        integers(job, 2)[:, :, 0], integers(job, 3), numbers(job, 4), numbers(job, 5),
-        integers(job, 6)[:, :, 0], integers(job, 7), numbers(job, 8), numbers(job, 9),
+        floats(job, 0)[:, 0, 0], floats(job, 1)[:, :, 0],
+        integers(job, 2)[:, :, 0], integers(job, 3), floats(job, 4), floats(job, 5),
+        integers(job, 6)[:, :, 0], integers(job, 7), floats(job, 8), floats(job, 9),
     )  # fmt: skip
 
 
@@ -73,32 +56,28 @@ def patch(tables, lens, d):
     return tables.y_start[lens, d], tables.x_start[lens, d]
 
 
-@inline
-def padded(count):
-    return (count + WIDTH - 1) // WIDTH * WIDTH
-
-
+# These test `numbers[0]` before a ring's hole, so that LLVM makes a loop without branches for Eq. (2).
 @inline
 def _falloff(distance2, limit2, slope):
-    t = v.clipped((limit2 - distance2) * slope)
+    t = simd.clip((limit2 - distance2) * slope)
     return t * t * (THREE - TWO * t)
 
 
 @inline
 def _falloff_slope(distance2, limit2, slope):
-    t = v.clipped((limit2 - distance2) * slope)
+    t = simd.clip((limit2 - distance2) * slope)
     return t * (t - ONE) * (SIX * slope)
 
 
 @inline
 def _field(numbers, distance2):
-    """Of a ring; beyond it, where it does not count, a polynomial would overflow."""
-    return TWO * v.clipped(distance2 * (HALF * numbers[5]))
+    """The variable of a ring's polynomial, which would overflow beyond the ring, where it does not count."""
+    return TWO * simd.clip(distance2 * (HALF * numbers[5]))
 
 
 @inline
 def weight(tables, d, distance2):
-    """What a lens gives to sixteen voxels."""
+    """A lens's weight for sixteen voxels."""
     numbers, parameters = tables.numbers, tables.parameters
     share = _falloff(distance2, numbers[1], numbers[2])
     if numbers[0] == ZERO:
@@ -108,7 +87,7 @@ def weight(tables, d, distance2):
     if numbers[3] > ZERO:
         share = share - _falloff(distance2, numbers[3], numbers[4])
     t = _field(numbers, distance2)
-    value = v.zeros()
+    value = simd.zeros()
     for power in range(parameters.shape[1] - 1, -1, -1):
         value = value * t + parameters[d, power]
     return value * share
@@ -126,7 +105,7 @@ def weight_slope(tables, d, distance2):
     if numbers[3] > ZERO:
         share = share - _falloff(distance2, numbers[3], numbers[4])
         share_slope = share_slope - _falloff_slope(distance2, numbers[3], numbers[4])
-    t, value, slope = _field(numbers, distance2), v.zeros(), v.zeros()
+    t, value, slope = _field(numbers, distance2), simd.zeros(), simd.zeros()
     for power in range(parameters.shape[1] - 1, -1, -1):
         slope = slope * t + value
         value = value * t + parameters[d, power]
@@ -134,8 +113,8 @@ def weight_slope(tables, d, distance2):
 
 
 @inline
-def add_parameters_bar(tables, d, distance2, factor, at_bar):
-    """What the weight's parameters change, times a factor, added to sixteen sums for each parameter."""
+def add_parameters_vjp(tables, d, distance2, factor, at_sums):
+    """Add the derivatives of `weight` by its parameters, times a factor, to sixteen sums for each parameter."""
     numbers, parameters = tables.numbers, tables.parameters
     share = _falloff(distance2, numbers[1], numbers[2])
     if numbers[0] == ZERO:
@@ -143,13 +122,13 @@ def add_parameters_bar(tables, d, distance2, factor, at_bar):
         cos2 = depth2 / (depth2 + distance2)
         # By z': 4 C tan^2(theta) cos^2(theta) / z'.
         term = factor * share * cos2 * cos2 * cos2 * distance2 * (TWO * TWO / (depth2 * parameters[d, 0]))
-        v.store(at_bar, v.load(at_bar) + term)
+        simd.store(at_sums, simd.load(at_sums) + term)
         return
     if numbers[3] > ZERO:
         share = share - _falloff(distance2, numbers[3], numbers[4])
     t, term = _field(numbers, distance2), factor * share
     for power in range(parameters.shape[1]):
-        v.store(at_bar + 64 * power, v.load(at_bar + 64 * power) + term)
+        simd.store(at_sums + 64 * power, simd.load(at_sums + 64 * power) + term)
         term = term * t
 
 
@@ -170,48 +149,37 @@ def chord(x2, y2, limit2, begin, end):
 
 @inline
 def pixel_and_fraction(pixel, fraction, pixels):
-    """The pixel below a ray, with a neighbour above it also at the sensor's edge."""
+    """The pixel below a ray, which has a neighbour above it also at the sensor's edge."""
     low = min(max(np.int64(pixel), 0), pixels - 2)
     return low, fraction + np.float32(np.int64(pixel) - low)
 
 
 @inline
-def line(tables, lens, d, k, pixels):
-    """The row of pixels that a row of voxels meets, and how far it is to the next."""
+def pixel_row(tables, lens, d, k, pixels):
+    """The row of pixels that a row of voxels meets, and the fraction of the way to the next."""
     return pixel_and_fraction(tables.y_pixel[lens, d, k], tables.y_fraction[lens, d, k], pixels)
 
 
 @inline
 def blend(job, buffer, row, first, last, above, below, target):
-    """Two neighbouring rows of the image, weighted, sixteen pixels a time; the last begin before their place."""
-    columns, kind = size(job, buffer, 1), job[BUFFERS + PER_BUFFER * buffer + 1]
+    """The weighted sum of two neighbouring rows of the image, by blocks; the last block begins before its place."""
+    columns, kind = size(job, buffer, 1), pixel_type(job, buffer)
     start = row * columns
     for block in range(first, last):
         j = min(WIDTH * block, columns - WIDTH)
-        upper = v.load_pixels(kind, address(job, buffer), start + j)
-        lower = v.load_pixels(kind, address(job, buffer), start + columns + j)
-        v.store(target + 4 * j, above * upper + below * lower)
+        upper = simd.load_pixels(kind, address(job, buffer), start + j)
+        lower = simd.load_pixels(kind, address(job, buffer), start + columns + j)
+        simd.store(target + 4 * j, above * upper + below * lower)
 
 
 @inline
-def bytes_of(kind):
-    return 1 if kind == v.UINT8 else 2 if kind == v.UINT16 else 4
-
-
-@inline
-def image_shape(job, has_image):
-    # An image of ones is not read.
-    return (size(job, FIRST, 0), size(job, FIRST, 1)) if has_image else (2, 2)
-
-
-@inline
-def voxels(at_row, c, left, at_edge):
-    """Sixteen voxels of a row from `c` on, of which `left` are there; what follows is zero."""
+def load_voxels(at_row, c, left, at_edge):
+    """Sixteen voxels of a row from `c` on, of which `left` exist; the others are zero."""
     if left >= WIDTH:
-        return v.load(at_row + 4 * c)
-    for rest in range(WIDTH):
-        v.store_one(at_edge + 4 * rest, v.load_one(at_row + 4 * (c + rest)) if rest < left else ZERO)
-    return v.load(at_edge)
+        return simd.load(at_row + 4 * c)
+    for n in range(WIDTH):
+        simd.store_one(at_edge + 4 * n, simd.load_one(at_row + 4 * (c + n)) if n < left else ZERO)
+    return simd.load(at_edge)
 
 
 @inline
@@ -228,7 +196,7 @@ def first_below(pixel, limit):
 
 
 @inline
-def keep(arrays):
-    """Numba frees an array after its last use, and to use its address is none: this is."""
+def keep_alive(arrays):
+    """Numba frees an array after its last use, and does not count the use of its address."""
     for array in arrays:
         array[0] = ZERO

@@ -1,40 +1,61 @@
-"""Sixteen numbers at once in numba: a type with arithmetic, and what loads and stores it.
+"""SIMD for numba: a type of sixteen float32 with arithmetic, loads, stores and permutations.
 
-LLVM vectorises loops of unknown length by itself, but leaves up to 63 of their turns to a scalar loop, which for rows
-of a hundred voxels is half of the time. It cuts the sixteen into what the processor has.
+LLVM vectorises loops of unknown length by itself, but leaves up to 63 of their iterations to a scalar loop, which for
+rows of a hundred voxels is half of the time. It splits the sixteen into the registers that the processor has.
 """
 
+import inspect
 import operator
-from inspect import unwrap
 from typing import Any
 
 from llvmlite import ir
 from numba import carray as _carray, extending, njit, types  # pyright: ignore[reportPrivateImportUsage]
+from numba.core import config
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import lower_builtin, models, register_model, type_callable
 
-from .dispatch import WIDTH
-
-# What XLA calls the types of pixels; an image of ones is a bool.
+WIDTH = 16
+# XLA's numbers of pixel types. An image of ones is one bool.
 BOOL, UINT8, UINT16 = 1, 6, 7
-# Any order of sums, but NaN stays NaN.
+# Sums may be reordered, but NaN stays NaN.
 FLAGS = ("reassoc", "nsz", "arcp", "contract", "afn")
 FAST = {"fastmath": set(FLAGS), "error_model": "numpy"}
-FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
-I32 = ir.IntType(32)
-INTEGERS = ir.VectorType(I32, WIDTH)
-# What it makes of a function takes one argument less, which type checkers cannot know.
-intrinsic: Any = extending.intrinsic
+I8, I32, I64, F32 = ir.IntType(8), ir.IntType(32), ir.IntType(64), ir.FloatType()
+FLOATS, INTEGERS = ir.VectorType(F32, WIDTH), ir.VectorType(I32, WIDTH)
+TWO, PAIRS = ir.VectorType(F32, 2), ir.VectorType(F32, 2 * WIDTH)
+_FEATURES = getattr(config, "CPU_FEATURES", None)
+# Whether one instruction permutes 32 numbers.
+HAS_AVX512 = "+avx512f" in (get_host_cpu_features() if _FEATURES is None else _FEATURES)
 carray: Any = _carray
 
 
 def inline(function):
-    """A function for kernels, without what type checkers have wrapped around it."""
-    return njit(inline="always", **FAST)(unwrap(function))
+    """Compile a function into its callers. Type checkers' wrappers are removed."""
+    return njit(inline="always", **FAST)(inspect.unwrap(function))
 
 
 def function(function):
-    """A function for kernels that is compiled once, however often it is called."""
-    return njit(**FAST)(unwrap(function))
+    """Compile a function once."""
+    return njit(**FAST)(inspect.unwrap(function))
+
+
+def instruction(result) -> Any:
+    """Make `emit(builder, *values)`, which writes LLVM code, callable in kernels. Integer arguments arrive as int64."""
+
+    def decorate(emit):
+        def define(_, *kinds):
+            kinds = [types.int64 if isinstance(kind, types.Integer) else kind for kind in kinds]
+
+            def code(context, builder, signature, values):
+                value = emit(builder, *values)
+                return context.get_dummy_value() if result is types.none else value
+
+            return result(*kinds), code
+
+        define.__name__, define.__signature__ = emit.__name__, inspect.signature(emit)  # pyright: ignore
+        return extending.intrinsic(define)
+
+    return decorate
 
 
 class Vector(types.Type):
@@ -53,12 +74,7 @@ class _Model(models.PrimitiveModel):
         super().__init__(manager, kind, FLOATS)
 
 
-def splat(builder, number):
-    first = builder.insert_element(ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined), number, I32(0))
-    return builder.shuffle_vector(first, first, ir.Constant(INTEGERS, [0] * WIDTH))
-
-
-def _arithmetic(operation, instruction):
+def _arithmetic(operation, name):
     @type_callable(operation)
     def kind(_):
         def of(a, b):
@@ -68,231 +84,193 @@ def _arithmetic(operation, instruction):
         return of
 
     def code(context, builder, signature, arguments):
-        both = [a if kind == VECTOR else splat(builder, a) for a, kind in zip(arguments, signature.args, strict=True)]
-        return getattr(builder, instruction)(*both, flags=FLAGS)
+        both = [a if kind == VECTOR else _splat(builder, a) for a, kind in zip(arguments, signature.args, strict=True)]
+        return getattr(builder, name)(*both, flags=FLAGS)
 
     for pair in ((VECTOR, VECTOR), (VECTOR, types.float32), (types.float32, VECTOR)):
         lower_builtin(operation, *pair)(code)
 
 
-for _operation, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _arithmetic(_operation, _instruction)
+_arithmetic(operator.add, "fadd")
+_arithmetic(operator.sub, "fsub")
+_arithmetic(operator.mul, "fmul")
+_arithmetic(operator.truediv, "fdiv")
 
 
-def pointer_to(builder, address, kind):
-    return builder.inttoptr(address, kind.as_pointer())
+def _splat(builder, number):
+    first = builder.insert_element(ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined), number, I32(0))
+    return builder.shuffle_vector(first, first, ir.Constant(INTEGERS, [0] * WIDTH))
 
 
-@intrinsic
-def load(_, address):
-    """From an address that is a multiple of four."""
-    return VECTOR(address), lambda context, builder, signature, arguments: builder.load(
-        pointer_to(builder, arguments[0], FLOATS), align=4
-    )
+def _constant(number):
+    return ir.Constant(FLOATS, [number] * WIDTH)
 
 
-@intrinsic
-def load_pixels(_, kind, address, number):
-    """Sixteen pixels from a number on, of the types that XLA numbers so: bytes, words of 16 bits, or else float32."""
-
-    def code(context, builder, signature, arguments):
-        kind, address, number = arguments
-        values = []
-        found = builder.append_basic_block("found")
-        for wanted, bits in ((UINT8, 8), (UINT16, 16)):
-            here, elsewhere = builder.append_basic_block(), builder.append_basic_block()
-            builder.cbranch(builder.icmp_signed("==", kind, kind.type(wanted)), here, elsewhere)
-            builder.position_at_end(here)
-            place = builder.add(address, builder.mul(number, number.type(bits // 8)))
-            integers = builder.load(pointer_to(builder, place, ir.VectorType(ir.IntType(bits), WIDTH)), align=1)
-            values.append((builder.uitofp(integers, FLOATS), here))
-            builder.branch(found)
-            builder.position_at_end(elsewhere)
-        place = builder.add(address, builder.mul(number, number.type(4)))
-        values.append((builder.load(pointer_to(builder, place, FLOATS), align=4), elsewhere))
-        builder.branch(found)
-        builder.position_at_end(found)
-        value = builder.phi(FLOATS)
-        for pixels, block in values:
-            value.add_incoming(pixels, block)
-        return value
-
-    return VECTOR(types.int64, types.int64, types.int64), code
+def _order(builder, first, second, order):
+    return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(I32, len(order)), order))
 
 
-@intrinsic
-def store(_, address, vector):
-    """To an address that is a multiple of four."""
-
-    def code(context, builder, signature, arguments):
-        builder.store(arguments[1], pointer_to(builder, arguments[0], FLOATS), align=4)
-        return context.get_dummy_value()
-
-    return types.none(address, vector), code
+def _load(builder, address, kind, align=4):
+    return builder.load(builder.inttoptr(address, kind.as_pointer()), align=align)
 
 
-@intrinsic
-def clipped(_, vector):
+def _store(builder, value, address):
+    builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)
+
+
+pointer = instruction(types.voidptr)(lambda builder, address: builder.inttoptr(address, I8.as_pointer()))
+zeros = instruction(VECTOR)(lambda builder: _constant(0.0))
+load = instruction(VECTOR)(lambda builder, address: _load(builder, address, FLOATS))
+load_one = instruction(types.float32)(lambda builder, address: _load(builder, address, F32))
+load_int = instruction(types.int32)(lambda builder, address: _load(builder, address, I32))
+store = instruction(types.none)(lambda builder, address, vector: _store(builder, vector, address))
+store_one = instruction(types.none)(lambda builder, address, number: _store(builder, number, address))
+# Two neighbours, as 64 bits.
+copy_two = instruction(types.none)(lambda builder, source, target: _store(builder, _load(builder, source, I64), target))
+
+
+@instruction(types.none)
+def add_two(builder, source, target):
+    """Add two neighbours to two others."""
+    value = _load(builder, source, TWO)
+    _store(builder, builder.fadd(_load(builder, target, TWO), value), target)
+
+
+@instruction(types.none)
+def prefetch(builder, address):
+    """Read a line into the cache; the address need not exist."""
+    kind = ir.FunctionType(ir.VoidType(), [I8.as_pointer(), I32, I32, I32])
+    call = builder.module.declare_intrinsic("llvm.prefetch", [I8.as_pointer()], kind)
+    builder.call(call, [builder.inttoptr(address, I8.as_pointer()), I32(0), I32(3), I32(1)])
+
+
+@instruction(VECTOR)
+def load_pixels(builder, kind, address, number):
+    """Sixteen pixels from a number on, of `UINT8`, `UINT16` or float32."""
+    values = []
+    done = builder.append_basic_block("done")
+    for wanted, bits in ((UINT8, 8), (UINT16, 16)):
+        here, elsewhere = builder.append_basic_block(), builder.append_basic_block()
+        builder.cbranch(builder.icmp_signed("==", kind, kind.type(wanted)), here, elsewhere)
+        builder.position_at_end(here)
+        place = builder.add(address, builder.mul(number, number.type(bits // 8)))
+        integers = _load(builder, place, ir.VectorType(ir.IntType(bits), WIDTH), align=1)
+        values.append((builder.uitofp(integers, FLOATS), here))
+        builder.branch(done)
+        builder.position_at_end(elsewhere)
+    place = builder.add(address, builder.mul(number, number.type(4)))
+    values.append((_load(builder, place, FLOATS), elsewhere))
+    builder.branch(done)
+    builder.position_at_end(done)
+    value = builder.phi(FLOATS)
+    for pixels, block in values:
+        value.add_incoming(pixels, block)
+    return value
+
+
+@instruction(VECTOR)
+def clip(builder, vector):
     """To 0 ... 1."""
-
-    def code(context, builder, signature, arguments):
-        (value,) = arguments
-        zero, one = (splat(builder, ir.Constant(ir.FloatType(), number)) for number in (0.0, 1.0))
-        value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
-        return builder.select(builder.fcmp_ordered("<", value, one), value, one)
-
-    return VECTOR(vector), code
+    zero, one = _constant(0.0), _constant(1.0)
+    vector = builder.select(builder.fcmp_ordered(">", vector, zero), vector, zero)
+    return builder.select(builder.fcmp_ordered("<", vector, one), vector, one)
 
 
-@intrinsic
-def total(_, vector):
+@instruction(types.float32)
+def total(builder, vector):
     """The sum of the sixteen."""
-
-    def code(context, builder, signature, arguments):
-        (value,) = arguments
-        count = WIDTH
-        while count > 1:
-            count //= 2
-            halves = (ir.Constant(ir.VectorType(I32, count), list(range(start, start + count))) for start in (0, count))
-            low, high = (builder.shuffle_vector(value, value, half) for half in halves)
-            value = builder.fadd(low, high)
-        return builder.extract_element(value, I32(0))
-
-    return types.float32(vector), code
+    count = WIDTH
+    while count > 1:
+        count //= 2
+        low, high = (_order(builder, vector, vector, list(range(n, n + count))) for n in (0, count))
+        vector = builder.fadd(low, high)
+    return builder.extract_element(vector, I32(0))
 
 
-@intrinsic
-def zeros(_):
-    return VECTOR(), lambda context, builder, signature, arguments: ir.Constant(FLOATS, [0.0] * WIDTH)
+@instruction(VECTOR)
+def bitwise_or(builder, first, second):
+    bits = [builder.bitcast(value, INTEGERS) for value in (first, second)]
+    return builder.bitcast(builder.or_(*bits), FLOATS)
 
 
-@intrinsic
-def copy_two(_, source, target):
-    """Two neighbours, 64 bits, from and to addresses that are multiples of four."""
-
-    def code(context, builder, signature, arguments):
-        both = ir.IntType(64)
-        value = builder.load(pointer_to(builder, arguments[0], both), align=4)
-        builder.store(value, pointer_to(builder, arguments[1], both), align=4)
-        return context.get_dummy_value()
-
-    return types.none(source, target), code
+@instruction(types.boolean)
+def any_nonzero(builder, vector):
+    nonzero = builder.bitcast(builder.fcmp_unordered("!=", vector, _constant(0.0)), ir.IntType(WIDTH))
+    return builder.icmp_unsigned("!=", nonzero, nonzero.type(0))
 
 
-@intrinsic
-def pointer(_, address):
-    """An address as a pointer."""
-    return types.voidptr(address), lambda context, builder, signature, arguments: builder.inttoptr(
-        arguments[0], context.get_value_type(types.voidptr)
-    )
+@instruction(types.none)
+def clamp_pixels(builder, pixel, fraction, top, low, right):
+    """Move sixteen pixels (int32) at `pixel` to 0 ... `top`, and correct their fractions of the way to the next."""
+    pixel, fraction = _load(builder, pixel, INTEGERS), _load(builder, fraction, FLOATS)
+    zero, top = ir.Constant(INTEGERS, [0] * WIDTH), _splat(builder, builder.trunc(top, I32))
+    inside = builder.select(builder.icmp_signed(">", pixel, zero), pixel, zero)
+    inside = builder.select(builder.icmp_signed("<", inside, top), inside, top)
+    _store(builder, inside, low)
+    beyond = builder.sitofp(builder.sub(pixel, inside), FLOATS)
+    _store(builder, builder.fadd(fraction, beyond, flags=FLAGS), right)
 
 
-@intrinsic
-def add_two(_, source, target):
-    """Two neighbours, added to two others."""
-
-    def code(context, builder, signature, arguments):
-        both = ir.VectorType(ir.FloatType(), 2)
-        there = pointer_to(builder, arguments[1], both)
-        value = builder.load(pointer_to(builder, arguments[0], both), align=4)
-        builder.store(builder.fadd(builder.load(there, align=4), value), there, align=4)
-        return context.get_dummy_value()
-
-    return types.none(source, target), code
-
-
-@intrinsic
-def load_one(_, address):
-    return types.float32(address), lambda context, builder, signature, arguments: builder.load(
-        pointer_to(builder, arguments[0], ir.FloatType())
-    )
-
-
-@intrinsic
-def load_int(_, address):
-    """An int32."""
-    return types.int32(address), lambda context, builder, signature, arguments: builder.load(
-        pointer_to(builder, arguments[0], I32)
-    )
-
-
-@intrinsic
-def store_one(_, address, number):
-    def code(context, builder, signature, arguments):
-        builder.store(arguments[1], pointer_to(builder, arguments[0], ir.FloatType()))
-        return context.get_dummy_value()
-
-    return types.none(address, number), code
-
-
-@intrinsic
-def either(_, first, second):
-    """All bits of both: zero where both are."""
-
-    def code(context, builder, signature, arguments):
-        bits = [builder.bitcast(value, INTEGERS) for value in arguments]
-        return builder.bitcast(builder.or_(*bits), FLOATS)
-
-    return VECTOR(first, second), code
-
-
-@intrinsic
-def any_light(_, vector):
-    """Whether one of the sixteen is not zero."""
-
-    def code(context, builder, signature, arguments):
-        lit = builder.fcmp_unordered("!=", arguments[0], ir.Constant(FLOATS, [0.0] * WIDTH))
-        return builder.icmp_unsigned("!=", builder.bitcast(lit, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
-
-    return types.boolean(vector), code
-
-
-@intrinsic
-def split(_, pixel, fraction, top, low, right):
-    """Sixteen pixels (int32) and fractions of the way to the next, to pixels from zero to a top and their fractions."""
-
-    def code(context, builder, signature, arguments):
-        pixel, fraction, top, low, right = arguments
-        pixel = builder.load(pointer_to(builder, pixel, INTEGERS), align=4)
-        fraction = builder.load(pointer_to(builder, fraction, FLOATS), align=4)
-        zero, top = ir.Constant(INTEGERS, [0] * WIDTH), splat(builder, builder.trunc(top, I32))
-        inside = builder.select(builder.icmp_signed(">", pixel, zero), pixel, zero)
-        inside = builder.select(builder.icmp_signed("<", inside, top), inside, top)
-        builder.store(inside, pointer_to(builder, low, INTEGERS), align=4)
-        beyond = builder.sitofp(builder.sub(pixel, inside), FLOATS)
-        builder.store(builder.fadd(fraction, beyond, flags=FLAGS), pointer_to(builder, right, FLOATS), align=4)
-        return context.get_dummy_value()
-
-    return types.none(pixel, fraction, top, low, right), code
-
-
-@intrinsic
-def subtract(_, address, number):
+@instruction(types.none)
+def subtract(builder, address, number):
     """A number from sixteen integers (int32)."""
-
-    def code(context, builder, signature, arguments):
-        there = pointer_to(builder, arguments[0], INTEGERS)
-        less = builder.sub(builder.load(there, align=4), splat(builder, builder.trunc(arguments[1], I32)))
-        builder.store(less, there, align=4)
-        return context.get_dummy_value()
-
-    return types.none(address, number), code
+    _store(
+        builder, builder.sub(_load(builder, address, INTEGERS), _splat(builder, builder.trunc(number, I32))), address
+    )
 
 
-@intrinsic
-def fetch(_, address):
-    """Ask for what is at an address, which need not be one, before it is read or written."""
+def _load_every_second(builder, address, first):
+    both = _load(builder, address, PAIRS)
+    return _order(builder, both, both, list(range(first, 2 * WIDTH, 2)))
 
-    def code(context, builder, signature, arguments):
-        byte = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
-        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        builder.call(prefetch, [pointer_to(builder, arguments[0], ir.IntType(8)), I32(0), I32(3), I32(1)])
-        return context.get_dummy_value()
 
-    return types.none(address), code
+load_even = instruction(VECTOR)(lambda builder, address: _load_every_second(builder, address, 0))
+load_odd = instruction(VECTOR)(lambda builder, address: _load_every_second(builder, address, 1))
+
+
+@instruction(types.none)
+def store_pairs(builder, address, even, odd):
+    """32 numbers, by turns from the one and the other."""
+    _store(builder, _order(builder, even, odd, [i // 2 + WIDTH * (i % 2) for i in range(2 * WIDTH)]), address)
+
+
+@instruction(VECTOR)
+def permute(builder, places, shift, first, second):
+    """Of 32 numbers those at sixteen places (int32, at an address) plus `shift`; only the last five bits count."""
+    return _permute(builder, _places(builder, places, shift), first, second)
+
+
+@instruction(VECTOR)
+def permute_64(builder, places, shift, first, second, third, fourth):
+    """Of 64 numbers those at sixteen places (int32, at an address) plus `shift`."""
+    places = _places(builder, places, shift)
+    near, far = _permute(builder, places, first, second), _permute(builder, places, third, fourth)
+    last = ir.Constant(INTEGERS, [2 * WIDTH - 1] * WIDTH)
+    return builder.select(builder.icmp_signed(">", places, last), far, near)
+
+
+def _places(builder, address, shift):
+    return builder.add(_load(builder, address, INTEGERS), _splat(builder, builder.trunc(shift, I32)))
+
+
+def _permute(builder, places, first, second):
+    name, kind = "llvm.x86.avx512.vpermi2var.ps.512", ir.FunctionType(FLOATS, [FLOATS, INTEGERS, FLOATS])
+    call = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+    return builder.call(call, [first, places, second])
+
+
+@instruction(types.none)
+def transpose(builder, source, target):
+    """Sixteen rows of sixteen numbers to columns."""
+    rows = [_load(builder, builder.add(source, I64(4 * WIDTH * number)), FLOATS) for number in range(WIDTH)]
+    # Squares of 1, 2, 4 and 8 a side change places across the diagonal.
+    size = 1
+    while size < WIDTH:
+        upper = [i if i & size == 0 else WIDTH + i - size for i in range(WIDTH)]
+        lower = [i + size if i & size == 0 else WIDTH + i for i in range(WIDTH)]
+        for one in (i for i in range(WIDTH) if i & size == 0):
+            pair = rows[one], rows[one + size]
+            rows[one], rows[one + size] = _order(builder, *pair, upper), _order(builder, *pair, lower)
+        size *= 2
+    for number, row in enumerate(rows):
+        _store(builder, row, builder.add(target, I64(4 * WIDTH * number)))

@@ -1,4 +1,4 @@
-"""The kernels that numba compiles: the same numbers as XLA's, from any thread, and only where they are at hand."""
+"""The kernels that numba compiles: the same numbers as XLA's, from any thread, and only where numba works."""
 
 import os
 import re
@@ -7,7 +7,6 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import import_module
-from inspect import unwrap
 from pathlib import Path
 
 import equinox as eqx
@@ -17,16 +16,15 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.projection import bilinear, convolution as convolve
-from gs_jax.projection.bilinear import Shapes
-from gs_jax.projection.convolution import Sizes
-from gs_jax.projection.cpu import dispatch as native
+from gs_jax.projection import linear_map
+from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.rays import Envelope, RingLight, trace
 
 from .helpers import scene
 
 NumbaError = pytest.importorskip("numba.core.errors").NumbaError
-bridge, shuffles = (import_module(f"gs_jax.projection.cpu.{name}") for name in ("ffi", "shuffles"))
+dispatch, ffi, simd = (import_module(f"gs_jax.projection.cpu.{name}") for name in ("dispatch", "ffi", "simd"))
+ROOT = Path(__file__).parents[1]
 
 # Voxels of all sizes, whose rays are 0.4 to 14 pixels apart: sixteen meet up to 32, 48, 64 or more pixels, and a pixel
 # is reached by two, four or more. Volumes that are narrower than sixteen; rays off the sensor; a sensor of odd shape.
@@ -51,26 +49,21 @@ def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5, seed=0):
     return Shapes(imager.sensor.shape, grid.volume_shape, weight), rays, image, volume
 
 
-def compared(*calls):
-    """Each `(function, shapes, *arrays)` natively, and by XLA in float64: in float32 its derivatives cancel more.
+def compare(*calls):
+    """Each `(function, shapes, *arrays)` by kernels, and by XLA in float64: in float32 its derivatives cancel more.
 
     In one program each: most of the time is XLA's compiler's.
     """
     double = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a
-    given = [arrays for _, _, *arrays in calls]
-    functions = [(function, shapes) for function, shapes, *_ in calls]
-
-    def lowered(arrays, of=lambda function: function):
-        run = lambda each: [of(f)(shapes, *one) for (f, shapes), one in zip(functions, each, strict=True)]
-        return jax.jit(run).lower(arrays)
-
-    ours, plain = lowered(given), lowered(jax.tree.map(double, given), unwrap)
-    assert ours.as_text().count(f"@{native.TARGET}(") == len(calls)
-    assert native.TARGET not in plain.as_text()
-    found, expected = ours.compile()(given), plain.compile()(jax.tree.map(double, given))
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    arrays = [arrays for _, _, *arrays in calls]
+    run = jax.jit(lambda arrays: [f(shapes, *own) for (f, shapes, *_), own in zip(calls, arrays, strict=True)])
+    ours, plain = run.lower(arrays), run.lower(jax.tree.map(double, arrays))
+    assert ours.as_text().count(f"@{dispatch.TARGET}(") == len(calls)
+    assert dispatch.TARGET not in plain.as_text()
+    result, expected = ours.compile()(arrays), plain.compile()(jax.tree.map(double, arrays))
+    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
         assert double(a).dtype == b.dtype
-        # Sums of both signs: what rounding leaves is seen against the largest.
+        # Sums of both signs: rounding is relative to the largest.
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * float(jnp.abs(b).max()))
     return expected
 
@@ -82,54 +75,44 @@ def compared(*calls):
 )
 def test_all_three_are_those_of_xla(weight, grid):
     shapes, rays, image, volume = problem(weight, grid)
-    volumes_and_image = compared(
-        (bilinear._gather, shapes, rays, image),
-        (bilinear._gather, shapes, rays, None),
-        (bilinear._scatter, shapes, rays, volume),
-        (bilinear._rays_bar, shapes, rays, image, volume),
-        (bilinear._rays_bar, shapes, rays, None, volume),
+    volumes_and_image = compare(
+        (image_to_volume, shapes, rays, image),
+        (image_to_volume, shapes, rays, None),
+        (volume_to_image, shapes, rays, volume),
+        (rays_vjp, shapes, rays, image, volume),
+        (rays_vjp, shapes, rays, None, volume),
     )[:3]
     assert all(result.any() for result in volumes_and_image)
 
 
-@pytest.mark.integration
-def test_sums_of_convolutions_are_those_of_xla():
-    """And the convolutions of one image: the fourth kernel, of which `test_convolve.py` knows more."""
-    rng = np.random.default_rng(0)
-    kernels, *sharp = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(2, 5, 5), *2 * [(46, 39)]])
-    sizes = Sizes((40, 33), (46, 39), whole=False, symmetric=False)
-    image = jnp.asarray(rng.normal(size=sizes.image), jnp.float32)
-    compared((convolve._convolve, sizes, kernels, tuple(sharp)), (convolve._correlate, sizes, kernels, image))
-
-
 def test_the_nearest_pixel():
     shapes, rays, image, volume = problem(WEIGHTS[0], nearest=True)
-    compared((bilinear._gather, shapes, rays, image), (bilinear._scatter, shapes, rays, volume))
+    compare((image_to_volume, shapes, rays, image), (volume_to_image, shapes, rays, volume))
 
 
 @pytest.mark.parametrize("dtype", [jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_])
 def test_pixels_of_other_types(dtype):
     shapes, rays, image, volume = problem(WEIGHTS[0])
     image = (200 * image).astype(dtype)
-    compared((bilinear._gather, shapes, rays, image), (bilinear._rays_bar, shapes, rays, image, volume))
+    compare((image_to_volume, shapes, rays, image), (rays_vjp, shapes, rays, image, volume))
 
 
 def test_nothing_is_seen():
     shapes, rays, image, volume = problem(WEIGHTS[0])
     away = rays._replace(x=rays.x._replace(distance2=jnp.full_like(rays.x.distance2, 1e8)))
-    for result in (
-        bilinear._gather(shapes, away, image),
-        bilinear._scatter(shapes, away, volume),
-        *jax.tree.leaves(bilinear._rays_bar(shapes, away, image, volume)),
-    ):
-        assert not result.any()
+    results = (
+        image_to_volume(shapes, away, image),
+        volume_to_image(shapes, away, volume),
+        rays_vjp(shapes, away, image, volume),
+    )
+    assert not any(result.any() for result in jax.tree.leaves(results))
 
 
 def test_adjoint():
     for weight in WEIGHTS:
         shapes, rays, image, volume = problem(weight)
-        forth = jnp.vdot(bilinear._scatter(shapes, rays, volume), image)
-        np.testing.assert_allclose(jnp.vdot(bilinear._gather(shapes, rays, image), volume), forth, rtol=1e-5)
+        forth = jnp.vdot(volume_to_image(shapes, rays, volume), image)
+        np.testing.assert_allclose(jnp.vdot(image_to_volume(shapes, rays, image), volume), forth, rtol=1e-5)
 
 
 @pytest.mark.integration
@@ -140,8 +123,8 @@ def test_derivatives_in_both_modes_and_batches():
     v = imager.sensor_distance
     weight = jnp.cos(jnp.arange(np.prod(grid.volume_shape), dtype=jnp.float32)).reshape(grid.volume_shape)
     by_v = jax.grad(lambda v: jnp.vdot(weight, back(image, v)))(v)
-    forward = jnp.vdot(weight, jax.jvp(lambda v: back(image, v), (v,), (jnp.ones_like(v),))[1])
-    np.testing.assert_allclose(by_v, forward, rtol=1e-3)
+    by_jvp = jnp.vdot(weight, jax.jvp(lambda v: back(image, v), (v,), (jnp.ones_like(v),))[1])
+    np.testing.assert_allclose(by_v, by_jvp, rtol=1e-3)
     batch = jax.vmap(back, (0, None))(jnp.stack([image, 2 * image]), v)
     np.testing.assert_allclose(batch[1], 2 * batch[0], rtol=1e-6)
     (transposed,) = jax.linear_transpose(lambda image: back(image, v), image)(weight)
@@ -150,29 +133,30 @@ def test_derivatives_in_both_modes_and_batches():
 
 def test_programs_may_run_at_once():
     shapes, rays, image, volume = problem(WEIGHTS[0], GRIDS[4], lenses=40)
-    gather = jax.jit(lambda image: bilinear._gather(shapes, rays, image))
-    both = jax.jit(lambda image: gather(image).sum() + bilinear._scatter(shapes, rays, volume).sum())
+    gather = jax.jit(lambda image: image_to_volume(shapes, rays, image))
+    both = jax.jit(lambda image: gather(image).sum() + volume_to_image(shapes, rays, volume).sum())
     expected, total = gather(image), both(image)
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda number: (both if number % 3 == 0 else gather)(image), range(120)))
-    for number, result in enumerate(found):
-        # Bit by bit: the order of a voxel's sum is no matter of threads.
+        results = list(pool.map(lambda number: (both if number % 3 == 0 else gather)(image), range(120)))
+    for number, result in enumerate(results):
+        # Bit by bit: threads do not change the order of a voxel's sum.
         np.testing.assert_array_equal(result, total if number % 3 == 0 else expected)
 
 
 def test_float64_and_narrow_sensors_are_for_xla():
     imager, grid = scene()
     image = jnp.zeros(imager.sensor.shape)
-    assert native.TARGET not in backproject.lower(image, imager, grid).as_text()
+    assert dispatch.TARGET not in backproject.lower(image, imager, grid).as_text()
+    low = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)
+    assert dispatch.TARGET not in backproject.lower(image, low(imager), low(grid), normalize=True).as_text()
     narrow = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((96, 12), 0.0045), 5.8, 0.45)
-    narrow, grid = jax.tree.map(lambda a: a.astype(jnp.float32), (narrow, grid))
-    assert native.TARGET not in backproject.lower(jnp.zeros((96, 12), jnp.float32), narrow, grid).as_text()
+    assert dispatch.TARGET not in backproject.lower(jnp.zeros((96, 12), jnp.float32), low(narrow), low(grid)).as_text()
 
 
 @pytest.fixture
 def loading():
-    """Kernels are looked up anew, before and after."""
-    caches = native._load, native._warn
+    """Kernels are loaded anew, before and after."""
+    caches = linear_map._load, linear_map._warn
     for function in caches:
         function.cache_clear()
     yield
@@ -182,30 +166,30 @@ def loading():
 
 def test_without_numba(monkeypatch, loading):
     shapes, rays, image, _ = problem(WEIGHTS[0])
-    expected = bilinear._gather(shapes, rays, image)
-    native._load.cache_clear()
+    expected = image_to_volume(shapes, rays, image)
+    linear_map._load.cache_clear()
     monkeypatch.setitem(sys.modules, "numba", None)  # an import that fails
-    assert native.kernel_number("gather") is None
-    found = jax.jit(lambda image: bilinear._gather(shapes, rays, image))
-    assert native.TARGET not in found.lower(image).as_text()
-    np.testing.assert_allclose(found(image), expected, rtol=1e-5, atol=1e-5)
+    assert linear_map.cpu_kernel("gather") is None
+    gather = jax.jit(lambda image: image_to_volume(shapes, rays, image))
+    assert dispatch.TARGET not in gather.lower(image).as_text()
+    np.testing.assert_allclose(gather(image), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_numba_that_cannot_compile_the_kernels_is_told_once(monkeypatch, loading):
+def test_a_numba_that_cannot_compile_the_kernels_gives_one_warning(monkeypatch, loading):
     def fail(name):
         raise NumbaError(f"No implementation of function\nin {name}")
 
-    monkeypatch.setattr(bridge, "number", fail)
-    with pytest.warns(RuntimeWarning, match="XLA is used instead") as said:
-        assert [native.kernel_number(name) for name in bridge.KERNELS] == [None] * 4
-    assert len(said) == 1 and str(said[0].message).endswith("NumbaError: No implementation of function")
+    monkeypatch.setattr(dispatch, "load", fail)
+    with pytest.warns(RuntimeWarning, match="XLA is used instead") as warned:
+        assert [linear_map.cpu_kernel(name) for name in dispatch.KERNELS] == [None] * 5
+    assert len(warned) == 1 and str(warned[0].message).endswith("NumbaError: No implementation of function")
 
 
 def test_xla_refuses_a_handler_of_a_version_that_it_does_not_know(monkeypatch):
-    monkeypatch.setattr(bridge, "TARGET", "gs_jax_later")
-    monkeypatch.setattr(bridge, "VERSION", (0, 99))
+    monkeypatch.setattr(dispatch, "TARGET", "gs_jax_later")
+    monkeypatch.setattr(dispatch, "VERSION", (0, 99))
     with pytest.raises(RuntimeError, match=r"0\.99"):
-        bridge._register.__wrapped__()
+        dispatch._register.__wrapped__()
 
 
 def comparisons():
@@ -215,18 +199,17 @@ def comparisons():
     for dtype in (jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_):
         test_pixels_of_other_types(dtype)
     test_adjoint()
-    test_sums_of_convolutions_are_those_of_xla()
 
 
 @pytest.mark.integration
-def test_processors_that_do_not_pick():
-    """Without AVX-512 the same numbers, by other ways; in a process of its own, for which numba compiles so."""
-    if not shuffles.PICKS:
+def test_processors_without_avx512():
+    """The same numbers in other ways; in a process of its own, for which numba compiles so."""
+    if not simd.HAS_AVX512:
         pytest.skip("this processor has no AVX-512: the other tests run the kernels without it, and none with it")
-    code = "import jax; jax.config.update('jax_enable_x64', True); from tests import test_native as t; "
-    code += "assert not t.shuffles.PICKS; t.comparisons()"
-    environment, root = os.environ | {"NUMBA_CPU_NAME": "generic"}, Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=root, capture_output=True, text=True)
+    code = "import jax; jax.config.update('jax_enable_x64', True); from tests import test_cpu_kernels as t; "
+    code += "assert not t.simd.HAS_AVX512; t.comparisons(); from tests import test_convolve as c; c.comparisons()"
+    environment = os.environ | {"NUMBA_CPU_NAME": "generic"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -241,7 +224,7 @@ def fields(name):
     text = re.search(rf"struct XLA_FFI_{name} {{(.*?)\n}};", header, re.DOTALL)
     assert text
     code = re.sub(r"//.*", "", text[1])
-    # Structures in structures are as long as they are.
+    # Lengths of structures in structures.
     sizes = {"XLA_FFI_Args": 5, "XLA_FFI_Rets": 5, "XLA_FFI_Attrs": 6, "XLA_FFI_Api_Version": 3}
     places, place = {}, 0
     for kind, field, function in re.findall(r"([\w ]+?[ *]+)(\w+);|_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_(\w+)\)", code):
@@ -251,21 +234,16 @@ def fields(name):
 
 
 def test_the_layout_is_that_of_the_header():
-    frame = fields("CallFrame")
-    assert (frame["extension_start"], frame["api"]) == (bridge._EXTENSION, bridge._API)
-    assert (frame["ctx"], frame["args"], frame["rets"]) == (bridge._CONTEXT, bridge._ARGUMENTS, bridge._RESULTS)
-    assert frame["attrs"] + fields("Attrs")["attrs"] == bridge._ATTRIBUTES
+    places = lambda structure, *names: tuple(fields(structure)[name] for name in names)
+    assert places("CallFrame", "extension_start", "api") == (ffi.EXTENSION, ffi.API)
+    assert places("CallFrame", "ctx", "args", "rets") == (ffi.CONTEXT, ffi.ARGUMENTS, ffi.RESULTS)
+    assert sum(places("CallFrame", "attrs") + places("Attrs", "attrs")) == ffi.ATTRIBUTES
     for name, items in (("Args", "args"), ("Rets", "rets")):
-        found = fields(name)
-        assert (found["size"], found[items]) == (bridge._COUNT, bridge._ITEMS)
-    buffer = fields("Buffer")
-    assert [buffer[name] for name in ("dtype", "data", "rank", "dims")] == [2, 3, 4, 5]
-    api = fields("Api")
-    assert [api[name] for name in ("Error_Destroy", "ThreadPool_Schedule", "ThreadPool_NumThreads")] == [
-        bridge._ERROR_DESTROY, bridge._SCHEDULE, bridge._THREADS,
-    ]  # fmt: skip
-    schedule = fields("ThreadPool_Schedule_Args")
-    assert [schedule[name] for name in ("ctx", "task", "data")] == [2, 3, 4]
-    assert fields("ThreadPool_NumThreads_Args")["num_threads"] == 3
-    assert fields("Error_Destroy_Args")["error"] == 2
-    assert fields("Metadata")["api_version"] == 1
+        assert places(name, "size", items) == (ffi.COUNT, ffi.ITEMS)
+    assert places("Buffer", "dtype", "data", "rank", "dims") == (2, 3, 4, 5)
+    functions = places("Api", "Error_Destroy", "ThreadPool_Schedule", "ThreadPool_NumThreads")
+    assert functions == (ffi.ERROR_DESTROY, ffi.SCHEDULE, ffi.THREADS)
+    assert places("ThreadPool_Schedule_Args", "ctx", "task", "data") == (2, 3, 4)
+    assert places("ThreadPool_NumThreads_Args", "num_threads") == places("Buffer", "data")
+    assert places("Error_Destroy_Args", "error") == (2,)
+    assert places("Metadata", "api_version") == (1,)

@@ -1,0 +1,78 @@
+"""A linear map with given derivatives, under all that JAX does to it: the registration is JAX's to change."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from gs_jax.projection.linear_map import LinearMap
+
+SCALE, MATRIX = 3, jax.random.normal(jax.random.key(0), (4, 3))
+X, Y = jnp.array([1.0, -2.0, 0.5]), jnp.array([0.3, 1.0, -1.0, 2.0])
+
+_product = LinearMap(
+    lambda scale, matrix, x: scale * matrix @ x,
+    lambda scale, matrix, y: scale * matrix.T @ y,
+    lambda scale, matrix, x, y: scale * jnp.outer(y, x),
+)
+
+
+def product(matrix, x):
+    return _product(SCALE, matrix, x)
+
+
+def plain(matrix, x):
+    return SCALE * matrix @ x
+
+
+def same(derive, rtol=1e-12, atol=0.0):
+    """Whether `derive` gives the same for both."""
+    for a, b in zip(jax.tree.leaves(derive(product)), jax.tree.leaves(derive(plain)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=atol)
+
+
+@pytest.mark.parametrize("compiled", [lambda f: f, jax.jit], ids=["eager", "jit"])
+def test_values_derivatives_and_transpose_are_those_of_a_plain_function(compiled):
+    tangents = (jnp.cos(MATRIX), jnp.sin(X))
+    transpose = lambda f, m=MATRIX: jax.linear_transpose(lambda x: f(m, x), X)
+    same(lambda f: compiled(f)(MATRIX, X))
+    same(lambda f: compiled(lambda *both: jax.jvp(f, both, tangents))(MATRIX, X))
+    same(lambda f: compiled(jax.jacrev(f, (0, 1)))(MATRIX, X))
+    same(lambda f: compiled(jax.jacfwd(f, (0, 1)))(MATRIX, X))
+    same(lambda f: compiled(transpose(f))(Y))
+    same(lambda f: compiled(jax.linear_transpose(transpose(f), Y))((X,)))
+    same(lambda f: compiled(jax.grad(lambda m: (transpose(f, m)(Y)[0] ** 2).sum()))(MATRIX))
+    check_grads(product, (MATRIX, X), order=1)
+
+
+@pytest.mark.parametrize("axes", [(None, 0), (0, None), (0, 0), (2, 1)])
+def test_vmap_over_any_argument(axes):
+    batch = [
+        a if axis is None else jnp.stack([a * (i + 1) for i in range(5)], axis)
+        for a, axis in zip((MATRIX, X), axes, strict=True)
+    ]
+    same(lambda f: jax.vmap(f, axes)(*batch))
+    same(lambda f: jax.grad(lambda *both: (jax.vmap(f, axes)(*both) ** 2).sum(), (0, 1))(*batch))
+
+
+def test_it_is_an_operator_that_is_solved_with():
+    operator = lx.FunctionLinearOperator(lambda x: product(MATRIX, x), jax.ShapeDtypeStruct(X.shape, X.dtype))
+    np.testing.assert_allclose(operator.as_matrix(), SCALE * MATRIX, rtol=1e-12)
+    np.testing.assert_allclose(operator.T.mv(Y), SCALE * MATRIX.T @ Y, rtol=1e-12)
+    normal = lx.TaggedLinearOperator(operator.T @ operator, lx.positive_semidefinite_tag)
+    solution = lx.linear_solve(normal, operator.T.mv(Y), lx.CG(rtol=1e-12, atol=1e-12)).value
+    np.testing.assert_allclose(solution, np.linalg.lstsq(SCALE * MATRIX, Y)[0], rtol=1e-9)
+
+
+def test_second_derivatives_are_those_of_a_plain_function():
+    loss = lambda f: lambda m, x: jnp.sum(f(jnp.sin(m), x) ** 3)
+    both = (MATRIX, X)
+    for derive in (
+        lambda f: jax.hessian(loss(f), (0, 1))(*both),
+        lambda f: jax.jacrev(jax.grad(loss(f), (0, 1)), (0, 1))(*both),
+        lambda f: jax.jvp(jax.grad(loss(f), (0, 1)), both, both)[1],
+        lambda f: jax.jit(jax.grad(lambda m: jnp.sum(jax.grad(loss(f))(m, X) ** 2)))(MATRIX),
+    ):
+        same(derive, rtol=1e-10, atol=1e-12)
