@@ -8,6 +8,8 @@ The reconstruction is normalised `backproject` minus its local background: light
 whose low frequencies no layout can remove, because the lenses that see a point lie within one field radius.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,6 +168,7 @@ def reconstruction_loss(
     margin: int = 0,
     window: tuple[int, int] | None = None,
     field: tuple[float, float] = (0.0, 0.0),
+    types: Sequence[tuple[Imager, Float[Array, "plane tall wide"], Real]] = (),
 ) -> Float[Array, ""]:
     """Mean misfit of random scenes that are imaged with noise and reconstructed, dB; lower is better.
 
@@ -197,6 +200,8 @@ def reconstruction_loss(
         axis; for a smaller part, the grid's middle is uniform over `field`.
     field
         `(x, y)` of the rectangle of these positions, centred on the sensor, mm.
+    types
+        Lenses of each type with their own PSF and electrons, in place of `psf` and `electrons`.
 
     Returns
     -------
@@ -214,15 +219,17 @@ def reconstruction_loss(
         raise ValueError(f"`margin` must be 0 or more and leave voxels of {grid.shape}, got {margin}.")
     inner = np.s_[:, margin : grid.shape[0] - margin, margin : grid.shape[1] - margin]
     dtype = imager.sensor_distance.dtype
-    images = footprints(imager, grid, psf)
+    parts = [(one, footprints(one, grid, own), light) for one, own, light in types or [(imager, psf, electrons)]]
 
     def one(key):
         scene_key, noise_key, place_key = jax.random.split(key, 3)
         place = jax.random.uniform(place_key, (2,), dtype, -0.5, 0.5) * jnp.asarray(field, dtype)
         place = place + jnp.asarray(imager.sensor.origin, dtype)
-        local, lit = (imager, None) if window is None else crop_field(imager, place, window)
+        cut = lambda whole: (whole, None) if window is None else crop_field(whole, place, window)
+        local, lit = cut(imager)
         truth = random_scene(scene_key, grid, density=density, width=width)
-        image = noisy(noise_key, electrons * forward(truth, local, grid, images), read_noise)
+        light = sum(electrons * forward(truth, cut(one)[0], grid, images) for one, images, electrons in parts)
+        image = noisy(noise_key, jnp.asarray(light), read_noise)
         estimate = reconstruct(image, local, grid, background_width=background_width, lit=lit)
         return misfit_db(estimate[inner], truth[inner])
 

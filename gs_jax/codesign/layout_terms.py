@@ -94,8 +94,9 @@ def log_error_for_exposure(imager: Imager, at: Conditions, key: PRNGKeyArray) ->
     """`log_error` with the lenses' own spots and the light of the exposure."""
     at = dataclasses.replace(at, depths=_three(at))
     # `forward` does not scale light with the depth: all three planes have the mean.
-    electrons = jnp.mean(lens_electrons(imager, at)) * (_voxel_pitch(imager) / PLACE) ** 2
-    return _log_error(imager, at, key, psf=spots(imager, at, _SPOT), electrons=electrons)
+    share = (_voxel_pitch(imager) / PLACE) ** 2
+    of_type = lambda one, own: (one, spots(one, own, _SPOT), share * jnp.mean(lens_electrons(one, own)))
+    return _log_error(imager, at, key, types=[of_type(*part) for part in per_type(imager, at)])
 
 
 def _three(at: Conditions) -> Float[Array, "3"]:

@@ -26,7 +26,7 @@ from .parameters import Values, candidate, evaluated, start_values
 from .solve import NOT_FINITE, Bounds, Box, State, Stepper, run, solver_of, stepper
 from .study import MOST_TYPES, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_entry
-from .terms import TERMS, with_terms
+from .terms import with_terms
 
 
 class Problem(NamedTuple):
@@ -69,7 +69,8 @@ def problem_of(design: Design, study: Study) -> Problem:
 
 
 def _check_free(design: Design, study: Study) -> None:
-    _check_types(len(lenses_by_type(design.imager().array)), study)
+    if (count := len(lenses_by_type(design.imager().array))) > MOST_TYPES:
+        raise InputError(f"`lens`: a search takes up to {MOST_TYPES} lens types, got {count}.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
     twice = sum(study.depths_mm or design.imaging.working_distance_mm)
@@ -79,14 +80,6 @@ def _check_free(design: Design, study: Study) -> None:
     of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant", "aspheric_terms"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
         raise InputError(f"`free.{min(of_lens)}` needs a design without `lens.focal_length_mm`.")
-
-
-def _check_types(count: int, study: Study) -> None:
-    if count > MOST_TYPES:
-        raise InputError(f"`lens`: a search takes up to {MOST_TYPES} lens types, got {count}.")
-    named = [*(term.name for term in study.terms), *(limit.name for limit in study.pareto)]
-    if alike := [name for name in named if count > 1 and not TERMS[name].types]:
-        raise InputError(f"`terms`: {alike[0]} needs lenses that are alike, got {count} lens types.")
 
 
 def make_stage(problem: Problem, index: int) -> Stage:

@@ -38,15 +38,13 @@ _GROUP = "gs_jax.terms"
 class Term(NamedTuple):
     """A term: its meaning in words, and its function of an imager and `Conditions`.
 
-    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument; with `types`
-    it also takes lenses of several types.
+    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument.
     """
 
     meaning: str
     function: Callable[..., Float[Array, "..."]]
     log: bool = False
     random: bool = False
-    types: bool = False
 
 
 def _scaled(unit, function):
@@ -62,62 +60,51 @@ def _in_the_middle(function):
 
 
 TERMS: dict[str, Term] = {
-    "lateral_resolution_um": Term(
-        "lateral resolution in focus (Eq. 5)", _scaled(UM, objectives.lateral_resolution), types=True
-    ),
-    "axial_resolution_um": Term(
-        "axial resolution in focus (Eq. 6)", _scaled(UM, objectives.axial_resolution), types=True
-    ),
-    "depth_of_field_mm": Term("depth of field (Eq. 8)", _in_the_middle(objectives.depth_of_field), types=True),
+    "lateral_resolution_um": Term("lateral resolution in focus (Eq. 5)", _scaled(UM, objectives.lateral_resolution)),
+    "axial_resolution_um": Term("axial resolution in focus (Eq. 6)", _scaled(UM, objectives.axial_resolution)),
+    "depth_of_field_mm": Term("depth of field (Eq. 8)", _in_the_middle(objectives.depth_of_field)),
     "depth_of_field_eq7_mm": Term(
         "depth of field (Eq. 7)",
         _in_the_middle(objectives.approximate_depth_of_field),
-        types=True,
     ),
-    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", objectives.focus_offset, types=True),
-    "blur_um": Term("diameter of the thin lens's blur, in the object", _scaled(UM, objectives.blur), types=True),
-    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", objectives.log_strehl, log=True, types=True),
-    "wavefront_waves": Term("RMS wavefront error over the field", objectives.wavefront_error, types=True),
-    "lenses_per_point": Term("lenses that see a point, N_e", objectives.lenses_per_point, types=True),
-    "occupancy": Term("occupancy V (Eq. 11)", objectives.occupancy, types=True),
-    "light_percent": Term("share of a point's light that is used", _scaled(100, objectives.light), types=True),
-    "field_of_view_mm": Term("width of the field of view", objectives.field_of_view, types=True),
-    "thickness_mm": Term("thickness, plate and sensor distance", _of_imager(objectives.thickness), types=True),
-    "psf_width_um": Term(
-        "width of the spot (FWHM of its variance), in the object", _scaled(UM, objectives.spot_width), types=True
-    ),
-    "encircled_radius_um": Term(
-        "radius of 80 % of the rays, in the object", _scaled(UM, objectives.encircled_radius), types=True
-    ),
-    "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0], types=True),
-    "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing), types=True),
-    "web_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap), types=True),
+    "focus_offset": Term("focus from the middle of the depths, 1 at their ends", objectives.focus_offset),
+    "blur_um": Term("diameter of the thin lens's blur, in the object", _scaled(UM, objectives.blur)),
+    "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", objectives.log_strehl, log=True),
+    "wavefront_waves": Term("RMS wavefront error over the field", objectives.wavefront_error),
+    "lenses_per_point": Term("lenses that see a point, N_e", objectives.lenses_per_point),
+    "occupancy": Term("occupancy V (Eq. 11)", objectives.occupancy),
+    "light_percent": Term("share of a point's light that is used", _scaled(100, objectives.light)),
+    "field_of_view_mm": Term("width of the field of view", objectives.field_of_view),
+    "thickness_mm": Term("thickness, plate and sensor distance", _of_imager(objectives.thickness)),
+    "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", _scaled(UM, objectives.spot_width)),
+    "encircled_radius_um": Term("radius of 80 % of the rays, in the object", _scaled(UM, objectives.encircled_radius)),
+    "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),
+    "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing)),
+    "web_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap)),
     "hole_mm": Term(
         "distance of a place on the plate from a lens",
         _of_imager(objectives.uncovered_distance),
-        types=True,
     ),
-    "coverage": Term("share of the plate that is clear aperture", objectives.coverage, types=True),
-    "sag_mm": Term("height of a whole lens", objectives.sag, types=True),
-    "ghosts": Term("RMS sidelobe of the array PSF over its peak", ghosts, random=True, types=True),
-    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage, types=True),
-    "spectral_flatness": Term("flatness of the array PSF's spectrum, 1 if white", flatness, random=True, types=True),
-    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True, types=True),
+    "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
+    "sag_mm": Term("height of a whole lens", objectives.sag),
+    "ghosts": Term("RMS sidelobe of the array PSF over its peak", ghosts, random=True),
+    "lens_shortage": Term("mean over the plate of one over the lenses that see a point", shortage),
+    "spectral_flatness": Term("flatness of the array PSF's spectrum, 1 if white", flatness, random=True),
+    "condition_number": Term("largest over smallest power of that spectrum", conditioning, random=True),
     "localization_um": Term("least error of locating a point, x, y, z", localization, random=True),
     "reconstruction_error": Term("relative error of reconstructed scenes", log_error, log=True, random=True),
     "scene_error": Term(
         "relative error of reconstructed scenes, for an exposure", log_error_for_exposure, log=True, random=True
     ),
-    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error, types=True),
+    "volume_error": Term("relative error of volumes, best linear estimate, for an exposure", volume_error),
     "crowded_precision_um": Term(
-        "least error of locating a point in a scene, x, y, z, for an exposure", crowded_precision, types=True
+        "least error of locating a point in a scene, x, y, z, for an exposure", crowded_precision
     ),
     "edge_slope_deg": Term(
         "slope at the clear aperture's rim",
         _scaled(180 / math.pi, objectives.edge_slope),
-        types=True,
     ),
-    "least_radius_mm": Term("least radius of curvature of a lens's surface", objectives.surface_radius, types=True),
+    "least_radius_mm": Term("least radius of curvature of a lens's surface", objectives.surface_radius),
 }
 
 # As they are in every process, whatever a caller puts into the table.

@@ -124,15 +124,10 @@ def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
 def live_terms(start: Start, study: Study | None) -> tuple[str, ...]:
     """Names of the study's terms that are evaluated at each move.
 
-    Not those of random scenes, `lens_shortage`, which needs the field radius when it is compiled, and those of one lens
-    type where there are several.
+    Random terms are left out, and `lens_shortage`, which needs the field radius when it is compiled.
     """
-
-    def is_live(name: str) -> bool:
-        term = TERMS[name]
-        return not term.random and name != "lens_shortage" and (term.types or len(start.types) == 1)
-
-    return () if study is None else tuple(table.name for table in study.terms if is_live(table.name))
+    names = () if study is None else tuple(table.name for table in study.terms)
+    return tuple(name for name in names if not TERMS[name].random and name != "lens_shortage")
 
 
 class Evaluation(NamedTuple):
