@@ -17,7 +17,9 @@ from gs_jax.mold.solids import MoldShape, alignment_marks, mold_bounds
 
 DESIGNS = Path(__file__).parents[1] / "design"
 # One alone, two that overlap, one across the edge of the plate.
-ARRAY = MicrolensArray([[-2.0, 1.0], [1.0, 0.0], [1.6, 0.0], [0.0, -3.0]], 2.0, 1.43, 1.0, 1.0, size=(6.0, 6.0))
+ARRAY = MicrolensArray(
+    [[-2.0, 1.0], [1.0, 0.0], [1.6, 0.0], [0.0, -3.0]], 2.0, 1.43, [0.8, 1, 1, 1], 1.0, size=(6.0, 6.0)
+)
 # Of two discs as far apart as 0.6 of their diameter: twice a disc less the lens that they share.
 PAIR = 2 * math.pi / 4 - (2 * 0.25 * math.acos(0.6) - 0.3 * math.sqrt(1 - 0.36))
 
@@ -29,7 +31,7 @@ def area(ring) -> float:
 
 def test_openings_are_the_lenses_on_the_plate():
     mask = make_mask(ARRAY)
-    np.testing.assert_allclose(mask.circles, [[-2, 1, 1]])
+    np.testing.assert_allclose(mask.circles, [[-2, 1, 0.8]])
     assert sum(map(area, mask.openings)) == pytest.approx(PAIR + math.pi / 8, rel=1e-3)
     assert max(np.abs(ring).max() for ring in mask.openings) <= 3
     low, high = mold_bounds(ARRAY, MoldShape())
@@ -44,7 +46,7 @@ def test_dxf(tmp_path):
     assert document.units == 4 and not document.audit().errors  # mm
     found = {layer: [e for e in document.modelspace() if e.dxf.layer == layer] for layer in ("OPENINGS", "MARKS")}
     (circle,) = (e for e in found["OPENINGS"] if e.dxftype() == "CIRCLE")
-    assert tuple(circle.dxf.center)[:2] == (-2, 1) and circle.dxf.radius == 0.5
+    assert tuple(circle.dxf.center)[:2] == (-2, 1) and circle.dxf.radius == 0.4
     assert len(found["MARKS"]) == 3 and len(found["OPENINGS"]) == 3
 
 
@@ -54,7 +56,7 @@ def test_svg(tmp_path):
     assert root.get("width") == f"{np.ptp(make_mask(ARRAY).outline[:, 0]):.10g}mm"
     (circle,) = root.iterfind(".//{*}circle")
     # The y axis of SVG points down, that of the drawing up.
-    assert (circle.get("cx"), circle.get("cy"), circle.get("r")) == ("-2", "1", "0.5")
+    assert (circle.get("cx"), circle.get("cy"), circle.get("r")) == ("-2", "1", "0.4")
     (group,) = root
     assert group.get("transform") == "matrix(1 0 0 -1 0 0)"
 

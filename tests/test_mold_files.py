@@ -1,7 +1,6 @@
 """STL and 3MF as other programs read them, and what is measured in them."""
 
 import struct
-import zipfile
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.make import check_measurement
 from gs_jax.mold.manufacturability import check_solid
 from gs_jax.mold.measurement import measure_lenslets, summarize
-from gs_jax.mold.solids import MoldShape, array_solid, array_volume, engraving_tools, mold_bounds, mold_solid
+from gs_jax.mold.solids import MoldShape, array_solid, array_volume, mold_solid
 
 from .test_mold import CHORD, lenses, random_lenses
 
@@ -50,40 +49,17 @@ def test_stl_holds_the_solid(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".3mf", ".STL"])
-def test_another_reader_finds_it_watertight(tmp_path, suffix):
-    array = random_lenses()
-    path = tmp_path / f"a{suffix}"
-    write_mesh(path, float32_mesh(array_solid(array, 2e-4)), 'a <b> & "c"')
-    mesh = trimesh.load_mesh(path)
-    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
+def test_a_file_is_watertight_for_others_and_reads_back(tmp_path, suffix):
+    array, path = random_lenses(), tmp_path / f"a{suffix}"
+    mesh = float32_mesh(array_solid(array, 2e-4))
+    write_mesh(path, mesh, 'a <b> & "c"')
+    other = trimesh.load_mesh(path)
+    assert other.is_watertight and other.is_winding_consistent and other.euler_number == 2
     # The bar, at a finer chord error than the default: small lenses have more rim.
-    np.testing.assert_allclose(mesh.volume, array_volume(array), rtol=1e-4)
-
-
-def test_3mf_says_millimetres(tmp_path):
-    write_mesh(tmp_path / "a.3mf", float32_mesh(array_solid(random_lenses(), CHORD)), "a")
-    with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
-        assert b'unit="millimeter"' in archive.read("3D/3dmodel.model")[:2000]
-
-
-@pytest.mark.parametrize("suffix", [".stl", ".3mf"])
-def test_what_is_written_is_read_back(tmp_path, suffix):
-    mesh = float32_mesh(array_solid(random_lenses(), CHORD))
-    write_mesh(tmp_path / f"a{suffix}", mesh, "a")
-    again = read_mesh(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(other.volume, array_volume(array), rtol=1e-4)
+    again = read_mesh(path)
     np.testing.assert_array_equal(np.float32(again.vertices), mesh.vertices)
     np.testing.assert_array_equal(np.sort(again.facets, axis=0), np.sort(mesh.facets, axis=0))
-
-
-def test_mold_array_and_marks_fill_the_block(tmp_path):
-    array, shape = random_lenses(), MoldShape(label="fill")
-    part = array_solid(array, CHORD)
-    write_mesh(tmp_path / "array.stl", float32_mesh(part), "array")
-    write_mesh(tmp_path / "mold.stl", float32_mesh(mold_solid(array, part, shape)), "mold")
-    filled = sum(volume_of(corners_in_stl(tmp_path / name)[1]) for name in ("array.stl", "mold.stl"))
-    engraved = sum(tool.trim_by_plane([0, 0, -1], 0).volume() for tool in engraving_tools(array, shape))
-    # The bar is 1e-5; the rounding to float32 leaves less.
-    np.testing.assert_allclose(filled + engraved, np.prod(np.diff(mold_bounds(array, shape), axis=0)), rtol=1e-6)
 
 
 def test_vertices_that_float32_cannot_tell_apart_are_merged():
@@ -167,7 +143,10 @@ def test_lenses_that_are_not_where_they_should_be_are_found():
 
 
 def test_facets_cost_light_as_the_square_of_their_depth():
-    """An equilateral facet `rho^2 / (2 R)` deep is `1 - r^2 / rho^2` of it deep at `r` from its middle: 0.19 RMS."""
+    """An equilateral facet `rho^2 / (2 R)` deep is `1 - r^2 / rho^2` of it deep at `r` from its middle."""
+    corners = np.array([[1, 0], [-0.5, 3**0.5 / 2], [-0.5, -(3**0.5) / 2]])
+    samples = np.random.default_rng(0).dirichlet([1, 1, 1], 200_000) @ corners
+    variation = (samples**2).sum(axis=1).std()
     array = lenses([[0, 0]], (2.4, 2.4))
     measured = {}
     for chord in (2e-4, 4e-4):
@@ -176,7 +155,7 @@ def test_facets_cost_light_as_the_square_of_their_depth():
     rms = {chord: numbers["surface_error_rms_um"] / 1000 for chord, numbers in measured.items()}
     # Not all facets are equilateral, or as deep as they may be.
     for chord, found in rms.items():
-        assert 0.7 * 0.194 < found / chord < 1.1 * 0.194
+        assert 0.7 * variation < found / chord < 1.1 * variation
     np.testing.assert_allclose(rms[4e-4] / rms[2e-4], 2, rtol=0.1)
     numbers = measured[2e-4]
     waves = 0.43 * numbers["surface_error_rms_um"] / 0.52
@@ -202,13 +181,6 @@ def test_a_lens_that_is_not_there_is_said():
     assert any(
         finding.check == "lenses not measured" for finding in check_measurement(measured, chord=CHORD, radius=2.0)
     )
-
-
-def test_the_variance_of_an_equilateral_facet():
-    """What the test above takes as known, by sampling."""
-    weights = np.random.default_rng(0).dirichlet([1, 1, 1], 200_000)
-    corners = np.array([[1, 0], [-0.5, 3**0.5 / 2], [-0.5, -(3**0.5) / 2]])
-    assert (((weights @ corners) ** 2).sum(axis=1)).std() == pytest.approx(0.194, abs=2e-3)
 
 
 def test_float32_arrays_are_measured_alike():

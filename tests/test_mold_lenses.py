@@ -243,20 +243,6 @@ def test_what_neighbours_hide_is_not_facetted():
     assert_sound(dense)
 
 
-def test_openings_of_a_mask_are_as_wide_as_their_lenses():
-    mask = make_mask(unequal(centers=CENTERS * 1.2))
-    alone = {round(float(d), 9) for d in mask.circles[:, 2]}
-    assert alone <= set(DIAMETERS.tolist()) and len(alone) > 0
-    area = lambda ring: float(ring[:, 0] @ np.roll(ring[:, 1], -1) - ring[:, 1] @ np.roll(ring[:, 0], -1)) / 2
-    discs = [
-        m3.CrossSection.circle(d / 2, 4000).translate(c)
-        for c, d in zip((CENTERS * 1.2).tolist(), DIAMETERS, strict=True)
-    ]
-    union = m3.CrossSection.batch_boolean(discs, m3.OpType.Add) ^ m3.CrossSection.square([4.0, 3.0], center=True)
-    opened = sum(map(area, mask.openings)) + math.pi / 4 * (mask.circles[:, 2] ** 2).sum()
-    assert opened == pytest.approx(union.area(), rel=1e-3)
-
-
 class UnequalDesign(Design):
     """A design of lenses that differ, as far as the part is concerned."""
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 
 import matplotlib.image
 import numpy as np
@@ -53,19 +54,9 @@ def run(*arguments):
 
 
 def design(**changes) -> Design:
-    """The design above with other values in one table or more."""
-    data = {
-        "name": "small",
-        "sensor": {"pixel_pitch_um": 20.0, "shape": [200, 200]},
-        "lens": {"radius_of_curvature_mm": 2.0, "refractive_index": 1.43, "aperture_diameter_mm": 1.4},
-        "array": {"size_mm": [3.0, 3.0], "substrate_thickness_mm": 1.0, "centers_mm": [[0.0, 0.0], [1.1, 0.2]]},
-        "imaging": {
-            "sensor_distance_mm": 5.8,
-            "working_distance_mm": [18.0, 30.0],
-            "wavelength_nm": 520.0,
-            "field_radius_mm": 3.0,
-        },
-    }
+    """Two lenses of the design above, with other values in one table or more."""
+    data = tomllib.loads(DESIGN)
+    data["array"]["centers_mm"] = data["array"]["centers_mm"][:2]
     for table, values in changes.items():
         data[table].update(values)
     return Design.model_validate(data)

@@ -179,11 +179,11 @@ def test_the_first_key_skips_to_the_content(made, browser):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (("design.toml", "-o", "r.txt"), "allowed: .html"),
-        (("design.toml", "points.csv", "-o", "r.html"), "points by --points"),
+        (("design.toml", "-o", "r.txt"), ".html"),
+        (("design.toml", "points.csv", "-o", "r.html"), "--points"),
         (("design.toml", "-o", "r.html", "--tolerance", "capture.tif"), "capture.tif: "),
         (("design.toml", "-o", "r.html", "--tolerance", "other.json"), "got no 'depth_mm'"),
-        (("design.toml", "-o", "r.html", "--capture", "small.tif"), "small.tif: found"),
+        (("design.toml", "-o", "r.html", "--capture", "small.tif"), "small.tif: "),
         (("none.toml", "-o", "r.html"), "none.toml: "),
     ],
 )
@@ -272,15 +272,14 @@ def test_the_contrast_of_a_perfect_lens():
 
 @pytest.mark.integration
 def test_charts_draw_what_is_finite():
-    drawn = line_chart({"a <b>": ([1.0, 2.0, 3.0], [1.0, None, 3.0])}, x="x", y="y", title="t")
-    assert drawn.count("<polyline") == 1 and "a &lt;b&gt;" in drawn and "nan" not in drawn
-    assert "no finite number" in line_chart({"a": ([1.0], [None])}, x="x", y="y", title="t")
-    for log in (False, True):
-        assert "nan" not in line_chart({"a": ([1.0], [2.0])}, x="x", y="y", title="t", log=log)
+    chart = lambda *line, **options: line_chart({"a <b>": line}, x="x", y="y", title="t", **options)
+    drawn = chart([1.0, 2.0, 3.0], [1.0, None, 3.0])
+    assert drawn.count("<polyline") == 1 and "a &lt;b&gt;" in drawn and "no finite number" in chart([1.0], [None])
+    assert not any("nan" in each for each in (drawn, chart([1.0], [2.0]), chart([1.0], [2.0], log=True)))
 
 
 @pytest.mark.integration
-def test_thinning_is_the_mean_of_squares():
+def test_downsampled_pixels_are_means_of_blocks():
     image = np.arange(36.0).reshape(6, 6)
     np.testing.assert_allclose(downsample(image, 3), image.reshape(3, 2, 3, 2).mean((1, 3)))
     assert downsample(np.ones((1, 9)), 3).shape == (1, 3)

@@ -30,25 +30,14 @@ _MAX_CONIC_DEVIATION, _MAX_DEVIATION = 0.1, 3e-4
 
 @dataclass(frozen=True)
 class LensletMeasurement:
-    """Lenslets of a mesh, one entry each; NaN where there are too few vertices.
+    """Lenslets of a mesh, one entry each; NaN where there are too few vertices. Lengths in mm, angles in radians.
 
-    Parameters
-    ----------
-    center
-        Axis of the best-fit surface with the conic constant of the design, `(x, y)`, mm.
-    radius
-        Radius of curvature of that surface, mm.
-    misfit
-        RMS distance of the vertices from that surface, mm.
-    conic, conic_deviation
-        Conic constant of the best fit with free radius, and its standard deviation from the scatter and rounding of
-        the vertices. Its effect is `r^4 / (8 R^3)`, so small apertures determine it poorly: NaN above 0.1.
-    offset, surface_rms
-        Mean distance of the facets outside the design's surface, and the RMS of the remainder, mm.
-    slope_rms
-        RMS angle between facets and the design's surface, radians.
-    vertices
-        Number of vertices that belong to this lenslet alone.
+    `center`, `radius` and the RMS distance of the vertices, `misfit`, are of the best-fit surface with the conic
+    constant of the design. `conic` is that of the best fit with free radius, and `conic_deviation` its standard
+    deviation from the scatter and rounding of the vertices. The effect of a conic constant is `r^4 / (8 R^3)`, so small
+    apertures determine it poorly: NaN above 0.1. `offset` is the mean distance of the facets outside the design's
+    surface, `surface_rms` the RMS of the remainder, and `slope_rms` the RMS angle between facets and surface.
+    `vertices` counts those that belong to the lenslet alone.
     """
 
     center: Float[np.ndarray, "lens 2"]

@@ -59,20 +59,9 @@ def line_chart(
 ) -> str:
     """A line chart as SVG with a legend.
 
-    Parameters
-    ----------
-    lines
-        Values along x and y by the name of the line; None and values that are not finite are left out.
-    x, y
-        Labels of the axes.
-    title
-        Alternative text.
-    log
-        Makes the y axis logarithmic.
-    marks
-        Draws a dot at each point.
-    bounds
-        Limits of the y axis; by default those of the lines, from 0 unless the axis is logarithmic.
+    `lines` has values along x and y by the name of the line; None and values that are not finite are left out. `title`
+    is the alternative text, `log` is for the y axis, and `marks` draws a dot at each point. `bounds` are the limits of
+    the y axis, by default those of the lines, from 0 unless the axis is logarithmic.
     """
     data = {name: _finite(line, log) for name, line in lines.items()}
     points = np.concatenate(list(data.values()), axis=1)
