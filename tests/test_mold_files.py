@@ -90,10 +90,10 @@ def test_what_is_no_solid_is_found():
 @pytest.mark.parametrize("name", ["a.obj", "a", "a.stl.txt"])
 def test_another_suffix_is_refused(tmp_path, name):
     mesh = float32_mesh(array_solid(random_lenses(), CHORD))
-    with pytest.raises(InputError, match="allowed: .stl, .3mf"):
+    with pytest.raises(InputError, match=r"\.3mf"):
         write_mesh(tmp_path / name, mesh, "a")
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match="one of .stl, .3mf"):
+    with pytest.raises(InputError, match=r"\.3mf"):
         read_mesh(tmp_path / name)
 
 

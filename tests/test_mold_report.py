@@ -117,7 +117,7 @@ def test_the_options_change_the_mold(folder):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (("-o", "part.obj"), "allowed: .stl, .3mf"),
+        (("-o", "part.obj"), ".3mf"),
         (("-o", "missing/part.stl"), "no folder"),
         (("-o", "part.stl", "--chord-um", 100), "the chord error must be at most"),
     ],
@@ -134,7 +134,7 @@ def test_wrong_input_is_one_line_and_writes_nothing(folder, arguments, message):
 @pytest.mark.parametrize("value", ["-1", "nan", "x", "1e9"])
 def test_a_wrong_number_is_refused(folder, option, value):
     result = run("design.toml", "-o", "part.stl", f"{option}={value}")
-    assert result.exit_code == 2 and "allowed:" in result.output
+    assert result.exit_code == 2 and "must be" in result.output
 
 
 @pytest.mark.parametrize(
