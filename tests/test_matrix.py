@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gs_jax.design.sheet import datasheet
 
 import gs_jax as gs
 from gs_jax import Design, Grid, InputError
@@ -21,6 +20,7 @@ from gs_jax.apps.report.page import write_report
 from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
+from gs_jax.design.datasheets import datasheet
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
@@ -77,6 +77,9 @@ DEVICES: dict[str, Callable[[], Design]] = {
     "one lens": lambda: cropped("geomscope", lenses=1, array={"size_mm": (2.0, 2.0)}),
     "float64": lambda: cropped("geomscope"),
 }
+# Numbers of pixels without a common divisor, as many as a camera has: binned or not, all methods must cope.
+LARGE = "3001 x 4093"
+DEVICES[LARGE] = lambda: cropped("geomscope", shape=(3001, 4093), sensor={"pixel_pitch_um": 2.6})
 
 
 class Case:
@@ -265,11 +268,13 @@ ALSO = (
 
 
 def pairs():
-    for number, device in enumerate(DEVICES):
+    for number, device in enumerate(name for name in DEVICES if name != LARGE):
         chosen = {*ALWAYS, *(tasks[number % len(tasks)] for tasks in IN_TURN)}
         for task in TASKS:
             marks = () if task in chosen or (device, task) in ALSO else pytest.mark.integration
             yield pytest.param(device, task, "near", marks=marks, id=f"{device}-{task}")
+    for task in ("points", "backproject", "list-rl", "richardson-lucy", "map"):
+        yield pytest.param(LARGE, task, "near", marks=pytest.mark.integration, id=f"{LARGE}-{task}")
     # The designs that are recommended most, with all of the light.
     for device in ("geomscope-asphere", "geomscope-exposure"):
         for task in ("points", *METHODS):
