@@ -32,63 +32,14 @@ def lens(plano, **parts):
     return MicrolensArray([[0.0, 0.0]], orientation="plano" if plano else "curved", **given)
 
 
-def refract(direction, normal, n, n_):
-    """Snell's law for unit vectors, the normal along the light."""
-    cos = np.sum(direction * normal, axis=-1, keepdims=True)
-    across = n * (direction - cos * normal)
-    return (across + np.sqrt(n_**2 - np.sum(across**2, axis=-1, keepdims=True)) * normal) / n_
-
-
-def to_sphere(point, direction, center, radius):
-    """Distance along rays to a sphere, to the point nearest its vertex; and the normal there, along the light.
-
-    The centre is on the axis behind the vertex for a positive radius.
-    """
-    offset = point - center
-    b = np.sum(offset * direction, axis=-1)
-    c = np.sum(offset**2, axis=-1) - radius**2
-    distance = -b - np.sign(radius) * np.sqrt(b**2 - c)
-    normal = -(offset + distance[..., None] * direction) / radius
-    return distance, normal
-
-
-def traced_wavefront(plano, pupil, height, v):
-    """Optical path of the chief ray less that of rays to `pupil` (ray, 2), to the sphere about the image at `v`.
-
-    Exact: a plane and a sphere that touch at the origin. The point is at `-height`, the image on the +x side.
-    """
-    source = np.array([-height, 0.0, -DEPTH])
-    image = np.array([height * v / DEPTH, 0.0, v])
-    radius = F * (N - 1)
-    aim = np.concatenate([np.zeros((1, 2)), pupil])
-    point = np.concatenate([aim, np.zeros((len(aim), 1))], axis=1)
-    path = np.linalg.norm(point - source, axis=1)
-    direction = (point - source) / path[:, None]
-    axis = np.broadcast_to([0.0, 0.0, 1.0], direction.shape)
-    if plano:
-        direction = refract(direction, axis, 1, N)
-        step, normal = to_sphere(point, direction, np.array([0, 0, -radius]), -radius)
-        path, point = path + N * step, point + step[:, None] * direction
-        direction = refract(direction, normal, N, 1)
-    else:
-        step, normal = to_sphere(point, direction, np.array([0, 0, radius]), radius)
-        path, point = path + step, point + step[:, None] * direction
-        direction = refract(direction, normal, 1, N)
-        step = -point[:, 2] / direction[:, 2]
-        path, point = path + N * step, point + step[:, None] * direction
-        direction = refract(direction, axis, N, 1)
-    step, _ = to_sphere(point, direction, image, np.linalg.norm(image))
-    path = path + step
-    return path[0] - path[1:]
-
-
 def fitted(plano, a, height, v):
-    """Coefficients of `r^4, r^3 cos, r^2 cos^2, r^2` among others, from traced rays."""
+    """Coefficients of `r^4, r^3 cos, r^2 cos^2, r^2` among others, from exact rays; the image is on the +x side."""
     r, angle = np.meshgrid(np.linspace(0.1, 1, 12), np.linspace(0, 2 * np.pi, 24, endpoint=False))
     x, y = (r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()
     square = x**2 + y**2
     terms = [square**2, x * square, x**2, square, x, x**3, x**2 * square, x**4, square**3]
-    error = traced_wavefront(plano, a * np.stack([x, y], axis=1), height, v)
+    imager = Imager(lens(plano, substrate_thickness=0.0), Sensor((8, 8), 0.005), v, 3.0)
+    error = -wavefront(imager, DEPTH, a * np.stack([x, y], axis=1), (-height, 0.0))
     return np.linalg.lstsq(np.stack(terms, axis=1), error, rcond=None)[0][:4]
 
 

@@ -93,12 +93,7 @@ def test_huygens_principle_summed_directly(v, field):
     direct = np.array(direct)
     tiny = unit(v, pitch=0.0045 / 4)
     ours = diffraction_psf(
-        tiny,
-        z,
-        size=4 * size - 1 if size % 2 == 0 else 4 * size + 1,
-        field=field,
-        radius=RADIUS,
-        samples=1,
+        tiny, z, size=4 * size - 1 if size % 2 == 0 else 4 * size + 1, field=field, radius=RADIUS, samples=1
     )
     middle = ours.shape[0] // 2
     line = np.asarray(ours)[middle, middle + np.round(fine / (0.0045 / 4)).astype(int)]
@@ -220,13 +215,7 @@ def test_gradients(kind):
         image = kind(imager, depth, **arguments)
         return smooth @ image @ smooth
 
-    arguments = (
-        unit(),
-        jnp.array(20.0),
-        jnp.array([0.6, -0.3]),
-        jnp.array([0.2, 0.1]),
-        jnp.array(0.4),
-    )
+    arguments = (unit(), jnp.array(20.0), jnp.array([0.6, -0.3]), jnp.array([0.2, 0.1]), jnp.array(0.4))
     # Rays cross pixel borders and edges of the soft aperture: kinks, of a 1/32768 and a 1/1000 of the light each.
     rtol = 2e-2 if kind is geometric_psf else 1e-3
     # The wavelength is 1e-4 of the rest: a step of 1e-7 mm is still small for it.
