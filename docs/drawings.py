@@ -109,8 +109,8 @@ def field() -> str:
     return svg(620, 330, parts)
 
 
-def core_halo() -> str:
-    """A spot: the position of the chief ray, the core beside it, and the halo around and behind the core."""
+def stray_light() -> str:
+    """A spot: the position of the chief ray, the core beside it, and the stray light around and behind the core."""
     x, y = 320.0, 120.0
     shades = [
         f'<ellipse cx="{x + 26 * s:.0f}" cy="{y}" rx="{100 * s:.0f}" ry="{78 * s:.0f}" fill="{GLASS}" opacity="0.45"/>'
@@ -128,7 +128,7 @@ def core_halo() -> str:
         line(x - 54, y - 58, x - 47, y - 14, FAINT),
         text(x - 20, y - 90, "core: a few pixels, the bright part"),
         line(x - 12, y - 84, x - 24, y - 8, FAINT),
-        text(x + 110, y + 70, "halo: more than half of the light"),
+        text(x + 110, y + 70, "stray light: more than half of all"),
         *measure(70, x - 26, y + 100, "M (1 + e) times the field"),
     ]
     return svg(640, 250, parts)
@@ -189,7 +189,7 @@ def imports_drawing() -> str:
     return svg(wide, 40 + high * len(rows) - 10, parts)
 
 
-DRAWINGS = {"chief-ray": chief_ray, "field": field, "core-halo": core_halo, "imports": imports_drawing}
+DRAWINGS = {"chief-ray": chief_ray, "field": field, "stray-light": stray_light, "imports": imports_drawing}
 
 
 def main() -> None:

@@ -225,7 +225,6 @@ def check_positive(name, value):
 
 
 def half_size(size) -> Float[np.ndarray, "2"]:
-    """Half the plate's size, mm."""
     if len(size) != 2 or not all(0 < length < math.inf for length in size):
         raise InputError(f"`size` must be two positive lengths, mm, got {tuple(size)}.")
     return np.array(size, float) / 2

@@ -18,14 +18,14 @@ KINDS = [diffraction_psf, geometric_psf, gaussian_psf]
 SLOW_FIRST = [*(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[:2]), gaussian_psf]
 
 
-def unit(v=5.8, dtype=jnp.float64, pitch=0.0045, **lens):
+def lenslet(v=5.8, dtype=jnp.float64, pitch=0.0045, **lens):
     imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((64, 64), pitch), v, 3.0)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), imager)
 
 
 def in_focus(**more):
     """A thin lens whose sensor is at the image of a point 20 mm in front."""
-    return unit(1 / (1 / 4.65 - 1 / (20 + 1 / 1.43)), thin_lens_focal_length=4.65, **more)
+    return lenslet(1 / (1 / 4.65 - 1 / (20 + 1 / 1.43)), thin_lens_focal_length=4.65, **more)
 
 
 def centroid(image):
@@ -60,7 +60,7 @@ def test_what_is_outside_the_window_is_accounted_for():
 @pytest.mark.parametrize("field", [(0.0, 0.0), (2.0, -1.0)])
 def test_far_from_focus_it_is_the_shadow_of_the_aperture(field):
     """Thin lens, v = 4 mm: a disc, a (1 - v/v') in radius, evenly lit, about the chief ray."""
-    imager = unit(4.0, thin_lens_focal_length=4.65)
+    imager = lenslet(4.0, thin_lens_focal_length=4.65)
     image = diffraction_psf(imager, 20.0, size=129, radius=RADIUS, field=field)
     blur = RADIUS * (1 - 4 * (1 / 4.65 - 1 / (20 + 1 / 1.43))) / 0.0045
     distance = np.hypot(*(np.indices((129, 129)) - 64))
@@ -75,7 +75,7 @@ def test_far_from_focus_it_is_the_shadow_of_the_aperture(field):
 @pytest.mark.parametrize(("v", "field"), [pytest.param(4.0, (0.0, 0.0), marks=pytest.mark.slow), (5.67, (3.0, 0.0))])
 def test_huygens_principle_summed_directly(v, field):
     """Wavelets from points of the lens, a sum for each point of the sensor; no exit pupil, no linear phase."""
-    imager, z, size = unit(v), 20.0, 65 if field[0] else 129
+    imager, z, size = lenslet(v), 20.0, 65 if field[0] else 129
     count = 400
     side = RADIUS * (2 * (np.arange(count) + 0.5) / count - 1)
     points = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
@@ -91,7 +91,7 @@ def test_huygens_principle_summed_directly(v, field):
         total = to_lens + np.sqrt(behind**2 + ((points - chief - [x, 0]) ** 2).sum(1))
         direct.append(abs(np.exp(2j * np.pi / WAVELENGTH * (total - total[0])).sum()) ** 2)
     direct = np.array(direct)
-    tiny = unit(v, pitch=0.0045 / 4)
+    tiny = lenslet(v, pitch=0.0045 / 4)
     ours = diffraction_psf(
         tiny, z, size=4 * size - 1 if size % 2 == 0 else 4 * size + 1, field=field, radius=RADIUS, samples=1
     )
@@ -116,8 +116,8 @@ SMALL = {
 @pytest.mark.parametrize("what", SMALL)
 def test_strehl_of_small_errors_is_the_exponential(what):
     lens, radius, beside, field = SMALL[what]
-    v = best_focus(unit(**lens), 20.0, field=field, radius=radius) + beside
-    imager = unit(v, **lens)
+    v = best_focus(lenslet(**lens), 20.0, field=field, radius=radius) + beside
+    imager = lenslet(v, **lens)
     rms = wavefront_rms(imager, 20.0, field=field, radius=radius) / WAVELENGTH
     assert 0.02 < rms < 0.1
     ratio = strehl(imager, 20.0, field=field, radius=radius)
@@ -134,14 +134,14 @@ def test_strehl_is_one_without_aberrations():
 def test_rays_and_waves_have_the_same_centroid(field):
     """Ehrenfest: the mean of the waves is that of the rays, whatever the aberrations."""
     options = dict(size=129, field=field, radius=RADIUS)
-    image, rays, gauss = (kind(unit(5.2), 20.0, **options) for kind in KINDS)
+    image, rays, gauss = (kind(lenslet(5.2), 20.0, **options) for kind in KINDS)
     # The wings outside the window, and the aperture's soft edge: some hundredths of a pixel.
     np.testing.assert_allclose(centroid(image), centroid(rays), atol=0.15)
     np.testing.assert_allclose(centroid(gauss), centroid(rays), atol=0.02)
 
 
 def test_the_gaussian_has_the_rays_second_moment():
-    imager = unit(4.0)
+    imager = lenslet(4.0)
     image = gaussian_psf(imager, 20.0, size=257, radius=RADIUS)
     second = lambda a: (np.asarray(a) * (np.arange(257) - 128.0) ** 2).sum()
     rays = geometric_psf(imager, 20.0, size=257, radius=RADIUS)
@@ -153,23 +153,23 @@ def test_the_gaussian_has_the_rays_second_moment():
 @pytest.mark.parametrize("kind", KINDS)
 def test_sum_centre_and_symmetry(kind):
     options = dict(size=65, radius=RADIUS)
-    image = kind(unit(), 20.0, **options)
+    image = kind(lenslet(), 20.0, **options)
     np.testing.assert_allclose(image.sum(), 1, rtol=1e-12)
     # The spiral of rays is symmetric only on average.
     tolerance = 3e-3 if kind is geometric_psf else 1e-12
     for other in (image.T, image[::-1], image[:, ::-1]):
         np.testing.assert_allclose(other, image, atol=tolerance * float(image.max()))
-    moved = kind(unit(), 20.0, offset=(0.3, -0.4), **options)
+    moved = kind(lenslet(), 20.0, offset=(0.3, -0.4), **options)
     # The wide halo is cut by the window, on one side more.
     np.testing.assert_allclose(centroid(moved), [0.3, -0.4], atol=0.03)
-    along_x, along_y = (kind(unit(), 20.0, field=field, **options) for field in ((2.0, 0.0), (0.0, 2.0)))
+    along_x, along_y = (kind(lenslet(), 20.0, field=field, **options) for field in ((2.0, 0.0), (0.0, 2.0)))
     np.testing.assert_allclose(along_y, along_x.T, atol=20 * tolerance * float(along_x.max()))
 
 
 @pytest.mark.parametrize("kind", [diffraction_psf, geometric_psf])
 def test_edges_cut_the_aperture(kind):
     """Half a lens far from focus makes half a disc, on the side where the lens is: before the image, no inversion."""
-    imager = unit(4.0, thin_lens_focal_length=4.65)
+    imager = lenslet(4.0, thin_lens_focal_length=4.65)
     options = dict(size=129, radius=RADIUS, edges=np.array([[1e-6, 0.0]]))
     image = kind(imager, 20.0, **options)
     # Half of the middle column, 1/80 of the light, and Fresnel's fringes are beyond.
@@ -183,7 +183,7 @@ def test_edges_cut_the_aperture(kind):
 )
 def test_float32(v, field, size):
     options = dict(size=size, field=field, radius=RADIUS)
-    exact, low = diffraction_psf(unit(v), 20.0, **options), diffraction_psf(unit(v, jnp.float32), 20.0, **options)
+    exact, low = diffraction_psf(lenslet(v), 20.0, **options), diffraction_psf(lenslet(v, jnp.float32), 20.0, **options)
     assert low.dtype == jnp.float32
     # Phases of 30 waves to a thousandth.
     np.testing.assert_allclose(low, exact, rtol=0, atol=2e-3 * float(exact.max()))
@@ -193,14 +193,14 @@ def test_float32(v, field, size):
 @pytest.mark.parametrize(("v", "size", "samples"), [(5.8, 65, 3), (4.0, 129, 4)])
 def test_more_samples_change_little(v, size, samples):
     """Parseval asks for 1.9 and 2.8. What is left is the aperture's edge, and light folded back."""
-    image, finer = (diffraction_psf(unit(v), 20.0, samples=s, size=size, radius=RADIUS) for s in (samples, 6))
+    image, finer = (diffraction_psf(lenslet(v), 20.0, samples=s, size=size, radius=RADIUS) for s in (samples, 6))
     assert float(jnp.abs(image - finer).sum()) < 0.03
 
 
 @pytest.mark.integration
 def test_depths_map():
     depths = jnp.array([18.0, 20.0])
-    one = lambda z: diffraction_psf(unit(), z, size=33, radius=RADIUS)
+    one = lambda z: diffraction_psf(lenslet(), z, size=33, radius=RADIUS)
     np.testing.assert_allclose(jax.vmap(one)(depths)[1], one(20.0), atol=1e-12)
 
 
@@ -215,7 +215,7 @@ def test_gradients(kind):
         image = kind(imager, depth, **arguments)
         return smooth @ image @ smooth
 
-    arguments = (unit(), jnp.array(20.0), jnp.array([0.6, -0.3]), jnp.array([0.2, 0.1]), jnp.array(0.4))
+    arguments = (lenslet(), jnp.array(20.0), jnp.array([0.6, -0.3]), jnp.array([0.2, 0.1]), jnp.array(0.4))
     # Rays cross pixel borders and edges of the soft aperture: kinks, of a 1/32768 and a 1/1000 of the light each.
     rtol = 2e-2 if kind is geometric_psf else 1e-3
     # The wavelength is 1e-4 of the rest: a step of 1e-7 mm is still small for it.
@@ -225,7 +225,7 @@ def test_gradients(kind):
 @pytest.mark.slow
 def test_gradient_of_the_strehl_ratio():
     ratio = jax.jit(lambda imager, depth: strehl(imager, depth, radius=0.4, samples=64))
-    check_grads(ratio, (unit(5.9), jnp.array(20.0)), order=1, eps=1e-7, atol=1e-4, rtol=1e-4)
+    check_grads(ratio, (lenslet(5.9), jnp.array(20.0)), order=1, eps=1e-7, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", SLOW_FIRST)
@@ -241,4 +241,4 @@ def test_gradients_are_finite_for_an_ideal_lens_on_its_axis(kind):
 )
 def test_wrong_arguments_are_named(options, words):
     with pytest.raises(ValueError, match=words):
-        diffraction_psf(unit(), 20.0, **options)
+        diffraction_psf(lenslet(), 20.0, **options)

@@ -7,9 +7,8 @@ from scipy.optimize import fminbound
 
 from gs_jax import Imager, MicrolensArray, Sensor
 from gs_jax.geometry import chief_ray
-from gs_jax.optics import raytrace as refraction
 from gs_jax.optics.aberrations import best_focus, wavefront, wavefront_rms
-from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
+from gs_jax.optics.raytrace import pupil_quadrature, refract, solid_angle, to_numpy, trace_lenslet, transmittance
 
 WAVELENGTH = 520e-6
 FIELDS = [(0.0, 0.0), (1.0, -0.4), (0.0, 3.0)]
@@ -21,7 +20,7 @@ SHAPES: list[dict] = [
 ]
 
 
-def unit(v=5.8, dtype=jnp.float64, **lens):
+def lenslet(v=5.8, dtype=jnp.float64, **lens):
     imager = Imager(MicrolensArray([[0.0, 0.0]], **lens), Sensor((64, 64), 0.0045), v, 3.0)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), imager)
 
@@ -37,7 +36,7 @@ def some_points(radius=0.9, count=40):
 @pytest.mark.parametrize(("depth", "thickness"), [(20.0, 1.0), (3.0, 2.5)])
 def test_fermat_and_snell(field, lens, depth, thickness):
     """The path through a point of the lens is least over the plane, and has Snell's slopes at the curved side."""
-    imager = unit(substrate_thickness=thickness, **lens)
+    imager = lenslet(substrate_thickness=thickness, **lens)
     n, v, flipped = 1.43, 5.8, lens.get("orientation") == "curved"
     leg = lambda a, b: jnp.sqrt(jnp.sum((a - b) ** 2))
     at = lambda p, z: jnp.append(p, z)
@@ -84,18 +83,18 @@ def falls(squared, orientation="plano", conic_constant=0.0, aspheric_terms=()):
 @pytest.mark.parametrize("lens", [*SHAPES, {"thin_lens_focal_length": 4.65}], ids=str)
 def test_rays_without_a_compiler_are_the_same(field, lens):
     """Beyond the surface too; and the solid angle is what the Jacobian of the slope by the point says."""
-    imager, points = unit(**lens), 2.2 * some_points()
+    imager, points = lenslet(**lens), 2.2 * some_points()
     wanted, (x, y) = trace_lenslet(imager, 20.0, points, field), field
-    host = refraction.refract(refraction.to_numpy(imager), 20.0, points.T, np.array([[x], [y]]))
+    host = refract(to_numpy(imager), 20.0, points.T, np.array([[x], [y]]))
     assert all(isinstance(part, np.ndarray) for part in jax.tree.leaves(host)) and host.valid.any()
     np.testing.assert_array_equal(host.valid, wanted.valid)
     for found, ours in ((host.landing, wanted.landing), (host.tangent, wanted.tangent)):
         np.testing.assert_allclose(found.T, ours, rtol=1e-12, atol=1e-14)
 
     def slope(point):
-        return refraction.refract(imager, jnp.asarray(20.0), point, jnp.asarray(field)).slope
+        return refract(imager, jnp.asarray(20.0), point, jnp.asarray(field)).slope
 
-    angle = refraction.solid_angle(refraction.to_numpy(imager), 20.0, host)
+    angle = solid_angle(to_numpy(imager), 20.0, host)
     jacobian = jnp.linalg.det(jax.vmap(jax.jacfwd(slope))(jnp.asarray(points)))
     expected = jnp.abs(jacobian) * (1 + jnp.sum(jax.vmap(slope)(jnp.asarray(points)) ** 2, -1)) ** -1.5
     np.testing.assert_allclose(angle[host.valid], expected[host.valid], rtol=1e-9)
@@ -104,15 +103,15 @@ def test_rays_without_a_compiler_are_the_same(field, lens):
 def test_light_is_counted_on_either_side():
     """On the axis both faces pass `1 - ((n - 1) / (n + 1))^2`, and a piece of the lens takes `dA / (4 pi z'^2)`."""
     for orientation, reduced in (("plano", 20 + 1 / 1.43), ("curved", 20.0)):
-        imager = refraction.to_numpy(unit(orientation=orientation))
-        ray = refraction.refract(imager, 20.0, np.zeros((2, 1)), np.zeros((2, 1)))
-        np.testing.assert_allclose(refraction.transmittance(imager, ray), (1 - (0.43 / 2.43) ** 2) ** 2, rtol=1e-12)
-        np.testing.assert_allclose(refraction.solid_angle(imager, 20.0, ray), reduced**-2.0, rtol=1e-12)
+        imager = to_numpy(lenslet(orientation=orientation))
+        ray = refract(imager, 20.0, np.zeros((2, 1)), np.zeros((2, 1)))
+        np.testing.assert_allclose(transmittance(imager, ray), (1 - (0.43 / 2.43) ** 2) ** 2, rtol=1e-12)
+        np.testing.assert_allclose(solid_angle(imager, 20.0, ray), reduced**-2.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lens", SHAPES, ids=str)
 def test_paraxial_rays_follow_the_shared_geometry(lens):
-    imager = unit(**lens)
+    imager = lenslet(**lens)
     field, points = 1e-4 * jnp.array([3.0, -2.0]), 1e-4 * some_points()
     landing = trace_lenslet(imager, 20.0, points, field).landing
     reduced = imager.reduced_depth(20.0)
@@ -130,8 +129,8 @@ def test_the_paths_slope_is_the_rays(field, lens):
     point = np.array([0.3, -0.5])
 
     def path_less_projection(v):
-        ray = trace_lenslet(unit(v, **lens), 20.0, point, field)
-        chief = trace_lenslet(unit(v, **lens), 20.0, np.zeros(2), field)
+        ray = trace_lenslet(lenslet(v, **lens), 20.0, point, field)
+        chief = trace_lenslet(lenslet(v, **lens), 20.0, np.zeros(2), field)
         return ray.path, jnp.sqrt(1 + jnp.sum(ray.tangent**2)) - jnp.sqrt(1 + jnp.sum(chief.tangent**2))
 
     (_, slope), (derivative, _) = jax.jvp(path_less_projection, (jnp.array(5.8),), (jnp.array(1.0),))
@@ -144,7 +143,7 @@ def test_an_ideal_lens_has_two_spheres():
     image = 1 / (1 / f - 1 / z)
     points = some_points()
     field = np.array([1.0, -2.0])
-    in_focus = wavefront(unit(image, thin_lens_focal_length=f), 20.0, points, field)
+    in_focus = wavefront(lenslet(image, thin_lens_focal_length=f), 20.0, points, field)
     np.testing.assert_allclose(in_focus, 0, atol=1e-14)
 
     v = 5.0
@@ -157,12 +156,12 @@ def test_an_ideal_lens_has_two_spheres():
     b = (from_center * direction).sum(1)
     to_sphere = -b - np.sqrt(b**2 - (from_center**2).sum(1) + (sphere**2).sum())
     expected = np.linalg.norm(bundle) - np.linalg.norm(bundle - surface, axis=1) + to_sphere
-    moved = wavefront(unit(v, thin_lens_focal_length=f), 20.0, points, field)
+    moved = wavefront(lenslet(v, thin_lens_focal_length=f), 20.0, points, field)
     np.testing.assert_allclose(moved, expected, atol=1e-13)
 
 
 def test_an_ideal_lens_collimates_from_its_focus():
-    rays = trace_lenslet(unit(thin_lens_focal_length=4.65), 4.65 - 1 / 1.43, some_points(), (0.5, 0.0))
+    rays = trace_lenslet(lenslet(thin_lens_focal_length=4.65), 4.65 - 1 / 1.43, some_points(), (0.5, 0.0))
     np.testing.assert_allclose(rays.tangent, np.broadcast_to([-0.5 / 4.65, 0], (40, 2)), atol=1e-14)
 
 
@@ -172,15 +171,15 @@ def test_an_ideal_lens_collimates_from_its_focus():
 @pytest.mark.parametrize("lens", SHAPES, ids=str)
 def test_float32_keeps_a_wavefront_of_30_waves_to_a_thousandth(v, field, lens):
     points = some_points(0.65)
-    exact = wavefront(unit(v, **lens), 20.0, points, field)
-    low = wavefront(unit(v, jnp.float32, **lens), 20.0, points, field)
+    exact = wavefront(lenslet(v, **lens), 20.0, points, field)
+    low = wavefront(lenslet(v, jnp.float32, **lens), 20.0, points, field)
     assert low.dtype == jnp.float32
     # Differences of paths, not paths: 25 mm in float32 alone would be wrong by 2e-3 waves in each of its sums.
     np.testing.assert_allclose(low, exact, rtol=0, atol=5e-4 * WAVELENGTH)
 
 
 def test_best_focus_of_a_thin_lens_is_the_image():
-    v = best_focus(unit(thin_lens_focal_length=4.65), 20.0, radius=0.3)
+    v = best_focus(lenslet(thin_lens_focal_length=4.65), 20.0, radius=0.3)
     np.testing.assert_allclose(v, 1 / (1 / 4.65 - 1 / (20 + 1 / 1.43)), rtol=1e-12)
 
 
@@ -188,10 +187,10 @@ def test_best_focus_of_a_thin_lens_is_the_image():
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("lens", SHAPES, ids=str)
 def test_best_focus_is_the_least_wavefront_error(field, lens):
-    error = jax.jit(lambda v: wavefront_rms(unit(v, **lens), 20.0, field=field, radius=0.65))
+    error = jax.jit(lambda v: wavefront_rms(lenslet(v, **lens), 20.0, field=field, radius=0.65))
     least = fminbound(lambda v: float(error(v)), 3.5, 6.5, xtol=1e-9)
     # A minimum is flat: half the digits. With the error off the axis, the Gauss-Newton steps end at 1e-5.
-    np.testing.assert_allclose(best_focus(unit(4.0, **lens), 20.0, field=field, radius=0.65), least, rtol=1e-5)
+    np.testing.assert_allclose(best_focus(lenslet(4.0, **lens), 20.0, field=field, radius=0.65), least, rtol=1e-5)
 
 
 def test_disc_averages():
@@ -207,17 +206,17 @@ def test_disc_averages():
 def test_no_ray_through_what_is_no_lens():
     """Beside the sphere, or where the light is reflected totally: no value, and gradients that are finite."""
     points = np.array([[2.5, 0.0], [2.0, 0.0], [1.9, 0.0], [0.5, 0.0]])
-    rays = trace_lenslet(unit(), 20.0, points)
+    rays = trace_lenslet(lenslet(), 20.0, points)
     assert rays.valid.tolist() == [False, False, False, True]
-    assert np.isnan(wavefront(unit(), 20.0, points)).tolist() == [True, True, True, False]
+    assert np.isnan(wavefront(lenslet(), 20.0, points)).tolist() == [True, True, True, False]
     total = lambda imager, points: jnp.sum(trace_lenslet(imager, 20.0, points).path)
-    gradients = jax.jit(jax.grad(total, (0, 1)))(unit(), jnp.asarray(points))
+    gradients = jax.jit(jax.grad(total, (0, 1)))(lenslet(), jnp.asarray(points))
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
 
 
 def test_a_perfect_wavefront_has_a_gradient():
     """An ideal lens in focus; the error is the root of zero."""
-    perfect = unit(8.0, thin_lens_focal_length=4.0, substrate_thickness=0.0)
+    perfect = lenslet(8.0, thin_lens_focal_length=4.0, substrate_thickness=0.0)
     value, slopes = jax.value_and_grad(lambda imager: wavefront_rms(imager, 8.0))(perfect)
     assert value < 1e-12 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
@@ -230,7 +229,7 @@ def test_gradients(lens, modes):
     values = jax.jit(lambda *arguments: (*trace_lenslet(*arguments)[:3], wavefront(*arguments)))
     # At the vertex and on the axis too; steps of 1e-5 of a smooth function leave 1e-9.
     for field in (jnp.zeros(2), jnp.array([1.0, 2.0])):
-        arguments = (unit(**lens), jnp.array(20.0), points, field)
+        arguments = (lenslet(**lens), jnp.array(20.0), points, field)
         check_grads(values, arguments, order=1, modes=modes, eps=1e-5, atol=1e-7, rtol=1e-6)
 
 
@@ -238,4 +237,6 @@ def test_gradients(lens, modes):
 @pytest.mark.parametrize("modes", [["fwd"], ["rev"]])
 def test_gradients_of_the_best_focus(modes):
     focus = jax.jit(lambda imager, depth, radius: best_focus(imager, depth, radius=radius))
-    check_grads(focus, (unit(), jnp.array(20.0), jnp.array(0.65)), order=1, modes=modes, eps=1e-5, atol=1e-6, rtol=1e-6)
+    check_grads(
+        focus, (lenslet(), jnp.array(20.0), jnp.array(0.65)), order=1, modes=modes, eps=1e-5, atol=1e-6, rtol=1e-6
+    )

@@ -140,7 +140,7 @@ def test_drawing_of_keys_is_small(tmp_path, monkeypatch):
         assert 10_000 < path.stat().st_size < 200_000
 
 
-@pytest.mark.parametrize("name", ["chief-ray", "field", "core-halo", "imports"])
+@pytest.mark.parametrize("name", ["chief-ray", "field", "stray-light", "imports"])
 def test_drawings_are_up_to_date(name):
     """`python docs/drawings.py` draws them; that of imports depends on the modules."""
     drawing = (DOCS / "drawings" / f"{name}.svg").read_text(encoding="utf-8")

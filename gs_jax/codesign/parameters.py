@@ -207,7 +207,7 @@ def significant(value: Float[Array, "..."]) -> Float64[np.ndarray, "..."]:
 
 
 def _of_lenses_rounded(imager: Imager, name: str, value: Float[Array, "..."]) -> float | list[float]:
-    """One number if all kinds come to the same."""
+    """One number if all types come to the same."""
     numbers = of_lenses(imager, value)
     numbers = np.round(np.asarray(numbers, float), _DIGITS) if name.endswith("_mm") else significant(numbers)
     return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

@@ -44,7 +44,7 @@ def findings(design: Design, sheet: dict[str, Any], *, circle_of_confusion: floa
     """
     parts = parts_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
     focus = _focus(design, sheet, parts, circle_of_confusion_of(design, circle_of_confusion))
-    # What a wavefront error does is said of lenses that are alike: each kind has its own.
+    # What a wavefront error does is said of lenses that are alike: each type has its own.
     strehl = _strehl(design, sheet, *parts[0]) if len(parts) == 1 else []
     checks = (_rays(sheet), focus, strehl, _pixels(design, sheet))
     return [sentence for check in (*checks, _pitch(sheet), _occupancy(sheet), _mask(sheet)) for sentence in check]
