@@ -95,15 +95,6 @@ def test_photon_transfer(gain, dtype):
     np.testing.assert_allclose(slope, 1 / gain, rtol=0.05)
 
 
-@pytest.mark.parametrize("level", [0.0, 400.0])
-def test_read_noise_and_offset(level):
-    camera = Camera(gain=0.25, offset=200.0, read_noise=3.0)
-    values = without_the_brightest(expose(flat(level), camera, KEY, peak_electrons=1000))
-    expected = math.sqrt(3**2 + level) / 0.25
-    np.testing.assert_allclose(values.std(), expected, rtol=5 / math.sqrt(2 * values.size))
-    np.testing.assert_allclose(values.mean(), 200 + level / 0.25, atol=5 * expected / math.sqrt(values.size))
-
-
 def test_a_dark_image_is_offset_and_read_noise():
     dark = jnp.zeros((400, 500))
     counts = np.asarray(expose(dark, Camera(), KEY, peak_electrons=1e4))

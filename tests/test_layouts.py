@@ -50,7 +50,7 @@ def scattered(count, size, seed):
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 2)) * size
 
 
-# 185 is near the fewest lenses that can do it, and takes a second or two.
+# 185 lenses hardly suffice, and take a second or two.
 CASES = [(count, seed) for count in (200, 213, 215) for seed in range(10)] + [(185, seed) for seed in range(3)]
 SLOW = [(185, seed) for seed in range(3, 20)]
 
