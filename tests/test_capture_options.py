@@ -103,12 +103,6 @@ def test_a_hot_pixel_is_repaired_unless_it_is_not_wanted(folder):
     assert volume.max() > 1000 and "bad pixel" not in result.stdout
 
 
-def test_a_camera_s_offset(folder):
-    volume, _, result = reconstruct("capture.tif", "--offset", "100")
-    assert "capture.tif: offset 100 taken off" in result.stdout
-    assert volume.max() < reconstruct("capture.tif")[0].max()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -149,19 +143,7 @@ def test_what_is_no_option_is_refused(folder, option):
 def test_deconvolve_reads_the_same_way(folder):
     save("capture.tif", np.stack([LIGHT, LIGHT]))
     save("psf.tif", 5 + np.pad([[50]], 6))
-    arguments = [
-        "deconvolve",
-        "capture.tif",
-        "psf.tif",
-        "--steps",
-        "1",
-        "-o",
-        "s.tif",
-        "--page",
-        "mean",
-        "--offset",
-        "5",
-    ]
+    arguments = "deconvolve capture.tif psf.tif --steps 1 -o s.tif --page mean --offset 5".split()
     result = CliRunner().invoke(commands, arguments, catch_exceptions=False)
     assert "2 captures: offset 5 taken off" in result.stdout
     assert "offset 5" in read_provenance("s.tif")["correction"]

@@ -8,6 +8,7 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
+from gs_jax.cli.options import Depths
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_points
@@ -70,18 +71,6 @@ def test_reconstruct(folder, monkeypatch, capsys, name):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("how", [("--method", "list-rl"), ("--method", "richardson-lucy"), ("--suppress", "unet")])
-def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
-    tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
-    # Without progress, which a busy machine shows.
-    command = (*RECONSTRUCT[:4], "18:22:1", "--voxel-um", "50", "--steps", "2", *how, "-o", "v.tif", "-q")
-    status, out, err = run(monkeypatch, capsys, *command)
-    assert (status, err) == (0, "") and out.startswith("v.tif: 5 x 39 x 33 voxels")
-    volume, _ = read_volume(folder / "v.tif")
-    assert np.isfinite(volume).all() and volume.min() >= 0
-
-
-@pytest.mark.integration
 def test_the_papers_clusters(folder, monkeypatch, capsys):
     """The brightest voxels of connected groups, here of one point seen by four lenses; in the volume and as a table."""
     image = np.full((96, 80), 16, np.uint16)
@@ -105,18 +94,7 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
     (folder / "design.toml").write_text(design)
     (folder / "points.csv").write_text("x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n")
     run(monkeypatch, capsys, "simulate", "points.csv", "design.toml", "-o", "capture.tif")
-    options = (
-        "--depths",
-        "19:21:0.25",
-        "--voxel-um",
-        "20",
-        "--suppress",
-        "points",
-        "-o",
-        "v.tif",
-        "--points",
-        "p.csv",
-    )
+    options = "--depths 19:21:0.25 --voxel-um 20 --suppress points -o v.tif --points p.csv".split()
     status, out, err = run(monkeypatch, capsys, "reconstruct", "capture.tif", "design.toml", *options)
     assert (status, err) == (0, "") and out.endswith("p.csv: 1 point\n")
     found = read_points(folder / "p.csv")[0]
@@ -126,17 +104,15 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
     assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
 
-def test_the_default_voxel_is_a_pixel_seen_at_the_middle_depth(folder, monkeypatch, capsys):
-    _, out, _ = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
-    expected = 20 * (20 + 1 / 1.43) / 5.8
-    assert f"{expected:.1f} um" in out
+def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
+    """The default voxel is a pixel as seen at the middle depth."""
+    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")
+    assert status == 0 and f"{20 * (20 + 1 / 1.43) / 5.8:.1f} um" in out and "at 20 mm" in out
 
 
-@pytest.mark.integration
-def test_depths_include_the_stop_only_when_it_falls_on_the_step(folder, monkeypatch, capsys):
-    for text, count in (("18:18.3:0.1", 4), ("18:18.25:0.1", 3), ("20:20:1", 1)):
-        status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], text, "-o", "v.tif")
-        assert status == 0 and out.startswith(f"v.tif: {count} x ")
+@pytest.mark.parametrize(("text", "count"), [("18:18.3:0.1", 4), ("18:18.25:0.1", 3), ("20:20:1", 1)])
+def test_depths_include_the_stop_only_when_it_falls_on_the_step(text, count):
+    assert len(Depths().convert(text, None, None)) == count
 
 
 POINTS = "x_mm,y_mm,z_mm,intensity\n0.02,-0.01,20,1\n0.1,0.05,21.5,2\n"

@@ -1,44 +1,45 @@
+"""Convolution with a measured PSF, its ADMM, and the deconvolution of images that SciPy convolved."""
+
+import inspect
 import math
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from jax.test_util import check_grads
-from scipy.signal import convolve2d
+from scipy.signal import convolve2d, fftconvolve
 
-from gs_jax.solvers.convolution import Convolution
+from gs_jax import ADMM, FISTA, InputError, RichardsonLucy
+from gs_jax.__main__ import commands
+from gs_jax.io.captures import read_capture, write_capture
+from gs_jax.io.provenance import read_provenance
+from gs_jax.reconstruction.deconvolution import deconvolve
+from gs_jax.solvers.base import differences, solve, total_variation
+from gs_jax.solvers.convolution import Convolution, ConvolutionADMM
 
-# Odd and even, larger and smaller than the image, one depth and several.
+# PSF and image, odd and even, larger and smaller than each other, one depth and several.
 SIZES = [((3, 4, 7), (11, 16)), ((2, 12, 15), (9, 10))]
 
 
-def system(psf_shape, image_shape, dtype=jnp.float64):
+def random_system(psf_shape, image_shape, dtype=jnp.float64):
     psf = jax.random.uniform(jax.random.key(0), psf_shape, dtype)
-    return psf, Convolution.of(psf, image_shape)
-
-
-def scene_of(convolution, dtype=jnp.float64):
-    return jax.random.normal(jax.random.key(1), convolution.scene_shape, dtype)
+    convolution = Convolution.of(psf, image_shape)
+    return psf, convolution, jax.random.normal(jax.random.key(1), convolution.scene_shape, dtype)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test_it_is_the_middle_of_scipys_convolution(sizes):
-    """Linear: nothing comes round from the far side."""
-    psf, convolution = system(*sizes)
-    scene = scene_of(convolution)
+def test_it_is_the_middle_of_scipys_linear_convolution(sizes):
+    psf, convolution, scene = random_system(*sizes)
     expected = 0
     for kernel, plane in zip(np.asarray(psf), np.asarray(scene), strict=True):
-        whole = convolve2d(plane, kernel)
+        full = convolve2d(plane, kernel)
         middle = [slice(k // 2, k // 2 + n) for k, n in zip(kernel.shape, plane.shape, strict=True)]
-        expected = expected + whole[*middle][convolution.window]
+        expected = expected + full[*middle][convolution.window]
     np.testing.assert_allclose(convolution(scene), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("sizes", SIZES)
-def test_every_pixel_of_the_psf_counts(sizes):
-    """The scene is large enough: in front of the image's corners, the whole PSF fits."""
-    psf, convolution = system(*sizes)
+    # The scene is large enough: in front of the image's corners the whole PSF fits.
     light = convolution.operator.T.mv(jnp.ones(convolution.image_shape))
     np.testing.assert_allclose(light.sum(), float(psf.sum()) * math.prod(convolution.image_shape), rtol=1e-12)
 
@@ -46,8 +47,8 @@ def test_every_pixel_of_the_psf_counts(sizes):
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 2e-6)])
 def test_adjoint(sizes, dtype, tolerance):
-    _, convolution = system(*sizes, dtype=dtype)
-    A, scene = convolution.operator, scene_of(convolution, dtype)
+    _, convolution, scene = random_system(*sizes, dtype=dtype)
+    A = convolution.operator
     image = jax.random.normal(jax.random.key(2), convolution.image_shape, dtype)
     forth, back = jnp.vdot(A.mv(scene), image), jnp.vdot(scene, A.T.mv(image))
     # Relative to the norms: the product itself may be near zero.
@@ -55,13 +56,209 @@ def test_adjoint(sizes, dtype, tolerance):
     np.testing.assert_allclose(forth, back, atol=tolerance * size)
 
 
-def test_gradients():
-    psf, convolution = system((2, 4, 5), (6, 7))
-    image_of = lambda psf, scene: Convolution.of(psf, (6, 7))(scene)
+def test_gradients_of_the_image():
+    psf, _, scene = random_system((2, 4, 5), (6, 7))
     # Bilinear: central differences of first order are exact but for rounding.
-    check_grads(image_of, (psf, scene_of(convolution)), order=1, eps=1e-2, atol=1e-8, rtol=1e-8)
-
-
-def test_a_wrong_psf_is_named():
+    check_grads(lambda psf, x: Convolution.of(psf, (6, 7))(x), (psf, scene), order=1, eps=1e-2, atol=1e-8, rtol=1e-8)
     with pytest.raises(ValueError, match=r"\(depth, row, column\) and not empty, got \(0, 3, 3\)"):
         Convolution.of(jnp.zeros((0, 3, 3)), (5, 5))
+
+
+def noisy_system(depths=1):
+    psf = jax.random.uniform(jax.random.key(0), (depths, 5, 4))
+    convolution = Convolution.of(psf, (12, 10))
+    scene = jnp.zeros(convolution.scene_shape).at[0, 5:8, 4:7].set(1.0).at[-1, 9, 9].set(2.0)
+    return convolution, convolution(scene) + 0.2 * jax.random.normal(jax.random.key(1), convolution.image_shape)
+
+
+def relative(convolution, image, **weights):
+    """Options of a solver, whose unit of weights is the largest voxel of the adjoint's scene."""
+    unit = convolution.operator.T.mv(image).max()
+    return {name: weight / unit for name, weight in weights.items()}
+
+
+def run(A, image, solver):
+    return jax.jit(lambda b: solve(A, b, solver))(image)
+
+
+def objective(convolution, image, x, *, tv, l1, isotropic=False):
+    residual = convolution(x) - image
+    variation = total_variation(differences(x, wrap=True), isotropic=isotropic)
+    return jnp.vdot(residual, residual) / 2 + tv * variation + l1 * jnp.sum(x)
+
+
+def numpy_admm(psf, image, steps, tv, l1, penalties=(1.0, 1.0, 1.0)):
+    """DiffuserCam's ADMM for one depth, written out: complex FFTs, three splits, multipliers and penalties."""
+    r, s, t = penalties
+    shape = [n + k - 1 for n, k in zip(image.shape, psf.shape, strict=True)]
+    corner = [(n - m) // 2 for n, m in zip(shape, image.shape, strict=True)]
+    window = slice(corner[0], corner[0] + image.shape[0]), slice(corner[1], corner[1] + image.shape[1])
+    kernel = np.zeros(shape)
+    kernel[: psf.shape[0], : psf.shape[1]] = psf
+    kernel = np.fft.fft2(np.roll(kernel, [-(k // 2) for k in psf.shape], (0, 1)))
+    forward = lambda x: np.fft.ifft2(kernel * np.fft.fft2(x)).real
+    adjoint = lambda x: np.fft.ifft2(kernel.conj() * np.fft.fft2(x)).real
+    step = lambda x: np.stack([np.roll(x, -1, 0) - x, np.roll(x, -1, 1) - x])
+    step_adjoint = lambda u: np.roll(u[0], 1, 0) - u[0] + np.roll(u[1], 1, 1) - u[1]
+    point = np.zeros(shape)
+    point[0, 0] = 1
+    inverse = 1 / (r * np.abs(kernel) ** 2 + s * np.fft.fft2(step_adjoint(step(point))).real + t)
+    seen, data = np.zeros(shape), np.zeros(shape)
+    seen[window], data[window] = 1, image
+    x = v = w = a = c = np.zeros(shape)
+    u = b = np.zeros((2, *shape))
+    for _ in range(steps):
+        v = (data + r * (forward(x) + a)) / (seen + r)
+        u = np.sign(d := step(x) + b) * np.maximum(np.abs(d) - tv / s, 0)
+        w = np.maximum(x + c - l1 / t, 0)
+        a, b, c = a + forward(x) - v, b + step(x) - u, c + x - w
+        target = r * adjoint(v - a) + s * step_adjoint(u - b) + t * (w - c)
+        x = np.fft.ifft2(inverse * np.fft.fft2(target)).real
+    w = np.maximum(x, 0)
+    residual = forward(w)[window] - image
+    return w, (residual**2).sum() / 2 + tv * np.abs(step(w)).sum() + l1 * w.sum()
+
+
+@pytest.mark.integration
+def test_the_cost_is_that_of_a_plain_numpy_version():
+    convolution, image = noisy_system()
+    psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
+    x, expected = numpy_admm(np.asarray(psf[0]), np.asarray(image), 4000, 0.05, 0.1)
+    solution = run(convolution, image, ConvolutionADMM(4000, **relative(convolution, image, tv=0.05, sparsity=0.1)))
+    np.testing.assert_allclose(objective(convolution, image, solution.x, tv=0.05, l1=0.1), expected, rtol=1e-8)
+    np.testing.assert_allclose(solution.costs[-1], expected, rtol=1e-8)
+    # The scenes differ in size by a margin that reaches no pixel and stays dark.
+    np.testing.assert_allclose(solution.x.sum(), x.sum(), rtol=1e-6)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("depths", [1, 2])
+def test_ffts_conjugate_gradients_and_fista_meet(depths):
+    """Sparsity alone, which all three have."""
+    convolution, image = noisy_system(depths)
+    sparse = relative(convolution, image, sparsity=0.2)
+    A, solvers = convolution.operator, (ADMM(500, **sparse), FISTA(1000, **sparse))
+    volumes = [run(convolution, image, ConvolutionADMM(3000, **sparse)).x, *(run(A, image, s).x for s in solvers)]
+    costs = [objective(convolution, image, x, tv=0.0, l1=0.2) for x in volumes]
+    np.testing.assert_allclose(costs, costs[-1], rtol=1e-8)
+
+
+@cache
+def minimum(depths, isotropic):
+    convolution, image = noisy_system(depths)
+    weights = relative(convolution, image, tv=0.05, sparsity=0.02)
+    return run(convolution, image, ConvolutionADMM(4000, isotropic=isotropic, **weights))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("depths", [1, 2])
+def test_total_variation_is_at_its_minimum(isotropic, depths):
+    """No direction leads down: random ones, toward the dark, and toward the solution of the other kind."""
+    convolution, image = noisy_system(depths)
+    solution = minimum(depths, isotropic)
+    cost = lambda x: float(objective(convolution, image, x, tv=0.05, l1=0.02, isotropic=isotropic))
+    noise = jax.random.normal(jax.random.key(3), (10, *solution.x.shape))
+    others = [solution.x * 0.99, minimum(depths, not isotropic).x]
+    others += [jnp.maximum(solution.x + 1e-3 * n, 0) for n in noise]
+    assert min(map(cost, others)) > cost(solution.x)
+    np.testing.assert_allclose(solution.costs[-1], cost(solution.x), rtol=1e-6)
+
+
+@pytest.mark.integration
+def test_the_penalty_adapts_and_the_residuals_stop_it():
+    convolution, image = noisy_system()
+    solver = ConvolutionADMM(3000, tolerance=1e-5, **relative(convolution, image, tv=0.05, sparsity=0.1))
+    scaled = jax.jit(lambda b, s: solve(convolution, s * b, solver))
+    for scale in (1e-3, 1e3):
+        solution = scaled(image, scale)
+        assert solution.converged and solution.steps < 2000
+        cost = objective(convolution, scale * image, solution.x, tv=0.05 * scale, l1=0.1 * scale) / scale**2
+        np.testing.assert_allclose(cost, solution.costs[solution.steps - 1] / scale**2, rtol=1e-3)
+
+
+@pytest.mark.integration
+def test_gradients_of_the_solution():
+    convolution, image = noisy_system()
+    psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
+    weight = jax.random.normal(jax.random.key(7), convolution.scene_shape)
+
+    def moment(psf, image, tv):
+        system = Convolution.of(psf, image.shape)
+        return jnp.vdot(weight, solve(system, image, ConvolutionADMM(4, tv=tv, isotropic=True)).x)
+
+    # Away from the kinks of soft thresholding at this generic point.
+    tv = jnp.asarray(relative(convolution, image, tv=0.05)["tv"])
+    check_grads(jax.jit(moment), (psf, image, tv), order=1, eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_a_dark_image_gives_zeros_and_finite_gradients(isotropic):
+    convolution, image = noisy_system(2)
+    solution = lambda b: solve(convolution, b, ConvolutionADMM(5, tv=0.1, isotropic=isotropic))
+    dark = jax.jit(solution)(0 * image)
+    assert not np.any(dark.x) and not np.any(dark.costs)
+    assert np.all(np.isfinite(jax.jit(jax.grad(lambda b: solution(b).x.sum()))(0 * image)))
+
+
+def test_low_frequencies_do_not_outweigh_the_regularizer():
+    """A diffuser's lowest are many times as strong as the rest: one penalty for all brings in the scene slowly.
+
+    LenslessPiCam's constant penalties, too, are beaten by far after so few steps.
+    """
+    psf = jax.random.uniform(jax.random.key(0), (1, 32, 30))
+    psf = psf / jnp.linalg.norm(psf)
+    convolution = Convolution.of(psf, (32, 30))
+    image = convolution(jnp.zeros(convolution.scene_shape).at[0, 20:40, 18:40].set(1.0))
+    image = image / jnp.linalg.norm(image)
+    x = run(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).x
+    cost = objective(convolution, image, x, tv=1e-4, l1=0.0)
+    for penalties in ((1.0, 1.0, 1.0), (1e-6, 1e-5, 4e-5)):
+        assert 4 * cost < numpy_admm(np.asarray(psf[0]), np.asarray(image), 20, 1e-4, 0.0, penalties)[1]
+
+
+def bars() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A scene of three bars, the PSF of seven spots, and the image on an offset of 100."""
+    rng = np.random.default_rng(0)
+    scene, psf = np.zeros((60, 80)), np.zeros((41, 41))
+    scene[20:40, 20:24], scene[20:40, 34:38], scene[10:14, 30:60] = 1, 2, 1.5
+    psf[tuple(rng.integers(4, 37, (2, 7)))] = 1
+    psf = fftconvolve(psf, np.outer(np.hanning(5), np.hanning(5)), mode="same").clip(0)
+    return scene, psf, 100 + 1000 * fftconvolve(scene, psf / psf.sum(), mode="same").clip(0)
+
+
+SOLVERS = [ConvolutionADMM(80, sparsity=0.0, tv=1e-4), FISTA(80, sparsity=0.0), RichardsonLucy(80, accelerate=True)]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
+def test_deconvolution_finds_a_scene_in_its_unit(solver):
+    scene, psf, image = bars()
+    found = deconvolve(image, 7 + 50 * psf, solver)
+    assert found.shape == scene.shape and found.min() >= 0
+    assert np.linalg.norm(found / 1000 - scene) < 0.35 * np.linalg.norm(scene)
+    assert found.sum() / 1000 == pytest.approx(scene.sum(), rel=0.1)
+
+
+def test_wrong_input_of_deconvolution_is_named():
+    _, psf, image = bars()
+    with pytest.raises(InputError, match="psf must be the image of a point, got no light"):
+        deconvolve(image, np.ones((5, 5)))
+    with pytest.raises(InputError, match="psf.* 1 of 9 pixels NaN"):
+        deconvolve(image, np.diag([1.0, np.nan, 1.0]))
+    with pytest.raises(InputError, match="solver must be an object such as .*, got <class .*FISTA'>"):
+        inspect.unwrap(deconvolve)(image, psf, FISTA)  # past the tests' check of annotations
+    assert not deconvolve(np.zeros((20, 20)), psf).any()
+
+
+def test_the_deconvolve_command(tmp_path):
+    _, psf, image = bars()
+    write_capture(tmp_path / "c.tif", image.astype(np.float32))
+    write_capture(tmp_path / "psf.npy", psf.astype(np.float32))
+    arguments = ["deconvolve", str(tmp_path / "c.tif"), str(tmp_path / "psf.npy"), "--steps", "5"]
+    output = ["-o", str(tmp_path / "s.tif")]
+    assert CliRunner().invoke(commands, arguments + output).exit_code == 0
+    assert read_capture(tmp_path / "s.tif").shape == image.shape
+    assert {"input c.tif", "input psf.npy"} < set(read_provenance(tmp_path / "s.tif"))
+    wrong = CliRunner().invoke(commands, [*arguments, "--method", "fista", "--tv", "0.1", *output]).exception
+    assert isinstance(wrong, InputError) and "--method admm or richardson-lucy" in str(wrong)

@@ -60,6 +60,10 @@ def test_help_imports_nothing_heavy():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("Usage: gs-jax") == len(names)
+    context = click.Context(commands)
+    for name in COMMANDS:
+        command = commands.get_command(context, name)
+        assert command and command.help and command.get_short_help_str(200).endswith(".")
 
 
 @pytest.mark.integration
@@ -103,25 +107,10 @@ def test_what_people_write_is_replaced_by_force_alone(folder, monkeypatch, capsy
     assert (folder / "c.csv").read_text() == "mine"
     status, _, err = run(monkeypatch, capsys, *layout, "--force")
     assert status == 0 and "replaced c.csv" in err and "x_mm" in (folder / "c.csv").read_text()
-
-
-def test_results_are_replaced_and_it_is_said(folder, monkeypatch, capsys):
+    # Results need no force.
     (folder / "v.tif").write_text("old")
     status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
     assert status == 0 and err.strip() == "gs-jax: replaced v.tif"
-
-
-@pytest.fixture(scope="module")
-def small_disk(tmp_path_factory):
-    """A file system with room for 4 KiB."""
-    place = tmp_path_factory.mktemp("disk")
-    try:
-        mount = ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place]
-        subprocess.run(mount, check=True, capture_output=True, timeout=10)
-    except (OSError, subprocess.SubprocessError) as error:
-        pytest.skip(f"no file system can be mounted: {error}")
-    yield place
-    subprocess.run(["umount", place], check=True)
 
 
 NOISE = np.random.default_rng(0).random((2, 99, 99), np.float32)
@@ -166,24 +155,12 @@ def test_a_full_disk_is_one_line_and_status_1(small_disk, monkeypatch, capsys, n
     assert list(small_disk.iterdir()) == []
 
 
-@pytest.mark.integration
-def test_a_command_on_a_full_disk_leaves_nothing(small_disk, folder, monkeypatch, capsys):
-    path = small_disk / "v.ome.tif"
-    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", path)
-    assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
-    assert list(small_disk.iterdir()) == []
-
-
 def test_resume_without_a_checkpoint_says_that(folder, monkeypatch, capsys):
     (folder / "study.toml").touch()
     optimize = ("optimize", "design.toml", "--study", "study.toml", "-o", "new.toml")
     for arguments in (optimize, ("train", "-o", "w.npz")):
         status, _, err = run(monkeypatch, capsys, *arguments, "--resume")
-        assert (
-            status == 2
-            and "--resume must be used after an interrupted run, got no checkpoint" in err
-            and "study" not in err
-        )
+        assert status == 2 and "--resume must be used after an interrupted run" in err and "study" not in err
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path, monkeypatch):
@@ -265,13 +242,6 @@ def _started(code, *arguments, cwd=None):
             process.kill()
 
 
-def test_help_says_what_each_command_does():
-    context = click.Context(commands)
-    for name in COMMANDS:
-        command = commands.get_command(context, name)
-        assert command and command.help and command.get_short_help_str(200).endswith(".")
-
-
 def test_what_is_being_written_is_removed_with_the_process(tmp_path):
     from gs_jax.io.files import remove_temporaries
 
@@ -279,16 +249,6 @@ def test_what_is_being_written_is_removed_with_the_process(tmp_path):
         temporary.write_text("{")
         remove_temporaries()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_depth_is_one_number(folder, monkeypatch, capsys):
-    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")
-    assert status == 0 and "at 20 mm" in out
-
-
-def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
-    status, out, _ = run(monkeypatch, capsys)
-    assert status == 0 and out.startswith("Usage: gs-jax") and "reconstruct" in out
 
 
 IMPORTING = f"""
@@ -305,12 +265,7 @@ with exit_on_signal():
 def test_an_interrupt_within_an_import_is_no_exception(tmp_path):
     """It would be raised in the middle of an extension's initialisation, which may crash."""
     (tmp_path / "slow_extension.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTING],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+    done = subprocess.run([sys.executable, "-c", IMPORTING], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "gs-jax: interrupted\n")
 
 

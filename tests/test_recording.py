@@ -88,6 +88,10 @@ def test_every_frame_is_reconstructed_as_alone(folder, monkeypatch, capsys, name
     # Of one type and compiled in one way: float32 rounding is the same.
     np.testing.assert_allclose(volumes(), expected(), rtol=1e-5)
     assert read_provenance("v.zarr")[f"input {os.path.basename(name)}"].startswith("5 frames")
+    # Without an interval, time has no unit.
+    (image,) = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]["multiscales"]
+    assert image["axes"][0] == {"name": "t", "type": "time"}
+    assert image["datasets"][0]["coordinateTransformations"][0]["scale"][0] == 1
 
 
 @pytest.mark.integration
@@ -106,11 +110,7 @@ def test_the_same_as_page_by_page(folder, monkeypatch, capsys):
 @pytest.mark.integration
 def test_a_network_is_checked_on_the_first_frame(folder, monkeypatch, capsys):
     status, out, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:2]), "--suppress", "unet"))
-    assert (
-        (status, beside_progress(err)) == (0, [])
-        and out.count("imaged again") == 1
-        and "v.zarr: frame 0 imaged again is" in out
-    )
+    assert (status, beside_progress(err)) == (0, []) and out.count("v.zarr: frame 0 imaged again is") == 1
 
 
 def test_what_viewers_are_told(folder, monkeypatch, capsys):
@@ -148,13 +148,6 @@ def test_what_viewers_are_told(folder, monkeypatch, capsys):
     assert options["axis_labels"] == ("t", "z", "y", "x") and options["units"] == ("s", "um", "um", "um")
     window = attributes["omero"]["channels"][0]["window"]
     assert window["min"] <= window["start"] < window["end"] <= window["max"] == whole[0].max()
-
-
-def test_without_an_interval_time_has_no_unit(folder, monkeypatch, capsys):
-    run(monkeypatch, capsys, *command(save("rec.tif")))
-    (image,) = json.loads((folder / "v.zarr" / "zarr.json").read_text())["attributes"]["ome"]["multiscales"]
-    assert image["axes"][0] == {"name": "t", "type": "time"}
-    assert image["datasets"][0]["coordinateTransformations"][0]["scale"][0] == 1
 
 
 def test_odd_ends_are_means_of_what_is_there():
@@ -380,3 +373,50 @@ def test_memory_is_flat(folder):
         peaks.append(float(done.stdout.splitlines()[-1]))
     # 50 more volumes are 6 MiB each.
     assert peaks[1] - peaks[0] < 60 * 2**20
+
+
+DEVICES = """
+import sys
+import numpy as np, jax
+from gs_jax import Grid, read_design, reconstruct
+from gs_jax.reconstruction.pipeline import backproject_on_all_devices
+from gs_jax.reconstruction.methods import BackProjection
+
+imager = read_design("design.toml").imager()
+image = np.random.default_rng(0).uniform(0, 100, imager.sensor.shape).astype(np.float32)
+methods = BackProjection(), BackProjection(interpolation="nearest", normalize=True)
+for count, method in ((1, methods[0]), (7, methods[1]), (50, methods[0])):
+    grid = Grid.over(imager.sensor, depths=np.linspace(18, 22, count), pitch=0.05)
+    np.save(f"{sys.argv[1]}-{count}.npy", reconstruct(image, imager, grid, method))
+if jax.device_count() > 1:
+    volume = backproject_on_all_devices(image, imager, grid.at(grid.depths[:7]))
+    assert len(volume.sharding.device_set) == jax.device_count()
+print(jax.device_count())
+"""
+
+
+def on_devices(devices: int, *arguments) -> str:
+    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.integration
+def test_depths_on_three_devices(folder):
+    """Also where two have none, where they have other numbers, and where there are several rounds."""
+    for devices in (1, 3):
+        assert on_devices(devices, "-c", DEVICES, str(devices)).strip() == str(devices)
+    for count in (1, 7, 50):
+        one, three = (np.load(folder / f"{devices}-{count}.npy") for devices in (1, 3))
+        # Float32: a program of other shapes rounds otherwise.
+        np.testing.assert_allclose(three, one, rtol=1e-5, atol=1e-5 * one.max())
+
+
+@pytest.mark.integration
+def test_a_recording_on_two_devices(folder):
+    save("rec.tif", FRAMES[:2])
+    for devices in (1, 2):
+        on_devices(devices, "-m", "gs_jax", *command("rec.tif", output=f"{devices}.zarr"))
+    one, two = volumes("1.zarr"), volumes("2.zarr")
+    np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-5 * one.max())

@@ -1,4 +1,4 @@
-"""The solvers, on every kind of operator."""
+"""Richardson-Lucy, FISTA and ADMM, on every kind of operator."""
 
 from functools import cache, partial
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 from scipy.optimize import nnls
-from skimage.restoration import richardson_lucy as of_skimage
+from skimage.restoration import denoise_tv_chambolle, richardson_lucy as of_skimage
 
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.solvers.admm import ADMM
-from gs_jax.solvers.base import lambda_max, solve
+from gs_jax.solvers.base import differences, differences_adjoint, lambda_max, shrink, solve, total_variation
 from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
@@ -97,31 +97,21 @@ def test_a_dark_image_gives_zeros(solver, operator):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_what_no_pixel_sees_stays_dark(solver):
-    """An operator of zeros: nothing is known, and nothing is NaN."""
-    A = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
-    found = jax.jit(lambda image: solve(A, image, SOLVERS[solver](steps=5)))(jnp.ones(30))
-    assert not np.any(found.x)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_images_may_be_integers(solver):
+def test_zero_operators_integers_and_float32(solver):
+    A, make = dense(), SOLVERS[solver]
+    zero = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
+    assert not np.any(jax.jit(lambda image: solve(zero, image, make(steps=5)).x)(jnp.ones(30)))
     image = jnp.arange(30, dtype=jnp.uint16)
-    run = jax.jit(lambda image: solve(dense(), image, SOLVERS[solver](steps=5)).x)
+    run = jax.jit(lambda image: solve(A, image, make(steps=5)).x)
     np.testing.assert_array_equal(run(image), run(image.astype(float)))
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_dark_image_ends_it_in_float32(solver):
-    A = lx.MatrixLinearOperator(dense().matrix.astype(jnp.float32))
-    options = SOLVERS[solver](steps=20, tolerance=1e-3)
-    found = jax.jit(lambda image: solve(A, image, options))(jnp.zeros(30, jnp.float32))
-    assert found.converged and found.x.dtype == jnp.float32 and not np.any(found.x)
-    assert np.isnan(found.costs[found.steps :]).all() and not np.isnan(found.costs[: found.steps]).any()
+    single = lx.MatrixLinearOperator(A.matrix.astype(jnp.float32))
+    dark = jax.jit(lambda image: solve(single, image, make(steps=20, tolerance=1e-3)))(jnp.zeros(30, jnp.float32))
+    assert dark.converged and dark.x.dtype == jnp.float32 and not np.any(dark.x)
+    assert np.isnan(dark.costs[dark.steps :]).all() and not np.isnan(dark.costs[: dark.steps]).any()
 
 
 def by_geometry():
-    """The ray operator by what it is made of."""
+    """The ray operator as a function of its parameters."""
     imager, grid = scene(voxels=(4, 3), pitch=0.2, depths=(18.0, 20.0))
 
     def operator(centers, v):
@@ -201,6 +191,9 @@ def test_least_squares_without_negative_values_is_scipys(solver):
 
 def test_the_convex_solvers_meet_with_sparsity():
     A = dense()
+    # Perron's eigenvalue is far above the next here.
+    largest = np.linalg.svd(np.asarray(A.as_matrix()), compute_uv=False)[0] ** 2
+    np.testing.assert_allclose(largest_eigenvalue(A), largest, rtol=1e-10)
     image = A.mv(light(A)) + 0.1 * jax.random.normal(jax.random.key(4), A.out_structure().shape)
     weight = 0.02 * A.T.mv(image).max()
 
@@ -214,14 +207,12 @@ def test_the_convex_solvers_meet_with_sparsity():
 
 
 @pytest.mark.parametrize("solver", [FISTA, ADMM])
-def test_the_unit_of_sparsity_leaves_nothing_but_darkness(solver):
-    """A weight of 1 is the least that does, at which the solvers would be slow."""
+def test_zero_is_optimal_from_a_sparsity_of_1(solver):
     A = dense()
     image = A.mv(light(A))
     run = jax.jit(lambda b, sparsity: solve(A, b, solver(steps=2000, sparsity=sparsity)).x)
     np.testing.assert_allclose(run(image, 1.01), 0, atol=1e-9)
     assert run(image, 0.99).max() > 1e-3
-    # Of a negative image there is nothing to be seen, and no negative weight.
     assert lambda_max(-image) == 0 and not np.any(run(-image, 0.5))
 
 
@@ -279,15 +270,13 @@ def test_richardson_lucy_fits_a_slow_background():
     shape = A.out_structure().shape
     slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
     jitted = cache(lambda knots: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, background_knots=knots))))
-    error = lambda image, background_knots: float(
-        jnp.linalg.norm(jitted(background_knots)(image).x - truth) / jnp.linalg.norm(truth)
-    )
+    error = lambda image, knots: float(jnp.linalg.norm(jitted(knots)(image).x - truth) / jnp.linalg.norm(truth))
     assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
     assert error(A.mv(truth), 3) < 0.1
     assert not jitted(3)(jnp.zeros(shape)).x.any()
 
 
-def test_light_that_no_voxel_explains_does_not_go_to_those_that_few_pixels_see():
+def test_unexplained_light_does_not_go_to_voxels_that_few_pixels_see():
     """A column of 16 pixels on a voxel of each, but for the last, which half a percent of a pixel sees."""
     A = lx.MatrixLinearOperator(jnp.diag(jnp.append(jnp.ones(15), 0.005)))
     image = jnp.ones(16)
@@ -298,12 +287,10 @@ def test_light_that_no_voxel_explains_does_not_go_to_those_that_few_pixels_see()
     assert held[-1] < 4
 
 
-def test_tents_are_climbed_where_there_are_fewer_pixels():
-    image = jnp.ones((3, 40))
-    background_knots = jnp.ones((8, 8))
-    np.testing.assert_allclose(bilinear_background(background_knots, image), 1, rtol=1e-12)
-    found = np.asarray(background_step(background_knots, 2 * image))
-    assert np.isfinite(found).all() and set(np.round(np.unique(found), 9)) == {0.0, 2.0}
+def test_the_background_may_have_more_knots_than_there_are_pixels():
+    image, knots = jnp.ones((3, 40)), jnp.ones((8, 8))
+    np.testing.assert_allclose(bilinear_background(knots, image), 1, rtol=1e-12)
+    assert set(np.round(np.unique(np.asarray(background_step(knots, 2 * image))), 9)) == {0.0, 2.0}
 
 
 def test_richardson_lucy_climbs_and_keeps_the_light():
@@ -313,13 +300,6 @@ def test_richardson_lucy_climbs_and_keeps_the_light():
     assert np.all(np.diff(found.costs) <= 1e-12)
     # After each step the expected image holds as much light as the image (Lucy 1974).
     np.testing.assert_allclose(A.mv(found.x).sum(), image.sum(), rtol=1e-12)
-
-
-def test_largest_eigenvalue():
-    A = dense()
-    expected = np.linalg.svd(np.asarray(A.as_matrix()), compute_uv=False)[0] ** 2
-    # From below; Perron's eigenvalue stands far from the next here.
-    np.testing.assert_allclose(largest_eigenvalue(A), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -336,3 +316,61 @@ def test_wrong_arguments_are_named(solver):
         RichardsonLucy(background_knots=1)
     with pytest.raises(InputError, match="image must be 2-D .*, got 1-D"):
         solve(dense(), jnp.zeros(30), RichardsonLucy(background_knots=2))
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+def test_differences_and_their_adjoint(wrap):
+    x = jax.random.normal(jax.random.key(0), (3, 1, 5))
+    d = differences(x, wrap=wrap)
+    end = x[:1] if wrap else x[-1:]
+    np.testing.assert_array_equal(d[0], np.diff(x, axis=0, append=end))
+    assert d.shape == (2, 3, 1, 5)  # nothing along an axis of 1
+    u = jax.random.normal(jax.random.key(1), d.shape)
+    np.testing.assert_allclose(jnp.vdot(d, u), jnp.vdot(x, differences_adjoint(u, wrap=wrap)), rtol=1e-12)
+    assert differences(jnp.ones((1, 1, 1)), wrap=wrap).shape == (0, 1, 1, 1)
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+def test_shrinking_is_the_proximal_map(isotropic):
+    """Moreau: what is taken away lies in the dual ball, and touches it where something is left."""
+    u = jax.random.normal(jax.random.key(0), (2, 4, 5, 6))
+    left = shrink(u, 0.7, isotropic=isotropic)
+    taken, size = u - left, lambda v: jnp.sqrt(jnp.sum(v**2, axis=0)) if isotropic else jnp.abs(v)
+    assert size(taken).max() <= 0.7 + 1e-12
+    np.testing.assert_allclose(size(taken)[size(left) > 0], 0.7, rtol=1e-12)
+    np.testing.assert_allclose(jnp.vdot(taken, left), 0.7 * total_variation(left, isotropic=isotropic), rtol=1e-12)
+    gradient = jax.grad(lambda u: shrink(u, 0.7, isotropic=isotropic).sum())(jnp.zeros_like(u))
+    assert not np.any(gradient)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("tv", [0.0, 0.01])
+def test_few_applications_of_the_operator_reach_the_minimum(tv):
+    """Fewer equations than unknowns, as of a volume. FISTA's power method is not counted."""
+    A = lx.MatrixLinearOperator(jax.random.uniform(jax.random.key(0), (60, 120)))
+    scene = jnp.zeros(120).at[jnp.array([3, 20, 21, 50])].set(1.0)
+    image = A.mv(scene) + 0.05 * jax.random.normal(jax.random.key(1), (60,))
+    unit = A.T.mv(image).max()
+
+    def final(solver):
+        x = jax.jit(lambda b: solve(A, b, solver).x)(image)
+        residual = A.mv(x) - image
+        variation = total_variation(differences(x, wrap=False), isotropic=False)
+        return float(jnp.vdot(residual, residual) / 2 + unit * (tv * variation + 0.01 * jnp.sum(x)))
+
+    found, least = (final(ADMM(steps, sparsity=0.01, tv=tv)) for steps in (20, 2000))
+    assert found < 1.03 * least
+    if not tv:
+        assert found < 0.8 * final(FISTA(60, sparsity=0.01))
+        np.testing.assert_allclose(least, final(FISTA(2000, sparsity=0.01)), rtol=1e-6)
+
+
+def test_isotropic_total_variation_denoises_as_scikit_image_does():
+    """The identity as operator; Chambolle's dual method, without wrapping, is what scikit-image has."""
+    image = 3 + jnp.zeros((16, 14)).at[4:9, 5:11].set(2.0) + 0.3 * jax.random.normal(jax.random.key(2), (16, 14))
+    A = lx.IdentityLinearOperator(jax.ShapeDtypeStruct(image.shape, image.dtype))
+    solver = ADMM(600, sparsity=0.0, tv=0.4 / image.max(), isotropic=True)
+    found = jax.jit(lambda b: solve(A, b, solver))(image)
+    expected = denoise_tv_chambolle(np.asarray(image), weight=0.4, eps=1e-12, max_num_iter=20000)
+    # Both converge sublinearly; Chambolle's is at about 1e-4 after so many.
+    np.testing.assert_allclose(found.x, expected, atol=2e-3)
