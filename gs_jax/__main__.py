@@ -1,7 +1,7 @@
-"""The command line: what runs a command and says what went wrong.
+"""The command line: runs a command, and turns errors into one line and an exit status.
 
-Exit status 0 on success; 2 on wrong input, 1 where files cannot be read or written, 130 on Ctrl-C and 143 on SIGTERM,
-each with one line and no traceback; 1 otherwise.
+The exit status is 0 on success; 2 on wrong input, 1 if a file cannot be read or written, 130 on Ctrl-C and 143 on
+SIGTERM, each with one line and no traceback; 1, with a traceback, on faults of the program.
 """
 
 import sys
@@ -18,8 +18,8 @@ from .base.progress import QUIET, VERBOSE, shown
 from .cli.files import ARGUMENTS
 from .cli.interrupt import exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
 
-# Of a message; what is at its end is the least.
-_LONGEST = 380
+# Longer messages are cut: their ends matter least.
+_MAX_MESSAGE = 380
 # The module of each command in `gs_jax/cli`, imported when the command is used: some need seconds that others do not.
 COMMANDS = {
     "reconstruct": "reconstruct",
@@ -44,7 +44,7 @@ COMMANDS = {
 
 
 def main(leave: Callable[[int], object] = sys.exit) -> None:
-    """Run the command line, and exit; `leave` is how, after an interrupt."""
+    """Run the command line and exit, after an interrupt by `leave`."""
     partial_outputs.clear()
     try:
         status = commands.main(standalone_mode=False, prog_name="gs-jax")
@@ -56,7 +56,7 @@ def main(leave: Callable[[int], object] = sys.exit) -> None:
         click.echo(interrupt_message(), err=True)
         leave(exit_status(error.__cause__ or error))
     except OSError as error:
-        # A full disk or a vanished folder is nobody's wrong input; what has no number is a fault of ours.
+        # A full disk or a missing folder; errors without a number are faults of the program.
         if error.errno is None:
             raise
         where = f"{error.filename}: " if error.filename else ""
@@ -66,13 +66,13 @@ def main(leave: Callable[[int], object] = sys.exit) -> None:
 
 
 def script() -> None:
-    """`main` as a process of its own, which signals end soon."""
+    """Run `main` as a process that ends soon after a signal."""
     with exit_on_signal():
         main(exit_now)
 
 
 def _fail(message: str, status: int) -> None:
-    click.echo(f"gs-jax: {message}" if len(message) <= _LONGEST else f"gs-jax: {message[:_LONGEST]} ...", err=True)
+    click.echo(f"gs-jax: {message[:_MAX_MESSAGE]}{' ...' * (len(message) > _MAX_MESSAGE)}", err=True)
     sys.exit(status)
 
 
@@ -103,25 +103,25 @@ def _set_level(context: click.Context, param: click.Parameter, value: bool) -> N
 _LEVELS = [
     click.Option(names, is_flag=True, expose_value=False, callback=_set_level, help=text)
     for names, text in (
-        (["-q", "--quiet"], "Show no progress, and not what is replaced."),
-        (["-v", "--verbose"], "Say after each piece of work how long it took."),
+        (["-q", "--quiet"], "Show no progress and no replaced files."),
+        (["-v", "--verbose"], "Print the duration of each step."),
     )
 ]
 
 
 @contextmanager
-def _questions_in_one_line() -> Iterator[None]:
-    """Each `InputWarning` is said once."""
-    said = set()
+def _print_warnings_once() -> Iterator[None]:
+    """Print each `InputWarning` once, in one line."""
+    printed = set()
     with warnings.catch_warnings():
-        usual = warnings.showwarning
+        show_other = warnings.showwarning
         warnings.simplefilter("always", InputWarning)
 
         def show(message, category, *place, **more):
             if not issubclass(category, InputWarning):
-                usual(message, category, *place, **more)
-            elif str(message) not in said:
-                said.add(str(message))
+                show_other(message, category, *place, **more)
+            elif str(message) not in printed:
+                printed.add(str(message))
                 click.echo(f"gs-jax: {' '.join(str(message).split())}", err=True)
 
         warnings.showwarning = show
@@ -137,7 +137,7 @@ def _questions_in_one_line() -> Iterator[None]:
 def commands():
     """Design, simulate and reconstruct with lensless 3-D microscopes of random microlenses."""
     context = click.get_current_context()
-    context.with_resource(_questions_in_one_line())
+    context.with_resource(_print_warnings_once())
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
 

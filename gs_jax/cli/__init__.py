@@ -1,1 +1,1 @@
-"""The commands, one file each; `gs_jax.__main__` lists them."""
+"""Commands of `gs-jax`; `gs_jax.__main__` lists the module of each."""

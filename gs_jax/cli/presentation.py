@@ -23,15 +23,7 @@ from .options import DESIGN, CaptureOptions, capture_options
 @click.option("--capture", type=Path, help="CAPTURE.tif: the capture of VOLUME.")
 @click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
 @capture_options
-def report_command(
-    design: Path,
-    volume: Path | None,
-    output: Path,
-    points: Path | None,
-    capture: Path | None,
-    tolerance: Path | None,
-    camera: CaptureOptions,
-):
+def report_command(design: Path, volume: Path | None, output: Path, camera: CaptureOptions, **files: Path | None):
     """Write one page, for any browser and without a network, about the microscope of DESIGN and a reconstruction.
 
     VOLUME is an output of `gs-jax reconstruct`. The page has the device to scale, the datasheet and violated
@@ -40,38 +32,33 @@ def report_command(
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
-    check_output(output, [".html"])
-    check_may_write(output, inputs=(design, volume, points, capture, tolerance, *camera.files))
-    if volume and volume.suffix.lower() in (".csv", ".toml"):
-        raise InputError(f"{volume}: VOLUME must be .ome.tif or .zarr; points are given by --points.")
     from ..apps.report.page import write_report
     from ..apps.report.report_tables import read_tolerance
     from ..design.design import design_text, read_design
+    from ..io.point_tables import read_points
     from ..io.provenance import read_provenance
+    from ..io.volumes import read_volume
 
-    microscope = read_design(design)
-    given, origins = {}, {}
+    points, capture, tolerance = files["points"], files["capture"], files["tolerance"]
+    inputs = (design, volume, points, capture, tolerance)
+    check_output(output, [".html"])
+    check_may_write(output, inputs=(*inputs, *camera.files))
+    if volume and volume.suffix.lower() in (".csv", ".toml"):
+        raise InputError(f"{volume}: VOLUME must be .ome.tif or .zarr; points are given by --points.")
+    microscope, results = read_design(design), {}
     if volume:
-        from ..io.volumes import read_volume
-
-        given["volume"], given["grid"] = read_volume(volume)
+        results["volume"], results["grid"] = read_volume(volume)
     if points:
-        from ..io.point_tables import read_points
-
-        given["points"] = read_points(points)
+        results["points"] = read_points(points)
     if capture:
         camera.imager(microscope.imager())
-        given["image"] = camera.read(capture)
+        results["image"] = camera.read(capture)
     if tolerance:
-        given["tolerance"] = read_tolerance(tolerance)
-    for path in (volume, points, capture, tolerance):
-        if path:
-            origins[path.name] = read_provenance(path)
-    provenance = provenance_of(design, volume, points, capture, tolerance, design=design_text(microscope))
+        results["tolerance"] = read_tolerance(tolerance)
+    origins = {path.name: read_provenance(path) for path in inputs[1:] if path}
+    provenance = camera.recorded(provenance_of(*inputs, design=design_text(microscope)))
     with Progress() as progress, errors_name_file(design):
-        write_report(
-            output, microscope, **given, origins=origins, provenance=camera.recorded(provenance), progress=progress
-        )
+        write_report(output, microscope, **results, origins=origins, provenance=provenance, progress=progress)
     camera.print_corrections()
     click.echo(f"{output}: {output.stat().st_size / 1e6:.1f} MB, opens in any browser")
 

@@ -1,1 +1,1 @@
-"""From a capture to a volume, whatever the method."""
+"""Reconstruction of volumes from captures, by any method."""

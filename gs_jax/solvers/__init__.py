@@ -1,1 +1,1 @@
-"""Iterative reconstruction, for any linear operator."""
+"""Iterative solvers for any linear operator."""
