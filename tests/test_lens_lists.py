@@ -52,7 +52,7 @@ def test_columns_of_the_centers(tmp_path):
     (tmp_path / "c.csv").write_text(COLUMNS)
     file = {"array.centers_mm": MISSING, "array.centers_file": "c.csv"}
     assert read_design(written(tmp_path, keys | file)) == lists
-    both = "found `lens.radius_of_curvature_mm` and a column", "`array.centers_file`", "one of them"
+    both = "only one of `lens.radius_of_curvature_mm`", "`array.centers_file`"
     message_of(with_file(tmp_path, COLUMNS), *both)
     message_of(with_file(tmp_path, COLUMNS.replace("1,9", "thick")), "line 3, radius_of_curvature_mm", "thick")
     twice = COLUMNS.replace("conic_constant", "radius_of_curvature_mm")
@@ -60,8 +60,8 @@ def test_columns_of_the_centers(tmp_path):
 
 
 WRONG = [
-    ({"lens.radius_of_curvature_mm": [2.0, 1.9]}, ["`lens.radius_of_curvature_mm`", "found 2", "one, or 3"]),
-    ({"lens.conic_constant": [0.0] * 4}, ["`lens.conic_constant`", "found 4", "one, or 3"]),
+    ({"lens.radius_of_curvature_mm": [2.0, 1.9]}, ["`lens.radius_of_curvature_mm`", "one number or 3", "got 2"]),
+    ({"lens.conic_constant": [0.0] * 4}, ["`lens.conic_constant`", "one number or 3", "got 4"]),
     ({"lens.radius_of_curvature_mm": [2.0, "a", 2]}, ["`lens.radius_of_curvature_mm[1]`", "'a'", "for each lens"]),
     ({"lens.radius_of_curvature_mm": [2.0, -1.0, 2]}, ["`lens.radius_of_curvature_mm[1]`", "-1.0"]),
     ({"lens.aperture_diameter_mm": []}, ["`lens.aperture_diameter_mm`", "found []", "for each lens"]),

@@ -113,6 +113,19 @@ def test_what_people_write_is_replaced_by_force_alone(folder, monkeypatch, capsy
     assert status == 0 and err.strip() == "gs-jax: replaced v.tif"
 
 
+@pytest.fixture(scope="module")
+def small_disk(tmp_path_factory):
+    """A file system with room for 4 KiB."""
+    place = tmp_path_factory.mktemp("disk")
+    try:
+        mount = ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place]
+        subprocess.run(mount, check=True, capture_output=True, timeout=10)
+    except (OSError, subprocess.SubprocessError) as error:
+        pytest.skip(f"no file system can be mounted: {error}")
+    yield place
+    subprocess.run(["umount", place], check=True)
+
+
 NOISE = np.random.default_rng(0).random((2, 99, 99), np.float32)
 GRID = Grid([18.0, 20.0], NOISE.shape[1:], 0.1)
 MESH = Mesh(NOISE.reshape(-1, 3)[:999], np.arange(999).reshape(-1, 3))

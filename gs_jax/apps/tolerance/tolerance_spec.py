@@ -6,9 +6,8 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from ...base.errors import InputError
-from ...io.files import read_text
+from ...io.files import PathLike, read_text
 from ...io.toml import Table, one_line
-from ...typing import PathLike
 
 
 def _field(default: float, most: float, unit: str, title: str, *, least: float = 0.0) -> Any:
