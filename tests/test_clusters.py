@@ -72,21 +72,14 @@ def test_of_equal_voxels_the_first_is_the_point():
     assert (x, y, z, value) == (pytest.approx(-0.1), 0, 20, 1)
 
 
-@pytest.mark.parametrize("value", [0.0, 3.0, -1.0])
-def test_a_flat_volume_has_no_points(value):
-    assert find_clusters(np.full((2, 6, 6), value), Grid([18.0, 20.0], (6, 6), 0.1)).shape == (0, 4)
-
-
-@pytest.mark.parametrize(
-    ("volume", "thresholds", "words"),
-    [
-        (np.zeros((1, 6, 6)), (0.1,), r"grid's shape \(2, 6, 6\), got \(1, 6, 6\)"),
-        (np.zeros((2, 6, 6)), (0.1, 1.0), r"between 0 and 1, got \(0.1, 1.0\)"),
-    ],
-)
-def test_wrong_volumes_and_thresholds_are_named(volume, thresholds, words):
-    with pytest.raises(ValueError, match=words):
-        find_clusters(volume, Grid([18.0, 20.0], (6, 6), 0.1), thresholds=thresholds)
+def test_flat_and_wrong_volumes():
+    grid = Grid([18.0, 20.0], (6, 6), 0.1)
+    for value in (0.0, 3.0, -1.0):
+        assert find_clusters(np.full((2, 6, 6), value), grid).shape == (0, 4)
+    with pytest.raises(ValueError, match=r"grid's shape \(2, 6, 6\), got \(1, 6, 6\)"):
+        find_clusters(np.zeros((1, 6, 6)), grid)
+    with pytest.raises(ValueError, match=r"between 0 and 1, got \(0.1, 1.0\)"):
+        find_clusters(np.zeros((2, 6, 6)), grid, thresholds=(0.1, 1.0))
 
 
 def test_clusters_of_noise_are_left_out():
