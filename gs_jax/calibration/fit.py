@@ -23,7 +23,6 @@ from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
 from .initial_guess import guess_from_pattern, guess_without_lenses
-from .point_sources import Sources, SpotLists, Spots, assign_spots, find_spots_mm
 from .spot_model import (
     FITTABLE,
     FITTED,
@@ -43,6 +42,7 @@ from .spot_model import (
     trace_core_offsets,
     weighted_residuals,
 )
+from .spots import Sources, SpotLists, Spots, assign_spots, find_spots_mm
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)

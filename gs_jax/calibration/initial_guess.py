@@ -22,8 +22,8 @@ from ..geometry import Imager
 from ..lenses import EACH, lenses_by_type
 from ..optics.raytrace import to_numpy
 from ..typing import Image
-from .point_sources import Sources, SpotLists, assign_spots, classify_lenses
 from .spot_model import match_radius, trace_core_offsets, with_centers
+from .spots import Sources, SpotLists, assign_spots, classify_lenses
 
 # Brightest spots of each source that pairs begin with, and that are matched; sources and neighbours at most.
 _FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12

@@ -74,8 +74,8 @@ def calibrate_command(
 
     from ..calibration.calibrated_design import apply_calibration, plot_residuals, summary_table
     from ..calibration.fit import SELF_FITTED, calibrate, self_calibrate
-    from ..calibration.point_sources import Sources
     from ..calibration.spot_model import FITTED
+    from ..calibration.spots import Sources
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions

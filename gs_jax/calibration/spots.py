@@ -1,4 +1,4 @@
-"""Point sources of a calibration, their spots in captures, and which spot belongs to which source and lens.
+"""Point sources of a calibration, their spots in captures, and the assignment of spots to sources and lenses.
 
 The middle of a spot is where a Gaussian window that moves to the centroid of what it sees comes to rest (mean shift),
 so that rays far from the core do not count.
