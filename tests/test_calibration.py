@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from experiments.calibration import NAMES, device, on_captures, true_values
 from gs_jax import (
     Camera,
+    Design,
     Grid,
     Imager,
     InputError,
@@ -45,8 +46,8 @@ from .helpers import needs
 POINTS = np.array([[0.4, -0.3, 18.0], [-1.0, 0.2, 20.0], [0.3, 1.1, 22.0]])
 
 
-def drawn(places, shape, seed=0, noise=2.0) -> np.ndarray:
-    """Gaussian spots `(row, column)` on an offset, with noise, a hot pixel and a spot of nothing."""
+def render_spots(places, shape, seed=0, noise=2.0) -> np.ndarray:
+    """Gaussian spots at `(row, column)` on an offset, with noise, a hot pixel and a spot of no source."""
     rng = np.random.default_rng(seed)
     image = rng.normal(100, noise, shape)
     side = np.arange(-8, 9)
@@ -59,10 +60,10 @@ def drawn(places, shape, seed=0, noise=2.0) -> np.ndarray:
     return image
 
 
-def spots_of(imager: Imager, point) -> np.ndarray:
-    """Where exact rays put the cores of a point's spots, `(row, column)`, nearest lenses first; a tenth is missing.
+def traced_spots(imager: Imager, point) -> np.ndarray:
+    """Trace the cores of a point's spots, `(row, column)`, nearest lenses first, without a tenth of them.
 
-    In the plate's own frame, from which vertices and rays are turned into the sensor's: the tilt is exact.
+    Computed in the plate's frame and rotated into the sensor's, so that the tilt is exact.
     """
     tilt = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt)
     steepest = np.append(tilt, 0) / max(np.linalg.norm(tilt), 1e-12)
@@ -86,10 +87,10 @@ def spots_of(imager: Imager, point) -> np.ndarray:
 
 
 def captures(imager: Imager, points=POINTS, of=None) -> list[np.ndarray]:
-    """Each with the points that `of` says, by default one."""
+    """Captures of points, whose capture numbers are `of`; by default one point in each."""
     of = np.arange(len(points)) if of is None else np.asarray(of)
-    places = [np.concatenate([spots_of(imager, p) for p in points[of == k]]) for k in range(of.max() + 1)]
-    return [drawn(each, imager.sensor.shape, seed) for seed, each in enumerate(places)]
+    places = [np.concatenate([traced_spots(imager, p) for p in points[of == k]]) for k in range(of.max() + 1)]
+    return [render_spots(each, imager.sensor.shape, seed) for seed, each in enumerate(places)]
 
 
 def check(found: Calibration, actual: Imager, names=NAMES, **also):
@@ -105,7 +106,7 @@ def test_spots_are_found_within_a_fiftieth_of_a_pixel():
     rng = np.random.default_rng(0)
     places = np.stack(np.meshgrid(*2 * [np.linspace(250, 900, 6)], indexing="ij"), -1).reshape(-1, 2)
     places = places + rng.uniform(-0.5, 0.5, places.shape)
-    found = find_spots(drawn(places, (1000, 1000)), 60)
+    found = find_spots(render_spots(places, (1000, 1000)), 60)
     distance = np.linalg.norm(found[:, None] - places, axis=-1).min(0)
     assert distance.max() < 0.05 and np.sqrt((distance**2).mean()) < 0.02
     assert len(find_spots(np.random.default_rng(1).normal(100, 2, (300, 300)), 60)) == 0
@@ -417,14 +418,9 @@ def test_the_command(tmp_path):
     # Wide enough for the whole plate: designs whose lenses cannot be seen are refused.
     wide = Sensor((2400, 2400), 0.006)
     actual, design = (dataclasses.replace(imager, sensor=wide) for imager in (actual, design))
-    pairs = tuple(map(tuple, np.asarray(design.array.centers, float).tolist()))
-    plain = geomscope(sensor_distance_mm=float(design.sensor_distance))
-    tables = {
-        "array": plain.array.model_copy(update={"centers_mm": pairs, "size_mm": (14.0, 14.0)}),
-        "sensor": plain.sensor.model_copy(update={"pixel_pitch_um": 6.0, "shape": design.sensor.shape}),
-        "imaging": plain.imaging.model_copy(update={"field_radius_mm": design.field_radius}),
-    }
-    write_design(tmp_path / "design.toml", plain.model_copy(update=tables))
+    array = dataclasses.replace(design.array, size=(14.0, 14.0))
+    listed = dataclasses.replace(design, array=array)
+    write_design(tmp_path / "design.toml", Design.from_imager(listed, name="small", working_distance_mm=(18.0, 30.0)))
     names = []
     for number, image in enumerate(captures(actual)):
         names.append(str(tmp_path / f"{number}.tif"))
