@@ -104,14 +104,14 @@ def sample_views(points: Float[np.ndarray, "point 3"], image: DetectionImage, im
     # k = 1 would drop the axis of lenses.
     distance, lens = tree.query(from_axis, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
-    distance, lens = np.where(seen, distance, 0), np.where(seen, lens, 0)
-    pixels = np.asarray(imager.sensor.to_pixels(host.views(points[:, None], lens).spot))
+    views = host.views(points[:, None], np.where(seen, lens, 0))
+    pixels = np.asarray(imager.sensor.to_pixels(views.spot))
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
     row, column = np.moveaxis(np.floor(pixels + 0.5).astype(int), -1, 0)
     interpolated = map_coordinates(image.light, np.moveaxis(pixels, -1, 0), np.float64, order=1, mode="nearest")
     light, noise = (np.where(seen, part, 0) for part in (interpolated, image.noise[row, column].astype(np.float64)))
-    return ViewSamples(pixels, light, noise, distance, seen)
+    return ViewSamples(pixels, light, noise, np.where(seen, distance, 0), seen)
 
 
 def sample_views_by_type(
