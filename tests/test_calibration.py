@@ -444,7 +444,7 @@ def test_the_command(tmp_path):
             "p.csv: positions: every capture needs one or more sources, got 1 sources for 3 captures",
         ),
         (["--from-scene"], "calibrate needs --positions"),
-        (["--fit", "focus"], "found 'focus', allowed: sensor-distance, rotation"),
+        (["--fit", "focus"], "must be some of sensor-distance, rotation"),
     ):
         wrong = CliRunner().invoke(commands, [*arguments, str(tmp_path / "other.toml"), *more])
         assert message in f"{wrong.exception} {wrong.output}" and wrong.exit_code
