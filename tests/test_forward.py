@@ -14,7 +14,7 @@ from scipy.special import erf
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
 from gs_jax.apps.benchmark_measure import peak_mib
 from gs_jax.geometry import envelope
-from gs_jax.projection.point_sources import STEPS, forward_points, stamps
+from gs_jax.projection.point_sources import STEPS, forward_points, make_stamps
 
 from .helpers import scene
 
@@ -93,7 +93,7 @@ def test_light_of_chief_rays_beside_the_sensor():
     beside = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((41, 41), 0.01), 5.0, 3.0, shift=(0.22, 0.0))
     fine = np.zeros((1, 55, 55))
     fine[0, 20:35, 20:35] = 1 / 225
-    point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, stamps(np.array([20.0]), fine))
+    point = forward_points(np.array([[0.0, 0.0, 20.0, 1.0]]), beside, make_stamps(np.array([20.0]), fine))
     kernel = jnp.asarray(fine.reshape(1, 11, 5, 11, 5).sum((2, 4)))
     np.testing.assert_allclose(forward(jnp.ones((1, 1, 1)), beside, lone, kernel), point, atol=1e-6)
 
@@ -224,7 +224,7 @@ def test_points_are_gaussians_where_the_chief_rays_land():
     points = np.array([[0.03, 0.01, 20.0, 2.0], [-0.11, 0.12, 21.0, 1.0], [1.45, 0.3, 20.5, 1.0]])
     width, size = np.array([0.03, 0.05]), 25 * STEPS
     fine = np.stack([np.outer(*2 * [line(size, (size - 1) / 2, w, 0.02 / STEPS)]) for w in width])
-    image = forward_points(points, imager, stamps(np.array([20.0, 22.0]), fine))
+    image = forward_points(points, imager, make_stamps(np.array([20.0, 22.0]), fine))
     expected = np.zeros((120, 100))
     pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
     for (x, y, z, intensity), places in zip(points, pixels.swapaxes(0, 1), strict=True):
@@ -269,7 +269,7 @@ def test_many_points_are_spots_one_by_one(dtype):
     points[0, :2] = imager.centers[0]
     depths, fine = np.array([18.0, 19.0, 22.0]), np.zeros((3, 5 * STEPS, 5 * STEPS))
     fine[:, 2:-2, 2:-2] = rng.uniform(0, 1, (3, 21, 21))  # a margin for what moves
-    image = forward_points(points.astype(dtype), imager, stamps(depths, fine.astype(dtype)))
+    image = forward_points(points.astype(dtype), imager, make_stamps(depths, fine.astype(dtype)))
     assert image.dtype == dtype
     expected = spots_one_by_one(points.astype(dtype), imager, depths, fine)
     if dtype == jnp.float64:
@@ -285,7 +285,7 @@ def test_many_points_take_little_memory():
     centers = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0)), -1).reshape(-1, 2)
     imager = Imager(MicrolensArray(centers), Sensor((64, 64), 0.3), 5.8, 0.25)
     points = np.random.default_rng(6).uniform([0, 0, 20, 1], [20, 10, 22, 2], (50_000, 4))
-    kernels = stamps(np.array([20.0, 22.0]), np.ones((2, 15, 15)))
+    kernels = make_stamps(np.array([20.0, 22.0]), np.ones((2, 15, 15)))
     forward_points(points[:10], imager, kernels)
     memory, image = peak_mib(lambda: forward_points(points, imager, kernels))
     assert image.any() and not memory > 100  # NaN where it is not known
@@ -293,7 +293,7 @@ def test_many_points_take_little_memory():
 
 def test_no_points_give_a_dark_image():
     imager, _ = scene()
-    image = forward_points(np.zeros((0, 4)), imager, stamps(np.array([20.0]), np.ones((1, 15, 15))))
+    image = forward_points(np.zeros((0, 4)), imager, make_stamps(np.array([20.0]), np.ones((1, 15, 15))))
     assert image.shape == imager.sensor.shape and not image.any()
 
 
@@ -303,4 +303,4 @@ def test_no_points_give_a_dark_image():
 )
 def test_wrong_stamps_are_refused(depths, size, words):
     with pytest.raises(ValueError, match=words):
-        stamps(np.array(depths), np.ones((len(depths), size, size)))
+        make_stamps(np.array(depths), np.ones((len(depths), size, size)))

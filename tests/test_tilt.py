@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, find_points, forward
-from gs_jax.projection.point_sources import forward_points, stamps
+from gs_jax.projection.point_sources import forward_points, make_stamps
 
 from .helpers import backproject_loop, scene
 
@@ -116,7 +116,7 @@ def test_points_are_where_the_grid_has_them_and_are_found():
     spot = np.zeros((3, 45, 45))
     spot[:, 22, 22] = 1
     drawn = forward_points(
-        np.column_stack([grid.to_mm(voxels), np.ones(12)]), imager, stamps(np.asarray(grid.depths), spot)
+        np.column_stack([grid.to_mm(voxels), np.ones(12)]), imager, make_stamps(np.asarray(grid.depths), spot)
     )
     exact = np.asarray(forward(volume, imager, grid))
     blurred = [gaussian_filter(np.asarray(image), 2) for image in (drawn, exact)]

@@ -53,7 +53,7 @@ class Stamps(NamedTuple):
     ring: Ring | None = None
 
 
-def stamps(
+def make_stamps(
     depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"], ring: Ring | None = None
 ) -> Stamps:
     """Stamps from PSFs on pixels a fifth as large, `(depth, 5 size, 5 size)` with an odd size.
@@ -220,8 +220,8 @@ def full_image_of_points(
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for edges, *parts, profiles in rings:
         kernels = np.stack([render_kernel(profile, STEPS * size, STEPS) for profile in profiles])
-        spots = stamps(fine, kernels.astype(np.float32), Ring(edges, *parts))
-        image += forward_points(points, imager, spots, progress)
+        stamps = make_stamps(fine, kernels.astype(np.float32), Ring(edges, *parts))
+        image += forward_points(points, imager, stamps, progress)
     # The stray light ripples below zero in places; clipping adds light, which scaling removes.
     clipped = np.maximum(image, 0)
     return clipped * (image.sum() / max(clipped.sum(), np.finfo(image.dtype).tiny))

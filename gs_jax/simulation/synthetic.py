@@ -24,7 +24,7 @@ from ..optics.field_varying import field_varying_psf, make_polar_grid
 from ..optics.lens_types import relative_areas, split_by_type
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
-from ..projection.point_sources import STEPS, forward_points, full_image_of_points, stamps
+from ..projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps
 from ..typing import Number, PathLike
 
 Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]
@@ -186,7 +186,7 @@ def simulate_points(
     for slab in np.unique(slabs):
         some = depths[slab * _SLAB :][: _SLAB + 1]
         fine = np.stack([kernel(depth) for depth in progress.track(some, "Point spread functions")])
-        image = image + forward_points(points[slabs == slab], imager, stamps(some, fine), progress)
+        image = image + forward_points(points[slabs == slab], imager, make_stamps(some, fine), progress)
     return np.asarray(image)
 
 
