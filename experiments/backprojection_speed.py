@@ -28,8 +28,8 @@ from matplotlib.figure import Figure
 from experiments.common import Report, main, table
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
-from gs_jax.apps.benchmark_measure import peak_mib, timed
 from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.apps.method_benchmark import peak_mib, timed
 from gs_jax.base.arrays import in_float32
 from gs_jax.base.machine import describe, status_mib
 from gs_jax.base.progress import Progress

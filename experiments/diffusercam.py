@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 from experiments.common import Report, main, table
-from gs_jax.apps.benchmark_measure import timed
+from gs_jax.apps.method_benchmark import timed
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
 from gs_jax.solvers.base import differences, solve, total_variation

@@ -21,7 +21,7 @@ from experiments.common import OPTIONAL_PATH, Report, design_of, main, points_of
 from experiments.point_density import scene
 from experiments.profiles import local_maxima
 from gs_jax import Grid
-from gs_jax.apps.benchmark_measure import timed
+from gs_jax.apps.method_benchmark import timed
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.clusters import find_clusters

@@ -33,9 +33,8 @@ from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
 from gs_jax import Grid, Imager, Unrolled, forward_residual
-from gs_jax.apps.benchmark_measure import timed
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.benchmark_scenes import spots
+from gs_jax.apps.method_benchmark import render_points, timed
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
@@ -75,7 +74,7 @@ def _captured(data: Path, name: str, depths: np.ndarray, emitters: np.ndarray | 
     grid = voxel_grid(imager, list(depths), pixels=PIXELS_PER_VOXEL)
     if emitters is None:
         points = points_of(data, name)
-        return Scene(image, imager, grid, spots(points, grid, grid.pitch / FWHM), points)
+        return Scene(image, imager, grid, render_points(points, grid, grid.pitch / FWHM), points)
     return Scene(image, imager, grid, np.asarray(rasterize(emitters, grid), np.float32))
 
 
@@ -143,7 +142,7 @@ def methods(s: Scene, networks: Unrolled, steps: int, progress: Progress) -> dic
     """Every method as a function without arguments, by name."""
     by = lambda method: reconstruct(s.image, s.imager, s.grid, method, progress=progress)
     solve = lambda name: by(METHODS[name](steps))
-    of = lambda points: Result(spots(points, s.grid, float(s.grid.pitch) / FWHM), points)
+    of = lambda points: Result(render_points(points, s.grid, float(s.grid.pitch) / FWHM), points)
     return {
         "zeros": lambda: Result(np.zeros_like(s.truth)),
         "backproject": lambda: Result(solve("backproject")),

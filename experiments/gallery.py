@@ -32,8 +32,8 @@ from experiments import (
 from experiments.backprojection_speed import Job, race
 from experiments.common import OPTIONAL_PATH, Report, design_of, main, table
 from gs_jax.apps import benchmark_report as benchmark
-from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.method_benchmark import run as run_benchmark, slopes
+from gs_jax.apps.benchmark_report import markdown_table, time_exponents
+from gs_jax.apps.method_benchmark import run as run_benchmark
 from gs_jax.base.progress import Progress
 
 
@@ -220,7 +220,7 @@ def figure_9(data: Path | None, progress: Progress) -> Page:
     with progress.step("Back-projection at the paper's full scale"):
         ours = race(Job(), ["gs_jax"], 5, {})["contestants"]["gs_jax"]["median_s"]
     records, _ = run_benchmark(_SIDES, progress=progress)
-    exponents = slopes(records)
+    exponents = time_exponents(records)
     claims = [
         Claim(
             "Fig. 8",

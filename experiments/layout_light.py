@@ -28,24 +28,30 @@ from gs_jax import (
     reconstruct,
 )
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.random_scenes import PLANES, random_scene, shared_out
-from gs_jax.apps.training.simulated_captures import FIELD_RADIUS, Kind, tables
+from gs_jax.apps.training.simulated_captures import (
+    FIELD_RADIUS,
+    SCENE_PLANES,
+    CaptureSpec,
+    random_scene,
+    resample_scene,
+    trace_optics,
+)
 from gs_jax.base.arrays import in_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
 from gs_jax.projection.forward_model import make_psf_model
 from gs_jax.simulation.synthetic import electrons
 
-KIND = Kind(288, 0.018, 0.064, 7, binning=4)
-DEPTHS = 20.0 + 0.5 * (np.arange(KIND.planes) - KIND.planes // 2)
+SPEC = CaptureSpec(288, 0.018, 0.064, 7, binning=4)
+DEPTHS = 20.0 + 0.5 * (np.arange(SPEC.planes) - SPEC.planes // 2)
 LENSES, DISTANCE, STEPS = 20, 5.8, 12
 LEVELS = ("near", "full")
-_ELECTRONS = 5000 * KIND.binning**2
+_ELECTRONS = 5000 * SPEC.binning**2
 
 
 def layouts() -> dict[str, np.ndarray]:
     """Layouts with equally many lenses, those nearest to the middle of a pattern; mm."""
-    side, wide = 1.05 * KIND.side, 2 * KIND.side
+    side, wide = 1.05 * SPEC.side, 2 * SPEC.side
     rng = np.random.default_rng(0)
     rows = np.repeat(np.cumsum([0, 0.9, 1.5, 1.0, 1.6, 0.9, 1.5]), 7)
     uneven = np.column_stack([np.tile(1.25 * np.arange(7), 7) + np.repeat(rng.uniform(0, 1.25, 7), 7), rows])
@@ -72,23 +78,25 @@ def run(names: list[str] | None = None, *, scenes: int = 6, steps: int = STEPS, 
 
 
 def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[float]:
-    sensor = Sensor((KIND.pixels, KIND.pixels), KIND.pixel)
+    sensor = Sensor((SPEC.pixels, SPEC.pixels), SPEC.pixel)
     imager = Imager(MicrolensArray(centers), sensor, DISTANCE, FIELD_RADIUS)
-    between = np.linspace(DEPTHS[0] - 0.2, DEPTHS[-1] + 0.2, PLANES)
+    between = np.linspace(DEPTHS[0] - 0.2, DEPTHS[-1] + 0.2, SCENE_PLANES)
     single = in_float32(imager)
-    grid = in_float32(Grid.over(sensor, depths=DEPTHS, pitch=KIND.pitch))
-    fine = in_float32(Grid(between, tuple(2 * n for n in grid.shape), KIND.pitch / 2))
-    optics = lambda depths: tables(imager, depths, KIND) if level == "full" else make_psf_model(single, depths, "near")
+    grid = in_float32(Grid.over(sensor, depths=DEPTHS, pitch=SPEC.pitch))
+    fine = in_float32(Grid(between, tuple(2 * n for n in grid.shape), SPEC.pitch / 2))
+    optics = lambda depths: (
+        trace_optics(imager, depths, SPEC) if level == "full" else make_psf_model(single, depths, "near")
+    )
     of_scene, of_volume = optics(between), optics(DEPTHS)
     results = []
     for number in range(scenes):
         scene = random_scene(fine.shape, np.random.default_rng(number))
         image = jnp.maximum(forward(scene, single, fine, of_scene), 0)
-        camera = Camera(gain=10.0 * KIND.binning**2, read_noise=2.0 * KIND.binning)
+        camera = Camera(gain=10.0 * SPEC.binning**2, read_noise=2.0 * SPEC.binning)
         counts = expose(image, camera, jax.random.key(number), peak_electrons=_ELECTRONS)
         light = np.asarray(electrons(counts, camera), np.float32)
         volume = reconstruct(light, single, grid, PinholeRichardsonLucy(steps, accelerate=True), optics=of_volume)
-        truth = shared_out(scene, between, DEPTHS)
+        truth = resample_scene(scene, between, DEPTHS)
         results.append(quality(volume, truth).psnr_db - quality(np.zeros_like(truth), truth).psnr_db)
     return results
 

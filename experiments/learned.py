@@ -28,8 +28,8 @@ import numpy as np
 from experiments.common import Report, main, table
 from gs_jax import Unrolled, make_psf_model, quality, reconstruct, suppress
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.recipes import UNROLLED
-from gs_jax.apps.training.simulated_captures import Example, Kind, example
+from gs_jax.apps.training.simulated_captures import CaptureSpec, Example, simulate_example
+from gs_jax.apps.training.training_loop import UNROLLED
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import pretrained
@@ -81,12 +81,12 @@ def imaged_noise(volume: np.ndarray, e: Example) -> float:
     return float(np.std(image) / np.std(e.image))
 
 
-def run(networks: Unrolled, scenes: int, kind: Kind = UNROLLED, *, progress: Progress) -> dict[str, dict]:
+def run(networks: Unrolled, scenes: int, spec: CaptureSpec = UNROLLED, *, progress: Progress) -> dict[str, dict]:
     """Return `gains` of the scenes with an object, dB, and `noise` of the others, by method."""
     by_name = methods(networks, progress)
     results = {name: {"gains": [], "noise": []} for name in by_name}
     for number in progress.track(range(scenes), "Scenes"):
-        e = example(SEED, number, kind)
+        e = simulate_example(SEED, number, spec)
         for name, method in by_name.items():
             volume = method(e)
             if e.truth.any():

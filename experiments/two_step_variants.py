@@ -27,15 +27,14 @@ from experiments.common import Report, main, table
 from experiments.learned import interval
 from gs_jax import backproject, quality
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.apps.training.recipes import slices_loss
-from gs_jax.apps.training.simulated_captures import Kind, example
-from gs_jax.apps.training.training_loop import Recipe, start, train
+from gs_jax.apps.training.simulated_captures import CaptureSpec, simulate_example
+from gs_jax.apps.training.training_loop import Recipe, init, slices_loss, train
 from gs_jax.apps.training.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import UNet, multislice_network, standardize
 from gs_jax.optics.psf_core import apparent_depths
 
-KIND = Kind(640, 0.009, 0.04, PLANES)
+SPEC = CaptureSpec(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8
 # As in `gs_jax.apps.training.training_slices`: smallest norm to which errors are relative.
 _GHOSTS, _LEAST_ENERGY = 0.05, 1e-3
@@ -58,8 +57,8 @@ class Gated(eqx.Module):
         return 2 * jax.nn.sigmoid(self.network(slices)) * slices[self.network.offsets.index(0)]
 
 
-def stack(seed: int, number: int, kind: Kind = KIND) -> Stack:
-    image, imager, grid, truth = example(seed, number, kind)
+def stack(seed: int, number: int, spec: CaptureSpec = SPEC) -> Stack:
+    image, imager, grid, truth = simulate_example(seed, number, spec)
     seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
     mean = lambda image: np.asarray(backproject(image, imager, seen, normalize=True))
     volume, unit = standardize(np.asarray(backproject(image, imager, seen)))
@@ -129,14 +128,16 @@ def _cut(one: Stack, multiple: int) -> Stack:
     return Stack(*(part[:, :rows, :columns] for part in one))
 
 
-def run(steps: int, count: int, held_out: int, kind: Kind = KIND, *, progress: Progress) -> dict[str, list[float]]:
+def run(
+    steps: int, count: int, held_out: int, spec: CaptureSpec = SPEC, *, progress: Progress
+) -> dict[str, list[float]]:
     """Return gains over an empty volume for the held-out scenes that show something, dB, by variant."""
-    stacks = [stack(0, number, kind) for number in progress.track(range(count), "Simulating captures")]
-    judged = [_cut(stack(1, number, kind), 8) for number in progress.track(range(held_out), "Simulating others")]
+    stacks = [stack(0, number, spec) for number in progress.track(range(count), "Simulating captures")]
+    judged = [_cut(stack(1, number, spec), 8) for number in progress.track(range(held_out), "Simulating others")]
     results = {}
     for name, (recipe, spread) in progress.track(variants(stacks).items(), "Variants"):
         with progress.counter(f"Training: {name}", steps) as advance:
-            state = train(recipe, start(recipe, steps=steps, seed=0), each=lambda state: advance())  # noqa: B023
+            state = train(recipe, init(recipe, steps=steps, seed=0), callback=lambda state: advance())  # noqa: B023
         gain = lambda one, network=state.network, spread=spread: (
             quality(cleaned(network, one, spread), one.truth).psnr_db
             - quality(np.zeros_like(one.truth), one.truth).psnr_db

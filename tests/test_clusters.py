@@ -5,7 +5,7 @@ import pytest
 from skimage.measure import label
 
 from gs_jax import Grid
-from gs_jax.apps.benchmark_scenes import spots
+from gs_jax.apps.method_benchmark import render_points
 from gs_jax.detection.clusters import find_clusters
 
 
@@ -88,5 +88,5 @@ def test_clusters_of_noise_are_left_out():
     # A maximum among 1440 Gaussian values exceeds five deviations once in 2000 times.
     assert not len(find_clusters(noise, grid))
     points = np.array([[0.35, -0.45, 20.0, 2.0], [-0.55, 0.85, 20.0, 1.0]])
-    found = find_clusters(spots(points, grid, 0.12) + noise, grid)
+    found = find_clusters(render_points(points, grid, 0.12) + noise, grid)
     np.testing.assert_allclose(found[:, :2], points[:, :2], atol=0.051)  # half a voxel

@@ -12,7 +12,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
-from gs_jax.apps.benchmark_measure import peak_mib
+from gs_jax.apps.method_benchmark import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.projection.point_sources import STEPS, forward_points, make_stamps
 

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.solver_options import glow
 from gs_jax import Grid, ImagingOperator, backproject, forward, make_psf_model
-from gs_jax.apps.method_benchmark import obstacle
+from gs_jax.apps.method_benchmark import skip_reason
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import psf_of_depth
@@ -192,7 +192,7 @@ def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
         voxel_grid(imager, [18.0, 20.0], 0.001)
     with pytest.raises(InputError, match="GiB that are free"):
         simulate_volume(np.ones((1, 900, 900), np.float32), imager, Grid([20.0], (900, 900), 0.001))
-    assert obstacle("admm, dense", 30, None, 1e9) is not None
+    assert skip_reason("admm, dense", 30, None, 1e9) is not None
 
 
 def test_pixels_of_any_number_are_summed():

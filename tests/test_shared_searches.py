@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from gs_jax.apps.training.recipes import unrolled_cases
 from gs_jax.apps.training.simulated_captures import SCENES
-from gs_jax.apps.training.training_slices import stacks
+from gs_jax.apps.training.training_loop import simulate_unrolled_examples
+from gs_jax.apps.training.training_slices import simulate_stacks
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import run_study
@@ -111,14 +111,16 @@ def test_terms_of_ones_own(two, monkeypatch):
 
 
 def test_training_data(two, tmp_path):
-    made = stacks(tmp_path / "two", SCENES + 1, 5, kinds=TINY, workers=two)
-    for a, b in zip(made, stacks(tmp_path / "one", SCENES + 1, 5, kinds=TINY), strict=True):
+    made = simulate_stacks(tmp_path / "two", SCENES + 1, 5, specs=TINY, workers=two)
+    for a, b in zip(made, simulate_stacks(tmp_path / "one", SCENES + 1, 5, specs=TINY), strict=True):
         for x, y in zip(a, b, strict=True):
             np.testing.assert_allclose(x, y, rtol=2e-3, atol=2e-3 * np.abs(y).max())
 
 
 def test_training_cases(two):
-    made, alone = (unrolled_cases(SCENES + 1, 0, kind=TINY_UNROLLED, workers=workers) for workers in (two, None))
+    made, alone = (
+        simulate_unrolled_examples(SCENES + 1, 0, spec=TINY_UNROLLED, workers=workers) for workers in (two, None)
+    )
     for a, b in zip(made, alone, strict=True):
         for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5 * np.abs(y).max(initial=1e-30))

@@ -6,11 +6,16 @@ import optax
 import pytest
 from click.testing import CliRunner
 
-from gs_jax.apps.training import random_scenes as scenes, training_slices as slices
-from gs_jax.apps.training.recipes import slices_loss
-from gs_jax.apps.training.simulated_captures import Kind
-from gs_jax.apps.training.training_loop import Recipe, read_checkpoint, start, train, write_checkpoint
-from gs_jax.apps.training.training_slices import Stack, paper_batch, patches, simulated_stack, stacks
+from gs_jax.apps.training import simulated_captures as scenes, training_slices as slices
+from gs_jax.apps.training.simulated_captures import CaptureSpec
+from gs_jax.apps.training.training_loop import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
+from gs_jax.apps.training.training_slices import (
+    Stack,
+    sample_paper_batch,
+    sample_patches,
+    simulate_stack,
+    simulate_stacks,
+)
 from gs_jax.base.errors import InputError
 from gs_jax.cli.reconstruct import reconstruct_command
 from gs_jax.cli.train import train_command as command
@@ -23,7 +28,7 @@ from gs_jax.reconstruction.pipeline import reconstruct
 from .test_cli import DESIGN
 
 
-def toy(offsets=(0,), batch=lambda rng: paper_batch(rng, 16)) -> Recipe:
+def toy(offsets=(0,), batch=lambda rng: sample_paper_batch(rng, 16)) -> Recipe:
     network = lambda key: UNet(offsets, (4, 8), standardized=False, key=key)
     return Recipe(network, lambda steps: optax.rmsprop(optax.cosine_decay_schedule(3e-3, steps)), batch, slices_loss)
 
@@ -35,7 +40,7 @@ def assert_equal(a, b):
 
 @pytest.mark.integration
 def test_the_loss_falls():
-    losses = train(toy(), start(toy(), steps=40, seed=1)).losses
+    losses = train(toy(), init(toy(), steps=40, seed=1)).losses
     assert np.isfinite(losses).all()
     assert losses[-10:].mean() < 0.5 * losses[:5].mean()
 
@@ -43,17 +48,17 @@ def test_the_loss_falls():
 @pytest.mark.integration
 def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
     """Bit for bit: weights, the optimizer's memory and losses, through a file."""
-    whole = train(toy(), start(toy(), steps=8, seed=2))
+    whole = train(toy(), init(toy(), steps=8, seed=2))
 
     class Interrupt(Exception): ...
 
-    def each(state):
+    def callback(state):
         if state.step == 5:
             write_checkpoint(tmp_path / "c", state)
             raise Interrupt
 
     with pytest.raises(Interrupt):
-        train(toy(), start(toy(), steps=8, seed=2), each=each)
+        train(toy(), init(toy(), steps=8, seed=2), callback=callback)
     state = read_checkpoint(tmp_path / "c", toy(), steps=8, seed=2)
     assert state.step == 5 and np.isnan(state.losses[5:]).all()
     assert_equal(train(toy(), state), whole)
@@ -61,15 +66,15 @@ def test_an_interrupted_training_ends_as_if_it_were_not(tmp_path):
 
 @pytest.mark.integration
 def test_seeds_make_a_difference():
-    states = [train(toy(), start(toy(), steps=2, seed=seed)) for seed in (0, 0, 1)]
+    states = [train(toy(), init(toy(), steps=2, seed=seed)) for seed in (0, 0, 1)]
     assert_equal(states[0], states[1])
     assert not np.array_equal(states[0].losses, states[2].losses)
 
 
 def test_checkpoints_of_another_training_are_refused(tmp_path):
     path = tmp_path / "c"
-    write_checkpoint(path, start(toy(), steps=8, seed=2))
-    with pytest.raises(InputError, match=r"found a training of seed 2, allowed: .* 3"):
+    write_checkpoint(path, init(toy(), steps=8, seed=2))
+    with pytest.raises(InputError, match="seed of the training must be 3, as given, got 2"):
         read_checkpoint(path, toy(), steps=8, seed=3)
     for recipe, steps in ((toy(), 9), (toy((-1, 0, 1)), 8)):
         with pytest.raises(InputError, match=f"checkpoint of this network and of {steps} steps"):
@@ -80,7 +85,7 @@ def test_checkpoints_of_another_training_are_refused(tmp_path):
 
 
 def test_the_papers_slices():
-    batch = paper_batch(np.random.default_rng(0), 64)
+    batch = sample_paper_batch(np.random.default_rng(0), 64)
     assert batch.slices.shape == (10, 1, 64, 64) and batch.truth.shape == (10, 64, 64)
     slices, truth = batch.slices[:, 0], batch.truth
     # Where nothing is drawn and nothing shines over, what is left is the noise of 5 %; the median is over such places.
@@ -95,21 +100,21 @@ def test_the_papers_slices():
 
 
 def test_nothing_drawn_is_no_division_by_zero(monkeypatch):
-    monkeypatch.setattr(slices, "drawn", lambda size, *_: np.zeros((size, size), np.float32))
-    batch = paper_batch(np.random.default_rng(0), 16)
+    monkeypatch.setattr(slices, "draw_objects", lambda size, *_: np.zeros((size, size), np.float32))
+    batch = sample_paper_batch(np.random.default_rng(0), 16)
     assert np.isfinite(batch.slices).all() and not batch.truth.any()
 
 
 @pytest.mark.parametrize("kind", scenes._DRAW)
 def test_every_kind_of_object_is_drawn(kind):
-    plane = scenes.drawn(120, np.random.default_rng(3), 20, (kind,))
+    plane = scenes.draw_objects(120, np.random.default_rng(3), 20, (kind,))
     assert plane.shape == (120, 120) and 0 < np.count_nonzero(plane) < plane.size
     assert plane.min() == 0 and plane.max() <= 10
 
 
 def test_a_sheet_is_shared_out_to_the_planes():
     page = np.ones((60, 60), np.float32)
-    sheets = [scenes.on_sheet(page, np.random.default_rng(seed)) for seed in range(8)]
+    sheets = [scenes.lay_on_sheet(page, np.random.default_rng(seed)) for seed in range(8)]
     for scene in sheets:
         np.testing.assert_allclose(scene.sum(0), page, rtol=1e-6)
         assert np.count_nonzero(scene.sum((1, 2))) >= 2
@@ -120,7 +125,7 @@ def test_a_sheet_is_shared_out_to_the_planes():
 def test_the_truth_lies_where_the_scene_does():
     scene = np.zeros((2, 8, 6), np.float32)
     scene[0, 2:4, 4:6] = 1
-    found = scenes.shared_out(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
+    found = scenes.resample_scene(scene, np.array([20.1, 30.0]), np.array([19.6, 20.0, 20.4]))
     expected = np.zeros((3, 4, 3))
     expected[1:, 1, 2] = 0.75, 0.25
     np.testing.assert_allclose(found, expected, atol=1e-6)
@@ -134,7 +139,7 @@ def ramp(planes=5, size=40) -> Stack:
 
 def test_patches_keep_slices_and_truth_together():
     offsets = (-4, 0, 1)
-    batch = patches([ramp(), ramp()], offsets, np.random.default_rng(0), size=16, count=6)
+    batch = sample_patches([ramp(), ramp()], offsets, np.random.default_rng(0), size=16, count=6)
     assert batch.slices.shape == (6, 3, 16, 16)
     np.testing.assert_array_equal(batch.slices[:, 1], batch.truth)
     # Depths are in order, the outermost repeated.
@@ -144,16 +149,16 @@ def test_patches_keep_slices_and_truth_together():
 
 def test_an_empty_stack_gives_patches():
     dark = Stack(*np.zeros((2, 4, 20, 20), np.float16))
-    assert not patches([dark], (0,), np.random.default_rng(0), size=8, count=2).slices.any()
+    assert not sample_patches([dark], (0,), np.random.default_rng(0), size=8, count=2).slices.any()
 
 
 # Microscopes of few pixels.
-TINY = (Kind(96, 0.045, 0.2, 5),)
+TINY = (CaptureSpec(96, 0.045, 0.2, 5),)
 
 
 @pytest.mark.integration
 def test_a_simulated_stack_shows_its_scene():
-    one, again, other = (simulated_stack(0, number, TINY) for number in (0, 0, 1))
+    one, again, other = (simulate_stack(0, number, TINY) for number in (0, 0, 1))
     assert_equal(one, again)
     assert not np.array_equal(one.volume, other.volume)
     assert len(one.volume) == 5 and one.volume.shape == one.truth.shape
@@ -166,25 +171,25 @@ def test_a_simulated_stack_shows_its_scene():
 
 @pytest.mark.integration
 def test_some_stacks_are_nothing_but_noise():
-    stack = simulated_stack(0, 15, TINY)
+    stack = simulate_stack(0, 15, TINY)
     assert not stack.truth.any() and np.asarray(stack.volume, np.float32).std() > 0
 
 
 @pytest.mark.integration
 def test_stacks_are_kept(tmp_path):
     folder = tmp_path / "stacks"
-    made = stacks(folder, 2, 5, kinds=TINY)
-    for a, b in zip(stacks(folder, 2, 5, kinds=TINY), made, strict=True):
+    made = simulate_stacks(folder, 2, 5, specs=TINY)
+    for a, b in zip(simulate_stacks(folder, 2, 5, specs=TINY), made, strict=True):
         assert_equal(a, b)
     (folder / "5-1.npz").write_bytes(b"garbage")
     with pytest.raises(InputError, match=r"5-1\.npz"):
-        stacks(folder, 2, 5, kinds=TINY)
+        simulate_stacks(folder, 2, 5, specs=TINY)
 
 
 @pytest.fixture
 def toy_command(monkeypatch):
     module = sys.modules["gs_jax.cli.train"]
-    monkeypatch.setattr("gs_jax.apps.training.recipes.paper_recipe", toy)
+    monkeypatch.setattr("gs_jax.apps.training.training_loop.paper_recipe", toy)
     monkeypatch.setattr(module, "_EVERY", 2)
 
     def invoke(*arguments):
@@ -233,10 +238,10 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
         calls.append(rng)
         if len(calls) == 4:
             raise KeyboardInterrupt
-        return paper_batch(rng, 16)
+        return sample_paper_batch(rng, 16)
 
     with monkeypatch.context() as patched:
-        patched.setattr(sys.modules["gs_jax.apps.training.recipes"], "paper_recipe", lambda: toy(batch=batch))
+        patched.setattr(sys.modules["gs_jax.apps.training.training_loop"], "paper_recipe", lambda: toy(batch=batch))
         assert toy_command("--steps", 5, "-o", broken).exit_code == 1
     assert not broken.exists() and broken.with_suffix(".checkpoint").exists()
     assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0

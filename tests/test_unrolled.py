@@ -10,9 +10,17 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from experiments import learned
 from gs_jax import Grid, Imager, InputError, MicrolensArray, Sensor, Unrolled, reconstruct, solve
-from gs_jax.apps.training.recipes import UNROLLED, Case, finished, unrolled_cases, unrolled_loss, unrolled_recipe
-from gs_jax.apps.training.simulated_captures import SCENES, Kind, example
-from gs_jax.apps.training.training_loop import start, train
+from gs_jax.apps.training.simulated_captures import SCENES, CaptureSpec, simulate_example
+from gs_jax.apps.training.training_loop import (
+    UNROLLED,
+    UnrolledExample,
+    init,
+    simulate_unrolled_examples,
+    train,
+    unrolled_loss,
+    unrolled_recipe,
+    with_fixed_steps,
+)
 from gs_jax.base.progress import Progress
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.reconstruction.inverse_problem import InverseProblem, LensTypeGeometry
@@ -22,7 +30,7 @@ from gs_jax.solvers.richardson_lucy import bilinear_background
 from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
 
 KEY = jax.random.key(0)
-TINY = Kind(64, 0.06, 0.25, 3, binning=4)
+TINY = CaptureSpec(64, 0.06, 0.25, 3, binning=4)
 
 
 def imager(pixels=(160, 160), pitch=0.03) -> Imager:
@@ -31,7 +39,7 @@ def imager(pixels=(160, 160), pitch=0.03) -> Imager:
     return Imager(MicrolensArray(centers), Sensor(pixels, pitch), 5.75, 1.5)
 
 
-def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
+def small(networks: Unrolled | None = None) -> tuple[Unrolled, UnrolledExample]:
     """Chief rays through nine lenses, and the exact image of random voxels."""
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
     system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope, grid),))
@@ -39,7 +47,7 @@ def small(networks: Unrolled | None = None) -> tuple[Unrolled, Case]:
     light = system.operator.mv(truth)
     networks = networks or initialize_unrolled(1, 2, 3, 4, key=KEY)
     start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
-    return networks, Case(np.asarray(light), system, np.asarray(truth), start)
+    return networks, UnrolledExample(np.asarray(light), system, np.asarray(truth), start)
 
 
 @pytest.mark.integration
@@ -150,20 +158,20 @@ def test_weights_come_back(tmp_path):
 
 @pytest.mark.integration
 def test_an_example_is_its_seed_and_number():
-    one, again, other = (example(0, number, TINY) for number in (0, 0, SCENES))
+    one, again, other = (simulate_example(0, number, TINY) for number in (0, 0, SCENES))
     np.testing.assert_array_equal(one.image, again.image)
     np.testing.assert_array_equal(one.truth, again.truth)
     assert one.image.shape == (64, 64) and one.truth.shape == one.grid.volume_shape
     assert not np.array_equal(one.imager.array.centers, other.imager.array.centers)
-    empty = example(0, 15, TINY)
+    empty = simulate_example(0, 15, TINY)
     assert not empty.truth.any() and empty.image.std() > 0
 
 
 @pytest.mark.slow
 def test_training_makes_it_better():
-    cases = unrolled_cases(4, 0, kind=TINY)
+    cases = simulate_unrolled_examples(4, 0, spec=TINY)
     recipe = unrolled_recipe(cases)
-    state = train(recipe, start(recipe, steps=30, seed=0))
+    state = train(recipe, init(recipe, steps=30, seed=0))
     mean = lambda networks: np.mean([unrolled_loss(networks, case) for case in cases])
     assert mean(state.network) < 0.9 * mean(recipe.network(jax.random.key(0)))
 
@@ -183,7 +191,7 @@ def test_a_volume_imaged_again():
 
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
-    found, made = Unrolled.pretrained(), finished(initialize_unrolled(key=KEY))
+    found, made = Unrolled.pretrained(), with_fixed_steps(initialize_unrolled(key=KEY))
     assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 33
 
 
@@ -192,7 +200,7 @@ def test_little_is_invented_on_noise():
     """A capture that shows nothing: the volume, imaged again, is to be a tenth of the noise."""
     found = learned.run(Unrolled.pretrained(), 1, TINY._replace(pixels=96), progress=Progress())
     assert found["unrolled"]["gains"]
-    e = example(1, 15, UNROLLED)
+    e = simulate_example(1, 15, UNROLLED)
     assert not e.truth.any()
     volume = learned.solved(e, Unrolled.pretrained(), Progress())
     assert learned.imaged_noise(volume, e) < 0.1

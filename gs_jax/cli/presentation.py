@@ -121,13 +121,13 @@ def benchmark_command(out: Path):
     folder = make_folder(out)
     numbers, provenance = folder / "benchmark.json", provenance_of()
 
-    def each(records):
+    def callback(records):
         write_records(numbers, records, provenance)
         partial_outputs[numbers] = PARTIAL
 
     with Progress() as progress:
-        records, left_out = run(each=each, progress=progress)
-    write(records, left_out, folder, provenance)
-    for missing in left_out:
+        records, skipped = run(callback=callback, progress=progress)
+    write(records, skipped, folder, provenance)
+    for missing in skipped:
         click.echo(f"left out: {missing['method']} at {missing['pairs']:.1e} pairs: {missing['reason']}")
     click.echo(f"{folder}: benchmark.json, .csv, .md and .png")

@@ -36,9 +36,18 @@ def train_command(network: str, steps: int | None, seed: int, resume: bool, outp
     """
     import numpy as np
 
-    from ..apps.training.recipes import finished, multislice_recipe, paper_recipe, unrolled_cases, unrolled_recipe
-    from ..apps.training.training_loop import read_checkpoint, start, train as run, write_checkpoint
-    from ..apps.training.training_slices import stacks
+    from ..apps.training.training_loop import (
+        init,
+        multislice_recipe,
+        paper_recipe,
+        read_checkpoint,
+        simulate_unrolled_examples,
+        train as run,
+        unrolled_recipe,
+        with_fixed_steps,
+        write_checkpoint,
+    )
+    from ..apps.training.training_slices import simulate_stacks
     from ..detection.unet import write_weights
     from ..solvers.unrolled import write_unrolled
 
@@ -56,24 +65,24 @@ def train_command(network: str, steps: int | None, seed: int, resume: bool, outp
         elif network == "multislice":
             folder = output.with_name(f"{output.stem}-stacks")
             with workers:
-                recipe = multislice_recipe(stacks(folder, _STACKS, seed, progress, workers=workers))
+                recipe = multislice_recipe(simulate_stacks(folder, _STACKS, seed, progress, workers=workers))
         else:
             with workers:
-                recipe = unrolled_recipe(unrolled_cases(_CASES, seed, progress, workers=workers))
-        begin = partial(read_checkpoint, checkpoint) if resume else start
+                recipe = unrolled_recipe(simulate_unrolled_examples(_CASES, seed, progress, workers=workers))
+        begin = partial(read_checkpoint, checkpoint) if resume else init
         state = begin(recipe, steps=steps, seed=seed)
         with progress.counter("Training", steps - int(state.step)) as advance:
 
-            def each(state):
+            def callback(state):
                 done = int(state.step)
                 if done % _EVERY == 0 or done in (1, steps):
                     write_checkpoint(checkpoint, state)
                     write_json(history, {"seed": seed, "steps": steps, "loss": state.losses[:done]})
                 advance()
 
-            state = run(recipe, state, each=each)
+            state = run(recipe, state, callback=callback)
     if network == "unrolled":
-        write_unrolled(output, finished(state.network), provenance_of())
+        write_unrolled(output, with_fixed_steps(state.network), provenance_of())
     else:
         write_weights(output, state.network, provenance_of())
     click.echo(f"{output}: {network}, {steps} steps, loss {np.mean(state.losses[-_EVERY:]):.4f}")

@@ -1,1 +1,1 @@
-"""How the networks of the package are trained, and what on: simulated captures with all of their light."""
+"""Training of the networks that come with the package, and of a user's own."""

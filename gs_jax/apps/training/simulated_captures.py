@@ -1,8 +1,10 @@
-"""Simulated captures with all of their light, by random microscopes, and what they show.
+"""Simulated captures to train on: random scenes, imaged with all of their light by random microscopes.
 
-Everything is a function of a seed and a number: the same arguments give the same data. Host code, but for the optics.
+A scene has planes of objects of many kinds, sparse and dense, flat, inclined and curved. The same seed and number give
+the same data. Host code, but for the optics.
 """
 
+import math
 from functools import cache, lru_cache
 from typing import NamedTuple
 
@@ -10,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter
 
 from ...base.arrays import in_float32
 from ...geometry import Imager, Sensor
@@ -20,28 +24,29 @@ from ...optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_ps
 from ...projection.forward_model import forward
 from ...simulation.synthetic import Camera, electrons, expose
 from ...typing import Volume
-from .random_scenes import PLANES as SCENE_PLANES, random_scene, shared_out
 
-# Scenes that one microscope images: its tables take longer than an image.
-SCENES = 8
+# Planes of a scene; scenes per microscope, whose tables take longer than an image.
+SCENE_PLANES, SCENES = 6, 8
 FIELD_RADIUS = 3.0
-# Side of the square that a lens has to itself, mm: sqrt(400 / 213) on the authors' plate.
+# Side of a lens's share of the plate, mm: sqrt(400 / 213) on the authors' plate.
 LENS_SPACING = 1.37
-# Depths that any example may have, mm: they share the tables' nodes, and so what is compiled.
+# Depth range of all examples, mm: with common table nodes, programs are compiled once.
 _DEPTHS = np.array([16.5, 24.5])
-# No point is farther from a lens, along x or y, in widths of the sensor.
+# Largest distance of a point from a lens, along x or y, in widths of the sensor.
 _FARTHEST = 1.3
-# How far a capture's microscope is from what is known of it, standard deviations: of the lenses' places, mm, the
-# sensor's distance, relative, its turn, radians, and its place, mm.
-_LENSES_OFF, _DISTANCE_OFF, _TURNED, _SHIFTED = 0.0015, 7e-4, 2e-4, 0.003
-# Of the pixels, at most twice as many.
+# Standard deviations of what calibration leaves: lens positions, mm; sensor distance, relative; rotation, radians;
+# shift, mm.
+_LENS_ERROR, _DISTANCE_ERROR, _ROTATION_ERROR, _SHIFT_ERROR = 0.0015, 7e-4, 2e-4, 0.003
+# Share of dead pixels; at most twice as many.
 _DEAD = 1e-5
+_TEXT = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 
 
-class Kind(NamedTuple):
-    """Sizes of an example: pixels along a side and their pitch, that of the voxels, mm; planes; sensor's pixels in one.
+class CaptureSpec(NamedTuple):
+    """Size of a simulated capture, whose microscope has the paper's lenses on a smaller plate.
 
-    A smaller microscope than the paper's, of the same lenses: what a voxel sees is the same.
+    `pixels` along a side and their size `pixel`, mm; `pitch` of the voxels, mm; number of `planes` of the volume;
+    `binning`: sensor pixels along a side of a pixel.
     """
 
     pixels: int
@@ -55,18 +60,8 @@ class Kind(NamedTuple):
         return self.pixels * self.pixel
 
 
-class Device(NamedTuple):
-    """A microscope, what is known of it, depths of its volumes and of its scenes, and its light at the latter."""
-
-    imager: Imager
-    known: Imager
-    depths: np.ndarray
-    scene_depths: np.ndarray
-    optics: FieldVaryingPsf
-
-
 class Example(NamedTuple):
-    """A capture in electrons, the microscope as it is known, the voxels, and their light in the capture's unit."""
+    """A capture in electrons, the microscope as calibrated, the voxels, and their light in the capture's unit."""
 
     image: Float32[np.ndarray, "row column"]
     imager: Imager
@@ -74,65 +69,67 @@ class Example(NamedTuple):
     truth: Volume
 
 
-def example(seed: int, number: int, kind: Kind) -> Example:
-    """A random scene by a random microscope, with a camera's noise.
+def simulate_example(seed: int, number: int, spec: CaptureSpec) -> Example:
+    """Simulate the capture of a random scene by a random microscope, with a camera's noise.
 
-    Drawn are the layout (random, Poisson-disc or hexagonal), the sensor's distance and how well the lenses and the
-    sensor are where they should be, the depths and their step, the objects, the exposure (200 to 20,000 electrons in
-    the brightest pixel), an offset and dead pixels. One example in sixteen shows nothing but noise. Objects lie between
-    the volume's planes and beyond them, on voxels half as large.
+    Random are the layout (random, Poisson-disc or hexagonal), the sensor distance and the calibration's errors, the
+    depths and their step, the objects, the exposure (200 to 20,000 electrons in the brightest pixel), an offset and
+    dead pixels. One example in sixteen is an empty scene. Objects lie between the volume's planes and beyond them, on
+    voxels half as large.
     """
     rng = np.random.default_rng([seed, 2, number])
-    device = device_of(seed, number // SCENES, kind)
-    grid = in_float32(Grid.over(device.known.sensor, depths=device.depths, pitch=kind.pitch))
-    fine = in_float32(Grid(device.scene_depths, tuple(2 * n for n in grid.shape), kind.pitch / 2))
+    imager, calibrated, depths, scene_depths, optics = random_microscope(seed, number // SCENES, spec)
+    grid = in_float32(Grid.over(calibrated.sensor, depths=depths, pitch=spec.pitch))
+    fine = in_float32(Grid(scene_depths, tuple(2 * n for n in grid.shape), spec.pitch / 2))
     scene = np.zeros((SCENE_PLANES, *fine.shape), np.float32) if number % 16 == 15 else random_scene(fine.shape, rng)
-    image = jnp.maximum(forward(scene, in_float32(device.imager), fine, device.optics), 0)
-    counts, gain = _exposed(image, kind, rng)
-    truth = 4 * gain * shared_out(scene, device.scene_depths, device.depths)
-    return Example(counts, in_float32(device.known), grid, truth.astype(np.float32))
+    image = jnp.maximum(forward(scene, in_float32(imager), fine, optics), 0)
+    counts, gain = _expose(image, spec, rng)
+    truth = 4 * gain * resample_scene(scene, scene_depths, depths)
+    return Example(counts, in_float32(calibrated), grid, truth.astype(np.float32))
 
 
 @lru_cache(maxsize=2)
-def device_of(seed: int, number: int, kind: Kind) -> Device:
-    """The microscope that images some of the examples."""
+def random_microscope(
+    seed: int, number: int, spec: CaptureSpec
+) -> tuple[Imager, Imager, np.ndarray, np.ndarray, FieldVaryingPsf]:
+    """The true imager and the calibrated one, the depths of its volumes and scenes, and its optics at the latter."""
     rng = np.random.default_rng([seed, 1, number])
-    centers = _layout(kind, rng)
-    sensor = Sensor((kind.pixels, kind.pixels), kind.pixel)
-    known = Imager(MicrolensArray(centers), sensor, rng.uniform(5.6, 6.0), FIELD_RADIUS)
+    centers = _layout(spec, rng)
+    sensor = Sensor((spec.pixels, spec.pixels), spec.pixel)
+    calibrated = Imager(MicrolensArray(centers), sensor, rng.uniform(5.6, 6.0), FIELD_RADIUS)
     imager = Imager(
-        MicrolensArray(centers + rng.normal(0, _LENSES_OFF, centers.shape)),
+        MicrolensArray(centers + rng.normal(0, _LENS_ERROR, centers.shape)),
         sensor,
-        float(known.sensor_distance) * (1 + rng.normal(0, _DISTANCE_OFF)),
+        float(calibrated.sensor_distance) * (1 + rng.normal(0, _DISTANCE_ERROR)),
         FIELD_RADIUS,
-        rotation=rng.normal(0, _TURNED),
-        shift=rng.normal(0, _SHIFTED, 2),
+        rotation=rng.normal(0, _ROTATION_ERROR),
+        shift=rng.normal(0, _SHIFT_ERROR, 2),
     )
-    step = min(rng.uniform(0.15, 0.6), 5 / kind.planes)
-    depths = rng.uniform(19, 21.5) + step * (np.arange(kind.planes) - kind.planes // 2)
+    step = min(rng.uniform(0.15, 0.6), 5 / spec.planes)
+    depths = rng.uniform(19, 21.5) + step * (np.arange(spec.planes) - spec.planes // 2)
     scene_depths = np.sort(rng.uniform(depths[0] - step, depths[-1] + step, SCENE_PLANES))
-    return Device(imager, known, depths, scene_depths, tables(imager, scene_depths, kind))
+    return imager, calibrated, depths, scene_depths, trace_optics(imager, scene_depths, spec)
 
 
-def tables(imager: Imager, depths: np.ndarray, kind: Kind) -> FieldVaryingPsf:
-    """All of a microscope's light; of any example of a kind of the same shape."""
-    return in_float32(field_varying_psf(imager, depths, polar_grid=_nodes(kind)))
+def trace_optics(imager: Imager, depths: np.ndarray, spec: CaptureSpec) -> FieldVaryingPsf:
+    """All of the light of a microscope, in tables of one shape for all examples of a spec."""
+    return in_float32(field_varying_psf(imager, depths, polar_grid=_nodes(spec)))
 
 
 @cache
-def _nodes(kind: Kind) -> PolarGrid:
-    typical = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((kind.pixels, kind.pixels), kind.pixel), 5.8, FIELD_RADIUS)
-    return make_polar_grid(typical, _DEPTHS, extent=2 * _FARTHEST * kind.side)
+def _nodes(spec: CaptureSpec) -> PolarGrid:
+    typical = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((spec.pixels, spec.pixels), spec.pixel), 5.8, FIELD_RADIUS)
+    return make_polar_grid(typical, _DEPTHS, extent=2 * _FARTHEST * spec.side)
 
 
-def _layout(kind, rng):
-    """As many lenses for each example: their number decides shapes, and shapes compile."""
-    side = kind.side * rng.uniform(1, 1.2)
-    count, seed = round((1.1 * kind.side / LENS_SPACING) ** 2), int(rng.integers(2**31))
+def _layout(spec, rng):
+    """Of the same number of lenses for every example: it decides shapes, which are compiled."""
+    side = spec.side * rng.uniform(1, 1.2)
+    count, seed = round((1.1 * spec.side / LENS_SPACING) ** 2), int(rng.integers(2**31))
     name = rng.choice(["random", "random", "poisson", "hexagonal"])
     if name == "random":
         return np.asarray(random_layout(count, (side, side), diameter=None, seed=seed))
-    # More than are needed, of which those nearest to the middle are taken.
+    # More lenses than needed, of which those nearest to the middle are taken.
     if name == "poisson":
         centers = np.asarray(poisson_disc_layout((2 * side, 2 * side), min_distance=1.15, seed=seed))
     else:
@@ -142,11 +139,11 @@ def _layout(kind, rng):
     return centers[np.argsort(np.abs(centers).max(1), kind="stable")[:count]]
 
 
-def _exposed(image, kind, rng):
-    """Electrons of a noisy exposure, and how many there are for a unit of the image."""
-    largest, pixels = float(image.max()), kind.binning**2
+def _expose(image, spec, rng):
+    """Electrons of a noisy exposure, and their number per unit of the image."""
+    largest, pixels = float(image.max()), spec.binning**2
     peak = pixels * 10 ** rng.uniform(2.3, 4.3)
-    camera = Camera(gain=10.0 * pixels, read_noise=2.0 * kind.binning)
+    camera = Camera(gain=10.0 * pixels, read_noise=2.0 * spec.binning)
     if largest > 0:
         offset = float(rng.uniform(0, 0.2) * image.mean()) if rng.random() < 0.5 else 0.0
     else:
@@ -154,6 +151,122 @@ def _exposed(image, kind, rng):
     image = image + offset
     gain = peak / float(image.max())
     key = jax.random.key(int(rng.integers(2**31)))
-    found = np.array(electrons(expose(image, camera, key, peak_electrons=peak), camera), np.float32)
-    found[rng.random(found.shape) < _DEAD * rng.integers(0, 3)] = 0
-    return found, gain
+    counts = np.array(electrons(expose(image, camera, key, peak_electrons=peak), camera), np.float32)
+    counts[rng.random(counts.shape) < _DEAD * rng.integers(0, 3)] = 0
+    return counts, gain
+
+
+def random_scene(shape: tuple[int, int], rng: np.random.Generator) -> Float32[np.ndarray, "plane y x"]:
+    """Objects in some of the planes, or on a sheet across all: sparse or dense, of one kind or of all.
+
+    A sheet is inclined or curved. Some scenes have a texture, and some a smooth background in all planes, like tissue.
+    """
+    kinds = tuple(_DRAW) if rng.random() < 0.4 else (str(rng.choice(list(_DRAW))),)
+    few = {"point": 300, "disc": 150}.get(kinds[0], 30) if len(kinds) == 1 else 60
+    total = math.ceil(few ** rng.uniform(0.3, 1))
+    if rng.random() < 0.25:
+        scene = lay_on_sheet(draw_objects(shape[0], rng, total, kinds), rng)
+    else:
+        used = rng.choice(SCENE_PLANES, rng.integers(1, SCENE_PLANES + 1), replace=False)
+        counts = np.bincount(rng.choice(used, total), minlength=SCENE_PLANES)
+        scene = np.stack([draw_objects(shape[0], rng, int(count), kinds) for count in counts])
+    if rng.random() < 0.15:
+        scene = scene * _smooth_noise(scene.shape, shape[0] * 10 ** rng.uniform(-2, -1.3), rng)
+    if rng.random() < 0.2:
+        tissue = _smooth_noise(scene.shape, shape[0] * 10 ** rng.uniform(-1.3, -0.7), rng)
+        scene = scene + scene.max() * 10 ** rng.uniform(-2.5, -1) * tissue
+    return scene.astype(np.float32)
+
+
+def lay_on_sheet(page: Float32[np.ndarray, "y x"], rng: np.random.Generator) -> Float32[np.ndarray, "plane y x"]:
+    """Lay a page across the planes, flat or curved; each part is in the two nearest planes."""
+    turn, bend = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1) * (rng.random() < 0.5)
+    axis = np.linspace(-1, 1, len(page), dtype=np.float32)
+    along = (np.cos(turn) * axis + np.sin(turn) * axis[:, None]) / (abs(np.cos(turn)) + abs(np.sin(turn)))
+    height = (1 - bend) * (along + 1) / 2 + bend * along**2
+    plane = height * (SCENE_PLANES - 1)
+    return np.stack([page * np.maximum(1 - abs(plane - i), 0) for i in range(SCENE_PLANES)]).astype(np.float32)
+
+
+def resample_scene(scene: Float32[np.ndarray, "plane y2 x2"], plane_depths: np.ndarray, depths: np.ndarray) -> Volume:
+    """A scene on the volume's voxels, twice as wide: means of 2 x 2, and linear weights along z."""
+    planes, rows, columns = scene.shape
+    coarse = scene.reshape(planes, rows // 2, 2, columns // 2, 2).mean((2, 4))
+    step = depths[1] - depths[0]
+    weights = np.maximum(1 - np.abs(depths[:, None] - plane_depths[None]) / step, 0).astype(np.float32)
+    return np.tensordot(weights, coarse, 1)
+
+
+def _smooth_noise(shape, size, rng):
+    """Positive noise with the mean 1 and a correlation length of `size` voxels."""
+    noise = gaussian_filter(rng.standard_normal(shape, np.float32), (0.7, size, size))
+    return np.exp(noise / max(float(noise.std()), 1e-6) * 0.7 - 0.245)
+
+
+def draw_objects(size: int, rng: np.random.Generator, count: int, kinds: tuple[str, ...]) -> Float32[np.ndarray, "y x"]:
+    """A square plane with `count` objects of random intensity, drawn over each other."""
+    page = Image.new("F", (size, size))
+    for _ in range(count):
+        draw, brightness = _DRAW[str(rng.choice(kinds))], float(rng.uniform(0.2, 1))
+        middle = rng.uniform(0, size, 2)
+        # Radii are log-uniform.
+        radius = size * 10 ** rng.uniform(-1.5, -0.5)
+        draw(ImageDraw.Draw(page), middle, radius, brightness, rng)
+    return np.asarray(page)
+
+
+def _polygon(page, middle, radius, brightness, rng):
+    angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))
+    corners = middle + (radius * rng.uniform(0.4, 1, len(angles)) * np.stack([np.cos(angles), np.sin(angles)])).T
+    page.polygon(list(corners.ravel()), fill=brightness)
+
+
+def _lines(page, middle, radius, brightness, rng):
+    corners = middle + rng.uniform(-1, 1, (rng.integers(2, 5), 2)) * max(radius, 8)
+    page.line(list(corners.ravel()), fill=brightness, width=int(rng.integers(1, 2 + max(2, radius / 4))))
+
+
+def _bars(page, middle, radius, brightness, rng):
+    """Three parallel bars as far apart as wide, upright or not."""
+    width, turned = max(radius / 5, 1), rng.random() < 0.5
+    for i in (-2, 0, 2):
+        corners = width * np.array([[i - 0.5, -2.5], [i + 0.5, 2.5]])
+        page.rectangle(list((middle + (corners[:, ::-1] if turned else corners)).ravel()), fill=brightness)
+
+
+def _snowflake(page, middle, radius, brightness, rng):
+    """Six arms with a pair of branches each."""
+    turn, width = rng.uniform(0, np.pi / 3), max(1, int(radius * rng.uniform(0.04, 0.12)))
+    for angle in turn + np.pi / 3 * np.arange(6):
+        at = lambda length, angle=angle: length * radius * np.array([np.cos(angle), np.sin(angle)])
+        tip, fork = middle + at(1.0), middle + at(0.55)
+        page.line([*middle, *tip], fill=brightness, width=width)
+        for side in (angle - np.pi / 3, angle + np.pi / 3):
+            page.line([*fork, *(fork + at(0.35, side))], fill=brightness, width=width)
+
+
+def _letters(page, middle, radius, brightness, rng):
+    text = "".join(rng.choice(list(_TEXT), rng.integers(1, 4)))
+    font = ImageFont.load_default(size=max(2 * radius, 8))
+    page.text(tuple(middle - radius), text, fill=brightness, font=font)
+
+
+def _disc(page, middle, radius, brightness, rng):
+    half = np.full(2, max(radius / 8, 0.7))
+    page.ellipse([*(middle - half), *(middle + half)], fill=brightness)
+
+
+def _point(page, middle, radius, brightness, rng):
+    # A single voxel has little light beside an area: brighter, to be seen in the same scene.
+    page.point(list(middle), fill=brightness * 10 ** float(rng.uniform(0, 0.7)))
+
+
+_DRAW = {
+    "polygon": _polygon,
+    "lines": _lines,
+    "bars": _bars,
+    "snowflake": _snowflake,
+    "letters": _letters,
+    "disc": _disc,
+    "point": _point,
+}

@@ -1,33 +1,39 @@
-"""Training of a network by a recipe, with checkpoints from which it goes on exactly."""
+"""Training of a network by a recipe, with exact checkpoints; the recipes of the networks that come with the package."""
 
+import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
+from jax import lax
 from jaxtyping import Array, Float, Float32, PRNGKeyArray
 
 from ...base.errors import InputError
+from ...base.progress import Progress
+from ...base.workers import Workers
+from ...detection.unet import UNet, multislice_network, paper_network
 from ...io.files import atomic_write, check_input, decoding
-from ...typing import PathLike
+from ...reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset
+from ...solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
+from ...typing import PathLike, Volume
+from .simulated_captures import SCENES, CaptureSpec, simulate_example, trace_optics
+from .training_slices import Batch, Stack, sample_paper_batch, sample_patches
+
+# Captures of the unrolled networks: pixels are sums of 4 x 4, voxels as wide as those by default.
+UNROLLED = CaptureSpec(288, 0.018, 0.064, 7, binning=4)
+# The loss is relative to the truth's mean square plus this share of the start's.
+_START_SHARE = 0.2
+# Steps before the networks, and conjugate gradients after them, in use.
+_FIRST, _LAST = 20, 10
 
 
 class Recipe(NamedTuple):
-    """How a network is made and trained.
-
-    Parameters
-    ----------
-    network
-        Makes it from a key.
-    optimizer
-        Makes it for a number of steps.
-    batch
-        Draws one with a generator of random numbers.
-    loss
-        Of a network and a batch.
-    """
+    """How a network is made (from a key) and trained: optimizer (of a number of steps), batch, and loss."""
 
     network: Callable[[PRNGKeyArray], Any]
     optimizer: Callable[[int], optax.GradientTransformation]
@@ -36,17 +42,7 @@ class Recipe(NamedTuple):
 
 
 class State(eqx.Module):
-    """Where a training is: everything that decides how it goes on.
-
-    Parameters
-    ----------
-    network, optimizer
-        The weights, and what the optimizer remembers.
-    losses
-        One a step; those of steps to come are NaN.
-    seed, step
-        Which training it is, and the steps that are done.
-    """
+    """Everything that decides how a training goes on; `losses` of steps to come are NaN."""
 
     network: Any
     optimizer: optax.OptState
@@ -55,18 +51,18 @@ class State(eqx.Module):
     step: np.ndarray
 
 
-def start(recipe: Recipe, *, steps: int, seed: int) -> State:
-    """A training of `steps` steps before the first."""
+def init(recipe: Recipe, *, steps: int, seed: int) -> State:
+    """The state before the first of `steps` steps."""
     network: Any = recipe.network(jax.random.key(seed))  # optax does not know that modules are trees
     memory = recipe.optimizer(steps).init(network)
     return State(network, memory, np.full(steps, np.nan, np.float32), np.array(seed), np.array(0))
 
 
-def train(recipe: Recipe, state: State, *, each: Callable[[State], None] = lambda state: None) -> State:
-    """The rest of a training. `each` is called with the state after every step.
+def train(recipe: Recipe, state: State, *, callback: Callable[[State], None] = lambda state: None) -> State:
+    """Train to the last step, and call `callback` with the state after every step.
 
-    The batch of a step follows from the seed and the step alone, so that a training that goes on from a checkpoint
-    ends with the weights that it would have had without the interruption.
+    A batch depends on the seed and the step only, so that a training that goes on from a checkpoint ends with the same
+    weights as one without interruption.
     """
     steps = len(state.losses)
     for number in range(int(state.step), steps):
@@ -75,7 +71,7 @@ def train(recipe: Recipe, state: State, *, each: Callable[[State], None] = lambd
         losses = state.losses.copy()
         losses[number] = value
         state = State(network, memory, losses, state.seed, np.array(number + 1))
-        each(state)
+        callback(state)
     return state
 
 
@@ -88,23 +84,127 @@ def _step(recipe: Recipe, steps: int, network: Any, memory: optax.OptState, batc
 
 
 def write_checkpoint(path: PathLike, state: State) -> None:
-    """Writes a state, exactly, whole or not at all."""
+    """Write a state exactly, as a whole or not at all."""
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         eqx.tree_serialise_leaves(file, state)
 
 
 def read_checkpoint(path: PathLike, recipe: Recipe, *, steps: int, seed: int) -> State:
-    """The state in a file of `write_checkpoint`, of the same recipe, number of steps and seed.
+    """Read a state of the same recipe, number of steps and seed; nothing in the file is executed.
 
     Raises
     ------
     InputError
-        If the file cannot be read or is of another training. Nothing in it is ever executed.
+        If the file cannot be read or is of another training.
     """
-    expected = start(recipe, steps=steps, seed=seed)
-    kind = f"checkpoint of this network and of {steps} steps"
-    with decoding(check_input(path), kind), open(path, "rb") as file:
+    expected = init(recipe, steps=steps, seed=seed)
+    description = f"checkpoint of this network and of {steps} steps"
+    with decoding(check_input(path), description), open(path, "rb") as file:
         state = eqx.tree_deserialise_leaves(file, expected)
     if int(state.seed) != seed:
-        raise InputError(f"{path}: found a training of seed {int(state.seed)}, allowed: of the seed given, {seed}.")
+        raise InputError(f"{path}: the seed of the training must be {seed}, as given, got {int(state.seed)}.")
     return state
+
+
+def paper_recipe() -> Recipe:
+    """The paper's: RMSprop and mean squared error on synthetic polygons; the paper gives no rate."""
+    return Recipe(paper_network, lambda steps: optax.rmsprop(3e-4), sample_paper_batch, slices_loss)
+
+
+def multislice_recipe(stacks: list[Stack]) -> Recipe:
+    """Adam with a cosine schedule, and mean squared error on simulated stacks."""
+    offsets = eqx.filter_eval_shape(multislice_network, jax.random.key(0)).offsets
+    batch = lambda rng: sample_patches(stacks, offsets, rng)
+    return Recipe(multislice_network, partial(_adam, 1e-3), batch, slices_loss)
+
+
+def unrolled_recipe(examples: "list[UnrolledExample]") -> Recipe:
+    """Adam and relative squared error through all steps, and so through the operators and their exact adjoints."""
+    batch = lambda rng: examples[rng.integers(len(examples))]
+    return Recipe(lambda key: initialize_unrolled(key=key), partial(_adam, 2e-3), batch, unrolled_loss)
+
+
+def _adam(rate: float, steps: int) -> optax.GradientTransformation:
+    schedule = optax.warmup_cosine_decay_schedule(0, rate, min(100, steps // 10), steps)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+
+
+def slices_loss(network: UNet, batch: Batch) -> Float[Array, ""]:
+    """Weighted mean squared error over the voxels of a batch."""
+    error = jax.vmap(network)(jnp.asarray(batch.slices)) - jnp.asarray(batch.truth)
+    return jnp.mean(jnp.asarray(batch.weight) * jnp.mean(error**2, axis=(1, 2)))
+
+
+class UnrolledExample(NamedTuple):
+    """A capture above its offset, with the mean 1, its inverse problem, the truth, and the networks' first state."""
+
+    light: Float32[np.ndarray, "row column"]
+    system: InverseProblem
+    truth: Volume
+    start: UnrolledState
+
+
+def unrolled_loss(network: Unrolled, example: UnrolledExample) -> Float[Array, ""]:
+    """Squared error of the volume, relative to the truth's mean square and a share of the start's."""
+    truth, light, operator = jnp.asarray(example.truth), jnp.asarray(example.light), example.system.operator
+
+    # Not `step`, whose other branches would keep residuals for the gradient, too.
+    def network_step(state, _):
+        lucy, cost, _ = network.network_step(operator, light, state)
+        return state._replace(lucy=lucy, number=state.number + 1), cost
+
+    volume = network.estimate(lax.scan(network_step, example.start, length=network.power.size)[0])
+    start = network.estimate(example.start)
+    return jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
+
+
+def with_fixed_steps(network: Unrolled) -> Unrolled:
+    """A trained network as it is used: with more steps before it, and conjugate gradients after it.
+
+    On simulated captures ten of these gain 1.3 dB, and more than twelve no more. On ray-traced letters, which are whole
+    captures, 20 steps before the networks give 14.5 dB above an empty volume; the 15 of training 3 dB less.
+    """
+    return dataclasses.replace(network, first=_FIRST, last=_LAST, steps=_FIRST + network.power.size + _LAST)
+
+
+def simulate_unrolled_examples(
+    count: int,
+    seed: int,
+    progress: Progress | None = None,
+    spec: CaptureSpec = UNROLLED,
+    workers: Workers | None = None,
+) -> list[UnrolledExample]:
+    """Simulate the first examples of a seed, by workers if there are any."""
+    groups = [range(first, min(first + SCENES, count)) for first in range(0, count, SCENES)]
+    stream, results = (workers or Workers()).stream_of(partial(_simulator, seed, spec)), {}
+    with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
+        for group, result in stream(groups):
+            results[group.start] = result()
+            advance()
+    return [example for start in sorted(results) for example in results[start]]
+
+
+def _simulator(seed: int, spec: CaptureSpec):
+    networks = initialize_unrolled(key=jax.random.key(0))
+
+    def simulate(numbers):
+        examples, optics = [], None
+        for number in numbers:
+            image, imager, grid, truth = simulate_example(seed, number, spec)
+            # Of the calibrated microscope, which all of these numbers have in common.
+            optics = optics or trace_optics(imager, np.asarray(grid.depths, np.float64), spec)
+            light = subtract_offset(image)
+            unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
+            system = InverseProblem(imager, grid, optics, lens_type_geometries(imager, grid))
+            start = _run_fixed_steps(networks, system, light / unit)
+            examples.append(UnrolledExample(light / unit, system, truth / unit, start))
+        return examples
+
+    return simulate
+
+
+@eqx.filter_jit
+def _run_fixed_steps(networks, system, light):
+    """The state after the steps without networks, which training does not change."""
+    step = lambda state, _: networks.step(system.operator, light, state)[:2]
+    return lax.scan(step, networks.init(system.operator, light), length=networks.first)[0]
