@@ -13,7 +13,7 @@ from jax.test_util import check_grads
 from gs_jax import MicrolensArray
 from gs_jax.layouts import coverage, nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
-from gs_jax.optics.apertures import _edge_distances, aperture_area, clear_diameter, pitch
+from gs_jax.optics.apertures import _edge_distances, aperture_area, clear_area, clear_diameter, pitch
 from gs_jax.optics.psf_core import aperture_profile
 
 from .helpers import aperture_edge
@@ -248,3 +248,9 @@ def test_gradients_of_areas_of_lenses_that_differ(size):
         ends = [float(found({name: at[name] + s * 1e-6 * way[name] for name in names})[0]) for s in (1, -1)]
         expected = sum(float(np.vdot(slopes[name], way[name])) for name in names)
         assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_clear_areas_are_of_the_arrays_precision():
+    array = MicrolensArray([[0.0, 0.0], [1.2, 0.1]])
+    for dtype in (np.float32, np.float64):
+        assert clear_area(jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), array)).dtype == dtype

@@ -300,4 +300,4 @@ def clear_area(array: MicrolensArray) -> Float[Array, " lens"]:
     Glass beyond the plate's nominal size transmits light, too: in ray-traced captures of the authors' array, apertures
     that are cut there make the model 20 % too dark at the sensor's rim.
     """
-    return aperture_area(dataclasses.replace(array, size=(math.inf, math.inf)))
+    return aperture_area(dataclasses.replace(array, size=jnp.full_like(array.size, jnp.inf)))
