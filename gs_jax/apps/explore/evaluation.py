@@ -81,12 +81,7 @@ def make_sliders(design: Design) -> dict[str, Slider]:
     near, far = imaging.working_distance_mm
     ranges = {
         "sensor_distance_mm": ("sensor distance v", 0.6, 1.5, imaging.sensor_distance_mm),
-        "radius_of_curvature_mm": (
-            f"radius of curvature R{of_type}",
-            0.5,
-            2.0,
-            radius,
-        ),
+        "radius_of_curvature_mm": (f"radius of curvature R{of_type}", 0.5, 2.0, radius),
         "aperture_diameter_mm": (f"aperture D{of_type}", 0.15, 1.5, aperture),
         "pitch_mm": ("pitch", 0.6, 1.8, float(start_values(*start)["pitch_mm"])),
         "near_mm": ("nearest depth", 0.4, 1.6, near),
@@ -233,19 +228,18 @@ def moved_design(design: Design, start: Start, values: Values, provenance: dict[
 
 
 def lens_unit(start: Start, values: Values, number: int = 0) -> Imager:
-    """The first lens of a type, alone on the axis. Static fields that do not change its spots stay as they were."""
-    moved, own = moved_imager(start, values), start.imager
-    array = moved.array.lens(start.types[number][0])
-    array = dataclasses.replace(array, centers=jnp.zeros_like(array.centers), size=own.array.plate)
-    shift = jnp.zeros_like(moved.shift)
-    return dataclasses.replace(moved, array=array, field_radius=own.field_radius, shift=shift, tilt=None)
+    """The first lens of a type, alone on the axis."""
+    moved = moved_imager(start, values)
+    array = dataclasses.replace(moved.array.lens(start.types[number][0]), centers=jnp.zeros((1, 2)))
+    # The field radius is static, and does not change spots.
+    radius, shift = start.imager.field_radius, jnp.zeros_like(moved.shift)
+    return dataclasses.replace(moved, array=array, field_radius=radius, shift=shift, tilt=None)
 
 
 def pupil_samples(start: Start) -> int:
     """Samples per pixel that resolve the spots of the starting design: decides shapes, so no slider changes it."""
-    return int(
-        np.clip(math.ceil(1.5 * _fold(start.imager, float(jnp.max(start.imager.array.aperture_diameter)))), 2, 4)
-    )
+    widest = float(start.imager.array.aperture_diameter.max())
+    return int(np.clip(math.ceil(1.5 * _fold(start.imager, widest)), 2, 4))
 
 
 def _fold(imager: Imager, diameter: float) -> float:

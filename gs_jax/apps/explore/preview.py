@@ -1,7 +1,6 @@
 """Previews of a microscope whose numbers move: the ghosts of a point, and a small simulated reconstruction."""
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import jax
@@ -97,20 +96,18 @@ def reconstruct_points(start: Start, values: Values, clear_diameters: Float[np.n
     return Reconstruction(volume.max(0), points, (left, top, right, bottom), _contrast(volume, points, grid))
 
 
-def _backproject(image: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
-    """`gs_jax.backproject` more slowly, but compiled once for all plates and field radii, its static fields."""
-    array, dtype = dataclasses.replace(imager.array, size=(math.inf, math.inf)), imager.sensor_distance.dtype
-    fixed = dataclasses.replace(imager, array=array, field_radius=1.0)
-    return np.asarray(_sum_lenses(jnp.asarray(image, dtype), fixed, grid, jnp.asarray(imager.field_radius, dtype)))
+def _backproject(image, imager: Imager, grid: Grid) -> np.ndarray:
+    """`gs_jax.backproject` more slowly, but compiled once for all field radii, which are static there."""
+    image, radius = (jnp.asarray(x, imager.sensor_distance.dtype) for x in (image, imager.field_radius))
+    return np.asarray(_sum_lenses(image, dataclasses.replace(imager, field_radius=1.0), grid, radius))
 
 
 @jax.jit
 def _sum_lenses(image: Array, imager: Imager, grid: Grid, field_radius: Array) -> Array:
     def plane(depth):
         # Views are separable in x and y: one line of points along each is enough.
-        across, along = jnp.broadcast_to(depth, grid.x.shape), jnp.broadcast_to(depth, grid.y.shape)
-        across = jnp.stack([grid.x, jnp.zeros_like(across), across], -1)
-        along = jnp.stack([jnp.zeros_like(along), grid.y, along], -1)
+        across = jnp.stack([grid.x, 0 * grid.x, jnp.full_like(grid.x, depth)], -1)
+        along = jnp.stack([0 * grid.y, grid.y, jnp.full_like(grid.y, depth)], -1)
 
         def add_lens(lens, plane):
             by_x, by_y = imager.views(across, lens[None]), imager.views(along, lens[None])
