@@ -245,31 +245,23 @@ def test_gradients_are_finite_differences(design, outcome):
 
 
 @pytest.mark.integration
-def test_random_devices_agree_with_gradients(outcome):
-    """Where all is nearly linear; 100 devices have an RMS within 20 % or so."""
-    found = summarise_changes(outcome)
-    for key in ("depth_error_um", "depth_error_calibrated_um"):
-        assert found["all, drawn"][key] == pytest.approx(found["all, by gradient"][key], rel=0.25)
-    squares = [sum(np.asarray(outcome.alone[n].calibrated) ** 2 for n in ERROR_FIELDS if n not in CONSTANT)]
-    np.testing.assert_allclose(combine_changes(outcome.alone).calibrated, np.sqrt(squares[0]))
-
-
-@pytest.mark.integration
-def test_calibration_removes_distance_and_tilt(outcome):
-    """Distance and tilt are found by it and cost nothing; what remains is where lenses are, and what they are."""
+def test_sensitivities(outcome):
+    """A calibration finds distance and tilt, which cost nothing then; roughness takes light from the core."""
     alone = outcome.alone
     assert all(np.abs(alone[name].calibrated).max() < 1e-3 for name in ("sensor distance", "tilt"))
     assert alone["position"].calibrated.max() > 0.01 and alone["sensor distance"].designed.min() > 0.2
     # The closed form, but for cores that move with the distance.
     np.testing.assert_allclose(alone["sensor distance"].designed[:5], (18 + 1 / 1.43) * 0.05 / 3.8, rtol=0.05)
-
-
-@pytest.mark.integration
-def test_roughness_takes_light_from_the_core(outcome):
     lost = -((2 * np.pi * 0.43 * 20e-6 / 520e-6) ** 2)
-    np.testing.assert_allclose(outcome.alone["roughness"].log_strehl, lost, rtol=1e-6)
-    np.testing.assert_allclose(outcome.alone["roughness"].log_width, 0, atol=1e-12)
-    assert (np.asarray(outcome.alone["printed layers"].log_width) > 0).all()
+    np.testing.assert_allclose(alone["roughness"].log_strehl, lost, rtol=1e-6)
+    np.testing.assert_allclose(alone["roughness"].log_width, 0, atol=1e-12)
+    assert (np.asarray(alone["printed layers"].log_width) > 0).all()
+    squares = sum(np.asarray(alone[name].calibrated) ** 2 for name in ERROR_FIELDS if name not in CONSTANT)
+    np.testing.assert_allclose(combine_changes(alone).calibrated, np.sqrt(squares))
+    # Where all is nearly linear; 100 devices have an RMS within 20 % or so.
+    rows = summarise_changes(outcome)
+    for key in ("depth_error_um", "depth_error_calibrated_um"):
+        assert rows["all, drawn"][key] == pytest.approx(rows["all, by gradient"][key], rel=0.25)
 
 
 @pytest.mark.integration
