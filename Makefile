@@ -69,12 +69,12 @@ dist: .venv/dist
 	rm -rf dist .venv-wheel
 	$(BIN)/python -m build --outdir dist
 	$(PYTHON) -m venv .venv-wheel
-	.venv-wheel/bin/python -m pip install --quiet dist/*.whl
+	.venv-wheel/bin/python -m pip install --quiet "$$(ls dist/*.whl)[all]"
 	cd / && $(CURDIR)/.venv-wheel/bin/gs-jax demo --out $(CURDIR)/out/wheel
 
 .venv/core: pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[all]'
 	touch $@
 
 .venv/dev: .venv/core
@@ -96,6 +96,6 @@ dist: .venv/dist
 
 .venv-lowest/test: pyproject.toml
 	$$(command -v python3.11 || echo $(PYTHON)) -m venv .venv-lowest
-	sed -n '/^dependencies/,/^]/s/^ *"\(.*\)>=\(.*\)",$$/\1==\2/p' pyproject.toml > .venv-lowest/floors.txt
+	sed -n '/^dependencies/,/^gpu/p' pyproject.toml | grep -oE '[a-z0-9-]+>=[0-9.]+' | sed 's/>=/==/' > .venv-lowest/floors.txt
 	$(LOWEST) -m pip install --quiet --editable '.[test]' --constraint .venv-lowest/floors.txt
 	touch $@

@@ -327,3 +327,20 @@ def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
     assert counts.dtype == np.uint8 and counts.min() == 7 and counts.max() == 52
     status, _, err = run(monkeypatch, capsys, "simulate", "scene.csv", "design.toml", "--gain", "0", "-o", "c.tif")
     assert status == 2 and "must be 0.001 to 1e+06 electrons, got '0'" in err
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("zarr", "zarr", (*RECONSTRUCT, "-o", "out.zarr")),
+        ("jinja2", "report", ("report", "design.toml", "-o", "out.html")),
+        ("ezdxf", "mold", ("mask", "design.toml", "-o", "out.dxf")),
+    ],
+)
+def test_a_missing_extra_is_named_and_nothing_is_written(module, extra, arguments, folder, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.partition(".")[0] == module]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, module, None)
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2 and f"gs-jax[{extra}]" in err and err.count("\n") == 1
+    assert not list(Path().glob("out.*"))

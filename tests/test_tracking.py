@@ -94,5 +94,5 @@ def test_what_cannot_be_tracked_is_one_line(folder, monkeypatch, capsys):
     assert status == 2 and "--track must be used with a recording" in err
     monkeypatch.setitem(sys.modules, "trackpy", None)
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--track", "100", "--points", "p.csv"))
-    assert (status, err) == (2, "gs-jax: --track needs trackpy; install it with pip install 'gs-jax[track]'.\n")
+    assert (status, err) == (2, "gs-jax: trackpy is not installed; it comes with pip install 'gs-jax[track]'.\n")
     assert not (folder / "v.zarr").exists()

@@ -133,7 +133,7 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
     status, _, err = run(monkeypatch, capsys, *command("rec.tif", "--workers", "2"))
     assert (status, err) == (
         2,
-        "gs-jax: --workers: found no Dask, allowed: after pip install 'gs-jax[cluster]'.\n",
+        "gs-jax: distributed is not installed; it comes with pip install 'gs-jax[cluster]'.\n",
     )
     assert not (folder / "v.zarr").exists()
 

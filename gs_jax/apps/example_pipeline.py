@@ -7,12 +7,12 @@ from pathlib import Path
 from time import perf_counter
 
 import jax
-import jinja2
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
+from ..base.errors import needs_extra
 from ..base.progress import Progress
 from ..codesign.search import run_study
 from ..codesign.search_report import as_records, write_outcome
@@ -94,6 +94,9 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
         "mold": mold,
         "seconds": seconds,
     }
+    with needs_extra("report"):
+        import jinja2
+
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
     text = environment.from_string(_template("example_pipeline.md")).render(context)
     write_text(folder / "report.md", text, [".md"])

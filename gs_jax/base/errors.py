@@ -47,6 +47,15 @@ def errors_name_file(path: object) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from error
 
 
+@contextlib.contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Name the extra of an optional dependency that is imported within and not installed: `InputError`."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise InputError(f"{error.name} is not installed; it comes with pip install 'gs-jax[{extra}]'.") from error
+
+
 def short_repr(value: object) -> str:
     """What was found, short enough for a one-line message: `repr`, cut in length and depth."""
     return reprlib.repr(value)

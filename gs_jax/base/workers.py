@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 from .._version import __version__
-from .errors import InputError
+from .errors import InputError, needs_extra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -159,10 +159,8 @@ class Workers:
         os.environ["PYTHONWARNINGS"] = ",".join(
             filter(None, [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker"])
         )
-        try:
+        with needs_extra("cluster"):
             from distributed import Client, LocalCluster
-        except ImportError as error:
-            raise InputError(f"{name}: found no Dask, allowed: after pip install 'gs-jax[cluster]'.") from error
         if self.count:
             from dask.system import CPU_COUNT
 

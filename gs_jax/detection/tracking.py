@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from jaxtyping import Float
 
-from ..base.errors import InputError
+from ..base.errors import InputError, needs_extra
 
 # Frames that a particle may be missing from and still keep its number; trackpy's term.
 MEMORY = 2
@@ -16,10 +16,8 @@ MEMORY = 2
 
 def import_linker() -> Callable[..., Iterator[tuple[int, list[int]]]]:
     """Import `trackpy.link_iter` and silence its log; `InputError` if trackpy is not installed."""
-    try:
+    with needs_extra("track"):
         import trackpy
-    except ImportError as error:
-        raise InputError("--track needs trackpy; install it with pip install 'gs-jax[track]'.") from error
     trackpy.quiet()
     return trackpy.link_iter
 

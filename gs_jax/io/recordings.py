@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Shaped
 
-from ..base.errors import InputError
+from ..base.errors import InputError, needs_extra
 from ..typing import PathLike
 from .captures import CAPTURE_SUFFIXES, Wanted, check_colour, check_declared, checked, frames, opened_tiff, tiff_page
 from .files import check_input, decoding
@@ -104,8 +104,9 @@ def _counted(path: Path) -> list[Any]:
 
 
 def _of_zarr(path, page):
-    import zarr
-    from zarr import open as open_zarr
+    with needs_extra("zarr"):
+        import zarr
+        from zarr import open as open_zarr
 
     if page is not None:
         raise InputError(f"--page {page}: found {path}, a recording in Zarr, allowed: no page.")

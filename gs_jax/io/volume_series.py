@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
 from .files import atomic_write, decoding
@@ -119,7 +119,8 @@ class VolumeSeries:
             file.write(json.dumps(note, ensure_ascii=False) + "\n")
 
     def _create(self, volume) -> None:
-        import zarr
+        with needs_extra("zarr"):
+            import zarr
 
         shapes = pyramid(volume.shape[1:])
         depths = plain_depths(self.grid)
@@ -164,7 +165,8 @@ class VolumeSeries:
 
 def opened_levels(path: Path, grid: Grid) -> list[Any]:
     """The arrays of a store that is there, to write to: of the full size, and each next of half of it."""
-    import zarr
+    with needs_extra("zarr"):
+        import zarr
 
     group = zarr.open_group(path, mode="r+")
     return [group[str(level)] for level in range(len(pyramid(grid.shape)))]
@@ -216,7 +218,8 @@ def read_series(path: PathLike) -> Series | None:
     """What `VolumeSeries` wrote, or None if it is anything else."""
     if read_head(path) is None:
         return None
-    import zarr
+    with needs_extra("zarr"):
+        import zarr
 
     with decoding(Path(path), "OME-Zarr"):
         group = zarr.open_group(path, mode="r")

@@ -27,7 +27,7 @@ import numpy as np
 import tifffile
 from jaxtyping import Array, Shaped
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
 from .files import atomic_write, check_input, check_output, decoding
@@ -250,7 +250,8 @@ def _length(path: Path, element: ElementTree.Element, name: str, default_unit: s
 
 
 def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid, provenance: Provenance) -> None:
-    import zarr  # 0.15 s that TIFF does not need
+    with needs_extra("zarr"):
+        import zarr  # 0.15 s that TIFF does not need
 
     attributes = image_attributes(path, depths, grid, [voxels.shape[1:]], voxels, provenance)
     with atomic_write(path) as temporary:
@@ -260,7 +261,8 @@ def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
 
 
 def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
-    import zarr
+    with needs_extra("zarr"):
+        import zarr
 
     if not os.path.isdir(path):
         raise InputError(f"{path}: found {'a file' if os.path.exists(path) else 'nothing'}, allowed: a Zarr folder.")
@@ -419,7 +421,8 @@ def chunked(shape: tuple[int, int, int]) -> dict[str, Any]:
 
 def sharded(shape: tuple[int, int, int, int]) -> dict[str, Any]:
     """How volumes in time are stored: planes, or squares of them, those of a frame in one file."""
-    from zarr.codecs import BloscCodec
+    with needs_extra("zarr"):
+        from zarr.codecs import BloscCodec
 
     rows, columns = _square(shape)
     whole = (-(-shape[-2] // rows) * rows, -(-shape[-1] // columns) * columns)

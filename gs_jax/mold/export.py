@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from trimesh.exchange.stl import export_stl
 
 from .._version import __version__
-from ..base.errors import InputError
+from ..base.errors import InputError, needs_extra
 from ..io.files import atomic_write, check_input, check_output, decoding
 from ..io.provenance import KEY, Provenance, write_sidecar
 from ..lenses import MicrolensArray
@@ -140,7 +140,8 @@ def read_mesh(path: PathLike) -> Mesh:
     if path.stat().st_size > MAX_MESH_BYTES:
         raise InputError(f"{path}: must have at most {MAX_MESH_BYTES} bytes, got {path.stat().st_size}.")
     with decoding(path, "STL or 3MF file"):
-        scene = trimesh.load_scene(path, process=False)
+        with needs_extra("mold"):  # lxml, of 3MF
+            scene = trimesh.load_scene(path, process=False)
         loaded = scene.to_mesh()
         if scene.units not in (None, "mm", "millimeter", "millimeters"):
             loaded.units = scene.units
@@ -217,8 +218,9 @@ def write_mask(path: PathLike, mask: Mask, provenance: Provenance | None = None)
 
 
 def _write_dxf(path: Path, layers: dict[str, list[Ring]], circles: np.ndarray) -> None:
-    from ezdxf.filemanagement import new
-    from ezdxf.units import MM
+    with needs_extra("mold"):
+        from ezdxf.filemanagement import new
+        from ezdxf.units import MM
 
     document = new("R2010", units=MM)
     space = document.modelspace()
@@ -254,10 +256,8 @@ def _write_svg(path: Path, layers: dict[str, list[Ring]], circles: np.ndarray) -
 
 
 def _write_gds(path: Path, layers: dict[str, list[Ring]], circles: np.ndarray) -> None:
-    try:
+    with needs_extra("gds"):
         import gdstk
-    except ImportError as error:
-        raise InputError(f"{path.suffix} needs gdstk: pip install 'gs-jax[gds]'.") from error
     library = gdstk.Library("gs_jax", unit=_GDS_UNIT, precision=_GDS_GRID)
     cell = library.new_cell("MASK")
     um = 1000

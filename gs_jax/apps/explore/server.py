@@ -15,10 +15,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from ...base.errors import InputError
+from ...base.errors import InputError, needs_extra
 from ...codesign.study import Study
 from ...design.design import Design, write_design
 from ...pictures.volume_pictures import png_uri, to_uint8
@@ -79,6 +78,9 @@ class Session:
         self.start, self.sliders = start_of(design, study), make_sliders(design)
         self.terms = live_terms(self.start, study)
         self.kept: list[tuple[str, Values, Evaluation]] = []
+        with needs_extra("report"):
+            import jinja2
+
         environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
         environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
         text = (resources.files("gs_jax") / "apps" / "explore" / "parts.html").read_text("utf-8")

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.ticker import LogLocator, MaxNLocator
 
+from ...base.errors import needs_extra
 from ...design.design import Design
 from ...geometry import Imager
 from ...layouts import cell_edges
@@ -39,7 +40,8 @@ Numbers = Sequence[float | None] | np.ndarray
 
 @cache
 def _macros() -> Any:
-    import jinja2
+    with needs_extra("report"):
+        import jinja2
 
     text = (resources.files("gs_jax") / "apps" / "report" / "drawings.html").read_text("utf-8")
     return (

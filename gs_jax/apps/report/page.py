@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Num
 
-from ...base.errors import InputError
+from ...base.errors import InputError, needs_extra
 from ...base.progress import Progress
 from ...design.datasheets import datasheet
 from ...design.design import Design, design_text
@@ -133,7 +133,8 @@ def write_report(
 
 def render(name: str, context: Mapping[str, Any], folder: str = "report") -> str:
     """Renders a template in a folder of `gs_jax/apps` with the style sheet of the report and its own script."""
-    import jinja2
+    with needs_extra("report"):
+        import jinja2
 
     read = lambda *parts: resources.files("gs_jax").joinpath("apps", *parts).read_text("utf-8")
     environment = jinja2.Environment(
