@@ -306,13 +306,13 @@ def test_the_command(folder, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (("--position-um", "-1"), "found '-1', allowed: 0 to 1000 um"),
-        (("--index", "x"), "found 'x', allowed: 0 to 0.1"),
+        (("--position-um", "-1"), "must be 0 to 1000 um, got '-1'"),
+        (("--index", "x"), "must be 0 to 0.1, got 'x'"),
         (("--tolerances", "wrong.toml"), "`possition_um`: found a key that does not exist, allowed: `position_um`"),
         (("-o", "t.txt"), "found the suffix '.txt', allowed: .json"),
         (("--draws", "0"), "0 is not in the range"),
         (("--positions", "places.csv"), "places.csv: every source must have x, y and z"),
-        (("--min-strehl", "2"), "found '2', allowed: 0.001 to 1"),
+        (("--min-strehl", "2"), "must be 0.001 to 1, got '2'"),
     ],
 )
 def test_wrong_input_is_one_line(folder, monkeypatch, capsys, arguments, message):
