@@ -30,7 +30,7 @@ from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import peak_mib, timed
-from gs_jax.base.arrays import in_float32
+from gs_jax.base.arrays import to_float32
 from gs_jax.base.machine import describe, status_mib
 from gs_jax.base.progress import Progress
 from gs_jax.layouts import random_layout
@@ -87,7 +87,7 @@ def inputs(job: Job) -> Inputs:
     imager = Imager(MicrolensArray(centers), sensor, job.sensor_distance_mm, field_radius=3.0)
     grid = Grid(np.linspace(18, 24, job.depths), (job.voxels, job.voxels), FIELD_MM / job.voxels)
     random = lambda *shape: jnp.asarray(rng.random(shape, dtype=np.float32))
-    return Inputs(random(*sensor.shape), random(job.depths, *grid.shape), in_float32(imager), in_float32(grid))
+    return Inputs(random(*sensor.shape), random(job.depths, *grid.shape), to_float32(imager), to_float32(grid))
 
 
 def bilinear_form(centers, sensor_distance, s: Inputs):

@@ -36,7 +36,7 @@ from gs_jax.apps.training.simulated_captures import (
     resample_scene,
     trace_optics,
 )
-from gs_jax.base.arrays import in_float32
+from gs_jax.base.arrays import to_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
 from gs_jax.projection.forward_model import make_psf_model
@@ -81,9 +81,9 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
     sensor = Sensor((SPEC.pixels, SPEC.pixels), SPEC.pixel)
     imager = Imager(MicrolensArray(centers), sensor, DISTANCE, FIELD_RADIUS)
     between = np.linspace(DEPTHS[0] - 0.2, DEPTHS[-1] + 0.2, SCENE_PLANES)
-    single = in_float32(imager)
-    grid = in_float32(Grid.over(sensor, depths=DEPTHS, pitch=SPEC.pitch))
-    fine = in_float32(Grid(between, tuple(2 * n for n in grid.shape), SPEC.pitch / 2))
+    single = to_float32(imager)
+    grid = to_float32(Grid.over(sensor, depths=DEPTHS, pitch=SPEC.pitch))
+    fine = to_float32(Grid(between, tuple(2 * n for n in grid.shape), SPEC.pitch / 2))
     optics = lambda depths: (
         trace_optics(imager, depths, SPEC) if level == "full" else make_psf_model(single, depths, "near")
     )

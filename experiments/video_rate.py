@@ -19,8 +19,8 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, write_design
 from gs_jax.io.camera import prepare, read_frame
-from gs_jax.io.captures import Wanted
-from gs_jax.io.recordings import opened_recording
+from gs_jax.io.captures import Selection
+from gs_jax.io.recordings import open_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries
 from gs_jax.reconstruction.pipeline import reconstructor, voxel_grid
 from gs_jax.simulation.phantoms import random_points
@@ -60,11 +60,11 @@ def parts(path: Path, design: Design, depths: list[float], folder: Path, frames:
     grid = voxel_grid(imager, depths)
     volume_of, series = reconstructor(imager, grid), VolumeSeries(folder / "parts.zarr", frames, grid)
     prepared, times = prepare(imager.sensor.shape), []
-    with opened_recording(path) as recording:
+    with open_recording(path) as recording:
         assert recording is not None
         for frame in range(frames):
             began = time.perf_counter()
-            image = read_frame("a frame", recording.images(frame, Wanted()), prepared).image.astype(np.float32)
+            image = read_frame("a frame", recording.images(frame, Selection()), prepared).image.astype(np.float32)
             read = time.perf_counter()
             volume = volume_of(image, Progress())
             made = time.perf_counter()

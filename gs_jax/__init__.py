@@ -74,7 +74,7 @@ How good it is:
 
 Around all:
 
-    Progress             How far long work is, on standard error: bars on a terminal, else a line every ten seconds
+    Progress             Progress on standard error: bars on a terminal, otherwise a line every ten seconds
     InputError           Wrong input from a user, explained in one line
 
 """

@@ -14,7 +14,7 @@ import click
 
 from ._version import __version__
 from .base.errors import InputError, InputWarning
-from .base.progress import QUIET, VERBOSE, shown
+from .base.progress import QUIET, VERBOSE, verbosity
 from .cli.files import ARGUMENTS
 from .cli.interrupt import exit_now, exit_on_signal, exit_status, interrupt_message, partial_outputs
 
@@ -96,8 +96,8 @@ class _Commands(click.Group):
 
 def _set_level(context: click.Context, param: click.Parameter, value: bool) -> None:
     if value:
-        token = shown.set(QUIET if param.name == "quiet" else VERBOSE)
-        context.call_on_close(lambda: shown.reset(token))
+        token = verbosity.set(QUIET if param.name == "quiet" else VERBOSE)
+        context.call_on_close(lambda: verbosity.reset(token))
 
 
 _LEVELS = [

@@ -15,7 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .base.arrays import FINITE, POSITIVE, Rule, as_float, as_float_or_none, as_pair, as_shape, check_fields, library_of
+from .base.arrays import (
+    FINITE,
+    POSITIVE,
+    Rule,
+    array_namespace,
+    as_float,
+    as_float_or_none,
+    as_pair,
+    as_shape,
+    check_fields,
+)
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
 
@@ -219,13 +229,13 @@ class Imager(eqx.Module):
     def heights(self) -> Scalars:
         """Heights `(lens,)` of the vertices above `v`, toward the object, mm: 0 unless the array is tilted."""
         if self.tilt is None:
-            return library_of(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
+            return array_namespace(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
         return self._cosine * (self._in_plane @ self.tilt)
 
     @property
     def _in_plane(self):
         """Lens vertices after rotation and shift, before the tilt."""
-        xp = library_of(self.rotation)
+        xp = array_namespace(self.rotation)
         cos, sin = xp.cos(self.rotation), xp.sin(self.rotation)
         x, y = self.array.centers.T
         return xp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + self.shift[None]
@@ -234,7 +244,7 @@ class Imager(eqx.Module):
     def _cosine(self):
         """Cosine of the tilt's angle."""
         assert self.tilt is not None
-        return 1 / library_of(self.tilt).sqrt(1 + (self.tilt**2).sum())
+        return 1 / array_namespace(self.tilt).sqrt(1 + (self.tilt**2).sum())
 
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Reduced depth `z'` from the object to the lens vertices, mm.
@@ -242,7 +252,7 @@ class Imager(eqx.Module):
         It is `z + t/n` with the plate in front, and `z` with the curved side in front. An imager of NumPy's
         numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
         """
-        return library_of(self.sensor_distance).asarray(depth) + self.array.reduced_thickness_front
+        return array_namespace(self.sensor_distance).asarray(depth) + self.array.reduced_thickness_front
 
     @property
     def reduced_sensor_distance(self) -> Scalar:
@@ -266,7 +276,7 @@ class Imager(eqx.Module):
 
     def axis_offset(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Offset of a lens's axis, which is normal to the array, from its vertex at a depth, mm, `(*batch, 2)`."""
-        xp, reduced = library_of(self.sensor_distance), self.reduced_depth(depth)
+        xp, reduced = array_namespace(self.sensor_distance), self.reduced_depth(depth)
         tilt = xp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
         return -xp.multiply.outer(reduced, tilt)
 
@@ -296,7 +306,7 @@ class Imager(eqx.Module):
             Factor of the spot's distance from the image of the lens's axis: 1 for the chief ray, others for the core of
             a spot (`gs_jax.optics.psf_core`).
         """
-        xp = library_of(self.sensor_distance)
+        xp = array_namespace(self.sensor_distance)
         depth, lenses = points[..., 2], xp.asarray(lenses)
         magnification, reduced = distortion * self.magnification(depth), self.reduced_depth(depth)
         center, point = self.centers[lenses], points[..., :2]

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Rule, as_float, as_float_or_none, check_fields, library_of
+from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields
 from .base.errors import InputError
 from .typing import Scalar, Scalars
 
@@ -233,4 +233,4 @@ def sag_slope_over_r(
 
 def _root(squared_radius, radius_of_curvature, conic_constant):
     root2 = radius_of_curvature**2 - (1 + conic_constant) * squared_radius
-    return library_of(squared_radius).sqrt(root2)
+    return array_namespace(squared_radius).sqrt(root2)

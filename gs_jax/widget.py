@@ -27,7 +27,7 @@ from napari.utils.notifications import show_error, show_warning
 from qtpy.QtCore import QTimer
 
 from .base.errors import InputError
-from .base.progress import Ended, Watched
+from .base.progress import CancellableProgress, Cancelled
 from .cli.options import DESIGN, METHODS, SUPPRESSIONS, Depths, depth_range, shipped_designs
 
 # Milliseconds between updates of the progress bar.
@@ -53,7 +53,7 @@ def reconstruct_layers(
     method: str,
     suppress: str,
     points: bool,
-    progress: Watched,
+    progress: CancellableProgress,
 ) -> Result:
     """Reconstructs a file, or the pixels of a layer, as `gs-jax reconstruct` with these options.
 
@@ -64,7 +64,7 @@ def reconstruct_layers(
     """
     from .cli.options import CaptureOptions
     from .design.design import read_design
-    from .io.napari import points_layer, step_of, volume_layer
+    from .io.napari import mean_step, points_layer, volume_layer
     from .reconstruction.plan import Plan
 
     try:
@@ -83,10 +83,10 @@ def reconstruct_layers(
     grid, volume_of = plan.grid, plan.prepare(progress)
     with progress.step("Reconstructing"):
         volume, found, _, warning = volume_of(image, progress)
-    progress.go_on()
+    progress.check_cancelled()
     layers = [volume_layer(volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
     if found is not None:
-        layers.append(points_layer(found, f"{name}, {len(found)} points", step_of(grid)))
+        layers.append(points_layer(found, f"{name}, {len(found)} points", mean_step(grid)))
     z, y, x = volume.shape
     status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM_PER_MM:.4g} um laterally, {depth_range(planes)}"
     return Result(layers, _capture_transform(imager.sensor), status, warnings + ([warning] if warning else []))
@@ -95,7 +95,7 @@ def reconstruct_layers(
 def _correct_pixels(name, pixels, sensor):
     """Validates the pixels of a layer and repairs hot ones, as for a file; also returns warnings."""
     from .io.camera import prepare, read_frame
-    from .io.captures import DTYPES, checked
+    from .io.captures import DTYPES, check_images
 
     pixels = np.asarray(pixels)
     if pixels.shape != sensor.shape or pixels.dtype.name not in DTYPES:
@@ -104,7 +104,7 @@ def _correct_pixels(name, pixels, sensor):
             f"{name}: the layer must have {expected} pixels (rows x columns, as the design's sensor) of type "
             f"{', '.join(DTYPES)}, got {given} of {pixels.dtype}."
         )
-    frame = read_frame(name, checked(name, iter([pixels])), prepare(pixels.shape))
+    frame = read_frame(name, check_images(name, iter([pixels])), prepare(pixels.shape))
     return frame.image, frame.warnings
 
 
@@ -165,7 +165,7 @@ class Reconstruct(Container):
         # The timer polls what the other thread sets, and is deleted with the widget.
         self._done, closed = Event(), Event()
         self.native.destroyed.connect(lambda: closed.set())
-        self.progress = Watched(lambda: closed.is_set() or self.worker.abort_requested)
+        self.progress = CancellableProgress(lambda: closed.is_set() or self.worker.abort_requested)
         self._timer = QTimer(self.native)
         self._timer.setInterval(_POLL_INTERVAL)
         self._timer.timeout.connect(self._poll)
@@ -204,7 +204,7 @@ class Reconstruct(Container):
         # Other exceptions are errors of the program, which napari shows.
         try:
             self._result = reconstruct_layers(**request, progress=self.progress)
-        except Ended:
+        except Cancelled:
             pass
         except InputError as error:
             self._result = str(error)
@@ -214,7 +214,7 @@ class Reconstruct(Container):
             self._done.set()
 
     def _poll(self) -> None:
-        status, done, total = self.progress.now
+        status, done, total = self.progress.state
         self.bar.native.setRange(0, total or 0)
         self.bar.native.setValue(done)
         if status and self.cancel.enabled:

@@ -46,4 +46,4 @@ def _compiled_code_is_dropped():
 def _no_machine_is_slow(monkeypatch):
     """What a test reads on standard error is what it asked for, not that a slow machine took ten seconds."""
     monkeypatch.setattr("gs_jax.base.progress._EVERY", math.inf)
-    monkeypatch.setattr("gs_jax.base.progress._TELLING", math.inf)
+    monkeypatch.setattr("gs_jax.base.progress._MEASURED", math.inf)

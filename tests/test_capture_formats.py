@@ -146,7 +146,7 @@ def test_a_mosaic_is_split(tmp_path):
     np.testing.assert_array_equal(read("red"), GREY[1:36:2, 0:40:2])
     np.testing.assert_array_equal(read("blue"), GREY[0:36:2, 1:40:2])
     np.testing.assert_array_equal(read("green"), (GREY[0:36:2, 0:40:2] + GREY[1:36:2, 1:40:2].astype(float)) / 2)
-    refused(tmp_path / "a.npy", ["greyscale for --channel red", "--bayer"], channel="red")
+    refused(tmp_path / "a.npy", ["--channel red", "--bayer", "got greyscale"], channel="red")
 
 
 @pytest.mark.parametrize("declares", [True, False])

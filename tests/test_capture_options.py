@@ -79,7 +79,7 @@ def test_everything_at_once_is_said_and_recorded(folder):
         "2 bad pixels filled from neighbours: 1 hot in dark.tif, 1 in mask.png",
     ]
     assert result.stdout.splitlines()[:6] == [f"pages.tif: {line}" for line in lines]
-    assert "warning: pages.tif: found 9 pixels (0.00083 of all) at 4095" in result.stderr
+    assert "warning: pages.tif: 9 pixels (0.00083 of all) are saturated at 4095" in result.stderr
     said = read_provenance("v.ome.tif")
     assert all(line in said["correction"] for line in lines)
     assert {"input dark.tif", "input flat.tif", "input mask.png"} < set(said)
@@ -109,7 +109,7 @@ def test_a_hot_pixel_is_repaired_unless_it_is_not_wanted(folder):
         (["--roi", "10,4,60,80"], ["--roi", "rows 10 to 69 and columns 4 to 83", "96 x 80"]),
         (["--roi", "10,4,60,60"], ["capture.tif", "96 x 80", "60 x 60", "--roi"]),
         (["--binning", "2"], ["capture.tif", "96 x 80", "48 x 40", "--binning"]),
-        (["--bayer", "RGGB"], ["--bayer RGGB", "no --channel", "red, green, blue"]),
+        (["--bayer", "RGGB"], ["--bayer RGGB", "got none", "red, green, blue"]),
         (["--channel", "red"], ["capture.tif", "greyscale", "--bayer"]),
         (["--page", "2"], ["capture.tif", "--page 2", "1 pages"]),
         (["--dark", "missing.tif"], ["missing.tif", "No such file"]),

@@ -56,7 +56,7 @@ def test_columns_by_name_and_unit_by_key(tmp_path):
     blanks = "n  X (um)  Y (um)  Z (um)\n9 0 -1000 -500\n9 0 500 1250\n9 0 1000 -1000\n"
     path = with_file(tmp_path, blanks, centers_columns=["Y (um)", "Z (um)"])
     assert read_design(path).array.centers_mm == CENTERS
-    message_of(with_file(tmp_path, text, centers_columns=["c", "d"]), "no one column 'd'", "'a', 'b', 'c'")
+    message_of(with_file(tmp_path, text, centers_columns=["c", "d"]), "column 'd'", "'a', 'b', 'c'")
     message_of(with_file(tmp_path, "1,2\n", centers_columns=["c", "d"]), "no header", "'c' and 'd'")
 
 

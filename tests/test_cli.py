@@ -133,8 +133,8 @@ def test_simulate_points(folder, monkeypatch, capsys):
 
 
 WRONG_SCENES = [
-    ("x,y,z\n1,2,3\n", "found the header 'x,y,z'"),
-    ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm: found -20.0, allowed: a depth above 0"),
+    ("x,y,z\n1,2,3\n", "got 'x,y,z'"),
+    ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm: must be above 0, got -20.0"),
     ("x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
 ]
 
@@ -144,7 +144,7 @@ def test_wrong_scenes_give_one_line_and_status_2(folder, monkeypatch, capsys, co
     (folder / "points.csv").write_text(content)
     status, out, err = run(monkeypatch, capsys, "simulate", "points.csv", "design.toml", "-o", "c.tif")
     assert (status, out) == (2, "") and not (folder / "c.tif").exists()
-    assert re.fullmatch(r"gs-jax: points\.csv[^\n]+\n", err) and words in err
+    assert re.fullmatch(r"gs-jax: [^\n]*points\.csv[^\n]*\n", err) and words in err
 
 
 def test_a_negative_voxel_names_the_file(folder, monkeypatch, capsys):
@@ -194,7 +194,7 @@ WRONG_ARGUMENTS = [
     (("reconstruct", "capture.tif"), "DESIGN"),
     (("reconstruct", "capture.tif", "design.toml", "-o", "v.tif"), "--depths"),
     (RECONSTRUCT, "--output"),
-    ((*RECONSTRUCT, "-o", "v.jpg"), "v.jpg: found the suffix '.jpg', allowed: .tif"),
+    ((*RECONSTRUCT, "-o", "v.jpg"), "suffix: must be .tif"),
     ((*RECONSTRUCT, "-o", "nowhere/v.tif"), "nowhere"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0"), "must be 0.01 to 1e+06 um, got '0'"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "-3"), "got '-3'"),
@@ -221,7 +221,7 @@ WRONG_ARGUMENTS = [
     ),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "missing.npz"), "missing.npz"),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "design.toml"), "design.toml: not a whole"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "p.txt: found the suffix"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "suffix: must be .csv, got '.txt' (p.txt)"),
     (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
     (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
     (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "CAPTURE comes first"),
@@ -239,7 +239,7 @@ WRONG_ARGUMENTS = [
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif"), "missing.csv"),
     (("simulate", "capture.tif", "design.toml", "-o", "c.tif"), "capture.tif"),
     (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "got a design: SCENE comes first"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "c.jpg: found the suffix"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "got '.jpg' (c.jpg)"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.png", "--no-noise"), ".tif, .tiff or .npy with --no-noise"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--psf", "round"), "'round' is not"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),

@@ -54,7 +54,7 @@ def test_nothing_is_written_on_wrong_input(folder):
     before = set(folder.iterdir())
     with pytest.raises(InputError, match="got no checkpoint new.checkpoint"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
-    with pytest.raises(InputError, match="found the suffix '.json'"):
+    with pytest.raises(InputError, match="got '.json'"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")
     with pytest.raises(InputError, match="study.toml: `pareto`: found nothing"):
         run(pareto, "study.toml", "--out", "new")

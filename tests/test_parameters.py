@@ -141,7 +141,7 @@ def test_aspheric_terms_of_a_lens_without_any(design):
 
 
 def test_values_that_make_no_microscope(design, parent):
-    with pytest.raises(InputError, match="make no microscope: `lens.aperture_diameter_mm`: found 3.0"):
+    with pytest.raises(InputError, match="`lens.aperture_diameter_mm`.*3.0"):
         new_design(
             design, *parent, values={"aperture_diameter_mm": jnp.array(3.0), "radius_of_curvature_mm": jnp.array(1.2)}
         )

@@ -8,8 +8,8 @@ import sys
 import psutil
 import pytest
 
-from gs_jax.base import machine as memory, progress as module
-from gs_jax.base.progress import QUIET, VERBOSE, Ended, Progress, Watched, shown
+from gs_jax.base import machine, progress as module
+from gs_jax.base.progress import QUIET, VERBOSE, CancellableProgress, Cancelled, Progress, verbosity
 
 from .test_cli import RECONSTRUCT, folder
 
@@ -19,7 +19,7 @@ __all__ = ["folder"]
 @pytest.fixture(autouse=True)
 def _lines_come_as_a_user_gets_them(monkeypatch):
     monkeypatch.setattr(module, "_EVERY", 10.0)
-    monkeypatch.setattr(module, "_TELLING", 3.0)
+    monkeypatch.setattr(module, "_MEASURED", 3.0)
 
 
 @pytest.fixture
@@ -62,15 +62,15 @@ def test_a_terminal_gets_a_bar_with_count_and_time_left(monkeypatch, capsys):
 
 def test_how_much_is_shown(clock, capsys):
     for level, said in ((QUIET, ""), (VERBOSE, "gs-jax: Reading: 2, 12 s\n")):
-        token = shown.set(level)
+        token = verbosity.set(level)
         with Progress() as progress:
             list(progress.track(iter("ab"), "Reading"))
-        shown.reset(token)
+        verbosity.reset(token)
         assert capsys.readouterr().err == said
 
 
 def test_work_over_a_minute_is_announced(clock, capsys, monkeypatch):
-    monkeypatch.setattr(module, "most_memory", lambda: 2.9 * 2**30)
+    monkeypatch.setattr(module, "peak_memory", lambda: 2.9 * 2**30)
     for count, quarter, said in ((20, "", "80 s in all"), (600, "--voxel-um 80", "40 min in all")):
         with Progress() as progress:
             list(progress.track(range(count), "Iterating", quarter=quarter))
@@ -86,18 +86,18 @@ def test_memory_where_proc_does_not_tell_it(status, monkeypatch, tmp_path):
     file = tmp_path / "status"
     if status:
         file.write_text(status, encoding="utf-8")
-    monkeypatch.setattr(memory, "Path", lambda _: file)
-    assert math.isnan(memory.status_mib("VmRSS"))
+    monkeypatch.setattr(machine, "Path", lambda _: file)
+    assert math.isnan(machine.status_mib("VmRSS"))
     now = psutil.Process().memory_info().rss
     # The kernel counts pages of threads late; the process that started this one may have had more.
-    assert 0.9 * now < memory.most_memory() < 100 * now
+    assert 0.9 * now < machine.peak_memory() < 100 * now
 
 
 def test_what_compiles_or_waits_once_is_not_taken_for_usual(monkeypatch, capsys):
     """As of a recording: the first frame compiles for 20 s, the second waits a second for the first to be written."""
     times = iter([0.0, 20.0, 21.0, *(21.0 + 0.1 * n for n in range(1, 5000))])
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
-    monkeypatch.setattr(module, "most_memory", lambda: 2**30)
+    monkeypatch.setattr(module, "peak_memory", lambda: 2**30)
     with Progress() as progress:
         list(progress.track(range(800), "Reconstructing"))
     lines = capsys.readouterr().err.splitlines()
@@ -112,12 +112,12 @@ def test_another_thread_sees_it_and_ends_it(monkeypatch, capsys):
     times = map(float, range(0, 100, 2))
     monkeypatch.setattr(module.time, "monotonic", lambda: next(times))
     seen, ends = [], False
-    progress = Watched(lambda: ends)
-    assert progress.now == ("", 0, None)
-    with pytest.raises(Ended), progress.step("Reconstructing"):
-        seen.append(progress.now)
+    progress = CancellableProgress(lambda: ends)
+    assert progress.state == ("", 0, None)
+    with pytest.raises(Cancelled), progress.step("Reconstructing"):
+        seen.append(progress.state)
         for number in progress.track(range(5), "Iterating"):
-            seen.append(progress.now)
+            seen.append(progress.state)
             ends = number == 2
     assert seen == [
         ("Reconstructing", 0, None),
@@ -125,8 +125,8 @@ def test_another_thread_sees_it_and_ends_it(monkeypatch, capsys):
         ("Iterating: 1 of 5", 1, 5),
         ("Iterating: 2 of 5, about 6 s left", 2, 5),
     ]
-    assert progress.now == ("", 0, None) and capsys.readouterr().err == ""
-    with pytest.raises(Ended), progress.step("Writing"):
+    assert progress.state == ("", 0, None) and capsys.readouterr().err == ""
+    with pytest.raises(Cancelled), progress.step("Writing"):
         seen.append("not reached")
     assert "not reached" not in seen
 
@@ -134,7 +134,7 @@ def test_another_thread_sees_it_and_ends_it(monkeypatch, capsys):
 def test_the_terminal_announces_it_too(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(module, "_LONG", 0.0)
-    monkeypatch.setattr(module, "_TELLING", 0.0)
+    monkeypatch.setattr(module, "_MEASURED", 0.0)
     with Progress() as progress:
         list(progress.track(range(3), "Imaging"))
     assert "Imaging: about" in capsys.readouterr().err
@@ -146,9 +146,9 @@ def test_the_memory_that_is_announced_is_what_is_taken(folder, method):
     """By the kernel's count at the end, within a factor of two; and the voxels named are twice as wide."""
     arguments = ["gs-jax", *RECONSTRUCT, "--method", method, "--steps", "4", "--voxel-um", "50", "-o", "v.ome.tif"]
     code = (
-        "import sys; from gs_jax.base import progress, memory; from gs_jax.__main__ import main\n"
-        f"progress._LONG = progress._TELLING = 0; sys.argv = {arguments!r}\n"
-        "try:\n    main()\nfinally:\n    print(memory.most_memory() / 2**30)"
+        "import sys; from gs_jax.base import progress, machine; from gs_jax.__main__ import main\n"
+        f"progress._LONG = progress._MEASURED = 0; sys.argv = {arguments!r}\n"
+        "try:\n    main()\nfinally:\n    print(machine.peak_memory() / 2**30)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
     line = next(line for line in done.stderr.splitlines() if "Iterating: about" in line)

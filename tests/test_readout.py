@@ -20,7 +20,7 @@ from gs_jax import (
 )
 from gs_jax.base.errors import InputError
 from gs_jax.io.camera import Readout
-from gs_jax.io.captures import PATTERNS, channel_of
+from gs_jax.io.captures import PATTERNS, mosaic_channel
 
 from .helpers import CAPTURES, scene
 
@@ -43,7 +43,7 @@ def read_out(image, readout):
     side, image = readout.binning, image[row : row + rows, column : column + columns]
     rows, columns = (n // side for n in image.shape)
     image = image[: rows * side, : columns * side].reshape(rows, side, columns, side).sum((1, 3))
-    return channel_of(image, readout.bayer, readout.channel) if readout.bayer else image
+    return mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image
 
 
 def with_sensor(imager, sensor) -> Imager:

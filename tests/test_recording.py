@@ -16,12 +16,12 @@ import zarr
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
-from gs_jax.io import volume_series, volumes as ngff
-from gs_jax.io.captures import Wanted
+from gs_jax.io import ngff, volume_series
+from gs_jax.io.captures import Selection
 from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
-from gs_jax.io.recordings import opened_recording
-from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halved
+from gs_jax.io.recordings import open_recording
+from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halve
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
@@ -152,7 +152,7 @@ def test_what_viewers_are_told(folder, monkeypatch, capsys):
 
 def test_odd_ends_are_means_of_what_is_there():
     volume = np.arange(15, dtype=np.float32).reshape(1, 3, 5)
-    np.testing.assert_allclose(halved(volume), [[[3, 5, 6.5], [10.5, 12.5, 14]]])
+    np.testing.assert_allclose(halve(volume), [[[3, 5, 6.5], [10.5, 12.5, 14]]])
 
 
 @pytest.mark.integration
@@ -195,7 +195,7 @@ def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, c
     (folder / "frames" / "notes.txt").touch()
     status, out, err = run(monkeypatch, capsys, *command("frames"))
     assert status == 1 and "3 frames in" in out
-    assert "gs-jax: frame 0 (f8.tif): " in err and "found 50 x 80 pixels" in err
+    assert "gs-jax: frame 0 (f8.tif): " in err and "got 50 x 80 pixels" in err
     assert "gs-jax: frame 2 (f10.tif): " in err and "not a whole and valid TIFF" in err
     assert err.endswith("gs-jax: v.zarr: 2 of 5 frames failed and are empty: 0, 2; --resume tries them again\n")
     whole = expected()
@@ -211,7 +211,7 @@ def test_bad_frames_are_named_and_made_when_they_are_good(folder, monkeypatch, c
 
 def test_where_no_frame_is_good_nothing_is_written(folder, monkeypatch, capsys):
     status, _, err = run(monkeypatch, capsys, *command(save("rec.tif", FRAMES[:, :50])))
-    assert status == 2 and "found 50 x 80 pixels" in err and not (folder / "v.zarr").exists()
+    assert status == 2 and "got 50 x 80 pixels" in err and not (folder / "v.zarr").exists()
 
 
 @pytest.mark.integration
@@ -221,9 +221,9 @@ def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
     run(monkeypatch, capsys, *command("frames"))
     before = files(folder / "v.zarr")
     for options, words in (
-        ((), "found 4 of 5 frames of a recording that was interrupted, allowed: --resume to go on, or --force"),
-        (("--resume", "--optics", "pinhole"), "found optics 'pinhole' for --resume, allowed: 'full', as it was begun"),
-        (("--resume", "--frame-interval", "2"), "found frame_interval '2.0' for --resume, allowed: 'nothing'"),
+        ((), "has 4 of 5 frames of an interrupted recording; give --resume"),
+        (("--resume", "--optics", "pinhole"), "optics with --resume: must be 'full', as before, got 'pinhole'"),
+        (("--resume", "--frame-interval", "2"), "frame_interval with --resume: must be 'nothing'"),
     ):
         status, _, err = run(monkeypatch, capsys, *command("frames"), *options)
         assert status == 2 and words in err
@@ -279,13 +279,13 @@ def test_it_is_compiled_once(folder, monkeypatch, capsys):
     [
         ("rec.tif", ("-o", "v.ome.tif"), "rec.tif must be one image, got 5 pages: choose one by --page 1 to 5"),
         ("frames", ("-o", "v.ome.tif"), "-o must be VOLUME.zarr, which has a time axis, for 5 frames, got v.ome.tif"),
-        ("empty", (), "empty: found no captures, allowed: files that end in .tif"),
-        ("no*.tif", (), "no*.tif: found no captures"),
+        ("empty", (), "empty: no captures; their files end in .tif"),
+        ("no*.tif", (), "no*.tif: no captures"),
         ("capture.tif", ("--resume",), "--resume must be used with a recording, got a single capture capture.tif"),
         ("capture.tif", ("--frame-interval", "1"), "--frame-interval must be used with a recording"),
-        ("flat.zarr", (), "flat.zarr: found an array of 96 x 80, allowed: (t, y, x)"),
-        ("deep.zarr", (), "deep.zarr: found an array of 5 x 3 x 96 x 80, allowed: (t, y, x)"),
-        ("double.zarr", (), "found pixels of type float64"),
+        ("flat.zarr", (), "array: must be (t, y, x), with axes of 1 alone between t and y, got 96 x 80"),
+        ("deep.zarr", (), "got 5 x 3 x 96 x 80"),
+        ("double.zarr", (), "got float64"),
         ("none.zarr", (), "none.zarr"),
         ("rec.zarr", ("-o", "rec.zarr"), "rec.zarr: cannot be written"),
     ],
@@ -306,9 +306,9 @@ def test_ome_zarr_with_channel_and_depth_is_a_recording(tmp_path):
     attributes = {"multiscales": [{"axes": [{"name": n} for n in "tczyx"], "datasets": [{"path": "full"}]}]}
     group = zarr.create_group(tmp_path / "a", zarr_format=2, attributes=attributes)
     group.create_array("full", data=FRAMES[:, None, None])
-    with opened_recording(tmp_path / "a") as recording:
+    with open_recording(tmp_path / "a") as recording:
         assert recording is not None and len(recording.names) == 5
-        np.testing.assert_array_equal(next(recording.images(3, Wanted())), FRAMES[3])
+        np.testing.assert_array_equal(next(recording.images(3, Selection())), FRAMES[3])
 
 
 def test_memory_is_bounded_and_work_overlaps(tmp_path):
@@ -352,8 +352,22 @@ def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
         reconstruct_frames(VolumeSeries(tmp_path / "v.zarr", 9, grid), lambda frame: frame, make)
     series = VolumeSeries(tmp_path / "v.zarr", 9, grid, resume=True)
     assert series.finished >= set(range(5)) and series.unfinished[-3:] == [6, 7, 8]
-    with pytest.raises(InputError, match="for --resume, allowed"):
+    with pytest.raises(InputError, match="with --resume: must be"):
         VolumeSeries(tmp_path / "v.zarr", 8, grid, resume=True)
+
+
+def test_a_full_disk_names_the_store(tmp_path):
+    class Full:
+        def __setitem__(self, *_):
+            raise OSError(28, "No space left on device")
+
+    grid = Grid([20.0], (4, 4), 0.1)
+    series = VolumeSeries(tmp_path / "v.zarr", 2, grid)
+    series.write(0, np.zeros(grid.volume_shape, np.float32))
+    series._levels = [Full()]
+    with pytest.raises(OSError, match="No space left") as caught:
+        series.write(1, np.zeros(grid.volume_shape, np.float32))
+    assert caught.value.filename == str(tmp_path / "v.zarr")
 
 
 @pytest.mark.slow
@@ -362,8 +376,8 @@ def test_memory_is_flat(folder):
     code = (
         "import sys; sys.argv = ['gs-jax', *sys.argv[1:]]\n"
         "from gs_jax.__main__ import main\n"
-        "from gs_jax.base.machine import most_memory\n"
-        "try:\n    main()\nfinally:\n    print(most_memory())"
+        "from gs_jax.base.machine import peak_memory\n"
+        "try:\n    main()\nfinally:\n    print(peak_memory())"
     )
     peaks = []
     for count in (10, 60):

@@ -56,7 +56,7 @@ def test_what_a_study_says(read):
         ("[2.0, 6.0]", "[-2.0, 6.0]", "must be above 0"),
         ("[2.0, 6.0]", "[0.0, inf]", "free.sensor_distance_mm"),
         ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
-        ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]`: found 0.0, allowed"),
+        ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]`: must be .*, got 0.0"),
         ("[18.0, 23.0]", "[18.0]", "`depths_mm"),
         ('"occupancy"', '"ocupancy"', "`terms` 1: name must be occupancy or one of 31 others, got 'ocupancy'"),
         ("at_most = 0.5", "", "one of at_most, .* must be given, got none"),
@@ -77,15 +77,15 @@ def test_what_a_study_says(read):
             "one of at_most and at_least must be given",
         ),
         ("[[stages]]", "[[terms]]\nname = 'occupancy'\nat_most = 0.4\n[[stages]]", "occupancy must be given once"),
-        ("depths_mm", "starts = 0\ndepths_mm", "`starts`: found 0, allowed: a whole number from 1"),
-        ("depths_mm", "depths_mm = ", "not valid TOML"),
+        ("depths_mm", "starts = 0\ndepths_mm", "`starts`: must be a whole number from 1.*, got 0"),
+        ("depths_mm", "depths_mm = ", "valid TOML"),
     ],
 )
 def test_a_wrong_study_is_explained_in_one_line(read, old, new, found):
     assert old in STUDY
     with pytest.raises(InputError, match=found) as error:
         read(STUDY.replace(old, new))
-    assert "study.toml: " in str(error.value) and "\n" not in str(error.value)
+    assert "study.toml" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_study_without_a_design(read, tmp_path):

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from gs_jax.base.machine import in_threads
+from gs_jax.base.machine import map_in_threads
 
 
 def test_results_are_in_the_order_of_the_items():
@@ -17,13 +17,13 @@ def test_results_are_in_the_order_of_the_items():
         first_may_end.set()
         return item**2
 
-    assert list(in_threads(work, range(20))) == [item**2 for item in range(20)]
+    assert list(map_in_threads(work, range(20))) == [item**2 for item in range(20)]
 
 
 def test_nothing_to_do():
-    assert not list(in_threads(str, []))
+    assert not list(map_in_threads(str, []))
 
 
 def test_an_error_is_passed_on():
     with pytest.raises(ZeroDivisionError):
-        list(in_threads(lambda item: 1 / item, [1, 0, 2]))
+        list(map_in_threads(lambda item: 1 / item, [1, 0, 2]))

@@ -74,7 +74,7 @@ def test_any_shape_goes_in_and_comes_out(shape):
 
 
 def test_a_volume_with_nan_is_named():
-    with pytest.raises(InputError, match="volume: found 9 of 18 voxels NaN"):
+    with pytest.raises(InputError, match="volume: must be finite, got 9 of 18 voxels NaN"):
         suppress(stack(2, 3, 3) * np.array([1, np.nan], np.float32)[:, None, None], small())
 
 
@@ -218,7 +218,7 @@ def test_a_file_that_would_fill_the_memory_is_refused(tmp_path):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("about.npy", "w") as member:
         for _ in range(129):
             member.write(bytes(2**20))
-    with pytest.raises(InputError, match=f"allowed: at most {2**27}"):
+    with pytest.raises(InputError, match=f"at most {2**27}"):
         read_weights(path)
 
 
@@ -227,7 +227,7 @@ def test_missing_and_unknown_weights(tmp_path):
         read_weights(tmp_path / "none.npz")
     with pytest.raises(InputError, match="one of paper, multislice"):
         pretrained("other")
-    with pytest.raises(InputError, match=r"allowed: \.npz"):
+    with pytest.raises(InputError, match=r"must be \.npz"):
         write_weights(tmp_path / "w.txt", small())
 
 

@@ -52,7 +52,7 @@ def squares(path: Path):
 
 def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(two, tmp_path):
     found, refused = {}, []
-    for number, result in two.stream_of(partial(squares, tmp_path))(range(40)):
+    for number, result in two.mapper(partial(squares, tmp_path))(range(40)):
         try:
             found[number] = result()
         except InputError as error:
@@ -73,7 +73,7 @@ def settings():
 
 def test_workers_share_the_cores_and_have_this_process_settings(two, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    ((_, result),) = two.stream_of(settings)([0])
+    ((_, result),) = two.mapper(settings)([0])
     dtype, where, threads = result()
     assert (dtype, where) == ("float64", str(tmp_path)) and 2 * int(threads) <= max(2, os.cpu_count() or 1)
 
@@ -87,17 +87,17 @@ def test_no_more_is_taken_than_is_needed(two):
             taken.append(number)
             yield number
 
-    for done, (_, result) in enumerate(two.stream_of(settings)(items())):
+    for done, (_, result) in enumerate(two.mapper(settings)(items())):
         assert result() and len(taken) - done <= 5
 
 
 def test_in_this_process_jobs_are_done_one_by_one():
     done = []
     with Workers() as workers:
-        for number, result in workers.stream_of(lambda: done.append)([1, 2]):
+        for number, result in workers.mapper(lambda: done.append)([1, 2]):
             assert len(done) == number - 1
             result()
-    assert done == [1, 2] and not Workers().elsewhere
+    assert done == [1, 2] and not Workers().remote
 
 
 def test_nothing_of_dask_is_imported_unless_it_is_asked_for(folder):
@@ -120,10 +120,10 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
         for options, words in (
             (
                 ("--scheduler", address),
-                f"--scheduler: found nobody who answers at {address}, allowed: a Dask scheduler",
+                f"--scheduler: no Dask scheduler is reachable at {address}",
             ),
-            (("--scheduler", "nowhere"), "--scheduler: found nobody who answers at nowhere"),
-            (("--scheduler", address, "--workers", "2"), "--workers: found --scheduler beside it"),
+            (("--scheduler", "nowhere"), "--scheduler: no Dask scheduler is reachable at nowhere"),
+            (("--scheduler", address, "--workers", "2"), "--workers: must not be given together with --scheduler"),
         ):
             status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
             assert status == 2 and words in err and err.count("\n") == 1

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 from skimage.feature import peak_local_max
 
-from ..base.arrays import in_float32
+from ..base.arrays import to_float32
 from ..base.errors import InputError
 from ..base.machine import available_memory, status_mib
 from ..base.progress import Progress
@@ -77,7 +77,7 @@ def make_microscope(side: int) -> tuple[Imager, Grid, Psf]:
     # The rays' blur is 0.1 mm and more: in pixels, and a pixel for what is beside it.
     size = 2 * math.ceil(0.1 / pitch) + 3
     psf = geometric_psf(imager, DEPTH, size=size, radius=clear_diameter(imager.array) / 2)
-    return in_float32(imager), in_float32(Grid([DEPTH], (side, side), pitch)), np.asarray(psf, np.float32)[None]
+    return to_float32(imager), to_float32(Grid([DEPTH], (side, side), pitch)), np.asarray(psf, np.float32)[None]
 
 
 def particle_width(imager: Imager) -> float:

@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake raises, and the warning of what looks like one."""
+"""`InputError`, which every mistake of a user raises, `InputWarning`, and the wording of their messages."""
 
 import contextlib
 import re
@@ -12,8 +12,8 @@ _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 class InputError(ValueError):
     """Wrong input from a user, explained in one line.
 
-    The line names the file, the key or argument, what was found and what is allowed. The command line
-    prints it and exits with status 2. A fault of the program itself never becomes an `InputError`.
+    The line names the key or argument, what is expected, what was given, and the file. The command line prints it and
+    exits with status 2. Any other exception is a fault of the program.
 
     Parameters
     ----------
@@ -35,16 +35,21 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Input that is possible but hardly meant: a question in one line. The command line prints it once and goes on."""
+    """Input that is valid but implausible: a question in one line. The command line prints it once and continues."""
+
+
+def input_error(name: str, allowed: object, given: object, file: object = None) -> InputError:
+    """`InputError` with the message "NAME: must be ALLOWED, got GIVEN (FILE)."."""
+    return InputError(f"{name}: must be {allowed}, got {given}{f' ({file})' if file else ''}.")
 
 
 @contextlib.contextmanager
 def errors_name_file(path: object) -> Iterator[None]:
-    """Around what does not know the file that its input came from: an `InputError` then names it."""
+    """Add the name of a file to each `InputError` that is raised inside."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{str(error).removesuffix('.')} ({path}).") from error
 
 
 @contextlib.contextmanager
@@ -57,5 +62,5 @@ def needs_extra(extra: str) -> Iterator[None]:
 
 
 def short_repr(value: object) -> str:
-    """What was found, short enough for a one-line message: `repr`, cut in length and depth."""
+    """`repr` of a value for a one-line message, limited in length and depth."""
     return reprlib.repr(value)

@@ -1,4 +1,4 @@
-"""What this installation is and runs on."""
+"""The machine: versions, devices, memory and threads. Importing this module does not import JAX."""
 
 import math
 import os
@@ -13,6 +13,11 @@ from typing import TypeVar
 import psutil
 
 from .._version import __version__
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+# Each thread holds the arrays that it works on, and memory bandwidth limits how many are of use.
+_MAX_THREADS = 8
 
 
 def describe() -> dict[str, str]:
@@ -32,12 +37,12 @@ def describe() -> dict[str, str]:
 
 
 def available_memory() -> int:
-    """Bytes that may be taken now without swapping; other programs have the rest of the machine's."""
+    """Bytes that this process can take without swapping."""
     return psutil.virtual_memory().available
 
 
 def status_mib(key: str) -> float:
-    """A line of Linux's `/proc/self/status`, MiB: `VmRSS` is resident now, `VmHWM` at most. NaN where it is missing."""
+    """Memory of this process as Linux counts it, in MiB: `VmRSS` now, `VmHWM` its peak; NaN elsewhere."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -45,27 +50,21 @@ def status_mib(key: str) -> float:
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(key)), math.nan)
 
 
-def most_memory() -> float:
-    """Bytes of memory that were resident at most so far."""
+def peak_memory() -> float:
+    """Peak resident memory of this process so far, in bytes."""
     if sys.platform == "win32":
         return psutil.Process().memory_info().peak_wset
-    # First, as `ru_maxrss` of a child starts with its parent's.
-    most = 2**20 * status_mib("VmHWM")
-    if not math.isnan(most):
-        return most
-    import resource  # Windows has none
+    # Preferred to `ru_maxrss`, which in a child process starts at its parent's.
+    peak = 2**20 * status_mib("VmHWM")
+    if not math.isnan(peak):
+        return peak
+    import resource  # absent on Windows
 
     # In bytes on macOS, in KiB elsewhere.
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
-# More would wait for memory, and each holds what it works on.
-_MOST = 8
-
-
-def in_threads(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """What `work` makes of each of the items, in their order, as it becomes ready; a thread for each core does so."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MOST)) as threads:
-        yield from threads.map(work, items)
+def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """`map` with a thread per core, for NumPy code, which releases Python's lock; results are in the items' order."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as threads:
+        yield from threads.map(function, items)

@@ -1,9 +1,9 @@
-"""How far long work is, and how long it will take: bars on a terminal, a line now and then in a pipe."""
+"""Progress reports: bars on a terminal, lines in a pipe, or a state that another thread reads."""
 
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import partial
 
@@ -17,21 +17,19 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from .machine import most_memory
+from .machine import peak_memory
 
-# Seconds between two lines; what takes longer than a minute is announced.
-_EVERY, _LONG = 10.0, 60.0
-# Seconds of parts after the first that tell how long the others take.
-_TELLING = 3.0
-# How much is shown: QUIET is nothing, VERBOSE a line after every piece of work.
+# Seconds between two lines; work that takes longer than `_LONG` is announced, once parts took `_MEASURED` seconds.
+_EVERY, _LONG, _MEASURED = 10.0, 60.0, 3.0
+# QUIET shows nothing, VERBOSE a line after every task.
 QUIET, NORMAL, VERBOSE = -1, 0, 1
-shown: ContextVar[int] = ContextVar("shown", default=NORMAL)
+verbosity: ContextVar[int] = ContextVar("verbosity", default=NORMAL)
 
 
 class Progress:
-    """How far long work is, on standard error: bars on a terminal, else a line every ten seconds.
+    """Progress on standard error: bars on a terminal, otherwise a line every ten seconds.
 
-    As much as `shown` says, within `with Progress() as progress:`; one that is not entered shows nothing.
+    It reports only inside its `with` block, as much as `verbosity` says.
 
     Examples
     --------
@@ -45,17 +43,11 @@ class Progress:
     _lines = False
 
     def __enter__(self) -> "Progress":
-        console, level = Console(stderr=True), shown.get()
+        console, level = Console(stderr=True), verbosity.get()
         if console.is_terminal and level == NORMAL:
+            counts = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
             times = TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()
-            self._bars = Bars(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                *times,
-                TextColumn("{task.fields[rate]}"),
-                console=console,
-            )
+            self._bars = Bars(*counts, *times, TextColumn("{task.fields[rate]}"), console=console)
             self._bars.start()
         self._lines = level == VERBOSE or (level == NORMAL and not console.is_terminal)
         return self
@@ -66,162 +58,158 @@ class Progress:
         self._lines = False
 
     def track(self, items: Iterable, description: str, *, quarter: str = "") -> Iterator:
-        """The items, one by one, as the parts of a counter."""
-        with self.counter(description, len(items) if isinstance(items, Sized) else None, quarter=quarter) as done:
+        """Iterate over items and count them."""
+        with self.counter(description, len(items) if isinstance(items, Sized) else None, quarter=quarter) as advance:
             for item in items:
                 yield item
-                done()
+                advance()
 
     @contextmanager
     def step(self, description: str) -> Iterator[None]:
-        """Work of unknown length."""
-        with self.counter(description, None) as done:
+        """Report a task of unknown length."""
+        with self.counter(description, None) as advance:
             yield
-            done()
+            advance()
 
-    @contextmanager
     def counter(
         self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
-    ) -> Iterator[Callable[[], None]]:
-        """Work of `total` parts; what it yields is called after each.
+    ) -> AbstractContextManager[Callable[[], None]]:
+        """Report a task of `total` parts, if known; call the value of the `with` statement after each part.
 
-        `quarter`: what would take a fourth of the time. `rate`: what the parts are, if so many a second are shown.
-        Soon after the second part, work of more than a minute is announced: its time, the memory, and the quarter.
+        A task of more than a minute is announced, with its time and memory, and the option `quarter` that would take a
+        quarter of the time. `rate` is the plural of the parts, if their number per second is shown.
         """
-        if bars := self._bars:
-            task = bars.add_task(description, total=total, rate="")
-            began = time.monotonic()
-            forecast = _Forecast(
-                description, total, partial(bars.console.print, highlight=False, soft_wrap=True), quarter
-            )
-
-            def advance():
-                bars.advance(task)
-                forecast(now := time.monotonic())
-                if rate and now > began:
-                    bars.update(task, rate=f"{forecast.done / (now - began):.3g} {rate}/s")
-
-            yield advance
-            if total is None:
-                bars.update(task, total=bars.tasks[task].completed)
-        elif self._lines:
-            yield (lines := _Lines(description, total, quarter, rate))
-            if shown.get() == VERBOSE:
-                lines.say(time.monotonic())
-        else:
-            yield lambda: None
+        task = _Task(description, total, quarter)
+        if self._bars:
+            return _bar(self._bars, task, rate)
+        return _lines(task, rate) if self._lines else nullcontext(lambda: None)
 
 
-class _Forecast:
-    """Called after each part; when what comes after the first tells, it says how long all will take.
+class _Task:
+    """Counts the parts of a task, and estimates its time.
 
-    The first part compiles, and of the others the longest is left out: it may have waited for the first to be written.
-    And how much memory: the most that was taken, as further parts take no more.
+    The first part compiles, and the longest of the others may have waited for output: the estimate leaves out both.
     """
 
-    def __init__(self, description: str, total: int | None, say: Callable[[str], object], quarter: str):
-        self.description, self.total, self.say, self.quarter = description, total, say, quarter
-        self.done, self.first, self.last, self.longest, self.said = 0, 0.0, 0.0, 0.0, False
+    def __init__(self, description: str, total: int | None, quarter: str = ""):
+        self.description, self.total, self.quarter = description, total, quarter
+        self.done, self.first, self.last, self.longest, self.announced = 0, 0.0, 0.0, 0.0, False
 
-    def __call__(self, now: float) -> None:
+    def advance(self, now: float) -> None:
         self.done += 1
         if self.done == 1:
             self.first = now
         else:
             self.longest = max(self.longest, now - self.last)
         self.last = now
-        if self.total is None or self.said or self.done < 2 or now - self.first < _TELLING:
-            return
-        self.said = True
-        if (whole := self.each * self.total) > _LONG:
-            sooner = f"; {self.quarter}: about {_in_words(whole / 4)}" if self.quarter else ""
-            memory = f"{most_memory() / 2**30:.2g} GiB of memory"
-            self.say(f"gs-jax: {self.description}: about {_in_words(whole)} in all, {memory}{sooner}")
 
     @property
-    def each(self) -> float:
-        """Seconds of a part, once there are two."""
+    def seconds_each(self) -> float:
+        """Seconds of a part; needs two parts."""
         left_out = self.done > 2
         return (self.last - self.first - left_out * self.longest) / (self.done - 1 - left_out)
+
+    def announcement(self) -> str | None:
+        """Time and memory of a long task, once, as soon as they can be estimated."""
+        if self.total is None or self.announced or self.done < 2 or self.last - self.first < _MEASURED:
+            return None
+        self.announced = True
+        if (seconds := self.seconds_each * self.total) <= _LONG:
+            return None
+        memory = f"{peak_memory() / 2**30:.2g} GiB of memory"  # further parts take no more
+        quarter = f"; {self.quarter}: about {_in_words(seconds / 4)}" if self.quarter else ""
+        return f"gs-jax: {self.description}: about {_in_words(seconds)} in all, {memory}{quarter}"
 
 
 def _in_words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 1.5 * _LONG else f"{seconds:.0f} s"
 
 
-class _Lines:
-    """Called after each part, it prints a line where the last is old."""
+@contextmanager
+def _bar(bars: Bars, task: _Task, rate: str) -> Iterator[Callable[[], None]]:
+    bar, began = bars.add_task(task.description, total=task.total, rate=""), time.monotonic()
 
-    def __init__(self, description: str, total: int | None, quarter: str, rate: str = ""):
-        self.description, self.total, self.rate, self.done = description, total, rate, 0
-        self.began = self.last = time.monotonic()
-        self.forecast = _Forecast(description, total, partial(print, file=sys.stderr, flush=True), quarter)
+    def advance():
+        bars.advance(bar)
+        task.advance(now := time.monotonic())
+        if text := task.announcement():
+            bars.console.print(text, highlight=False, soft_wrap=True)
+        if rate and now > began:
+            bars.update(bar, rate=f"{task.done / (now - began):.3g} {rate}/s")
 
-    def __call__(self) -> None:
-        self.done += 1
-        now = time.monotonic()
-        self.forecast(now)
-        if now - self.last >= _EVERY:
-            self.say(now)
-
-    def say(self, now: float) -> None:
-        self.last = now
-        taken, left = self.last - self.began, (self.total or self.done) - self.done
-        each = self.forecast.each if self.done > 1 else taken
-        time_left = f", about {each * left:.0f} s left" if left and self.done else ""
-        of, digits = f" of {self.total}" if self.total else "", 0 if taken >= _EVERY else 2
-        rate = f", {self.done / taken:.3g} {self.rate}/s" if self.rate and taken > 0 else ""
-        line = f"gs-jax: {self.description}: {self.done}{of}, {taken:.{digits}f} s{rate}{time_left}"
-        print(line, file=sys.stderr, flush=True)
+    yield advance
+    if task.total is None:
+        bars.update(bar, total=bars.tasks[bar].completed)
 
 
-class Ended(Exception):
-    """Work was ended between two of its parts, as somebody asked for."""
+@contextmanager
+def _lines(task: _Task, rate: str) -> Iterator[Callable[[], None]]:
+    say = partial(print, file=sys.stderr, flush=True)
+    began = last = time.monotonic()
+
+    def say_state(now: float):
+        nonlocal last
+        last, taken, done = now, now - began, task.done
+        left = (task.total or done) - done
+        each = task.seconds_each if done > 1 else taken
+        of, digits = f" of {task.total}" if task.total else "", 0 if taken >= _EVERY else 2
+        per_second = f", {done / taken:.3g} {rate}/s" if rate and taken > 0 else ""
+        time_left = f", about {each * left:.0f} s left" if left and done else ""
+        say(f"gs-jax: {task.description}: {done}{of}, {taken:.{digits}f} s{per_second}{time_left}")
+
+    def advance():
+        task.advance(now := time.monotonic())
+        if text := task.announcement():
+            say(text)
+        if now - last >= _EVERY:
+            say_state(now)
+
+    yield advance
+    if verbosity.get() == VERBOSE:
+        say_state(time.monotonic())
 
 
-class Watched(Progress):
-    """How far work is, for another thread that shows it, and may end it.
+class Cancelled(Exception):
+    """Work that was cancelled between two of its parts."""
 
-    Parameters
-    ----------
-    ended
-        Asked before each piece of work and after each part of it: if so, `Ended` is raised there.
-    """
 
-    def __init__(self, ended: Callable[[], bool]):
-        self._ended = ended
-        self._pieces: list[_Forecast] = []
+class CancellableProgress(Progress):
+    """Progress that another thread reads by `state`; raises `Cancelled` at the next part once `cancelled()` is true."""
+
+    def __init__(self, cancelled: Callable[[], bool]):
+        self._cancelled = cancelled
+        self._tasks: list[_Task] = []
 
     @contextmanager
     def counter(
         self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
     ) -> Iterator[Callable[[], None]]:
-        """As that of `Progress`; of pieces within each other the innermost is seen."""
-        self.go_on()
-        piece = _Forecast(description, total, lambda _: None, quarter)
+        """As `Progress.counter`; of nested tasks, `state` tells the innermost."""
+        self.check_cancelled()
+        task = _Task(description, total)
 
         def advance():
-            piece(time.monotonic())
-            self.go_on()
+            task.advance(time.monotonic())
+            self.check_cancelled()
 
-        self._pieces.append(piece)
+        self._tasks.append(task)
         try:
             yield advance
         finally:
-            self._pieces.remove(piece)
+            self._tasks.remove(task)
 
-    def go_on(self) -> None:
-        """Raises `Ended` if it is to end."""
-        if self._ended():
-            raise Ended
+    def check_cancelled(self) -> None:
+        if self._cancelled():
+            raise Cancelled
 
     @property
-    def now(self) -> tuple[str, int, int | None]:
-        """What is being done, how many parts of it are, and of how many, if that is known."""
-        piece = self._pieces[-1:]
-        if not piece:
+    def state(self) -> tuple[str, int, int | None]:
+        """Description of the task, its finished parts, and their total if it is known."""
+        if not self._tasks:
             return "", 0, None
-        one = piece[0]
-        left = one.each * (one.total - one.done) if one.total and one.done > 1 else 0.0
-        words = f"{one.description}: {one.done} of {one.total}" if one.total else one.description
-        return words + (f", about {_in_words(left)} left" if left else ""), one.done, one.total
+        task = self._tasks[-1]
+        if not task.total:
+            return task.description, task.done, task.total
+        left = task.seconds_each * (task.total - task.done) if task.done > 1 else 0.0
+        words = f"{task.description}: {task.done} of {task.total}" + (f", about {_in_words(left)} left" if left else "")
+        return words, task.done, task.total

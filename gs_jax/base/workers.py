@@ -1,7 +1,6 @@
-"""Independent jobs as one stream of what they return: in this process, in others of this machine, or on a cluster.
+"""Independent jobs: in this process, in other processes of this machine, or on the workers of a Dask scheduler.
 
-Others are reached by Dask, which gives the job of a worker that died to another one. It is imported when it is asked
-for.
+Dask gives the job of a worker that died to another one. It is imported only when it is used.
 """
 
 import contextlib
@@ -17,22 +16,23 @@ from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 from .._version import __version__
-from .errors import InputError, needs_extra
+from .errors import InputError, input_error, needs_extra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Results = Iterator[tuple[Item, Callable[[], Result]]]
 
-# Jobs given out for each worker, so that none waits for one.
+# Jobs that are submitted ahead for each worker, so that none is idle.
 _AHEAD = 2
-# Seconds that a scheduler has to answer, that a worker has to end, and between two looks at how many workers there are.
-_ANSWER, _END, _LOOK = 10, 2, 1.0
+# Seconds: timeout of the scheduler, timeout of closing, and between two counts of the workers.
+_ANSWER, _END, _RECOUNT = 10, 2, 1.0
 _lock = threading.Lock()
-# What this worker runs now, by token.
+# The function that this worker calls, by token.
 _functions: dict[str, Callable[[Any], Any]] = {}
 
 
 class _Work(NamedTuple):
-    """What a worker needs to make the function that it runs, once; `build` is read when it has its settings."""
+    """Settings of a worker, and the pickled `build`, which is read once they are set."""
 
     token: str
     version: str
@@ -42,15 +42,15 @@ class _Work(NamedTuple):
 
 
 class Workers:
-    """Who does independent jobs; used by `with`.
+    """Context manager of the processes that run independent jobs.
 
     Parameters
     ----------
     count
-        Processes on this machine, which share its cores. By default there are none: this process does the jobs.
+        Processes on this machine, which share its cores. By default this process runs the jobs itself.
     scheduler
-        Address of a Dask scheduler whose workers do them, such as `tcp://host:8786`. They see the files that this
-        process sees, by the same names, and have this version of `gs_jax`.
+        Address of a Dask scheduler, such as `tcp://host:8786`. Its workers must see the same files under the same
+        names, and have the same version of `gs_jax`.
 
     Raises
     ------
@@ -60,77 +60,71 @@ class Workers:
 
     def __init__(self, count: int | None = None, scheduler: str | None = None):
         if count and scheduler:
-            raise InputError("--workers: found --scheduler beside it, allowed: one of them.")
+            raise InputError("--workers: must not be given together with --scheduler.")
         self.count, self.scheduler = count, scheduler
         self._client: Any = None
         self._cluster: Any = None
 
     @property
-    def elsewhere(self) -> bool:
-        """Whether other processes do the jobs."""
+    def remote(self) -> bool:
+        """Whether other processes run the jobs."""
         return bool(self.count or self.scheduler)
 
     def __enter__(self) -> "Workers":
-        if self.elsewhere:
-            self._client = self._connected()
+        if self.remote:
+            self._client = self._connect()
         return self
 
     def __exit__(self, kind, *_) -> None:
         for each in (self._client, self._cluster):
-            # What has not ended by then ends with this process.
+            # Whatever has not ended after the timeout ends with this process.
             with contextlib.suppress(TimeoutError):
                 if each is not None:
                     each.close(timeout=_END)
 
-    def stream_of(
+    def mapper(
         self, build: Callable[[], Callable[[Item], Result]]
-    ) -> Callable[[Iterable[Item]], Iterator[tuple[Item, Callable[[], Result]]]]:
-        """From items to each of them, when its job is done, with what gives its result, or raises what the job raised.
+    ) -> Callable[[Iterable[Item]], Results[Item, Result]]:
+        """Return a function that maps items to pairs of an item and a callable, which returns or raises its result.
+
+        Items are taken as they are needed. Pairs come in the items' order if this process runs the jobs, otherwise as
+        jobs finish. A job whose worker dies runs again on another, so it must not matter if it writes a file twice.
 
         Parameters
         ----------
         build
-            Makes the function that is called with each item: in this process, or in each worker, once, so that each
-            compiles once. For workers it can be pickled, functions of a script or notebook by what they do, as its
-            items and results can.
-
-        Returns
-        -------
-        Callable
-            Its items are taken as they are needed. They come in their order if this process does the jobs; else as the
-            jobs are done. A job whose worker dies is done again by another, so it writes nothing, or what may be
-            written twice.
+            Returns the function that is called with each item. It runs once in this process or in each worker, so that
+            each compiles once. For workers it is pickled by value, as items and results are.
         """
         if self._client is None:
             function = build()
             return lambda items: ((item, partial(function, item)) for item in items)
-        import cloudpickle  # Dask brings it
+        import cloudpickle  # a dependency of Dask
         import jax
 
         double: Any = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
         work = _Work(uuid.uuid4().hex, __version__, os.getcwd(), double, cloudpickle.dumps(build))
-        return partial(self._stream, work)
+        return partial(self._map, work)
 
-    def _stream(self, work: _Work, items):
+    def _map(self, work: _Work, items):
         from distributed import as_completed
 
-        left, waiting, done = iter(items), {}, as_completed(loop=self._client.loop)
-        looked, threads = -math.inf, 1
+        remaining, running, done = iter(items), {}, as_completed(loop=self._client.loop)
+        counted, threads = -math.inf, 1
         try:
             while True:
-                # Workers come and go; to ask the scheduler takes as long as to give it a job.
-                if time.monotonic() - looked > _LOOK:
-                    looked, threads = time.monotonic(), max(1, sum(self._client.nthreads().values()))
-                room = _AHEAD * threads - len(waiting)
-                # What counts comes first: the other would take an item, and drop it.
-                for _, item in zip(range(room), left, strict=False):
+                # Workers come and go; asking the scheduler takes as long as submitting a job.
+                if time.monotonic() - counted > _RECOUNT:
+                    counted, threads = time.monotonic(), max(1, sum(self._client.nthreads().values()))
+                # `range` must come first: `zip` would otherwise take one item too many.
+                for _, item in zip(range(_AHEAD * threads - len(running)), remaining, strict=False):
                     future = self._client.submit(_run, work, pickle.dumps(item), pure=False)
-                    waiting[future.key] = item
+                    running[future.key] = item
                     done.add(future)
-                if not waiting:
+                if not running:
                     return
                 future = next(done)
-                yield waiting.pop(future.key), partial(self._result, future)
+                yield running.pop(future.key), partial(self._result, future)
         finally:
             done.clear()
 
@@ -142,23 +136,22 @@ class Workers:
         try:
             return future.result()
         except KilledWorker as error:
-            found = f"{error.allowed_failures + 1} workers ended by it"
+            count = error.allowed_failures + 1
             raise InputError(
-                f"found {found}, for want of memory perhaps, allowed: fewer workers, or more of it."
+                f"a job ended {count} workers, perhaps for want of memory; use fewer workers, or more memory."
             ) from error
         except ModuleNotFoundError as error:
-            raise InputError(f"found a worker without {error.name}, allowed: workers with the same gs_jax.") from error
+            raise InputError(f"a worker lacks {error.name}; all workers must have the same gs_jax.") from error
         except CancelledError as error:
             raise ConnectionResetError(0, "the scheduler does not answer any more", self.scheduler) from error
 
-    def _connected(self):
+    def _connect(self):
         name = "--scheduler" if self.scheduler else "--workers"
-        # For workers of this machine too, which read it when they start.
+        # In the environment, for the workers of this machine to read when they start.
         os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
-        # Python counts what a process that ends at once leaves to it.
-        os.environ["PYTHONWARNINGS"] = ",".join(
-            filter(None, [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker"])
-        )
+        # The resource tracker warns of what a killed process leaves behind.
+        filters = [os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker"]
+        os.environ["PYTHONWARNINGS"] = ",".join(filter(None, filters))
         with needs_extra("cluster"):
             from distributed import Client, LocalCluster
         if self.count:
@@ -170,27 +163,28 @@ class Workers:
                 dashboard_address="127.0.0.1:0",
                 memory_limit=None,
                 preload=[__name__],
-                env=_threads(max(1, CPU_COUNT // self.count)),
+                env=_thread_limits(max(1, CPU_COUNT // self.count)),
             )
         try:
             return Client(self._cluster or self.scheduler, timeout=_ANSWER, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            found = f"nobody who answers at {self.scheduler}"
-            raise InputError(f"{name}: found {found}, allowed: a Dask scheduler, as tcp://HOST:8786.") from error
+            raise InputError(
+                f"{name}: no Dask scheduler is reachable at {self.scheduler}; give an address as tcp://HOST:8786."
+            ) from error
 
 
 def dask_setup(_) -> None:
-    """Called by Dask in each worker of this machine: Ctrl-C is this process's to hear, with which they end."""
+    """Hook that Dask calls in each local worker: Ctrl-C is for the parent process, which ends the workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _threads(count: int) -> dict[str, str]:
-    """Variables that keep a process to so many threads: of XLA, on which the kernels run too, and of linear algebra."""
+def _thread_limits(count: int) -> dict[str, str]:
+    """Environment variables that limit the threads of XLA, which runs the kernels too, and of linear algebra."""
     return dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(count))
 
 
 def _run(work: _Work, item: bytes):
-    """In a worker, which reads the item when it has its settings."""
+    """Run a job in a worker, which unpickles the item after its settings are made."""
     with _lock:
         if work.token not in _functions:
             _prepare(work)
@@ -205,15 +199,15 @@ def _prepare(work: _Work) -> None:
 
     worker = get_worker()
     if work.version != __version__:
-        found = f"gs_jax {__version__} at the worker {worker.address}"
-        raise InputError(f"found {found}, allowed: {work.version}, as here.")
+        raise input_error(f"gs_jax of worker {worker.address}", f"version {work.version}, as here", __version__)
     try:
         os.chdir(work.folder)
     except OSError as error:
-        found = f"no such folder at the worker {worker.address}"
-        raise InputError(f"{work.folder}: found {found}, allowed: workers that see the same files.") from error
-    # JAX reads them when it is first used. Other machines' workers are told how many jobs they run, and no more.
-    for name, count in _threads(worker.state.nthreads).items():
+        raise InputError(
+            f"{work.folder}: no such folder at worker {worker.address}; all workers must see the same files."
+        ) from error
+    # JAX reads these when it is first used. Workers of other machines know how many jobs they run, and no more.
+    for name, count in _thread_limits(worker.state.nthreads).items():
         os.environ.setdefault(name, count)
     import jax
 

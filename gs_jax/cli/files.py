@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from ..base.errors import InputError
-from ..base.progress import QUIET, shown
+from ..base.progress import QUIET, verbosity
 
 # Files that people write by hand: designs, studies, points and centres.
 _WRITTEN_BY_HAND = (".toml", ".csv")
@@ -35,7 +35,7 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
         if path.suffix.lower() in _WRITTEN_BY_HAND and not force:
             raise InputError(f"{path}: the output must be a new file, got an existing one; --force replaces it.")
     if existing:
-        names, quiet = ", ".join(map(str, existing)), shown.get() == QUIET
+        names, quiet = ", ".join(map(str, existing)), verbosity.get() == QUIET
         click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
 
 

@@ -221,10 +221,10 @@ class CaptureOptions:
         import numpy as np
 
         from ..io.camera import prepare, read_frame
-        from ..io.captures import Wanted
+        from ..io.captures import Selection
 
         shape, readout = self.readout.region(self.sensor).shape, self.readout
-        wanted = Wanted(shape, None, readout.channel, readout.bayer)
+        wanted = Selection(shape, None, readout.channel, readout.bayer)
         prepared = prepare(readout.sensor(self.sensor).shape, shape, readout, self.correction)
         self.done = {line: [Path(f"{len(recording.names)} frames")] for line in prepared.done}
         shared = [*prepared.done, *prepared.warnings]

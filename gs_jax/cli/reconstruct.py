@@ -117,7 +117,7 @@ def reconstruct_command(
     """
     from ..design.design import design_text, read_design
     from ..io.point_tables import write_points
-    from ..io.recordings import opened_recording
+    from ..io.recordings import open_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.linear_map import xla_only
     from ..reconstruction.plan import Plan
@@ -138,9 +138,9 @@ def reconstruct_command(
     text, imager = design_text(microscope), camera.imager(microscope.imager())
     method_options |= {"points": points is not None, "weights": weights}
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
-    with opened_recording(capture, page=camera.page) as recording, Progress() as progress:
+    with open_recording(capture, page=camera.page) as recording, Progress() as progress:
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
-        given["--workers or --scheduler"] = workers.elsewhere
+        given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
             files = {"design_text": text, "capture": capture, "camera": camera, "points": points}

@@ -67,11 +67,11 @@ def check_recording(capture: Path, recording, output: Path, *, resume: bool, giv
 
 def open_frames(capture: Path, camera: CaptureOptions, plan):
     """`frames_of` a recording that stays open until the process ends; for workers."""
-    from ..io.recordings import opened_recording
+    from ..io.recordings import open_recording
 
     stack = ExitStack()
     atexit.register(stack.close)
-    return frames_of(stack.enter_context(opened_recording(capture, page=camera.page)), camera, plan)
+    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
 
 
 def frames_of(recording, camera: CaptureOptions, plan):
@@ -120,7 +120,7 @@ def reconstruct_recording(
     from ..io.volumes import plain_depths
     from ..reconstruction.recording import reconstruct_frames, reconstruct_frames_by
 
-    if workers.elsewhere:
+    if workers.remote:
         camera.frames(recording)  # reads the correction, which is printed below; workers read their own
         run = partial(reconstruct_frames_by, workers, open_frames=partial(open_frames, capture, camera, plan))
     else:

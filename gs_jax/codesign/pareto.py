@@ -116,7 +116,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     objectives = [next(term for term in kept if term.is_goal), *moving]
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
     build = with_terms(partial(searcher, sweep), [term.name for term in (*kept, *moving)])
-    stream, points = workers.stream_of(build), {}
+    stream, points = workers.mapper(build), {}
     front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
     with progress.counter("Trade-off", len(combinations)) as advance:
         values = start_values(problem.imager, problem.at)

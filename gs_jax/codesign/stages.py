@@ -202,12 +202,12 @@ def run_stages(
         ended = {end["start"] for end in log.ends if end["stage"] == stage.number}
         starts = [start for start in range(problem.study.starts if stage.number == 0 else 1) if start not in ended]
         with progress.counter(f"Stage {stage.number + 1}, {stage.table.solver}", len(starts)) as advance:
-            if workers and workers.elsewhere and len(starts) > 1:
+            if workers and workers.remote and len(starts) > 1:
                 # A worker runs a start from its beginning, whatever was saved of it.
                 saved = None
                 log.steps[:] = [step for step in log.steps if step["start"] in ended]
                 build = with_terms(partial(_starts_of_worker, problem, terms, values), [term.name for term in terms])
-                stream = workers.stream_of(build)
+                stream = workers.mapper(build)
                 for _, result in stream(starts):
                     steps, end = result()
                     log.steps.extend(steps)

@@ -18,16 +18,14 @@ solver = "levenberg-marquardt"
 """
 
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, short_repr
-from ..io.files import read_text
-from ..io.toml import Table, one_line
+from ..io.toml import Table, one_line, read_toml
 from ..lenses import Orientation
 from ..typing import PathLike
 from .parameters import NAMES
@@ -199,14 +197,11 @@ def read_study(path: PathLike) -> Study:
     >>> study.free, study.terms[0].name
     ({'sensor_distance_mm': (4.0, 8.0)}, 'focus_offset')
     """
-    text = read_text(path)
+    data = read_toml(path)
     try:
-        data: dict[str, Any] = tomllib.loads(text)
         return Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{path}: {_in_a_list(error) or one_line(error, Study, {})}.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
+        raise InputError(f"{_in_a_list(error) or one_line(error, Study, {})} ({path}).") from error
 
 
 def parent_path(path: PathLike, study: Study) -> Path:

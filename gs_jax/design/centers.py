@@ -82,7 +82,7 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
     try:
         keys = _Centers.model_validate({"array": given}).array
     except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error, _Centers, {})}.") from error
+        raise InputError(f"{one_line(error, _Centers, {})} ({path}).") from error
     if keys.centers_file is None:
         if rest := next((key for key in given if key not in ("mirror", "centers_file")), None):
             raise InputError(f"{path}: `array.{rest}` needs `array.centers_file`.")

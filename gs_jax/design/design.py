@@ -3,7 +3,6 @@
 import difflib
 import math
 import re
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
 from ..geometry import Imager, Sensor
-from ..io.files import read_text, write_text
-from ..io.toml import Table, one_line
+from ..io.files import write_text
+from ..io.toml import Table, one_line, read_toml
 from ..lenses import MicrolensArray
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
@@ -226,11 +225,7 @@ def read_design(path: PathLike) -> Design:
     >>> gs.write_design("mine.toml", gs.geomscope())
     >>> scope = gs.read_design("mine.toml").imager()
     """
-    text = read_text(path)
-    try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
+    data = read_toml(path)
     inline_centers(Path(path), data)
     return checked_design(path, data)
 
@@ -242,8 +237,7 @@ def checked_design(path: PathLike, data: dict[str, Any]) -> Design:
     except ValidationError as error:
         # A slip of a unit is why lenses are beside the sensor, and comes first.
         problems = [*slips(data), one_line(error, Design, {"array": list(CentersTable.model_fields)})]
-        end = "" if problems[-1].endswith("?") else "."
-        raise InputError(f"{path}: {' '.join(problems)}{end}") from error
+        raise InputError(f"{' '.join(problems)} ({path}).") from error
     for question in doubts(data):
         warnings.warn(f"{path}: {question}", InputWarning, stacklevel=3)
     return design

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
 from ..base.arrays import check_finite
-from ..base.machine import in_threads
+from ..base.machine import map_in_threads
 from ..typing import Image
 
 # Side of a tile with one background and one noise level, pixels: wider than a spot, narrower than haze. A band has as
@@ -48,7 +48,7 @@ def subsample(image: Pixels) -> Float32[np.ndarray, " pixel"]:
 
 def for_each_band(rows: int, work: Callable[[slice], object]) -> None:
     """Call `work` for every band of rows, on all cores."""
-    list(in_threads(work, [slice(start, min(start + _TILE, rows)) for start in range(0, rows, _TILE)]))
+    list(map_in_threads(work, [slice(start, min(start + _TILE, rows)) for start in range(0, rows, _TILE)]))
 
 
 def gaussian_smooth(image: Shaped[np.ndarray, "row column"], deviation: float) -> Pixels:

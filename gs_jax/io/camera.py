@@ -1,6 +1,5 @@
-"""Captures corrected for their camera: the one way from a file to light, of every command that reads captures."""
+"""From camera pixels to light: regions, binning and mosaics; dark frames and flat fields."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -8,44 +7,35 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, Shaped
 
-from ..base.errors import InputError, errors_name_file
+from ..base.errors import InputError, errors_name_file, input_error
 from ..geometry import Sensor
 from ..typing import PathLike
-from .captures import DTYPES, averaged, channel_of, frames, sites
+from .captures import DTYPES, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
+from .pixel_defects import count_saturated, fill_bad_pixels, find_hot_in_capture, find_hot_in_dark
 
-# A pixel with less than this share of the flat field's median has no light to speak of.
-_LEAST_GAIN = 0.05
-# Binned more than so, pixels hold whole spots of a well corrected lens.
-_SHARP = 2
-# Full scale of converters of these bits, as such or in the upper bits of 16.
-_BITS = (8, 10, 12, 14, 16)
-# So many pixels at the maximum, and more than twice those of the hundredth or the few counts below it, were cut off.
-_PILE, _FEW_COUNTS, _LEVELS = 10, 5, 32
-# In so many pixels levels are counted.
-_PIXELS = 500_000
-MASK_DTYPES = (*DTYPES, "bool")
-# So much of a mask may be bad: more is one that marks what is good.
-_MOST_BAD = 0.5
+# Pixels of the flat field below this share of its median are bad.
+_MIN_GAIN = 0.05
+# Pixels binned by more hold whole spots of a well corrected lens, which look like hot pixels.
+_MAX_SHARP_BINNING = 2
+_MASK_DTYPES = (*DTYPES, "bool")
 
 
 class Readout(NamedTuple):
-    """How a camera delivered a capture, so that the design of its whole sensor serves.
+    """How a camera delivered a capture: the region, binning and colour of its sensor.
 
-    The frame stays that of the whole sensor: points and volumes have the same coordinates as from a whole capture.
+    Coordinates stay those of the whole sensor: points and volumes are the same as from a whole capture.
 
     Parameters
     ----------
     roi
-        `(row, column, rows, columns)` of the region that was read out, in pixels of the whole sensor, counted from 0.
-        None: all of it.
+        `(row, column, rows, columns)` of the region, in pixels of the whole sensor, counted from 0. None: all of it.
     binning
-        So many pixels each way were made one, from the region's first on; what is left at its end is lost.
+        Pixels each way that are binned into one, from the region's first on; a rest at its end is lost.
     bayer
-        Colours of the capture's first pixels, row by row, where it is a mosaic: one of `PATTERNS`.
+        Colours of the first 2 x 2 pixels of a mosaic, row by row: one of `PATTERNS`.
     channel
-        Of a mosaic or a colour image: one of `CHANNELS`. Of a mosaic, an image of its cells of 2 x 2 pixels. Nothing is
-        interpolated: red and blue are the one pixel of the cell, where it is; green is the mean of the cell's two,
-        whose middle is the cell's.
+        Channel of a mosaic or a colour image: one of `CHANNELS`. A mosaic gives one pixel per 2 x 2 cell, without
+        interpolation: red and blue are the cell's one pixel, green is the mean of its two.
 
     Examples
     --------
@@ -58,73 +48,68 @@ class Readout(NamedTuple):
     channel: str | None = None
 
     def region(self, sensor: Sensor) -> Sensor:
-        """The pixels that the camera read out of a whole sensor: `shape` is that of the file.
+        """Return the pixels that the camera read out of a whole sensor, as in the file.
 
         Raises
         ------
         InputError
-            If the region is not on the sensor, less than 2 x 2 pixels are left, or the mosaic is binned.
+            If the region exceeds the sensor, less than 2 x 2 pixels are left, or a mosaic is binned.
         """
         row, column, rows, columns = self.roi or (0, 0, *sensor.shape)
         if not (0 <= row <= sensor.shape[0] - rows and 0 <= column <= sensor.shape[1] - columns):
-            found = f"rows {row} to {row + rows - 1} and columns {column} to {column + columns - 1}"
-            whole = f"{sensor.shape[0]} x {sensor.shape[1]}"
-            raise InputError(f"--roi: found {found}, allowed: within the sensor of {whole} (rows x columns, from 0).")
+            given = f"rows {row} to {row + rows - 1} and columns {column} to {column + columns - 1}"
+            raise input_error("--roi", f"within the sensor of {size_text(sensor.shape)} pixels, from 0", given)
         if self.bayer and self.binning > 1:
-            raise InputError(
-                f"--binning {self.binning}: found --bayer {self.bayer}, allowed: a mosaic without binning."
-            )
+            raise input_error("--binning", f"1 with --bayer {self.bayer}", f"--binning {self.binning}")
         return _part(sensor, (row, column), (rows, columns), self.binning)
 
     def sensor(self, sensor: Sensor) -> Sensor:
-        """The pixels of the image that is made of such a capture; errors as `region`, or as `sites`."""
+        """Return the pixels of the image that is made of such a capture; errors as `region` and `mosaic_sites`."""
         region = self.region(sensor)
         if not self.bayer:
             return region
         cells = _part(region, (0, 0), region.shape, 2)
-        y, x = np.mean(sites(self.bayer, self.channel), axis=0)
+        y, x = np.mean(mosaic_sites(self.bayer, self.channel), axis=0)
         x, y = (float(at - 0.5) * region.pixel_pitch + middle for at, middle in zip((x, y), cells.origin, strict=True))
         return Sensor(cells.shape, cells.pixel_pitch, (x, y))
 
-    def words(self) -> list[str]:
-        """What was read out, a line each."""
-        said = []
+    def describe(self) -> list[str]:
+        """One line for each of channel, region and binning that is set."""
+        lines = []
         if self.channel:
             mosaic = f"the mosaic {self.bayer}, an image of its cells of 2 x 2 pixels"
-            said.append(f"{self.channel} of {mosaic if self.bayer else 'a colour image'}")
+            lines.append(f"{self.channel} of {mosaic if self.bayer else 'a colour image'}")
         if self.roi:
             row, column, rows, columns = self.roi
-            said.append(f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1} of the sensor")
+            lines.append(f"rows {row} to {row + rows - 1}, columns {column} to {column + columns - 1} of the sensor")
         if self.binning > 1:
-            said.append(f"pixels binned {self.binning} x {self.binning}")
-        return said
+            lines.append(f"pixels binned {self.binning} x {self.binning}")
+        return lines
 
 
 def _part(sensor: Sensor, first: tuple[int, int], shape: tuple[int, int], side: int) -> Sensor:
-    """Squares of `side` pixels, as many as fit whole into the part of a sensor that begins at `first`."""
+    """Squares of `side` pixels, as many as fit into the part of a sensor that begins at `first`."""
     count = tuple(n // side for n in shape)
     if min(count) < 2:
-        found = f"{count[0]} x {count[1]} pixels that are left"
-        raise InputError(f"--roi, --binning: found {found}, allowed: 2 x 2 or more.")
+        raise input_error("--roi, --binning", "such that 2 x 2 pixels or more are left", size_text(count))
     middle = [at + n * side / 2 - whole / 2 for at, n, whole in zip(first, count, sensor.shape, strict=True)]
     y, x = (at * sensor.pixel_pitch + origin for at, origin in zip(middle, sensor.origin[::-1], strict=True))
     return Sensor(count, side * sensor.pixel_pitch, (x, y))
 
 
 class Correction(NamedTuple):
-    """What is known of a camera.
+    """Calibration files of a camera.
 
     Parameters
     ----------
     dark
-        A file of the same exposure without light, taken off; its pages are averaged, its hot pixels are bad.
+        File of the same exposure without light, which is subtracted; its pages are averaged, its hot pixels are bad.
     flat
-        A file of the sensor evenly lit, without the array, divided out; its pages are averaged, and what is off the
-        dark frame or the offset is off it, too. Pixels with less than 5 % of its median are bad.
+        File of the evenly lit sensor without the array, which is divided out; its pages are averaged, and dark frame or
+        offset are subtracted from it. Pixels with less than 5 % of its median are bad.
     bad_pixels
-        A file in which every pixel but 0 is bad; "auto" finds single hot pixels in a capture for which there is no dark
-        frame, and whose pixels have their neighbours beside them (no mosaic, binned by 2 at most); "none"
-        repairs none but those of `dark` and `flat`.
+        File in which every pixel but 0 is bad; "auto" finds single hot pixels of each capture, if there is no dark
+        frame, no mosaic, and a binning of 2 at most; "none" fills only those of `dark` and `flat`.
     offset
         Counts of a pixel without light, where there is no dark frame.
     """
@@ -136,9 +121,25 @@ class Correction(NamedTuple):
 
 
 class Corrected(NamedTuple):
-    """A capture, what was done to it, a line each, and what is to be said of it."""
+    """A corrected capture, a line for each step that was done, and warnings."""
 
     image: Num[np.ndarray, "row column"]
+    done: list[str]
+    warnings: list[str]
+
+
+class Prepared(NamedTuple):
+    """A correction whose files have been read, for any number of captures.
+
+    `bad` are the pixels to fill, `bad_counts` says how many were found where, and `find_hot` whether each capture is
+    searched for hot pixels.
+    """
+
+    dark: Num[np.ndarray, "row column"] | float | None
+    gain: Float32[np.ndarray, "row column"] | None
+    bad: Bool[np.ndarray, "row column"]
+    bad_counts: list[str]
+    find_hot: bool
     done: list[str]
     warnings: list[str]
 
@@ -151,63 +152,41 @@ def read_corrected(
     readout: Readout = Readout(),
     correction: Correction = Correction(),
 ) -> Corrected:
-    """A capture of a part of a sensor, corrected: an image for `readout.sensor(sensor)`.
+    """Read and correct a capture: an image for `readout.sensor(sensor)`.
 
-    Where nothing is to be done it has the file's own type, otherwise float32. Dark frame, flat field and mask are read
-    as the capture is: the same region, binning and channel.
+    The image keeps the type of the file if there is nothing to correct, otherwise it is float32. The files of the
+    correction have the same region, binning and channel as the capture.
 
     Parameters
     ----------
-    path
+    path, page
         As for `read_capture`.
     sensor
-        The whole, of the design. None: captures of any size, and no region.
-    page
-        As for `read_capture`, of the capture alone.
+        The whole sensor of the design. None: captures of any size, without a region.
     readout, correction
-        How the camera delivered all files, and what is known of it.
+        How the camera delivered all files, and its calibration files.
 
     Raises
     ------
     InputError
-        As `read_capture` and `Readout`, for each of the files under its own name; if there are both a dark frame and an
-        offset, the flat field is dark, or more than half of the pixels are masked.
+        As `read_capture` and `Readout`, naming the file; if there are both a dark frame and an offset, the flat field
+        is dark, or more than half of the pixels are masked.
 
     Examples
     --------
     >>> image, done, warnings = read_corrected("a.tif", scope.sensor, correction=Correction(dark=Path("dark.tif")))
     """
     shape = readout.region(sensor).shape if sensor else None
-    _check(correction)
-    images = frames(path, shape, page=page, channel=readout.channel, bayer=readout.bayer)
-    image, done, warnings = _averaged(path, images, readout)
-    prepared = prepare(image.shape, shape, readout, correction)
-    found = apply(image, prepared)
-    return Corrected(found.image, done + found.done, warnings + found.warnings)
+    images = read_images(path, Selection(shape, page, readout.channel, readout.bayer))
+    image, done, warnings = _average(path, images, readout)
+    return _apply(prepare(image.shape, shape, readout, correction), image, done, warnings)
 
 
-class Prepared(NamedTuple):
-    """A correction whose files have been read, for any number of captures.
-
-    Parameters
-    ----------
-    dark, gain
-        What is taken off, and what is divided by; None: nothing is.
-    bad
-        Pixels to fill, and how many were found where.
-    searched
-        Single hot pixels of each capture are bad, too.
-    done, warnings
-        As of `Corrected`.
-    """
-
-    dark: Num[np.ndarray, "row column"] | float | None
-    gain: Float32[np.ndarray, "row column"] | None
-    bad: Bool[np.ndarray, "row column"]
-    counted: list[str]
-    searched: bool
-    done: list[str]
-    warnings: list[str]
+def read_frame(
+    name: str, images: Iterator[Shaped[np.ndarray, "row column"]], prepared: Prepared, readout: Readout = Readout()
+) -> Corrected:
+    """Average and correct images, as `read_corrected` does those of a file; `name` is for messages."""
+    return _apply(prepared, *_average(name, images, readout))
 
 
 def prepare(
@@ -216,61 +195,66 @@ def prepare(
     readout: Readout = Readout(),
     correction: Correction = Correction(),
 ) -> Prepared:
-    """Reads what a correction needs, once.
+    """Read the files of a correction.
 
     Parameters
     ----------
     size
-        Of the images that are to be corrected.
+        Shape of the images that are corrected.
     shape
-        Of the captures in their files, if it is known.
+        Shape of the captures in their files, if it is known.
     readout, correction
-        As for `read_corrected`, errors too.
+        As for `read_corrected`, with the same errors.
     """
-    _check(correction)
-    bad, counted = np.zeros(size, bool), []
-    done, warnings = readout.words(), []
+    if correction.dark and correction.offset:
+        raise InputError(f"--offset: must not be given with --dark, got {correction.dark}; its offset is the dark's.")
+    bad, bad_counts = np.zeros(size, bool), []
+    done, warnings = readout.describe(), []
     dark, gain = correction.offset or None, None
+
+    def read_like_capture(path: Path) -> np.ndarray:
+        images = read_images(path, Selection(shape, "mean", readout.channel, readout.bayer))
+        image, _, more = _average(path, images, readout)
+        warnings.extend(more)
+        _check_size(path, image, size)
+        return image
+
+    def mark(pixels: np.ndarray, where: str) -> None:
+        bad[pixels] = True
+        if count := int(pixels.sum()):
+            bad_counts.append(f"{count} {where}")
+
     if correction.dark:
-        dark, said = _read_like(correction.dark, size, shape, readout)
-        warnings += said
-        bad |= _counted(hot_in_dark(dark), f"hot in {correction.dark.name}", counted)
+        dark = read_like_capture(correction.dark)
+        mark(find_hot_in_dark(dark), f"hot in {correction.dark.name}")
         done.append(f"dark frame {correction.dark.name} taken off, median {np.median(dark):g}")
     elif correction.offset:
         done.append(f"offset {correction.offset:g} taken off")
     if correction.flat:
-        flat, said = _read_like(correction.flat, size, shape, readout)
-        warnings += said
+        flat = read_like_capture(correction.flat)
         with errors_name_file(correction.flat):
-            gain, unlit = gain_of(flat, 0.0 if dark is None else dark)
-        bad |= _counted(unlit, f"unlit in {correction.flat.name}", counted)
+            gain, unlit = flat_field_gain(flat, 0.0 if dark is None else dark)
+        mark(unlit, f"unlit in {correction.flat.name}")
         done.append(f"flat field {correction.flat.name} divided out, {gain.min():.3g} to {gain.max():.3g}")
     if isinstance(correction.bad_pixels, Path):
-        where = f"in {correction.bad_pixels.name}"
-        bad |= _counted(_mask(correction.bad_pixels, size, shape, readout), where, counted)
+        mark(_read_mask(correction.bad_pixels, size, shape, readout), f"in {correction.bad_pixels.name}")
     automatic = correction.bad_pixels == "auto" and not (correction.dark or readout.bayer)
-    return Prepared(dark, gain, bad, counted, automatic and readout.binning <= _SHARP, done, warnings)
+    return Prepared(dark, gain, bad, bad_counts, automatic and readout.binning <= _MAX_SHARP_BINNING, done, warnings)
 
 
-def apply(image: Num[np.ndarray, "row column"], prepared: Prepared) -> Corrected:
-    """An image corrected; of its own type where nothing is to be done, otherwise float32."""
-    bad, counted, done, light = prepared.bad, list(prepared.counted), list(prepared.done), image
-    if prepared.searched:
-        bad = bad | _counted(hot_in_capture(image), "hot in the capture", counted)
+def _apply(prepared: Prepared, image: np.ndarray, done: list[str], warnings: list[str]) -> Corrected:
+    bad, bad_counts, done = prepared.bad, list(prepared.bad_counts), done + prepared.done
+    if prepared.find_hot:
+        hot = find_hot_in_capture(image)
+        bad = bad | hot
+        if hot.any():
+            bad_counts.append(f"{int(hot.sum())} hot in the capture")
     if prepared.dark is not None or prepared.gain is not None:
-        light = correct(image, 0.0 if prepared.dark is None else prepared.dark, prepared.gain)
-    if bad.any():
-        light = repaired(light, bad)
-        count = int(bad.sum())
-        done.append(f"{count} bad pixel{'s' * (count > 1)} filled from neighbours: {', '.join(counted)}")
-    return Corrected(light, done, list(prepared.warnings))
-
-
-def _check(correction):
-    if correction.dark and correction.offset:
-        raise InputError(
-            f"--offset: found --dark {correction.dark}, allowed: one of them; the dark frame has the offset."
-        )
+        image = correct(image, 0.0 if prepared.dark is None else prepared.dark, prepared.gain)
+    if count := int(bad.sum()):
+        image = fill_bad_pixels(image, bad)
+        done.append(f"{count} bad pixel{'s' * (count > 1)} filled from neighbours: {', '.join(bad_counts)}")
+    return Corrected(image, done, warnings + prepared.warnings)
 
 
 def correct(
@@ -278,181 +262,57 @@ def correct(
     dark: Num[np.ndarray, "row column"] | float = 0.0,
     gain: Float[np.ndarray, "row column"] | None = None,
 ) -> Float32[np.ndarray, "row column"]:
-    """`(image - dark) / gain`: light, where a camera says `gain * light + dark`."""
+    """Light of an image `gain * light + dark`."""
     light = np.asarray(image, np.float32) - np.asarray(dark, np.float32)
     return light if gain is None else light / np.asarray(gain, np.float32)
 
 
-def gain_of(
+def flat_field_gain(
     flat: Num[np.ndarray, "row column"], dark: Num[np.ndarray, "row column"] | float = 0.0
 ) -> tuple[Float32[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
-    """What each pixel makes of even light, 1 in the mean, and which pixels are too dark to say; these have 1.
+    """Relative gain of each pixel, with a mean of 1, and which pixels are too dark to tell; these have 1.
 
     Raises
     ------
     InputError
-        If the flat field's median is no brighter than the dark.
+        If the median of the flat field is not above the dark.
     """
     light = correct(flat, dark)
     middle = float(np.median(light))
     if not middle > 0:
-        raise InputError(f"found a median of {middle:g} above the dark, allowed: a flat field of even light.")
-    unlit = light < _LEAST_GAIN * middle
+        raise input_error("flat field", "even light, brighter than the dark", f"a median of {middle:g} above it")
+    unlit = light < _MIN_GAIN * middle
     return np.where(unlit, 1, light / light[~unlit].mean(dtype=np.float64)).astype(np.float32), unlit
 
 
-def saturated(image: Num[np.ndarray, "row column"]) -> tuple[int, int] | None:
-    """How many pixels were cut off, and the value at which; None if none were, or the type is no camera's.
+def _average(name: PathLike, images, readout: Readout) -> tuple[np.ndarray, list[str], list[str]]:
+    """Mean of images, of one channel of a mosaic; what was done; warnings."""
+    sizes, saturated = [], []
 
-    That is the brightest value, if it is the full scale of 8 to 16 bits, or if many more pixels have it than what is
-    just below.
-    """
-    if image.dtype.kind != "u":
-        return None
-    top = int(image.max())
-    count = int(np.count_nonzero(image == top))
-    full = {2**bits - 1 for bits in _BITS} | {2**16 - 2 ** (16 - bits) for bits in _BITS}
-    # Rounded noise piles up as well, within a few counts; a drawing has few values, in a part of its pixels, too.
-    least = max(top - max(top // 100, _FEW_COUNTS), 0)
-    below = int(np.count_nonzero(image >= least)) - count
-    step = math.isqrt(image.size // _PIXELS) + 1
-    levels = np.count_nonzero(np.bincount(image[::step, ::step].ravel()))
-    piled = count >= max(_PILE, 2 * below + 1) and levels >= _LEVELS
-    return (count, top) if piled or (top in full and count > 1) else None
+    def inspect(image):
+        sizes.append(image.size)
+        saturated.append(count_saturated(image))
+        return image
 
-
-def read_frame(
-    name: str, images: Iterator[Shaped[np.ndarray, "row column"]], prepared: Prepared, readout: Readout = Readout()
-) -> Corrected:
-    """As `read_corrected`, of images that are being read, with a correction that has been; `name` is for messages."""
-    image, done, warnings = _averaged(name, images, readout)
-    found = apply(image, prepared)
-    return Corrected(found.image, done + found.done, warnings + found.warnings)
-
-
-def _averaged(name, images, readout) -> tuple[np.ndarray, list[str], list[str]]:
-    """An image, or the mean of several; what was done; and what is to be said of it."""
-    cut: list[tuple[int, int] | None] = []
-    size = 0
-
-    def looked_at():
-        nonlocal size
-        for frame in images:
-            size = frame.size
-            cut.append(saturated(frame))
-            yield frame
-
-    image = averaged(looked_at())
-    image = channel_of(image, readout.bayer, readout.channel) if readout.bayer else image
-    done = [f"mean of {len(cut)} pages"] if len(cut) > 1 else []
-    found = [each for each in cut if each]
-    if not found:
+    image = average(map(inspect, images))
+    image = mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image
+    done = [f"mean of {len(sizes)} pages"] if len(sizes) > 1 else []
+    if not any(saturated):
         return image, done, []
-    count, value = sum(count for count, _ in found), max(value for _, value in found)
-    share = f"{count} pixels ({count / (len(cut) * size):.2g} of all) at {value}"
-    return image, done, [f"{name}: found {share}, where the camera cuts off: how much light they saw is unknown"]
+    count, value = sum(each[0] for each in saturated if each), max(each[1] for each in saturated if each)
+    share = f"{count} pixels ({count / sum(sizes):.2g} of all)"
+    return image, done, [f"{name}: {share} are saturated at {value}: the camera cut off their light"]
 
 
-def _read_like(path, size, shape, readout) -> tuple[np.ndarray, list[str]]:
-    """A file as the capture is read, and what is to be said of it."""
-    images = frames(path, shape, page="mean", channel=readout.channel, bayer=readout.bayer)
-    found, _, warnings = _averaged(path, images, readout)
-    _check_like(path, found, size)
-    return found, warnings
+def _check_size(path: Path, image: np.ndarray, size: tuple[int, int]) -> None:
+    if image.shape != size:
+        raise input_error("image", f"{size_text(size)} pixels, as the capture", size_text(image.shape), path)
 
 
-def _check_like(path, found, size):
-    if found.shape != size:
-        seen, allowed = (" x ".join(map(str, each)) for each in (found.shape, size))
-        raise InputError(f"{path}: found {seen} pixels (rows x columns), allowed: {allowed}, as the capture has.")
-
-
-def _mask(path, size, shape, readout) -> Bool[np.ndarray, "row column"]:
-    found = averaged(frames(path, shape, channel=readout.channel, bayer=readout.bayer, dtypes=MASK_DTYPES))
-    bad = (channel_of(found, readout.bayer, readout.channel) if readout.bayer else found) != 0
-    _check_like(path, bad, size)
-    if bad.mean() > _MOST_BAD:
-        raise InputError(f"{path}: found {bad.mean():.0%} of the pixels marked as bad, allowed: up to half; 0 is good.")
+def _read_mask(path: Path, size, shape, readout: Readout) -> Bool[np.ndarray, "row column"]:
+    image = average(read_images(path, Selection(shape, None, readout.channel, readout.bayer, _MASK_DTYPES)))
+    bad = (mosaic_channel(image, readout.bayer, readout.channel) if readout.bayer else image) != 0
+    _check_size(path, bad, size)
+    if bad.mean() > 0.5:  # a mask that marks good pixels
+        raise input_error("bad pixels", "at most half of all, with 0 for good ones", f"{bad.mean():.0%}", path)
     return bad
-
-
-def _counted(bad, where, counted):
-    """Bad pixels, whose number is added to a list, with where they were found."""
-    if count := int(bad.sum()):
-        counted.append(f"{count} {where}")
-    return bad
-
-
-# A pixel of a dark frame is hot if it is so many standard deviations brighter than the median of its neighbourhood of
-# 5 x 5; a count is rounded by half of one.
-_HOT, _ROUNDING = 10.0, 0.5
-# In a capture, a pixel is hot if it is brighter than all is dark by so many standard deviations, and none of its eight
-# neighbours has more than this share of what it has. In 24 ray-traced captures of points, whose spots are a pixel wide
-# at half their height, the brightest neighbour of a spot has 7 % or more, binned or not.
-_BRIGHT, _NEIGHBOUR = 100.0, 0.03
-
-
-def hot_in_dark(dark: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "row column"]:
-    """Which pixels of a dark frame are hot. Slow changes over the sensor, as an amplifier's glow, do not count."""
-    dark = np.asarray(dark, np.float32)
-    middle = float(np.median(dark))
-    deviation = max(1.4826 * float(np.median(np.abs(dark - middle))), _ROUNDING)
-    hot = dark > middle + _HOT * deviation
-    for some in _in_parts(np.argwhere(hot)):
-        local = np.median(_around(dark, some, 2), axis=1)
-        hot[tuple(some.T)] = dark[tuple(some.T)] > local + _HOT * deviation
-    return hot
-
-
-def hot_in_capture(image: Num[np.ndarray, "row column"]) -> Bool[np.ndarray, "row column"]:
-    """Which single pixels of a capture no light can have made: a spot, however sharp, shows in its neighbours.
-
-    Pixels that have their neighbours beside them; not those of a mosaic. It finds only what is far above the noise.
-    """
-    image = np.asarray(image)
-    # Levels of a part of the pixels are as good.
-    some = np.asarray(image[::3, ::3], np.float32)
-    level = float(np.median(some))
-    noise = float(np.sqrt(2 * np.mean(np.minimum(some - level, 0) ** 2)))
-    # Images without noise have bright pixels, too.
-    least = (float(image.max()) - level) / 100 if image.dtype.kind == "f" else _BRIGHT * _ROUNDING
-    hot = image > level + max(_BRIGHT * noise, least)
-    for some in _in_parts(np.argwhere(hot)):
-        brightest = np.delete(_around(image, some, 1), 4, axis=1).max(1)
-        hot[tuple(some.T)] = brightest - level < _NEIGHBOUR * (image[tuple(some.T)] - level)
-    return hot
-
-
-def repaired(
-    image: Num[np.ndarray, "row column"], bad: Bool[np.ndarray, "row column"]
-) -> Float32[np.ndarray, "row column"]:
-    """An image with bad pixels filled by the median of their good neighbours of 3 x 3, larger defects from their edge.
-
-    Raises
-    ------
-    ValueError
-        If there is no good pixel.
-    """
-    image, bad = np.array(image, np.float32), bad.copy()
-    if bad.all():
-        raise ValueError("`bad` must leave a pixel, got none.")
-    places = np.argwhere(bad)
-    while len(places):
-        near = np.where(_around(bad, places, 1), np.nan, _around(image, places, 1))
-        reached = ~np.isnan(near).all(1)
-        filled = tuple(places[reached].T)
-        image[filled], bad[filled] = np.nanmedian(near[reached], axis=1), False
-        places = places[~reached]
-    return image
-
-
-def _in_parts(places):
-    """A few at a time, for the memory of their neighbourhoods."""
-    return np.array_split(places, len(places) // 100_000 + 1)
-
-
-def _around(image, places, reach):
-    """The pixels of the square around each place, `(place, pixel)`; at the image's edge, the edge's."""
-    offsets = np.stack(np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"), -1).reshape(1, -1, 2)
-    near = np.clip(places[:, None] + offsets, 0, np.array(image.shape) - 1)
-    return image[near[..., 0], near[..., 1]]

@@ -1,41 +1,42 @@
-"""Captures on disk: greyscale TIFF, PNG or .npy of uint8, uint16 or float32, or a page or a colour of one.
+"""Reads and writes captures: greyscale TIFF, PNG or .npy of uint8, uint16 or float32, or one page or colour of a file.
 
-Their size and type are checked on the file's own declaration, before a pixel is decoded. To add a format, add its
-suffix to `_FORMATS` with a function that reads it and one that writes it.
+Size and type are checked as the file declares them, before pixels are decoded. To add a format, add its suffix to
+`_FORMATS` with a function that reads it and one that writes it.
 """
 
-import contextlib
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import tifffile
 from jaxtyping import Array, Float32, Shaped, UInt8, UInt16
-from PIL import Image
+from PIL import Image, ImageFile
 from PIL.PngImagePlugin import PngInfo
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike
-from .files import atomic_write, check_input, check_output, decoding
+from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar
-from .tiff import declared_mosaic, decode_plane, decode_png, page_count
+from .tiff import decode_plane, mosaic_pattern, open_tiff
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
+Images = Iterator[Shaped[np.ndarray, "row column"]]
 
-MAX_PIXELS = 10**9
 CHANNELS = ("red", "green", "blue")
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+MAX_PIXELS = 10**9
 DTYPES = ("uint8", "uint16", "float32")
+# What files call colour, None if grey, by number in PNG and in TIFF.
 _RGB, _MOSAIC = "colour (RGB)", 32803
-_COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
-_PHOTOMETRIC = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
+_PNG_COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
+_TIFF_COLOURS = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
 
 
-class Wanted(NamedTuple):
-    """What of a file is asked for: as `read_capture`, and types of pixels."""
+class Selection(NamedTuple):
+    """The part of a file to read, as the arguments of `read_capture`, and the types of pixels that are allowed."""
 
     shape: tuple[int, ...] | None = None
     page: int | str | None = None
@@ -63,18 +64,18 @@ def read_capture(
     shape
         `(rows, columns)` that the image in the file must have: the sensor's.
     page
-        Of a file of several, which count from 1 in the file's order; or "mean", of all, float32.
+        Page of a file of several, counted from 1; or "mean", the float32 mean of all.
     channel
-        "red", "green" or "blue" of a colour image, or of the mosaic that `bayer` says it is.
+        "red", "green" or "blue" of a colour image or a mosaic.
     bayer
-        Colours of the first pixels of a mosaic, row by row, such as "RGGB"; the capture is then of its cells of 2 x 2
-        pixels, as `gs_jax.io.camera.Readout` says, and its pixels are where `Readout.sensor` says.
+        Colours of the first 2 x 2 pixels of a mosaic, row by row, such as "RGGB". The capture then has one pixel per
+        2 x 2 cell; see `gs_jax.io.camera.Readout`.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is none of these, is damaged, of another size than `shape` or over 1e9 pixels, of
-        another type, holds a NaN or an infinity, or is in colour or has several pages and it is not said which to take.
+        If the file cannot be read, is damaged, has another size than `shape` or over 1e9 pixels, another type, a NaN or
+        an infinity, or has colours or pages of which none is chosen.
 
     Examples
     --------
@@ -83,58 +84,60 @@ def read_capture(
     >>> gs.read_capture("capture.tif").shape
     (200, 300)
     """
-    image = averaged(frames(path, shape, page=page, channel=channel, bayer=bayer))
-    return channel_of(image, bayer, channel) if bayer else image
+    image = average(read_images(path, Selection(shape, page, channel, bayer)))
+    return mosaic_channel(image, bayer, channel) if bayer else image
 
 
-def averaged(images: Iterator[Shaped[np.ndarray, "row column"]]) -> Shaped[np.ndarray, "row column"]:
-    """The mean of images, float32; a single one as it is."""
+def average(images: Iterable[Shaped[np.ndarray, "row column"]]) -> Shaped[np.ndarray, "row column"]:
+    """The float32 mean of images; a single one is returned unchanged."""
+    images = iter(images)
     total, count = next(images), 1
     for image in images:
         total, count = np.add(total, image, dtype=np.float64), count + 1
     return total if count == 1 else (total / count).astype(np.float32)
 
 
-def frames(
-    path: PathLike,
-    shape: tuple[int, int] | None = None,
-    *,
-    page: int | str | None = None,
-    channel: str | None = None,
-    bayer: str | None = None,
-    dtypes: tuple[str, ...] = DTYPES,
-) -> Iterator[Shaped[np.ndarray, "row column"]]:
-    """The pages of a capture that `page` names, one after the other; of a mosaic, all of its pixels.
-
-    Parameters and errors are those of `read_capture`.
-    """
+def read_images(path: PathLike, selection: Selection = Selection()) -> Images:
+    """Yield the selected pages of a capture, of a mosaic with all of its pixels; errors as `read_capture`."""
     path = check_input(path)
-    form = _FORMATS.get(path.suffix.lower())
-    if form is None:
-        raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(CAPTURE_SUFFIXES)}.")
-    if bayer:
-        sites(bayer, channel)
-    wanted = Wanted(shape and tuple(shape), page, channel, bayer, dtypes)
-    yield from checked(path, form.read(path, wanted))
+    read = _FORMATS[check_suffix(path, CAPTURE_SUFFIXES)].read
+    if selection.bayer:
+        mosaic_sites(selection.bayer, selection.channel)
+    shape = selection.shape
+    yield from check_images(path, read(path, selection._replace(shape=shape and tuple(shape))))
 
 
-def checked(
-    path: PathLike, images: Iterator[Shaped[np.ndarray, "row column"]]
-) -> Iterator[Shaped[np.ndarray, "row column"]]:
-    """Images of a file in the machine's byte order; `InputError` if they are of several sizes or not finite."""
+def check_images(path: PathLike, images: Images) -> Images:
+    """Yield images in the machine's byte order; `InputError` if their sizes differ or they are not finite."""
     size = None
     for pixels in images:
         size = size or pixels.shape
         if pixels.shape != size:
-            found = " and ".join(" x ".join(map(str, each)) for each in (size, pixels.shape))
-            raise InputError(f"{path}: found pages of {found} pixels for --page mean, allowed: all of one size.")
+            given = f"{size_text(size)} and {size_text(pixels.shape)}"
+            raise input_error("pages", "all of one size for --page mean", f"{given} pixels", path)
         pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
         if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
             row, column = np.argwhere(~np.isfinite(pixels))[0].tolist()
-            raise InputError(
-                f"{path}: found {pixels[row, column]} at pixel ({row}, {column}), allowed: finite numbers."
-            )
+            raise input_error(f"pixel ({row}, {column})", "finite", pixels[row, column], path)
         yield pixels
+
+
+def mosaic_sites(bayer: str, channel: str | None) -> list[tuple[int, int]]:
+    """`(row, column)` of a channel in a 2 x 2 cell of a mosaic; `InputError` for an unknown pattern or channel."""
+    if bayer not in PATTERNS:
+        raise input_error("--bayer", ", ".join(PATTERNS), short_repr(bayer))
+    if channel not in CHANNELS:
+        raise input_error(f"--channel with --bayer {bayer}", ", ".join(CHANNELS), channel or "none")
+    return [divmod(place, 2) for place, colour in enumerate(bayer) if colour == channel[0].upper()]
+
+
+def mosaic_channel(
+    mosaic: Shaped[np.ndarray, "row column"], bayer: str, channel: str | None
+) -> Shaped[np.ndarray, "y x"]:
+    """The image of one channel of a mosaic, a pixel per cell; green is a float32 mean. Errors as `mosaic_sites`."""
+    rows, columns = (n // 2 * 2 for n in mosaic.shape)
+    parts = [mosaic[row:rows:2, column:columns:2] for row, column in mosaic_sites(bayer, channel)]
+    return parts[0] if len(parts) == 1 else np.asarray(np.mean(parts, axis=0, dtype=np.float32))
 
 
 def write_capture(
@@ -151,7 +154,7 @@ def write_capture(
     image
         `(row, column)` of uint8, uint16 or float32.
     provenance
-        Where it comes from; beside an .npy.
+        Kept in the file, or beside an .npy.
 
     Raises
     ------
@@ -171,133 +174,138 @@ def write_capture(
         raise ValueError(f"`image` must be one of {', '.join(DTYPES)}, got {pixels.dtype.name}.")
     form = _FORMATS[path.suffix.lower()]
     if pixels.dtype.name not in form.dtypes:
-        allowed = f"{', '.join(form.dtypes)} in {path.suffix}; use .tif or .npy"
-        raise InputError(f"{path}: found pixels of type {pixels.dtype.name}, allowed: {allowed}.")
+        allowed = f"{', '.join(form.dtypes)} in {path.suffix} (use .tif or .npy)"
+        raise input_error("pixels", allowed, pixels.dtype.name, path)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         form.write(file, pixels, provenance)
     if path.suffix.lower() == ".npy":
         write_sidecar(path, provenance)
 
 
-def check_declared(path: Path, size: tuple[int, ...], dtype: str, wanted: Wanted) -> None:
-    """`InputError` unless the size and the type that a file declares are what is wanted."""
-    found, shape = " x ".join(str(n) for n in size), wanted.shape
+def size_text(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape))
+
+
+def check_declared(path: Path, size: tuple[int, ...], dtype: str, selection: Selection) -> None:
+    """Raise `InputError` unless the size and the type that a file declares are allowed."""
     if len(size) != 2 or min(size) < 1:
-        raise InputError(f"{path}: found an image of {found or 'no'} pixels, allowed: 2-D greyscale, rows x columns.")
-    if shape is not None and size != shape:
-        allowed = f"{shape[0]} x {shape[1]}, the sensor of the design, or what --roi and --binning leave of it"
-        raise InputError(f"{path}: found {found} pixels (rows x columns), allowed: {allowed}.")
+        raise input_error("image", "2-D greyscale, rows x columns", f"{size_text(size) or 'no'} pixels", path)
+    if selection.shape is not None and size != selection.shape:
+        allowed = f"{size_text(selection.shape)}, the sensor of the design or what --roi and --binning leave"
+        raise input_error("image", allowed, f"{size_text(size)} pixels (rows x columns)", path)
     if size[0] * size[1] > MAX_PIXELS:
-        raise InputError(f"{path}: found {found} pixels (rows x columns), allowed: at most {MAX_PIXELS} in all.")
-    if dtype not in wanted.dtypes:
+        raise input_error("image", f"of at most {MAX_PIXELS} pixels", size_text(size), path)
+    if dtype not in selection.dtypes:
         advice = "convert it without rescaling, e.g. in Fiji by Image > Type > 32-bit"
-        raise InputError(f"{path}: found pixels of type {dtype}, allowed: {', '.join(wanted.dtypes)}; {advice}.")
+        raise input_error("pixels", ", ".join(selection.dtypes), f"{dtype}; {advice}", path)
 
 
 def _pages(path: Path, count: int, page: int | str | None) -> range:
-    """The pages to read, counted from 0."""
+    """The selected pages, counted from 0."""
     if page == "mean":
         return range(count)
     if page is None and count == 1:
         return range(1)
     if page is None:
         choice = f"choose by --page 1 to {count}, or average repeated frames by --page mean"
-        raise InputError(f"{path}: found {count} pages, allowed: one; {choice}.")
+        raise InputError(f"{path}: {count} pages; {choice}.")
     if not isinstance(page, int) or not 1 <= page <= count:
-        raise InputError(f"{path}: found --page {page} for {count} pages, allowed: 1 to {count}, or mean.")
+        raise input_error("--page", f"1 to {count}, or mean", f"--page {page} of {count} pages", path)
     return range(page - 1, page)
 
 
-def check_colour(path: Path, colour: str | None, wanted: Wanted) -> None:
-    """`InputError` unless the channel that is wanted is there; `colour` is what the file says, None if it is grey."""
+def check_colour(path: Path, colour: str | None, selection: Selection) -> None:
+    """Raise `InputError` unless the selected channel exists; `colour` is what the file declares, None if it is grey."""
+    channel, bayer, channels = selection.channel, selection.bayer, ", ".join(CHANNELS)
     if colour and colour != _RGB:
-        raise InputError(f"{path}: found {colour}, allowed: greyscale, one sample a pixel, 0 as black.")
-    if colour and wanted.bayer:
-        raise InputError(f"{path}: found colour for --bayer {wanted.bayer}, allowed: a grey image of the mosaic.")
-    if colour and not wanted.channel:
-        raise InputError(f"{path}: found {colour}, allowed: greyscale, or --channel {', '.join(CHANNELS)} of it.")
-    if not colour and wanted.channel and not wanted.bayer:
-        allowed = "colour, or --bayer with it for a mosaic"
-        raise InputError(f"{path}: found greyscale for --channel {wanted.channel}, allowed: {allowed}.")
-    if wanted.channel and wanted.channel not in CHANNELS:
-        raise InputError(f"{path}: found --channel {wanted.channel}, allowed: {', '.join(CHANNELS)}.")
+        raise input_error("image", "greyscale, one sample a pixel, 0 as black", colour, path)
+    if colour and bayer:
+        raise input_error("image", f"the grey image of a mosaic for --bayer {bayer}", colour, path)
+    if colour and not channel:
+        raise input_error("image", f"greyscale, or --channel {channels} of it", colour, path)
+    if not colour and channel and not bayer:
+        raise input_error("image", f"colour for --channel {channel}, or a mosaic with --bayer", "greyscale", path)
+    if channel and channel not in CHANNELS:
+        raise input_error("--channel", channels, channel, path)
 
 
-def _taken(pixels: np.ndarray, wanted: Wanted, colours_first: bool = False) -> np.ndarray:
-    """The image that is wanted of what a page holds."""
-    if pixels.ndim == 2:
-        return pixels
-    return np.moveaxis(pixels, 0 if colours_first else -1, 0)[CHANNELS.index(wanted.channel or "")]
+def _check_mosaic(path: Path, declared: str | None, bayer: str | None) -> None:
+    if not bayer:
+        allowed = f"greyscale, or --bayer {declared or 'RGGB (or another)'} with --channel {', '.join(CHANNELS)}"
+        raise input_error("image", allowed, "a colour filter mosaic", path)
+    if declared and declared != bayer:
+        raise input_error("--bayer", f"{declared}, as the file declares", f"--bayer {bayer}", path)
 
 
-@contextlib.contextmanager
-def opened_tiff(path: Path) -> Iterator[tuple[tifffile.TiffFile, int]]:
-    """A TIFF, and how many pages it has."""
-    with contextlib.ExitStack() as stack:
-        with decoding(path, "TIFF"):
-            # Without OME: a set of files is not a capture, and no other file is to be opened.
-            tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
-            count = page_count(tiff)
-        yield tiff, count
+def _select_channel(pixels: np.ndarray, channel: str | None, axis: int = -1) -> np.ndarray:
+    return pixels if pixels.ndim == 2 else np.take(pixels, CHANNELS.index(channel or ""), axis)
 
 
-def tiff_page(path: Path, tiff: tifffile.TiffFile, index: int, wanted: Wanted) -> Shaped[np.ndarray, "row column"]:
-    """What is wanted of a page, counted from 0."""
+def read_tiff_page(path: Path, tiff: tifffile.TiffFile, index: int, selection: Selection) -> np.ndarray:
+    """The selected part of a page, counted from 0."""
     with decoding(path, "TIFF"):
         page = tiff.pages[min(index, len(tiff.pages) - 1)].aspage()
         photometric, samples = int(page.photometric), page.samplesperpixel
         size, dtype = tuple(page.shape), str(page.dtype)
-        planar, declared = int(page.planarconfig) == 2, declared_mosaic(page)
-    colour = _PHOTOMETRIC.get(photometric, f"{samples} samples a pixel, photometric {photometric}")
+        planar, declared = int(page.planarconfig) == 2, mosaic_pattern(page)
+    unusual = f"{samples} samples a pixel, photometric {photometric}"
+    colour = _TIFF_COLOURS.get(photometric, unusual)
     if photometric == 2 and samples >= 3 and len(size) == 3:
         size = size[1:] if planar else size[:2]
     elif samples != 1:
-        colour = f"{samples} samples a pixel, photometric {photometric}"
-    _check_mosaic(path, declared, wanted) if photometric == _MOSAIC else check_colour(path, colour, wanted)
-    check_declared(path, size, dtype, wanted)
-    return _taken(decode_plane(path, tiff, index), wanted, planar)
+        colour = unusual
+    if photometric == _MOSAIC:
+        _check_mosaic(path, declared, selection.bayer)
+    else:
+        check_colour(path, colour, selection)
+    check_declared(path, size, dtype, selection)
+    return _select_channel(decode_plane(path, tiff, index), selection.channel, 0 if planar else -1)
 
 
-def _read_tiff(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
-    with opened_tiff(path) as (tiff, count):
-        for index in _pages(path, count, wanted.page):
-            yield tiff_page(path, tiff, index, wanted)
+def _read_tiff(path: Path, selection: Selection) -> Iterator[np.ndarray]:
+    with open_tiff(path) as (tiff, count):
+        for index in _pages(path, count, selection.page):
+            yield read_tiff_page(path, tiff, index, selection)
 
 
-def _check_mosaic(path: Path, declared: str | None, wanted: Wanted) -> None:
-    if not wanted.bayer:
-        allowed = f"greyscale, or --bayer {declared or 'RGGB (or another)'} with --channel {', '.join(CHANNELS)}"
-        raise InputError(f"{path}: found a colour filter mosaic, allowed: {allowed}.")
-    if declared and declared != wanted.bayer:
-        raise InputError(f"{path}: found --bayer {wanted.bayer}, allowed: {declared}, as the file says.")
-
-
-def _read_png(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
+def _read_png(path: Path, selection: Selection) -> Iterator[np.ndarray]:
     with path.open("rb") as file:
         header = file.read(26)
     if len(header) < 26 or header[:8] != b"\x89PNG\r\n\x1a\n" or header[12:16] != b"IHDR":
-        raise InputError(f"{path}: not a whole and valid PNG: found another beginning.")
+        raise InputError(f"{path}: not a whole and valid PNG: another signature.")
     columns, rows, bits, colour = struct.unpack(">IIBB", header[16:])
-    check_colour(path, _COLOURS.get(colour, "an unknown type of pixels"), wanted)
+    check_colour(path, _PNG_COLOURS.get(colour, "an unknown type of pixels"), selection)
     dtype = {8: "uint8", 16: "uint16"}.get(bits, f"{bits}-bit")
-    check_declared(path, (rows, columns), dtype, wanted)
+    check_declared(path, (rows, columns), dtype, selection)
     with decoding(path, "PNG"), Image.open(path, formats=["PNG"]) as image:
         count = getattr(image, "n_frames", 1)
-        pixels = decode_png(path, image, bits)
+        pixels = _decode_png(path, image, bits)
     if count != 1:
-        raise InputError(f"{path}: found {count} pages, allowed: one in a PNG.")
-    _pages(path, 1, wanted.page)
-    yield _taken(pixels.astype(dtype), wanted)
+        raise input_error("PNG", "one image", f"{count} pages", path)
+    _pages(path, 1, selection.page)
+    yield _select_channel(pixels.astype(dtype), selection.channel)
 
 
-def _read_npy(path: Path, wanted: Wanted) -> Iterator[np.ndarray]:
+def _decode_png(path: Path, image: ImageFile.ImageFile, bits: int) -> np.ndarray:
+    """Pixels `(row, column)` or `(row, column, colour)`; Pillow reads 16-bit colour as its upper or its lower bytes."""
+    if bits != 16 or len(image.getbands()) == 1:
+        return np.array(image)
+    (tile,), halves = image.tile, []
+    for order in "BL":
+        with Image.open(path, formats=["PNG"]) as half:
+            half.tile = [tile._replace(args=f"{half.mode};16{order}")]
+            halves.append(np.array(half).astype(np.uint16))
+    return halves[0] << 8 | halves[1]
+
+
+def _read_npy(path: Path, selection: Selection) -> Iterator[np.ndarray]:
     with decoding(path, ".npy of numbers"):
         pixels = np.lib.format.open_memmap(path, mode="r")
     pages = pixels if pixels.ndim == 3 and len(pixels) else pixels[None]
-    check_colour(path, None, wanted)
-    for index in _pages(path, len(pages), wanted.page):
-        check_declared(path, pages[index].shape, pixels.dtype.name, wanted)
-        yield _taken(np.array(pages[index]), wanted)
+    check_colour(path, None, selection)
+    for index in _pages(path, len(pages), selection.page):
+        check_declared(path, pages[index].shape, pixels.dtype.name, selection)
+        yield np.array(pages[index])
 
 
 def _write_tiff(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None) -> None:
@@ -316,42 +324,14 @@ def _write_npy(file: BinaryIO, pixels: np.ndarray, provenance: Provenance | None
 
 
 class _Format(NamedTuple):
-    """How files of one suffix are read, page by page, and written, and what they can hold."""
+    """How files of one suffix are read, page by page, and written, and the types that they hold."""
 
-    read: Callable[[Path, Wanted], Iterator[np.ndarray]]
-    write: Callable[[BinaryIO, np.ndarray, Provenance | None], None]
+    read: Callable[[Path, Selection], Iterator[np.ndarray]]
+    write: Callable[[BinaryIO, np.ndarray, Provenance | None], Any]
     dtypes: tuple[str, ...] = DTYPES
 
 
-_FORMATS = {
-    ".tif": _Format(_read_tiff, _write_tiff),
-    ".tiff": _Format(_read_tiff, _write_tiff),
-    ".png": _Format(_read_png, _write_png, ("uint8", "uint16")),
-    ".npy": _Format(_read_npy, _write_npy),
-}
+_TIFF = _Format(_read_tiff, _write_tiff)
+_PNG = _Format(_read_png, _write_png, ("uint8", "uint16"))
+_FORMATS = {".tif": _TIFF, ".tiff": _TIFF, ".png": _PNG, ".npy": _Format(_read_npy, _write_npy)}
 CAPTURE_SUFFIXES = tuple(_FORMATS)
-
-
-def sites(bayer: str, channel: str | None) -> list[tuple[int, int]]:
-    """`(row, column)` in a cell of the pixels of a channel.
-
-    Raises
-    ------
-    InputError
-        If there is no such pattern or channel.
-    """
-    if bayer not in PATTERNS:
-        raise InputError(f"--bayer: found {short_repr(bayer)}, allowed: {', '.join(PATTERNS)}.")
-    if channel not in CHANNELS:
-        raise InputError(
-            f"--bayer {bayer}: found {f'--channel {channel}' if channel else 'no --channel'}, allowed: "
-            f"--channel {', '.join(CHANNELS)}."
-        )
-    return [divmod(place, 2) for place, colour in enumerate(bayer) if colour == channel[0].upper()]
-
-
-def channel_of(mosaic: Shaped[np.ndarray, "row column"], bayer: str, channel: str | None) -> Shaped[np.ndarray, "y x"]:
-    """The image of a mosaic's cells in one colour: see `Readout`. Green is float32; errors as `sites`."""
-    rows, columns = (n // 2 * 2 for n in mosaic.shape)
-    parts = [mosaic[row:rows:2, column:columns:2] for row, column in sites(bayer, channel)]
-    return parts[0] if len(parts) == 1 else np.asarray(np.mean(parts, axis=0, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""How a file is read whole, or written whole or not at all; text, tables of numbers, and JSON."""
+"""Reading files whole, and writing them whole or not at all: text, JSON, figures, and what other modules write."""
 
 import contextlib
 import errno
@@ -13,26 +13,22 @@ import time
 import uuid
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, input_error, short_repr
 
 # Not from `gs_jax.typing`, which imports JAX: the help of commands does without.
 PathLike = str | os.PathLike[str]
-AnyPath = TypeVar("AnyPath", bound=PurePath)
 
 MAX_TEXT_BYTES = 2**26
-# To remove a folder, and the seconds between them.
+# Attempts to remove a folder, and the seconds between them.
 _ATTEMPTS, _PAUSE = 30, 0.05
-# What is being written.
+# Files that are being written.
 _TEMPORARY: set[Path] = set()
-
-# What the root of an image in Zarr may hold. A store with anything else in it (labels, a plate, notes) is
-# somebody's work and is not replaced.
-_ZARR_METADATA = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}
-# What we add to volumes in time: `volume_series`.
-_OURS = {"frames.jsonl"}
+# Metadata of a Zarr image, and the journal of `VolumeSeries`. A store with anything else in its root (labels, a plate,
+# notes) may hold somebody's work and is not replaced.
+_ZARR_METADATA, JOURNAL = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}, "frames.jsonl"
 
 
 def _reason(error: Exception) -> str:
@@ -40,26 +36,19 @@ def _reason(error: Exception) -> str:
 
 
 def check_input(path: PathLike) -> Path:
-    """The path of a regular file that can be opened for reading.
-
-    Raises
-    ------
-    InputError
-        If it is missing, a folder or a device, or may not be read.
-    """
+    """Return the path of a regular file; `InputError` if it is missing, of another kind, or cannot be opened."""
     try:
         mode = os.stat(path).st_mode
         if stat.S_ISREG(mode):
             with open(path, "rb"):
                 return Path(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: the file cannot be read: {_reason(error)}.") from error
-    found = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-    raise InputError(f"{path}: found {found}, allowed: a file.")
+        raise InputError(f"{path}: cannot be read: {_reason(error)}.") from error
+    raise input_error(str(path), "a file", "a folder" if stat.S_ISDIR(mode) else "not a regular file")
 
 
 def read_text(path: PathLike, most: int = MAX_TEXT_BYTES) -> str:
-    """The text of a UTF-8 file of at most `most` bytes, by default 64 MiB, without a byte order mark.
+    """Read a UTF-8 file of at most `most` bytes, without its byte order mark.
 
     Raises
     ------
@@ -68,37 +57,37 @@ def read_text(path: PathLike, most: int = MAX_TEXT_BYTES) -> str:
     """
     path = check_input(path)
     if path.stat().st_size > most:
-        raise InputError(f"{path}: found {path.stat().st_size} bytes, allowed: at most {most}.")
+        raise input_error("file", f"at most {most} bytes", path.stat().st_size, path)
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: found a byte that is not UTF-8 at offset {error.start}, allowed: UTF-8.") from error
+        raise input_error("text", "UTF-8", f"another byte at offset {error.start}", path) from error
+
+
+def check_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
+    """Return the suffix of a path in lower case; `InputError` if it is none of these."""
+    suffix = Path(path).suffix
+    if suffix.lower() not in suffixes:
+        raise input_error("suffix", ", ".join(suffixes), short_repr(suffix), path)
+    return suffix.lower()
 
 
 def check_output(path: PathLike, suffixes: Sequence[str]) -> Path:
-    """A path that can be written, with one of the `suffixes`; to be asked before a long computation.
+    """Return a path that can be written; for calls before a long computation.
 
     Raises
     ------
     InputError
-        If the suffix is none of them, the folder is missing or not writable, or the path is taken by a folder
-        (other than an image in Zarr where that is what will be written) or a device.
+        If the suffix is none of `suffixes`, the folder is missing or not writable, or the path is a device or a folder,
+        other than a Zarr image that `.zarr` would replace.
     """
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: found the suffix {short_repr(path.suffix)}, allowed: {', '.join(suffixes)}.")
-    _check_target(path)
-    return path
+    check_suffix(path, suffixes)
+    _check_target(Path(path))
+    return Path(path)
 
 
 def make_folder(path: PathLike) -> Path:
-    """A folder to write several files to, made with its parents where it is missing.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made, is no folder, or cannot be written to.
-    """
+    """Make a folder and its parents if they are missing; `InputError` if it cannot be made or written to."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -114,29 +103,29 @@ def _check_target(path: Path) -> None:
         raise InputError(f"{path}: cannot be written: there is no folder {path.parent}.")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
-            taken = os.stat(path).st_mode
+            mode = os.stat(path).st_mode
     except FileNotFoundError:
         return
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be written: {_reason(error)}.") from error
     is_zarr = path.suffix.lower() == ".zarr"
-    if stat.S_ISDIR(taken) and not (is_zarr and _holds_only_an_image(path)):
-        raise InputError(f"{path}: cannot be written: found a folder, which is not replaced unless it is a Zarr image.")
-    if not stat.S_ISDIR(taken) and (is_zarr or not stat.S_ISREG(taken)):
-        raise InputError(f"{path}: cannot be written: found a file or device of another kind in its place.")
+    if stat.S_ISDIR(mode) and not (is_zarr and _is_only_an_image(path)):
+        raise InputError(f"{path}: cannot be written: a folder is replaced only if it is a Zarr image.")
+    if not stat.S_ISDIR(mode) and (is_zarr or not stat.S_ISREG(mode)):
+        raise InputError(f"{path}: cannot be written: a file or device of another kind has this name.")
 
 
-def _holds_only_an_image(folder: Path) -> bool:
-    names = set(os.listdir(folder))
-    return bool(names & _ZARR_METADATA) and all(name in _ZARR_METADATA | _OURS or name.isdecimal() for name in names)
+def _is_only_an_image(folder: Path) -> bool:
+    names = set(os.listdir(folder)) - {JOURNAL}
+    return bool(names & _ZARR_METADATA) and all(name in _ZARR_METADATA or name.isdecimal() for name in names)
 
 
 @contextlib.contextmanager
 def atomic_write(path: PathLike) -> Iterator[Path]:
-    """A path beside `path` to write a file or a Zarr folder to, which takes its place at the end.
+    """Give a temporary path for a file or a Zarr folder, which replaces `path` at the end of the `with` block.
 
-    Whatever goes wrong inside, an interrupt too, the new file is removed and the old one is as it was.
-    A link stays a link: what it points to is replaced.
+    After any exception the new file is removed and the old one is unchanged. A link stays a link: its target is
+    replaced.
 
     Raises
     ------
@@ -150,30 +139,40 @@ def atomic_write(path: PathLike) -> Iterator[Path]:
     temporary = _temporary_beside(target)
     _TEMPORARY.add(temporary)
     try:
-        yield temporary
-        if not temporary.is_dir():
-            with open(temporary, "r+b") as file:
-                os.fsync(file.fileno())
-        _replace(temporary, target)
-    except OSError as error:
-        # Errors of a full disk name no file or the temporary one; NumPy's and tifffile's have no number either.
-        if error.errno is not None and not str(error.filename or temporary).startswith(str(temporary)):
-            raise
-        reason = error.strerror or f"cannot be written: {error}"
-        raise OSError(error.errno or errno.ENOSPC, reason, str(path)) from error
+        with disk_errors_name(path, temporary):
+            yield temporary
+            if not temporary.is_dir():
+                with open(temporary, "r+b") as file:
+                    os.fsync(file.fileno())
+            _replace(temporary, target)
     finally:
         _remove(temporary)
         _TEMPORARY.discard(temporary)
 
 
+@contextlib.contextmanager
+def disk_errors_name(path: PathLike, written: Path) -> Iterator[None]:
+    """Make each `OSError` that comes from writing to `written` have a number and the name of `path`.
+
+    Errors of a full disk name no file or a temporary one; those of NumPy and tifffile have no number either.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and not str(error.filename or written).startswith(str(written)):
+            raise
+        reason = error.strerror or f"cannot be written: {error}"
+        raise OSError(error.errno or errno.ENOSPC, reason, str(path)) from error
+
+
 def remove_temporaries() -> None:
-    """Removes what `atomic_write` has not finished, when the process ends without its own cleaning up."""
+    """Remove what `atomic_write` has not finished, when the process is about to exit without unwinding."""
     for temporary in list(_TEMPORARY):
         _remove(temporary)
 
 
-def _temporary_beside(path: AnyPath) -> AnyPath:
-    # Not `tempfile`, whose files nobody else may read: the user's umask is to decide that.
+def _temporary_beside(path: Path) -> Path:
+    # Not by `tempfile`, whose files only their owner can read: the user's umask decides that.
     return path.with_name(f".gs-jax-{uuid.uuid4().hex[:12]}{path.suffix}")
 
 
@@ -192,7 +191,7 @@ def _replace(temporary: Path, path: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    # Zarr's own threads go on writing for a moment after an interrupt; the folder may be made only then.
+    # Zarr's threads continue to write for a moment after an interrupt; the folder may be made only then.
     for _ in range(_ATTEMPTS):
         if not path.is_dir():
             with contextlib.suppress(IsADirectoryError):
@@ -205,11 +204,8 @@ def _remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def decoding(path: Path, kind: str) -> Iterator[None]:
-    """Around a call of a third-party decoder, and nothing else: whatever it raises is the file's fault.
-
-    Its warnings and log lines are dropped: a file is read, or refused in one line.
-    """
+def decoding(path: PathLike, kind: str) -> Iterator[None]:
+    """Turn every exception of a third-party decoder into an `InputError`, and drop its warnings and log lines."""
     logger = logging.getLogger("tifffile")
     was_disabled, logger.disabled = logger.disabled, True
     try:
@@ -225,21 +221,16 @@ def decoding(path: Path, kind: str) -> Iterator[None]:
 
 
 def write_json(path: PathLike, data: Any) -> None:
-    """Writes `data` as JSON, whole or not at all.
+    """Write `data` as JSON; `InputError` as `check_output`.
 
     NumPy and JAX values become numbers and lists. JSON has no NaN and no infinity: both become null.
-
-    Raises
-    ------
-    InputError
-        As `check_output`, for `.json`.
     """
     text = json.dumps(_plain(data), indent=2, allow_nan=False, ensure_ascii=False)
     write_text(path, text + "\n", [".json"])
 
 
 def write_text(path: PathLike, text: str, suffixes: Sequence[str]) -> None:
-    """Writes UTF-8 text, whole or not at all; `InputError` as `check_output`."""
+    """Write UTF-8 text; `InputError` as `check_output`."""
     with atomic_write(check_output(path, suffixes)) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -255,6 +246,6 @@ def _plain(data: Any) -> Any:
 
 
 def write_figure(path: PathLike, figure: Any) -> None:
-    """Writes a figure as PNG at its own resolution, whole or not at all; `InputError` as `check_output`."""
+    """Write a matplotlib figure as PNG at its own resolution; `InputError` as `check_output`."""
     with atomic_write(check_output(path, [".png"])) as temporary:
         figure.savefig(temporary, format="png")

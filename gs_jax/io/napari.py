@@ -1,8 +1,6 @@
-"""Layers of napari: volumes, in time too, and points to scale and in one place, in um; and a reader that makes them.
+"""Layers of napari in um: volumes, volumes in time and points; and the reader that `napari.yaml` names.
 
-`napari.yaml` names the reader.
-
-napari's other readers of OME-TIFF leave out where the first voxel is, and those of CSV know pixels alone.
+napari's own readers of OME-TIFF ignore the position of the first voxel, and those of CSV know pixels only.
 """
 
 from collections.abc import Callable
@@ -15,24 +13,27 @@ from jaxtyping import Num
 from ..base.errors import InputError
 from ..grid import Grid
 from ..typing import Points
+from .ngff import display_range
 from .point_tables import POINTS_HEADER, read_points
 from .volume_series import Series, read_series
-from .volumes import VOLUME_SUFFIXES, display_range, read_volume
+from .volumes import VOLUME_SUFFIXES, read_volume
 
 Layer = tuple[Any, dict[str, Any], str]
 
 _UM = 1000.0
 _AXES: dict[str, Any] = {"axis_labels": ("z", "y", "x"), "units": ("um", "um", "um")}
+# Diameter of the ring around a point, um.
+_RING = 300.0
 
 
 def reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
-    """What reads this path, or None if it is not ours: napari then asks others."""
+    """Return the function that reads this path, or None if it is not ours: napari then asks other readers."""
     if isinstance(path, list):
         return None
     suffix = Path(path).suffix.lower()
     if suffix in VOLUME_SUFFIXES:
-        return _volume
-    return _points if suffix == ".csv" and _has_points(path) else None
+        return _read_volume
+    return _read_points if suffix == ".csv" and _has_points(path) else None
 
 
 def _has_points(path: str) -> bool:
@@ -43,9 +44,13 @@ def _has_points(path: str) -> bool:
         return False
 
 
-def _volume(path) -> list[Layer]:
+def _read_points(path) -> list[Layer]:
+    return [points_layer(read_points(path), Path(path).name)]
+
+
+def _read_volume(path) -> list[Layer]:
     if (series := read_series(path)) is not None:
-        return [_in_time(path, series)]
+        return [_series_layer(series, Path(path).name)]
     try:
         voxels, grid = read_volume(path)
     except InputError as error:
@@ -54,51 +59,46 @@ def _volume(path) -> list[Layer]:
 
 
 def volume_layer(volume: Num[np.ndarray, "depth y x"], grid: Grid, name: str) -> Layer:
-    """A volume, with the range of values that files of it have too."""
+    """A volume, with the display range that files of it have too."""
     first = _UM * np.array([float(grid.depths[0]), float(grid.y[0]), float(grid.x[0])])
-    scale = _UM * np.array([step_of(grid), grid.pitch, grid.pitch])
+    scale = _UM * np.array([mean_step(grid), grid.pitch, grid.pitch])
     options = {"scale": scale, "translate": first, "contrast_limits": display_range(volume), "name": name}
     return volume, options | _AXES, "image"
 
 
-def step_of(grid: Grid) -> float:
-    """From plane to plane in the mean, mm; a single plane is as thick as a voxel is wide."""
+def mean_step(grid: Grid) -> float:
+    """Mean distance of planes, mm; for a single plane the lateral pitch."""
     return float(np.diff(np.asarray(grid.depths, np.float64)).mean()) if grid.depths.size > 1 else grid.pitch
 
 
 def points_layer(points: Points, name: str, thickness: float = 0.25) -> Layer:
-    """Points, each shown in the planes that are less than half of `thickness` from it, mm."""
+    """Points as rings, shown in planes that are less than half of `thickness` from them, mm."""
     points = np.asarray(points, np.float64)
-    # A plane shows what is within half a unit of the data's.
+    # napari shows points within half a data unit of a plane.
     scale = np.array([_UM * thickness, 1.0, 1.0])
-    options = {"features": {"intensity": points[:, 3]}, "size": _SIZE, "scale": scale, "name": name}
-    marks = {
+    options = {
+        "features": {"intensity": points[:, 3]},
+        "size": _RING,
+        "scale": scale,
+        "name": name,
         "face_color": "transparent",
         "border_color": "cyan",
         "border_width": 0.15,
         "blending": "translucent_no_depth",
     }
-    return _UM * points[:, 2::-1] / scale, options | marks | _AXES, "points"
+    return _UM * points[:, 2::-1] / scale, options | _AXES, "points"
 
 
-def _in_time(path, series: Series) -> Layer:
-    """Volumes in time, which napari reads where it shows them."""
-    unit = "s" if series.interval else "pixel"
+def _series_layer(series: Series, name: str) -> Layer:
+    """Volumes in time, which napari reads as it shows them."""
+    multiscale = len(series.levels) > 1
     options = {
         "scale": series.scale,
         "translate": series.first,
-        "contrast_limits": series.shown,
-        "name": Path(path).name,
+        "contrast_limits": series.display,
+        "name": name,
         "axis_labels": ("t", *_AXES["axis_labels"]),
-        "units": (unit, *_AXES["units"]),
-        "multiscale": len(series.levels) > 1,
+        "units": ("s" if series.interval else "pixel", *_AXES["units"]),
+        "multiscale": multiscale,
     }
-    return series.levels if len(series.levels) > 1 else series.levels[0], options, "image"
-
-
-def _points(path) -> list[Layer]:
-    return [points_layer(read_points(path), Path(path).name)]
-
-
-# Of a ring around a point, um: it leaves what is in it to be seen.
-_SIZE = 300.0
+    return series.levels if multiscale else series.levels[0], options, "image"

@@ -1,52 +1,63 @@
-"""Tables of TOML files, and their problems in one line: the key, what was found and what is allowed."""
+"""Tables of TOML files as pydantic models, and their problems in one line."""
 
 import difflib
+import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Discriminator, ValidationError
 
-from ..base.errors import short_repr
+from ..base.errors import input_error, short_repr
+from ..typing import PathLike
+from .files import read_text
 
 Place = tuple[int | str, ...]
-# Of a value that is one number or several: pydantic's names for which of the two it is, which are no keys.
+# Tags of a union of one number and several; pydantic lists them among the keys of an error.
 ONE, EACH = "one number", "one for each"
 one_or_each = Discriminator(lambda value: EACH if isinstance(value, list | tuple) else ONE)
 
 
 class Table(BaseModel):
-    """A table whose keys are its fields: no other keys, no other types, no infinities. It does not change."""
+    """An immutable table that refuses unknown keys, other types and infinities."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> str:
-    """The first three problems of a file that is not a `model`.
+def read_toml(path: PathLike) -> dict[str, Any]:
+    """Read the tables of a TOML file; `InputError` as `read_text`, and if it is not valid TOML."""
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise input_error("file", "valid TOML", f"{error!s:.200}", path) from error
 
-    What is allowed is the description of the model's field.
+
+def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> str:
+    """Describe the first three problems of a table as "`KEY`: must be ALLOWED, got VALUE; ...".
 
     Parameters
     ----------
+    error
+        What pydantic raised.
     model
-        Its fields are keys, and those that are models themselves are tables.
+        Its fields are the keys; the description of a field says what is allowed.
     also
-        Keys of each table that the file may have and the model has not.
+        Keys of each inner table that the file may have beside those of the model.
     """
     problems = error.errors(include_url=False)
-    # A wrong element is reported again as an array that lacks it.
+    # Pydantic reports a wrong element a second time, as an array that lacks it.
     inner = {problem["loc"][:end] for problem in problems for end in range(1, len(problem["loc"]))}
     problems = [problem for problem in problems if problem["loc"] not in inner]
     lines = []
     for problem in problems[:3]:
-        place, found = problem["loc"], problem["input"]
+        place = problem["loc"]
         if not place:
             lines.append(problem["msg"].removeprefix("Value error, "))
         elif problem["type"] == "extra_forbidden":
-            nearest = _nearest(place, _keys(model, also))
-            lines.append(f"`{_dotted(place)}`: found a key that does not exist, allowed: {nearest}")
+            lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, _keys(model, also))}")
         else:
-            found = "nothing" if problem["type"] == "missing" else short_repr(found)
-            lines.append(f"`{_dotted(place)}`: found {found}, allowed: {_allowed(place, model)}")
+            given = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
+            lines.append(f"`{_dotted(place)}`: must be {_allowed(place, model)}, got {given}")
     more = len(problems) - len(lines)
     return "; ".join([*lines, f"and {more} more problems"] if more else lines)
 
@@ -61,7 +72,7 @@ def _table(annotation: Any) -> type[BaseModel] | None:
 
 
 def _allowed(place: Place, model: type[BaseModel]) -> str:
-    """The description of the field at `place`, or of the one that it is an element of."""
+    """Return the description of the field at `place`, or of the one that it is an element of."""
     description = ""
     for step in place:
         field = model.model_fields.get(str(step))
@@ -73,7 +84,7 @@ def _allowed(place: Place, model: type[BaseModel]) -> str:
 
 
 def _keys(model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """The keys of each table, and of the top level as ''."""
+    """Return the keys of each inner table, and those of the top level as ''."""
     keys = {"": list(model.model_fields)}
     for name, field in model.model_fields.items():
         if table := _table(field.annotation):
@@ -82,14 +93,14 @@ def _keys(model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> dict[str
 
 
 def _nearest(place: Place, keys: Mapping[str, Sequence[str]]) -> str:
-    """The key that was meant: one like it in the same table, or in another, or else every key of the table."""
+    """Suggest the same key of another table, a similar key, or else every key of this table."""
     *tables, wrong = (str(step) for step in place)
     here = keys.get(".".join(tables), [])
     everywhere = {key: f"{table}.{key}".removeprefix(".") for table, names in keys.items() for key in names}
     if wrong in everywhere:
-        return f"`{everywhere[wrong]}`, in its own table"
+        return f"did you mean `{everywhere[wrong]}`, in its own table?"
     if near := difflib.get_close_matches(wrong, here, n=1):
-        return f"`{near[0]}` (did you mean it?)"
+        return f"did you mean `{near[0]}`?"
     if near := difflib.get_close_matches(wrong, everywhere, n=1, cutoff=0.8):
-        return f"`{everywhere[near[0]]}` (did you mean it?)"
-    return ", ".join(f"`{key}`" for key in here)
+        return f"did you mean `{everywhere[near[0]]}`?"
+    return f"the keys are {', '.join(f'`{key}`' for key in here)}"

@@ -1,24 +1,21 @@
-"""Volumes on disk: OME-TIFF, or OME-Zarr when the name ends in `.zarr`.
+"""Reads and writes volumes: OME-TIFF, or OME-Zarr when the name ends in `.zarr`.
 
-Both hold float32 voxels `[depth, row, column]` as they are, and the grid in micrometres: the lateral pitch, every
-depth, and the centre of the first voxel, so that Fiji and napari show the volume to scale and in place; and the range
-of values to show.
+Both hold float32 voxels `[depth, row, column]` as they are, the grid in micrometres (lateral pitch, every depth, centre
+of the first voxel), so that Fiji and napari show the volume to scale and in place, and a display range.
 
-OME-TIFF has a second description after OME's, as ImageJ writes it: without Bio-Formats ImageJ knows no other. Readers
-of TIFF take the first, ImageJ takes the last.
+An OME-TIFF has ImageJ's description after OME's: readers of TIFF take the first, ImageJ without Bio-Formats the last.
 
-OME-Zarr is written in version 0.4 (Zarr 2), not 0.5 (Zarr 3): every reader of Fiji (n5-viewer, MoBIE, Bio-Formats)
-and of napari knows 0.4, while 0.5 needs recent versions of each; both are read here. Chunks are compressed with
-Blosc (LZ4), the default of bioformats2raw and ome-zarr-py and several times as fast as zlib; they are one plane deep,
-as planes are what a viewer asks for.
+OME-Zarr is written in version 0.4 (Zarr 2), which every reader of Fiji and napari knows, rather than 0.5 (Zarr 3);
+both are read. Chunks are one plane deep, as viewers ask for planes, and compressed with Blosc (LZ4), the default of
+bioformats2raw and ome-zarr-py.
 
-To add a format, add its suffix to `_FORMATS` at the end with a function that reads it and one that writes it.
+To add a format, add its suffix to `_FORMATS` with a function that reads it and one that writes it.
 """
 
 import contextlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 from xml.etree import ElementTree
@@ -27,17 +24,20 @@ import numpy as np
 import tifffile
 from jaxtyping import Array, Shaped
 
-from ..base.errors import InputError, needs_extra, short_repr
+from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
-from .files import atomic_write, check_input, check_output, decoding
-from .provenance import KEY, NAMESPACE, Provenance
-from .tiff import decode_page, place_for_description, take_place
+from .files import atomic_write, check_input, check_output, check_suffix, decoding
+from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
+from .provenance import NAMESPACE, Provenance
+from .tiff import decode_page
 
 MAX_VOXELS = 10**10
 
 _MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
 _MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
+# Tags of TIFF: a description, and the tag after it, in whose place a second description is written.
+_DESCRIPTION, _AFTER = 270, 271
 
 
 def write_volume(
@@ -57,9 +57,9 @@ def write_volume(
     volume
         `(depth, row, column)` of floating-point numbers, rounded to float32, or of integers that float32 holds exactly.
     grid
-        Where its voxels are.
+        Positions of the voxels.
     provenance
-        Where it comes from.
+        Kept in the file.
 
     Raises
     ------
@@ -77,12 +77,11 @@ def write_volume(
     """
     path = check_output(path, VOLUME_SUFFIXES)
     voxels = _as_float32(path, np.asarray(volume))
-    depths = plain_depths(grid)
     if voxels.shape != grid.volume_shape:
         raise ValueError(f"`volume` must have the grid's shape {grid.volume_shape}, got {voxels.shape}.")
     if not np.isfinite(voxels).all():
         raise ValueError("`volume` must be finite, got a NaN or an infinity.")
-    _FORMATS[path.suffix.lower()].write(path, voxels, depths, grid, provenance or {})
+    _FORMATS[path.suffix.lower()].write(path, voxels, plain_depths(grid), grid, provenance or {})
 
 
 def read_volume(path: PathLike) -> tuple[Volume, Grid]:
@@ -105,12 +104,9 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     >>> volume.shape, same.pitch
     ((3, 41, 41), 0.1)
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in VOLUME_SUFFIXES:
-        raise InputError(f"{path}: found the suffix {short_repr(suffix)}, allowed: {', '.join(VOLUME_SUFFIXES)}.")
-    voxels, grid = _FORMATS[suffix].read(Path(path))
+    voxels, grid = _FORMATS[check_suffix(path, VOLUME_SUFFIXES)].read(Path(path))
     if not np.isfinite(voxels).all():
-        raise InputError(f"{path}: found a NaN or an infinity among the voxels, allowed: finite numbers.")
+        raise input_error("voxels", "finite", "a NaN or an infinity", path)
     return voxels, grid
 
 
@@ -120,13 +116,13 @@ def _as_float32(path: Path, voxels: np.ndarray) -> Volume:
     if voxels.dtype.kind in "buif":
         with np.errstate(over="ignore", invalid="ignore"):
             cast = voxels.astype(np.float32)
-        # Of floating-point numbers only the range may be too wide; a count that is rounded is another count.
+        # Floating-point numbers may be rounded; an integer that is rounded is another count.
         is_float = voxels.dtype.kind == "f"
         fits = np.isfinite(cast) == np.isfinite(voxels) if is_float else cast.astype(np.float64) == voxels
         if fits.all():
             return cast
-    allowed = "floating-point numbers in float32's range, or integers that float32 holds exactly"
-    raise InputError(f"{path}: found voxels of type {voxels.dtype}, allowed: {allowed}.")
+    allowed = "floating-point numbers in the range of float32, or integers that float32 holds exactly"
+    raise input_error("voxels", allowed, voxels.dtype, path)
 
 
 def _mm(value: float, unit: float) -> float:
@@ -135,24 +131,24 @@ def _mm(value: float, unit: float) -> float:
 
 def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
     if len(shape) != 3 or min(shape) < 1 or math.prod(shape) > MAX_VOXELS:
-        raise InputError(f"{path}: found {shape} voxels, allowed: (depth, row, column), at most {MAX_VOXELS} in all.")
+        raise input_error("volume", f"(depth, row, column), at most {MAX_VOXELS} voxels in all", shape, path)
     if dtype.kind not in "buif" or not np.can_cast(dtype, np.float32):
-        raise InputError(f"{path}: found voxels of type {dtype}, allowed: float32, or integers up to 16 bits.")
+        raise input_error("voxels", "float32, or integers up to 16 bits", dtype, path)
 
 
 def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
-    """The grid of `depths` and of pitches and first voxel centres, both `(y, x)`, mm; centred if `first` is None."""
+    """Grid of depths, pitches `(y, x)` and centre of the first voxel `(y, x)`, mm; centred if `first` is None."""
     pitch = pitches[1]
     if not (1e-6 <= pitch <= 1e4 and math.isclose(pitches[0], pitch, rel_tol=1e-6)):
-        raise InputError(f"{path}: found voxels of {pitches} mm (y, x), allowed: squares from 1e-6 to 1e4 mm.")
+        raise input_error("voxels", "squares from 1e-6 to 1e4 mm", f"{pitches} mm (y, x)", path)
     for depth in depths:
         if not 1e-6 <= depth <= 1e4:
-            raise InputError(f"{path}: found a plane at the depth {depth} mm, allowed: from 1e-6 to 1e4 mm.")
+            raise input_error("depth of a plane", "from 1e-6 to 1e4 mm", f"{depth} mm", path)
     if first is None:
         return Grid(depths, shape, pitch)
     if not all(abs(place) <= 1e4 for place in first):
-        raise InputError(f"{path}: found the first voxel at {list(first)} mm (y, x), allowed: up to 1e4 mm.")
-    # To a picometre: what is centred is exactly so.
+        raise input_error("first voxel", "up to 1e4 mm from the axis", f"{list(first)} mm (y, x)", path)
+    # Rounded to a picometre, so that a centred volume is centred exactly.
     y, x = (round(at + (n - 1) / 2 * pitch, 9) for at, n in zip(first, shape, strict=True))
     return Grid(depths, shape, pitch, (x, y))
 
@@ -164,23 +160,17 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     planes, pitch, (first_y, first_x) = len(depths), grid.pitch, first_um(grid)
     plane: dict[str, Any] = {"PositionZ": [um(depth) for depth in depths]}
     plane |= {"PositionX": [first_x] * planes, "PositionY": [first_y] * planes}
-    metadata = {
-        "axes": "ZYX",
-        "Name": title(path),
-        "PhysicalSizeX": um(pitch),
-        "PhysicalSizeY": um(pitch),
-        "Plane": plane,
-    }
-    # Uneven depths: the mean step is what a viewer that knows one step only can show; the planes keep the truth.
+    metadata = {"axes": "ZYX", "Name": title(path), "PhysicalSizeX": um(pitch), "PhysicalSizeY": um(pitch)}
+    # The mean step of uneven depths serves viewers that know one step only; the planes have exact depths.
     step = float(np.mean(np.abs(np.diff(depths)))) if planes > 1 else 0.0
     if step > 0:
         metadata["PhysicalSizeZ"] = um(step)
     metadata |= {f"{name}Unit": "µm" for name in list(metadata) if name.startswith("PhysicalSize")}
-    plane |= {f"{name}Unit": ["µm"] * planes for name in list(plane)}
+    metadata["Plane"] = plane | {f"{name}Unit": ["µm"] * planes for name in plane}
     if provenance:
         metadata["MapAnnotation"] = {"Namespace": NAMESPACE, **provenance}
-    described = imagej_description(voxels, um(pitch), um(step), (first_x, first_y, um(depths[0])))
-    per_um = 1 / um(pitch)  # the unit is in ImageJ's description: TIFF knows inches and centimetres alone
+    imagej = _imagej_description(voxels, um(pitch), um(step), (first_x, first_y, um(depths[0])))
+    per_um = 1 / um(pitch)  # the unit is in ImageJ's description: TIFF has inches and centimetres only
     with atomic_write(path) as temporary:
         tifffile.imwrite(
             temporary,
@@ -190,22 +180,38 @@ def _write_tiff(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
             metadata=metadata,
             resolution=(per_um, per_um),
             resolutionunit="NONE",
-            extratags=[place_for_description(described)],
+            extratags=[(_AFTER, 2, 0, imagej, True)],
         )
-        take_place(temporary)
+        # tifffile writes one description, so the second one has another tag until here.
+        with tifffile.TiffFile(temporary) as tiff:
+            entry, order = tiff.pages.first.tags[_AFTER].offset, tiff.byteorder
+        with temporary.open("r+b") as file:
+            file.seek(entry)
+            file.write(_DESCRIPTION.to_bytes(2, "little" if order == "<" else "big"))
+
+
+def _imagej_description(voxels: np.ndarray, pitch_um: float, step_um: float, first_um: tuple[float, ...]) -> str:
+    """ImageJ's description of a stack whose first voxel is at `(x, y, z)`; without a step it is one plane."""
+    low, high = display_range(voxels)
+    stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
+    spacing = f"spacing={step_um}\n" if step_um > 0 else ""
+    sides = {"x": pitch_um, "y": pitch_um, "z": step_um}
+    # The position of zero, in voxels.
+    zero = "".join(f"{a}origin={-at / sides[a]:.6f}\n" for a, at in zip("xyz", first_um, strict=True) if sides[a])
+    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}{zero}loop=false\nmin={low}\nmax={high}\n"
 
 
 def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
     check_input(path)
     with contextlib.ExitStack() as stack:
         with decoding(path, "OME-TIFF"):
-            # The pages of this file in their order: tifffile's own view of OME opens further files.
+            # Pages of this file in their order; tifffile's view of OME may open further files.
             tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
             pages = cast(list[tifffile.TiffPage], list(tiff.pages))
             kinds = {(tuple(page.shape), page.dtype) for page in pages}
             root = ElementTree.fromstring(tiff.pages.first.description)
         if len(kinds) != 1:
-            raise InputError(f"{path}: found pages of {len(kinds)} sizes or types, allowed: one.")
+            raise input_error("pages", "of one size and type", f"{len(kinds)} sizes or types", path)
         size, dtype = kinds.pop()
         shape = (len(pages), *size)
         _check_declared(path, shape, np.dtype(dtype))
@@ -219,15 +225,15 @@ def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
 def _grid_of_ome(path: Path, root: ElementTree.Element, shape: tuple[int, int, int]) -> Grid:
     images = root.findall("{*}Image/{*}Pixels")
     if len(images) != 1:
-        raise InputError(f"{path}: found {len(images)} images in the OME-XML, allowed: one.")
+        raise input_error("OME-XML", "of one image", f"{len(images)} images", path)
     pixels = images[0]
-    found = tuple(pixels.get(f"Size{axis}") for axis in "TCZYX")
-    if found != ("1", "1", *(str(n) for n in shape)):
-        raise InputError(f"{path}: found the OME sizes {found} (T, C, Z, Y, X), allowed: {(1, 1, *shape)}.")
+    sizes = tuple(pixels.get(f"Size{axis}") for axis in "TCZYX")
+    if sizes != ("1", "1", *(str(n) for n in shape)):
+        raise input_error("OME sizes (T, C, Z, Y, X)", (1, 1, *shape), sizes, path)
     planes = {plane.get("TheZ"): plane for plane in pixels.findall("{*}Plane")}
-    missing = [index for index in range(shape[0]) if str(index) not in planes]
-    if missing:
-        raise InputError(f"{path}: found no `PositionZ` of plane {missing[0] + 1}, allowed: a depth for each plane.")
+    for index in range(shape[0]):
+        if str(index) not in planes:
+            raise InputError(f"{path}: no `PositionZ` of plane {index + 1}; a depth for each plane is needed.")
     ordered = [planes[str(index)] for index in range(shape[0])]
     depths = [_length(path, plane, "PositionZ", "reference frame") for plane in ordered]
     pitches = [_length(path, pixels, f"PhysicalSize{axis}", "µm") for axis in "YX"]
@@ -237,13 +243,13 @@ def _grid_of_ome(path: Path, root: ElementTree.Element, shape: tuple[int, int, i
 
 
 def _length(path: Path, element: ElementTree.Element, name: str, default_unit: str) -> float:
-    """An attribute of OME-XML, mm. `default_unit` is the schema's, where the attribute `...Unit` is missing."""
-    found, unit = element.get(name), element.get(f"{name}Unit", default_unit)
+    """An attribute of OME-XML in mm; `default_unit` is the schema's, where the attribute `...Unit` is missing."""
+    text, unit = element.get(name), element.get(f"{name}Unit", default_unit)
     try:
-        return _mm(float(found or ""), _MM_PER_UNIT[unit])
+        return _mm(float(text or ""), _MM_PER_UNIT[unit])
     except (ValueError, KeyError) as error:
-        value = "nothing" if found is None else f"{short_repr(found)} in {short_repr(unit)}"
-        raise InputError(f"{path}: OME-XML `{name}`: found {value}, allowed: a length in µm.") from error
+        given = "nothing" if text is None else f"{short_repr(text)} in {short_repr(unit)}"
+        raise input_error(f"OME-XML `{name}`", "a length in µm", given, path) from error
 
 
 # OME-Zarr
@@ -253,10 +259,10 @@ def _write_zarr(path: Path, voxels: np.ndarray, depths: list[float], grid: Grid,
     with needs_extra("zarr"):
         import zarr  # 0.15 s that TIFF does not need
 
-    attributes = image_attributes(path, depths, grid, [voxels.shape[1:]], voxels, provenance)
+    attributes = image_attributes(path, depths, grid, 1, voxels, provenance)
     with atomic_write(path) as temporary:
         group = zarr.create_group(store=temporary, zarr_format=2, attributes=attributes)
-        array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **chunked(voxels.shape))
+        array = group.create_array("0", shape=voxels.shape, dtype=voxels.dtype, **plane_chunks(voxels.shape))
         array[...] = voxels
 
 
@@ -265,26 +271,25 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
         import zarr
 
     if not os.path.isdir(path):
-        raise InputError(f"{path}: found {'a file' if os.path.exists(path) else 'nothing'}, allowed: a Zarr folder.")
+        raise input_error("volume", "a Zarr folder", "a file" if os.path.exists(path) else "nothing", path)
     with decoding(path, "OME-Zarr"):
         group = zarr.open_group(path, mode="r")
         attributes = group.attrs.asdict()
-    name, scale, first = _ngff(path, attributes)
+    name, scale, first = _parse_multiscales(path, attributes)
     with decoding(path, "OME-Zarr"):
         array = group[name]
     if not isinstance(array, zarr.Array):
-        raise InputError(f"{path}: found no array {short_repr(name)}, allowed: the one that the metadata names.")
+        raise InputError(f"{path}: no array {short_repr(name)}, which the metadata names.")
     _check_declared(path, array.shape, array.dtype)
     depths, rows, columns = array.shape
     z = [_mm(first[0] + index * scale[0], 1.0) for index in range(depths)]
     grid = _checked_grid(path, z, (rows, columns), scale[1:], first[1:])
     with decoding(path, "OME-Zarr"):
-        voxels = np.asarray(array[...], dtype=np.float32)
-    return voxels, grid
+        return np.asarray(array[...], dtype=np.float32), grid
 
 
-def _ngff(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], list[float]]:
-    """Name of the full-size array, scale and translation `(z, y, x)`, mm; of NGFF 0.4, or 0.5 (in `ome`)."""
+def _parse_multiscales(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], list[float]]:
+    """Name of the full-size array, scale and translation `(z, y, x)` in mm, of NGFF 0.4, or 0.5 (in `ome`)."""
     try:
         (multiscale,) = attributes.get("ome", attributes)["multiscales"]
         axes = [(axis["name"], _MM_PER_NAME[axis["unit"]]) for axis in multiscale["axes"]]
@@ -299,11 +304,11 @@ def _ngff(path: Path, attributes: dict[str, Any]) -> tuple[str, list[float], lis
         return str(dataset["path"]), step, first
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         allowed = "NGFF 0.4 or 0.5, axes z, y, x in micrometer, one scale and one translation"
-        raise InputError(f"{path}: found other `multiscales` metadata ({error!r:.80}), allowed: {allowed}.") from error
+        raise input_error("`multiscales`", allowed, f"{error!r:.80}", path) from error
 
 
 class _Format(NamedTuple):
-    """How a volume is read, and how voxels of float32 are written with their depths (mm) and grid."""
+    """How a volume is read, and how float32 voxels are written with their depths (mm) and grid."""
 
     read: Callable[[Path], tuple[np.ndarray, Grid]]
     write: Callable[[Path, np.ndarray, list[float], Grid, Provenance], None]
@@ -312,156 +317,3 @@ class _Format(NamedTuple):
 _TIFF, _ZARR = _Format(_read_tiff, _write_tiff), _Format(_read_zarr, _write_zarr)
 _FORMATS = {".tif": _TIFF, ".tiff": _TIFF, ".zarr": _ZARR}
 VOLUME_SUFFIXES = tuple(_FORMATS)
-
-
-CHUNK = 1024
-
-
-def um(mm: float) -> float:
-    """18100, not 18100.000000000004."""
-    return float(f"{mm * 1000:.12g}")
-
-
-def first_um(grid: Grid) -> tuple[float, float]:
-    """The centre of the first voxel of each plane, `(y, x)`, um, from what a float32 origin was meant to be."""
-    x, y = (float(str(at)) for at in np.asarray(grid.origin))
-    rows, columns = grid.shape
-    return um(y - (rows - 1) / 2 * grid.pitch), um(x - (columns - 1) / 2 * grid.pitch)
-
-
-def plain_depths(grid: Grid) -> list[float]:
-    """Depths as they were meant: 18.1, not float32's 18.100000381."""
-    return [float(str(depth)) for depth in np.asarray(grid.depths)]
-
-
-def step_of(path: Path, depths: list[float], pitch: float) -> float:
-    """The step of depths, mm; `InputError` if they have no single one, which OME-Zarr needs."""
-    # One plane has no step, and the format wants one: the lateral pitch, as of a cube.
-    step = (depths[-1] - depths[0]) / (len(depths) - 1) if len(depths) > 1 else pitch
-    even = np.abs(np.array(depths) - depths[0] - step * np.arange(len(depths))).max() <= 1e-6 * max(depths)
-    if step <= 0 or not even:
-        raise InputError(f"{path}: found uneven or descending depths, allowed in OME-Zarr: even steps; use .ome.tif.")
-    return step
-
-
-def image_attributes(
-    path: Path,
-    depths: list[float],
-    grid: Grid,
-    shapes: Sequence[tuple[int, ...]],
-    voxels: Volume,
-    provenance: Provenance,
-    *,
-    in_time: bool = False,
-    interval: float | None = None,
-) -> dict[str, Any]:
-    """Attributes of the group of an image.
-
-    Parameters
-    ----------
-    path
-        Whose name is the image's.
-    depths
-        Of the planes, mm.
-    grid
-        Where the voxels are.
-    shapes
-        `(row, column)` of the levels of a pyramid, the first of the full size, each next of half the rows and columns.
-    voxels
-        What the range of values to show is taken from.
-    provenance
-        Where the image comes from.
-    in_time, interval
-        The first axis is time; the seconds between frames, if they are known.
-
-    Raises
-    ------
-    InputError
-        As `step_of`.
-    """
-    pitch = grid.pitch
-    scale, first = [um(step_of(path, depths, pitch)), um(pitch), um(pitch)], [um(depths[0]), *first_um(grid)]
-    axes: list[dict[str, str]] = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
-    if in_time:
-        axes.insert(0, {"name": "t", "type": "time"} | ({"unit": "second"} if interval else {}))
-        scale, first = [interval or 1.0, *scale], [0.0, *first]
-    low, high = display_range(voxels)
-    window = {"min": float(voxels.min()), "max": float(voxels.max()), "start": low, "end": high}
-    channel = {"active": True, "color": "FFFFFF", "label": title(path), "window": window}
-    multiscale = {
-        **({} if in_time else {"version": "0.4"}),
-        "name": title(path),
-        "axes": axes,
-        "datasets": [
-            {"path": str(level), "coordinateTransformations": _transforms(scale, first, 2**level)}
-            for level in range(len(shapes))
-        ],
-    }
-    attributes = {"multiscales": [multiscale], "omero": {"channels": [channel], "rdefs": {"model": "greyscale"}}}
-    attributes = {"ome": {"version": "0.5", **attributes}} if in_time else attributes
-    return attributes | ({KEY: dict(provenance)} if provenance else {})
-
-
-def _transforms(scale, first, side):
-    """Of voxels that are the mean of `side` by `side`: wider, and with a centre further in."""
-    factors = [*[1] * (len(scale) - 2), side, side]
-    wider = [step * factor for step, factor in zip(scale, factors, strict=True)]
-    inner = [at + step * (factor - 1) / 2 for at, step, factor in zip(first, scale, factors, strict=True)]
-    return [{"type": "scale", "scale": wider}, {"type": "translation", "translation": inner}]
-
-
-def chunked(shape: tuple[int, int, int]) -> dict[str, Any]:
-    """How a volume is stored: planes, or squares of them, each a file."""
-    return {
-        "chunks": (1, *_square(shape)),
-        "compressors": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1},
-        "chunk_key_encoding": {"name": "v2", "separator": "/"},
-    }
-
-
-def sharded(shape: tuple[int, int, int, int]) -> dict[str, Any]:
-    """How volumes in time are stored: planes, or squares of them, those of a frame in one file."""
-    with needs_extra("zarr"):
-        from zarr.codecs import BloscCodec
-
-    rows, columns = _square(shape)
-    whole = (-(-shape[-2] // rows) * rows, -(-shape[-1] // columns) * columns)
-    return {
-        "chunks": (1, 1, rows, columns),
-        "shards": (1, shape[1], *whole),
-        "compressors": BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
-        "dimension_names": tuple("tzyx"),
-    }
-
-
-def _square(shape):
-    return tuple(min(n, CHUNK) for n in shape[-2:])
-
-
-# Percentiles of the values shown, of up to so many rows and columns.
-_SHOWN, _SAMPLED = (1, 99.9), 512
-
-
-def title(path: Path) -> str:
-    """The name of a volume in a file."""
-    return path.name.removesuffix(path.suffix).removesuffix(".ome")
-
-
-def display_range(voxels: np.ndarray) -> tuple[float, float]:
-    """What a viewer should show as black and white: few voxels are darker or brighter."""
-    some = voxels[:, :: max(voxels.shape[1] // _SAMPLED, 1), :: max(voxels.shape[2] // _SAMPLED, 1)]
-    for low, high in (np.percentile(some, _SHOWN), (voxels.min(), voxels.max())):
-        if low < high:
-            return float(low), float(high)
-    return float(low), float(low) + 1
-
-
-def imagej_description(voxels: np.ndarray, pitch_um: float, step_um: float, first_um: tuple[float, ...]) -> str:
-    """ImageJ's description of a stack whose first voxel is at `(x, y, z)`; without a step it is one plane."""
-    low, high = display_range(voxels)
-    stack = f"images={len(voxels)}\nslices={len(voxels)}\n" if len(voxels) > 1 else ""
-    spacing = f"spacing={step_um}\n" if step_um > 0 else ""
-    # Where zero is, counted in voxels.
-    sides = {"x": pitch_um, "y": pitch_um, "z": step_um}
-    zero = "".join(f"{a}origin={-at / sides[a]:.6f}\n" for a, at in zip("xyz", first_um, strict=True) if sides[a])
-    return f"ImageJ=1.54f\n{stack}unit=um\n{spacing}{zero}loop=false\nmin={low}\nmax={high}\n"

@@ -1,4 +1,4 @@
-"""Weights of networks as files: half-precision arrays, and what they are as JSON. Nothing in one is ever executed."""
+"""Weights of networks as .npz: float16 arrays, and the network's arguments as JSON. Reading never executes code."""
 
 import inspect
 import json
@@ -17,62 +17,58 @@ from ..typing import PathLike
 from .files import atomic_write, check_input, check_output, decoding
 from .provenance import KEY, Provenance
 
-_MOST_BYTES = 2**27
+_MAX_BYTES = 2**27
 
 
-def write_weights(path: PathLike, network: PyTree, about: dict[str, Any], provenance: Provenance | None = None) -> None:
-    """Writes the arrays of a network as `.npz`, in float16, with what makes another of its kind; whole or not at all.
-
-    Raises
-    ------
-    InputError
-        As `check_output`.
-    """
+def write_weights(
+    path: PathLike, network: PyTree, arguments: dict[str, Any], provenance: Provenance | None = None
+) -> None:
+    """Write the arrays of a network in float16, with the arguments of its skeleton; `InputError` as `check_output`."""
     arrays = {f"array_{i}": np.asarray(leaf, np.float16) for i, leaf in enumerate(jax.tree.leaves(network))}
     with atomic_write(check_output(path, [".npz"])) as temporary:
         if provenance:
             arrays[KEY] = np.array(json.dumps(dict(provenance)))
-        np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+        np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(arguments)), **arrays)
 
 
 def read_weights(path: PathLike, skeleton: Callable[..., PyTree]) -> PyTree:
-    """The network in a file of `write_weights`, in float32.
+    """Read a network that `write_weights` wrote, in float32.
 
     Parameters
     ----------
     path
-        Of the file.
+        File of weights.
     skeleton
-        From what the file says the network is to the shapes of its arrays (`eqx.filter_eval_shape`); a `ValueError` or
-        a `TypeError` says that there is no such network.
+        Returns the shapes of the network's arrays (`eqx.filter_eval_shape`) for the arguments in the file; raises
+        `ValueError` or `TypeError` if there is no such network.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or holds no network, or not the arrays of its network, finite.
+        If the file cannot be read, is of another network, or has other arrays than its network, or not finite ones.
     """
     path = check_input(path)
     with decoding(path, "file of weights (.npz)"):
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > _MOST_BYTES:
-            raise ValueError(f"found {size} bytes, allowed: at most {_MOST_BYTES}")
+        if size > _MAX_BYTES:
+            raise ValueError(f"must be at most {_MAX_BYTES} bytes, got {size}")
         with np.load(path, allow_pickle=False) as archive:
-            about, allowed = json.loads(str(archive["about"])), inspect.signature(skeleton)
+            arguments, signature = json.loads(str(archive["about"])), inspect.signature(skeleton)
             try:
-                allowed.bind(**about)
+                signature.bind(**arguments)
             except TypeError:
-                kind = f"found a network of another kind, {short_repr(about)}, allowed: one with"
-                raise ValueError(f"{kind} {', '.join(allowed.parameters)}") from None
-            leaves, structure = jax.tree.flatten(skeleton(**about))
+                allowed = f"a network with {', '.join(signature.parameters)}"
+                raise ValueError(f"must be {allowed}, got another kind, {short_repr(arguments)}") from None
+            leaves, structure = jax.tree.flatten(skeleton(**arguments))
             arrays = [archive[f"array_{i}"] for i in range(len(leaves))]
         for leaf, array in zip(leaves, arrays, strict=True):
             if array.shape != leaf.shape or array.dtype != np.float16 or not np.isfinite(array).all():
-                raise ValueError(f"found {array.dtype} {array.shape}, allowed: finite float16 {leaf.shape}")
+                raise ValueError(f"must have finite float16 arrays {leaf.shape}, got {array.dtype} {array.shape}")
     return jax.tree.unflatten(structure, [jnp.asarray(array, jnp.float32) for array in arrays])
 
 
 def shipped(name: str, skeleton: Callable[..., PyTree]) -> PyTree:
-    """A network that comes with the package."""
+    """Read a network that comes with the package."""
     with resources.as_file(resources.files("gs_jax") / "weights" / f"{name}.npz") as path:
         return read_weights(path, skeleton)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int, Num
 
-from ..base.machine import in_threads
+from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
@@ -209,7 +209,7 @@ def trace_stray_light(
     """The light at each depth that is not the cores', whose rings end at `ends`, in field radii."""
     aperture = aperture_profile(imager.array)
     each = zip(depths, map(PsfCores, *cores), strict=True)
-    tables = in_threads(lambda one: stray_light_table(imager, one[0], aperture, grid, one[1], ends), each)
+    tables = map_in_threads(lambda one: stray_light_table(imager, one[0], aperture, grid, one[1], ends), each)
     tracked = zip((progress or Progress()).track(depths, "Tracing stray light"), tables, strict=True)
     table = jnp.asarray(np.stack([table for _, table in tracked]), imager.sensor_distance.dtype)
     return StrayLight(table, jnp.mean(clear_area(imager.array)), imager.reduced_sensor_distance, grid)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 
-from ..base.machine import in_threads
+from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager, falloff
 from ..lenses import EACH, MicrolensArray, sag
@@ -193,7 +193,7 @@ def trace_cores(
     radii.
     """
     aperture = aperture_profile(imager.array, by_area=False)
-    tables = in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends), depths)
+    tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends), depths)
     tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
     return PsfCores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
@@ -246,7 +246,7 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
         beyond = float(imager.reduced_depth(0.0))
         return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
     aperture, fields = aperture_profile(imager.array, by_area=False), np.linspace(0, imager.field_radius, _FIELDS + 1)
-    return np.array(list(in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
+    return np.array(list(map_in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
 
 
 def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float[Array, " depth"]:
@@ -270,7 +270,7 @@ def ensquared_light(
         away = np.abs(rays.landing + np.stack([magnification * fields, 0 * fields], -1)[:, None])
         return np.where((away < side / 2).all(-1), rays.light, 0).sum(1)
 
-    return np.array(list(in_threads(share, depths)))
+    return np.array(list(map_in_threads(share, depths)))
 
 
 def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: ApertureProfile):

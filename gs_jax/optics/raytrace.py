@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..base.arrays import library_of
+from ..base.arrays import array_namespace
 from ..geometry import Imager, chief_ray
 from ..lenses import MicrolensArray
 from ..typing import Coordinates, ScalarLike, Scalars
@@ -79,7 +79,7 @@ def dot(a: Coordinates, b: Coordinates) -> Scalars:
 
 def secant(slope: Coordinates) -> Scalars:
     """Secant of the ray's angle with the axis."""
-    return library_of(slope).sqrt(1 + dot(slope, slope))
+    return array_namespace(slope).sqrt(1 + dot(slope, slope))
 
 
 def refract(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> RefractedRay:
@@ -98,7 +98,7 @@ def refract(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinat
 
 
 def _refract_plane_first(imager, depth, point, field) -> RefractedRay:
-    array, xp = imager.array, library_of(point)
+    array, xp = imager.array, array_namespace(point)
     n, t = array.refractive_index, array.substrate_thickness
     point, sag, ratio, reached = _surface(array, point)
     air = equivalent_air(n, t - sag, depth, point - field)
@@ -114,7 +114,7 @@ def _refract_plane_first(imager, depth, point, field) -> RefractedRay:
 
 
 def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
-    array, xp = imager.array, library_of(point)
+    array, xp = imager.array, array_namespace(point)
     n, t = array.refractive_index, array.substrate_thickness
     point, sag, ratio, reached = _surface(array, point)
     slope = (point - field) / (depth + sag)
@@ -136,7 +136,7 @@ def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
 
 def _refract_ideal(imager, depth, point, field) -> RefractedRay:
     """An ideal lens. The slope `(image - point) / v'` behind it is written with `1/v'`, which may be zero."""
-    array, v, xp = imager.array, imager.reduced_sensor_distance, library_of(point)
+    array, v, xp = imager.array, imager.reduced_sensor_distance, array_namespace(point)
     reduced = depth + array.reduced_thickness_front
     focal_length: Scalars = array.thin_lens_focal_length
     vergence = 1 / focal_length - 1 / reduced
@@ -151,7 +151,7 @@ def _refract_ideal(imager, depth, point, field) -> RefractedRay:
 
 def _surface(array, point):
     """The point on the curved side, its sag and slope ratio, and whether it exists; the axis where it does not."""
-    xp, r2 = library_of(point), dot(point, point)
+    xp, r2 = array_namespace(point), dot(point, point)
     reached = array.reaches(r2)
     point, r2 = xp.where(reached, point, 0), xp.where(reached, r2, 0)
     return point, array.sag(r2), array.sag_slope_over_r(r2), reached
@@ -170,19 +170,19 @@ def _incidence(index_ratio, slope, point, ratio):
 
 def _snell(lateral, axial, index_ratio, bend, point, ratio, valid):
     """Slopes behind a surface: those of `index_ratio` times the ray plus `bend` times the normal."""
-    xp, bend = library_of(point), bend / _normal_length(point, ratio)
+    xp, bend = array_namespace(point), bend / _normal_length(point, ratio)
     return xp.where(valid, index_ratio * lateral + bend * ratio * point, 0) / xp.where(
         valid, index_ratio * axial + bend, 1
     )
 
 
 def _normal_length(point, ratio):
-    return library_of(point).sqrt(1 + ratio**2 * dot(point, point))
+    return array_namespace(point).sqrt(1 + ratio**2 * dot(point, point))
 
 
 def equivalent_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coordinates) -> Scalars:
     """Layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
-    square, xp = dot(across, across), library_of(across)
+    square, xp = dot(across, across), array_namespace(across)
     g = thickness / n
     for _ in range(_NEWTON_STEPS):
         h = depth + g
@@ -194,7 +194,7 @@ def equivalent_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coord
 
 def slope_in_glass(n: Scalars, slope: Coordinates) -> Coordinates:
     """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
-    return slope / library_of(slope).sqrt(n**2 + (n**2 - 1) * dot(slope, slope))
+    return slope / array_namespace(slope).sqrt(n**2 + (n**2 - 1) * dot(slope, slope))
 
 
 def solid_angle(imager: Imager, depth: Scalars, ray: RefractedRay) -> Scalars:
@@ -209,7 +209,7 @@ def solid_angle(imager: Imager, depth: Scalars, ray: RefractedRay) -> Scalars:
     array = imager.array
     if array.thin_lens_focal_length is not None:
         return tilt
-    n, xp = array.refractive_index, library_of(ray.slope)
+    n, xp = array.refractive_index, array_namespace(ray.slope)
     steeper = dot(ray.slope, ray.point) * ray.sag_slope_over_r
     if array.orientation == "curved":
         return abs(1 - steeper) * tilt

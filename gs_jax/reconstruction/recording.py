@@ -17,7 +17,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..grid import Grid
-from ..io.volume_series import Note, VolumeSeries, opened_levels, write_frame
+from ..io.volume_series import Note, VolumeSeries, open_levels, write_frame
 from ..typing import Volume
 
 Frame = TypeVar("Frame")
@@ -108,7 +108,7 @@ def reconstruct_frames_by(
     frames = series.unfinished
     items = ((frame, series.exists) for frame in frames)
     with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
-        stream = workers.stream_of(partial(_frame_maker, open_frames, series.path, series.grid))
+        stream = workers.mapper(partial(_frame_maker, open_frames, series.path, series.grid))
         for (frame, _), result in stream(items):
             try:
                 volume, note = result()
@@ -124,7 +124,7 @@ def reconstruct_frames_by(
 def _frame_maker(open_frames, path: Path, grid: Grid):
     """In a worker: the function that makes a frame, and writes it if the store exists."""
     read, make = open_frames()
-    levels = cache(partial(opened_levels, path, grid))
+    levels = cache(partial(open_levels, path, grid))
     # Threads of a worker share one open file.
     lock = Lock()
 

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
-from ...base.arrays import in_float32
+from ...base.arrays import to_float32
 from ...geometry import Imager, Sensor
 from ...grid import Grid
 from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
@@ -79,13 +79,13 @@ def simulate_example(seed: int, number: int, spec: CaptureSpec) -> Example:
     """
     rng = np.random.default_rng([seed, 2, number])
     imager, calibrated, depths, scene_depths, optics = random_microscope(seed, number // SCENES, spec)
-    grid = in_float32(Grid.over(calibrated.sensor, depths=depths, pitch=spec.pitch))
-    fine = in_float32(Grid(scene_depths, tuple(2 * n for n in grid.shape), spec.pitch / 2))
+    grid = to_float32(Grid.over(calibrated.sensor, depths=depths, pitch=spec.pitch))
+    fine = to_float32(Grid(scene_depths, tuple(2 * n for n in grid.shape), spec.pitch / 2))
     scene = np.zeros((SCENE_PLANES, *fine.shape), np.float32) if number % 16 == 15 else random_scene(fine.shape, rng)
-    image = jnp.maximum(forward(scene, in_float32(imager), fine, optics), 0)
+    image = jnp.maximum(forward(scene, to_float32(imager), fine, optics), 0)
     counts, gain = _expose(image, spec, rng)
     truth = 4 * gain * resample_scene(scene, scene_depths, depths)
-    return Example(counts, in_float32(calibrated), grid, truth.astype(np.float32))
+    return Example(counts, to_float32(calibrated), grid, truth.astype(np.float32))
 
 
 @lru_cache(maxsize=2)
@@ -113,7 +113,7 @@ def random_microscope(
 
 def trace_optics(imager: Imager, depths: np.ndarray, spec: CaptureSpec) -> FieldVaryingPsf:
     """All of the light of a microscope, in tables of one shape for all examples of a spec."""
-    return in_float32(field_varying_psf(imager, depths, polar_grid=_nodes(spec)))
+    return to_float32(field_varying_psf(imager, depths, polar_grid=_nodes(spec)))
 
 
 @cache

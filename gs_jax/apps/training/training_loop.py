@@ -176,7 +176,7 @@ def simulate_unrolled_examples(
 ) -> list[UnrolledExample]:
     """Simulate the first examples of a seed, by workers if there are any."""
     groups = [range(first, min(first + SCENES, count)) for first in range(0, count, SCENES)]
-    stream, results = (workers or Workers()).stream_of(partial(_simulator, seed, spec)), {}
+    stream, results = (workers or Workers()).mapper(partial(_simulator, seed, spec)), {}
     with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
         for group, result in stream(groups):
             results[group.start] = result()

@@ -104,7 +104,7 @@ def simulate_stacks(
     missing = [number for number in range(count) if not _path(folder, seed, number).exists()]
     # One worker makes what one microscope images.
     groups = [[n for n in missing if n // SCENES == group] for group in sorted({n // SCENES for n in missing})]
-    stream = (workers or Workers()).stream_of(partial(_writer, folder, seed, specs))
+    stream = (workers or Workers()).mapper(partial(_writer, folder, seed, specs))
     with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
         for _, result in stream(groups):
             result()
