@@ -79,7 +79,7 @@ DEVICES: dict[str, Callable[[], Design]] = {
 }
 # Numbers of pixels without a common divisor, as many as a camera has: binned or not, all methods must cope.
 LARGE = "3001 x 4093"
-DEVICES[LARGE] = lambda: cropped("geomscope", shape=(3001, 4093), sensor={"pixel_pitch_um": 2.6})
+DEVICES[LARGE] = lambda: cropped("geomscope", shape=(3001, 4093), sensor={"pixel_pitch_um": 4.5})
 
 
 class Case:
