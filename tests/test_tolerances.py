@@ -308,8 +308,8 @@ def test_the_command(folder, monkeypatch, capsys):
     [
         (("--position-um", "-1"), "must be 0 to 1000 um, got '-1'"),
         (("--index", "x"), "must be 0 to 0.1, got 'x'"),
-        (("--tolerances", "wrong.toml"), "`possition_um`: found a key that does not exist, allowed: `position_um`"),
-        (("-o", "t.txt"), "found the suffix '.txt', allowed: .json"),
+        (("--tolerances", "wrong.toml"), "`possition_um`: no such key; did you mean `position_um`?"),
+        (("-o", "t.txt"), "suffix: must be .json, got '.txt'"),
         (("--draws", "0"), "0 is not in the range"),
         (("--positions", "places.csv"), "places.csv: every source must have x, y and z"),
         (("--min-strehl", "2"), "must be 0.001 to 1, got '2'"),
