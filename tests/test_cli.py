@@ -150,7 +150,7 @@ def test_wrong_scenes_give_one_line_and_status_2(folder, monkeypatch, capsys, co
 def test_a_negative_voxel_names_the_file(folder, monkeypatch, capsys):
     write_volume(folder / "scene.ome.tif", np.full((1, 3, 3), -1, np.float32), Grid([20.0], (3, 3), 0.05))
     status, _, err = run(monkeypatch, capsys, "simulate", "scene.ome.tif", "design.toml", "-o", "c.tif")
-    assert (status, err) == (2, "gs-jax: scene.ome.tif: voxels must not be negative, got -1.\n")
+    assert (status, err) == (2, "gs-jax: voxels must not be negative, got -1 (scene.ome.tif).\n")
 
 
 @pytest.mark.integration
