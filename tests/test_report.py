@@ -183,7 +183,7 @@ def test_the_first_key_skips_to_the_content(made, browser):
         (("design.toml", "points.csv", "-o", "r.html"), "--points"),
         (("design.toml", "-o", "r.html", "--tolerance", "capture.tif"), "capture.tif: "),
         (("design.toml", "-o", "r.html", "--tolerance", "other.json"), "got no 'depth_mm'"),
-        (("design.toml", "-o", "r.html", "--capture", "small.tif"), "small.tif: "),
+        (("design.toml", "-o", "r.html", "--capture", "small.tif"), "(small.tif)"),
         (("none.toml", "-o", "r.html"), "none.toml: "),
     ],
 )
