@@ -106,6 +106,11 @@ class MicrolensArray(eqx.Module):
         check_fields(self, centers=FINITE, conic_constant=FINITE, aspheric_terms=FINITE)
 
     @property
+    def half_size(self) -> Scalars:
+        """Half of `size`, in the precision of the centres."""
+        return (self.size / 2).astype(self.centers.dtype)
+
+    @property
     def plate(self) -> tuple[float, float]:
         """`size` as plain numbers. Host code."""
         x, y = np.asarray(self.size, float).tolist()

@@ -135,7 +135,7 @@ def test_the_bound_is_that_of_the_pixels():
 def test_spots_have_the_transfer_function():
     """Where all light is in the window and nothing is cut off below zero: the Fourier transform gives it back."""
     c = case({"aperture_diameter_mm": jnp.array(0.4), "sensor_distance_mm": jnp.array(5.6)})
-    found = jax.jit(lambda c: spots(*c, 65))(c)
+    found = jax.jit(lambda imager, at: spots(imager, at, 65))(*c)
     np.testing.assert_allclose(found.sum((1, 2)), 1, rtol=1e-9)
     frequency = np.fft.fftfreq(65)[[1, 4, 12]]
     seen = np.abs(np.fft.fft(found.sum(1)))[:, [1, 4, 12]]

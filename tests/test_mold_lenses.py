@@ -234,10 +234,10 @@ def test_a_part_whose_curved_side_faces_the_object_is_turned_over_and_not_mirror
 
 def test_what_neighbours_hide_is_not_facetted():
     near = MicrolensArray(CENTERS[:3], 2.0, 1.43, 1.5, size=(4.0, 3.0))
-    assert visible_radii(lenslets_of(near), near.size) == pytest.approx([0.75] * 3)
+    assert visible_radii(lenslets_of(near), near.plate) == pytest.approx([0.75] * 3)
     i, j = np.meshgrid(np.arange(-3, 4), np.arange(-3, 4))
     dense = MicrolensArray(0.4 * np.stack([i, j], axis=-1).reshape(-1, 2), 2.0, 1.43, 2.0, size=(2.8, 2.8))
-    reaches = visible_radii(lenslets_of(dense), dense.size)
+    reaches = visible_radii(lenslets_of(dense), dense.plate)
     # A cell's corner, and a tile or two.
     assert 0.2 * math.sqrt(2) < max(reaches) < 0.36
     assert_sound(dense)

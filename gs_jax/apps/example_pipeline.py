@@ -190,7 +190,7 @@ def _draw_words(image: np.ndarray, depths: list[float], volumes: dict[str, np.nd
     """The capture and its middle, and beside them a row per volume and a column per depth."""
     count = len(depths)
     figure = Figure(figsize=(3.1 * (count + 1) + 0.8, 2.9 * len(volumes)), dpi=110, layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, count)))
+    left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.25, count))))
     step = max(1, image.shape[0] // 1024)
     crop = image[tuple(slice(n // 2 - 400, n // 2 + 400) for n in image.shape)]
     captures = (image[::step, ::step], sensor, "capture"), (crop, Sensor(crop.shape, sensor.pixel_pitch), "its middle")

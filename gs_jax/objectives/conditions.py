@@ -150,7 +150,7 @@ def field_heights(imager: Imager, at: Conditions) -> Float[Array, " field"]:
 
 def finite_plate(imager: Imager) -> Float[Array, "2"]:
     """Size of the plate; `ValueError` if it is infinite, where lenses have no density."""
-    size = imager.array.size
+    size = 2 * imager.array.half_size
     if not isinstance(size, Tracer) and not np.isfinite(size).all():
         raise ValueError(f"`imager.array.size` must be finite, got {imager.array.plate}.")
     return size

@@ -47,7 +47,7 @@ def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Arra
         _, near = lax.top_k(-jnp.sum(offset**2, axis=1), count + 1)
         normal, height = _bisectors(offset[near], array.aperture_diameter)
         # Beyond the disc a line closes the polygon without effect, where the plate is infinite.
-        half = jnp.repeat(array.size / 2, 2)
+        half = jnp.repeat(array.half_size, 2)
         room = jnp.minimum(half - sides @ array.centers[lens], array.aperture_diameter)
         return _disc_polygon_area(jnp.concatenate([normal, sides]), jnp.concatenate([height, room]), radius)
 
@@ -66,16 +66,16 @@ def _edge_distances(array: MicrolensArray, count: int) -> Float[Array, "lens dir
         return jnp.min(jnp.where(jnp.arange(len(own)) == lens, jnp.inf, between))
 
     gaps = _map_lenses(gap, lax.stop_gradient(whole).centers) if len(own) > 1 else jnp.inf
-    discs = lambda: _disc_edges(array.centers, own[: len(array.centers)], whole.size, directions)
+    discs = lambda: _disc_edges(array.centers, own[: len(array.centers)], whole.half_size, directions)
     return lax.cond(jnp.min(gaps) >= 0, discs, lambda: _envelope_edges(whole, len(array.centers), directions))
 
 
-def _disc_edges(centers, radius, size, directions):
+def _disc_edges(centers, radius, half_size, directions):
     """Distance to the edge of each disc or of the plate."""
     edges = jnp.broadcast_to(radius[:, None], (len(centers), len(directions)))
     for axis in range(2):
         along = directions[:, axis]
-        room = size[axis] / 2 - centers[:, axis, None] * jnp.sign(along)[None]
+        room = half_size[axis] - centers[:, axis, None] * jnp.sign(along)[None]
         edges = jnp.minimum(edges, room / jnp.abs(along)[None])
     return edges
 
@@ -126,8 +126,8 @@ def _excess(whole: MicrolensArray, neighbours, direction, distance):
     most = jnp.maximum(others[jnp.argmax(others)], distance**2 - rim[0] ** 2)
     for axis in range(2):
         # A plate without an edge there gives no slope either, which -inf would.
-        bounded = jnp.isfinite(whole.size[axis])
-        half = jnp.where(bounded, whole.size[axis], 0) / 2
+        bounded = jnp.isfinite(whole.half_size[axis])
+        half = jnp.where(bounded, whole.half_size[axis], 0)
         beyond = jnp.abs(center[axis] + distance * direction[axis]) - half
         most = jnp.where(bounded, jnp.maximum(most, rim[0] * beyond), most)
     return most
@@ -214,7 +214,7 @@ def _(directions, lenses, primals, tangents):
 def _total_cell_area(array: MicrolensArray, cells: VoronoiCells):
     centers = array.centers
     sides = jnp.array([[-1, 0], [1, 0], [0, -1], [0, 1]], centers.dtype)
-    half = jnp.repeat(array.size / 2, 2)
+    half = jnp.repeat(array.half_size, 2)
     side = jnp.maximum(cells.beyond - len(centers), 0)
     own = centers[cells.lens]
     halfway, away = _bisectors(centers[jnp.minimum(cells.beyond, len(centers) - 1)] - own, array.aperture_diameter)
