@@ -86,7 +86,7 @@ def test_mirror_is_x_against_minus_x(tmp_path):
     ("keys", "words"),
     [
         ({"centers_unit": "inch"}, ["`array.centers_unit`", "'inch'", '"mm", "um" or "px"']),
-        ({"centers_unit": "um"}, ["x_mm,y_mm", "unit um", "one unit"]),
+        ({"centers_unit": "um"}, ["x_mm,y_mm", "unit must be", "got um"]),
         ({"centers_origin": "left"}, ["`array.centers_origin`", "'left'", '"corner"']),
         ({"centers_columns": "x"}, ["`array.centers_columns`", "'x'", "as in the header"]),
         ({"mirror": "yes"}, ["`array.mirror`", "'yes'", "true or false"]),
@@ -98,7 +98,7 @@ def test_wrong_keys(tmp_path, keys, words):
 
 
 def test_keys_of_a_file_without_one(tmp_path):
-    message_of(written(tmp_path, {"array.centers_unit": "um"}), "`array.centers_unit`", "no `array.centers_file`")
+    message_of(written(tmp_path, {"array.centers_unit": "um"}), "`array.centers_unit`", "needs `array.centers_file`")
     for wrong in (3, [3], [["x", 1.0]], [[]]):
         changes = {"array.centers_mm": wrong, "array.mirror": True}
         with pytest.raises(InputError, match="array.centers_mm"):

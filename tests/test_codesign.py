@@ -195,7 +195,7 @@ def test_both_limits_of_a_term_are_recorded(table1):
 
 def test_no_start_that_ends_anywhere(table1, monkeypatch):
     monkeypatch.setattr(stages, "targets_of", lambda terms: jnp.full(len(terms), jnp.nan))
-    with pytest.raises(InputError, match="no start came to a finite cost"):
+    with pytest.raises(InputError, match="no start reached a finite cost"):
         run_study(table1, study())
 
 
@@ -209,5 +209,5 @@ def test_files_and_objects_are_the_same(table1, tmp_path):
     assert found.design == run_study(table1, found.study).design
     array = table1.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
     (tmp_path / "b.toml").write_text((tmp_path / "b.toml").read_text().replace("sensor_distance", "pitch"))
-    with pytest.raises(InputError, match="b.toml: `free.pitch_mm`"):
+    with pytest.raises(InputError, match="`free.pitch_mm` .*b.toml"):
         run_study(table1.model_copy(update={"array": array}), tmp_path / "b.toml")

@@ -266,8 +266,8 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     ("options", "words"),
     [
         (["--json", "sheet.txt"], "sheet.txt"),
-        (["--depths", "20:22"], "allowed: START:STOP:STEP"),
-        (["--confusion-um", "0"], "allowed: 0.01 to 1e"),
+        (["--depths", "20:22"], "must be START:STOP:STEP"),
+        (["--confusion-um", "0"], "must be 0.01 to 1e"),
     ],
 )
 def test_wrong_options_are_one_line(tmp_path, monkeypatch, capsys, options, words):

@@ -56,7 +56,7 @@ def test_columns_of_the_centers(tmp_path):
     message_of(with_file(tmp_path, COLUMNS), *both)
     message_of(with_file(tmp_path, COLUMNS.replace("1,9", "thick")), "line 3, radius_of_curvature_mm", "thick")
     twice = COLUMNS.replace("conic_constant", "radius_of_curvature_mm")
-    message_of(with_file(tmp_path, twice), "'radius_of_curvature_mm' more than once")
+    message_of(with_file(tmp_path, twice), "one column 'radius_of_curvature_mm', got several")
 
 
 WRONG = [
@@ -64,8 +64,8 @@ WRONG = [
     ({"lens.conic_constant": [0.0] * 4}, ["`lens.conic_constant`", "one number or 3", "got 4"]),
     ({"lens.radius_of_curvature_mm": [2.0, "a", 2]}, ["`lens.radius_of_curvature_mm[1]`", "'a'", "for each lens"]),
     ({"lens.radius_of_curvature_mm": [2.0, -1.0, 2]}, ["`lens.radius_of_curvature_mm[1]`", "-1.0"]),
-    ({"lens.aperture_diameter_mm": []}, ["`lens.aperture_diameter_mm`", "found []", "for each lens"]),
-    ({"lens.aperture_diameter_mm": "wide"}, ["`lens.aperture_diameter_mm`", "found 'wide'"]),
+    ({"lens.aperture_diameter_mm": []}, ["`lens.aperture_diameter_mm`", "got []", "for each lens"]),
+    ({"lens.aperture_diameter_mm": "wide"}, ["`lens.aperture_diameter_mm`", "got 'wide'"]),
     ({"lens.radius_of_curvature_mm": [2.0, 0.9, 2]}, ["`lens.aperture_diameter_mm`", "2.0 of lens 2", "1.8 mm"]),
     ({"lens.conic_constant": [0.0, 0, 300]}, ["`lens.conic_constant[2]`", "-100 to 100"]),
     (

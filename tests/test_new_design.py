@@ -146,10 +146,10 @@ WRONG = [
     (["corner.csv", "no x or y is below 0", "--centers-origin corner"], {"centers": ("corner.csv",)}),
     (["working_distance_mm", "near below far"], {"working_distance_mm": (23, 18)}),
     (["aperture_diameter_mm", "at most 3.956 mm"], {"aperture_diameter_mm": (5,)}),
-    (["sensor.shape[0]", "found 1"], {"shape": (1, 400)}),
-    (["did you mean 520 nm (0.52 um)?", "allowed"], {"wavelength_nm": (0.52,)}),
+    (["sensor.shape[0]", "got 1"], {"shape": (1, 400)}),
+    (["did you mean 520 nm (0.52 um)?", "must be"], {"wavelength_nm": (0.52,)}),
     (["--sensor-distance-mm", "must be given"], {"working_distance_mm": (1, 2)}),
-    (["refractive_index", "found 0.9"], {"refractive_index": (0.9,)}),
+    (["refractive_index", "got 0.9"], {"refractive_index": (0.9,)}),
     (["size_mm", "lens 1", "plate"], {"size_mm": (0.5, 0.5)}),
 ]
 
@@ -199,7 +199,7 @@ def test_by_questions(lab, monkeypatch):
         ("4,6", "focal length of a lens, in air"),
         ("4.6", "must be a number of mm"),
         ("none.csv", "file of lens centres"),
-        ("vendor.csv", "Error: none.csv: the file cannot be read"),
+        ("vendor.csv", "Error: none.csv: cannot be read"),
         ("0.6 0.6", "width (x) and height (y) of the plate"),
         ("", "a plate that holds all lenses"),
         ("5", "D of each lens"),

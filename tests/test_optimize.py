@@ -56,10 +56,10 @@ def test_nothing_is_written_on_wrong_input(folder):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
     with pytest.raises(InputError, match="got '.json'"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")
-    with pytest.raises(InputError, match="study.toml: `pareto`: found nothing"):
+    with pytest.raises(InputError, match="`pareto` must be .*study.toml"):
         run(pareto, "study.toml", "--out", "new")
     (folder / "study.toml").write_text(STUDY.replace("[free]", "[free]\ndepth_span_mm = [1.0, 99.0]"))
-    with pytest.raises(InputError, match="study.toml: `free.depth_span_mm`"):
+    with pytest.raises(InputError, match="`free.depth_span_mm` .*study.toml"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml")
     assert set(folder.iterdir()) == before
 

@@ -62,7 +62,7 @@ REFUSED = [
 def test_what_is_impossible_is_refused_with_the_question(tmp_path, key, value, question):
     with pytest.raises(InputError) as caught:
         read_design(written(tmp_path, {key: value}))
-    assert question in str(caught.value) and "allowed" in str(caught.value)
+    assert question in str(caught.value) and "must be" in str(caught.value)
 
 
 def test_good_designs_raise_none(tmp_path):

@@ -156,7 +156,7 @@ def peak_mib(call: Callable[[], Any]) -> tuple[float, Any]:
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
     except OSError:
         return float("nan"), call()
     before = status_mib("VmRSS")

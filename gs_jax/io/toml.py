@@ -8,8 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Discriminator, ValidationError
 
 from ..base.errors import input_error, short_repr
-from ..typing import PathLike
-from .files import read_text
+from .files import PathLike, read_text
 
 Place = tuple[int | str, ...]
 # Tags of a union of one number and several; pydantic lists them among the keys of an error.

@@ -1,13 +1,12 @@
 """The tolerances of a device, as options and TOML files give them."""
 
-import tomllib
 from typing import Any
 
 from pydantic import Field, ValidationError
 
 from ...base.errors import InputError
-from ...io.files import PathLike, read_text
-from ...io.toml import Table, one_line
+from ...io.files import PathLike
+from ...io.toml import Table, one_line, read_toml
 
 
 def _field(default: float, most: float, unit: str, title: str, *, least: float = 0.0) -> Any:
@@ -51,10 +50,7 @@ def read_tolerances(path: PathLike) -> ToleranceSpec:
     InputError
         If the file cannot be read, or a key does not exist or has a wrong value.
     """
-    text = read_text(path)
     try:
-        return ToleranceSpec.model_validate(tomllib.loads(text))
+        return ToleranceSpec.model_validate(read_toml(path))
     except ValidationError as error:
-        raise InputError(f"{path}: {one_line(error, ToleranceSpec, {})}.") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid TOML: {str(error):.200}.") from error
+        raise InputError(f"{one_line(error, ToleranceSpec, {})} ({path}).") from error
