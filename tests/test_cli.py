@@ -134,7 +134,7 @@ def test_simulate_points(folder, monkeypatch, capsys):
 
 WRONG_SCENES = [
     ("x,y,z\n1,2,3\n", "got 'x,y,z'"),
-    ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm: must be above 0, got -20.0"),
+    ("x_mm,y_mm,z_mm,intensity\n0,0,-20,1\n", "point 1, z_mm must be above 0, got -20.0"),
     ("x_mm,y_mm,z_mm,intensity\n0,0,20,nan\n", "'nan'"),
 ]
 
@@ -194,7 +194,7 @@ WRONG_ARGUMENTS = [
     (("reconstruct", "capture.tif"), "DESIGN"),
     (("reconstruct", "capture.tif", "design.toml", "-o", "v.tif"), "--depths"),
     (RECONSTRUCT, "--output"),
-    ((*RECONSTRUCT, "-o", "v.jpg"), "suffix: must be .tif"),
+    ((*RECONSTRUCT, "-o", "v.jpg"), "suffix must be .tif"),
     ((*RECONSTRUCT, "-o", "nowhere/v.tif"), "nowhere"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0"), "must be 0.01 to 1e+06 um, got '0'"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "-3"), "got '-3'"),
@@ -221,7 +221,7 @@ WRONG_ARGUMENTS = [
     ),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "missing.npz"), "missing.npz"),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "unet", "--weights", "design.toml"), "design.toml: not a whole"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "suffix: must be .csv, got '.txt' (p.txt)"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--points", "p.txt"), "suffix must be .csv, got '.txt' (p.txt)"),
     (("reconstruct", "missing.tif", *RECONSTRUCT[2:], "-o", "v.tif"), "missing.tif"),
     (("reconstruct", "capture.tif", "missing.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "missing.toml"),
     (("reconstruct", "design.toml", "design.toml", *RECONSTRUCT[3:], "-o", "v.tif"), "CAPTURE comes first"),

@@ -490,7 +490,7 @@ def test_keys_are_replaced_and_checked():
     assert moved.name == "two" and moved.lens == design.lens
     with pytest.raises(InputError, match="such as sensor_distance_mm, .*got sensor_distance"):
         design.replace(sensor_distance=6.0)
-    with pytest.raises(InputError, match="`imaging.sensor_distance_mm`: must be a number of mm.*-1"):
+    with pytest.raises(InputError, match="`imaging.sensor_distance_mm` must be a number of mm.*-1"):
         design.replace(sensor_distance_mm=-1)
     with pytest.raises(InputError, match="near below far"):
         design.replace(working_distance_mm=(30.0, 18.0))

@@ -202,7 +202,7 @@ def test_a_widget_that_is_closed_ends_its_work(widget, viewer, fourth_step):
 @pytest.mark.parametrize(
     "field, value, message",
     [
-        ("design_file", "wrong.toml", "`lens.refractive_index`: must be a number above 1, up to 5, got -1"),
+        ("design_file", "wrong.toml", "`lens.refractive_index` must be a number above 1, up to 5, got -1"),
         ("design_file", "none.toml", "none.toml: "),
         ("depths", "18:17:1", "Depths must have .* got '18:17:1'"),
         ("voxel", 0.01, "at most .* GiB of the free memory"),

@@ -235,7 +235,7 @@ def test_a_wrong_image_is_named():
     spoilt = np.ones((896, 960))
     spoilt[:2, 0] = np.nan, np.inf
     for search in (find, lambda image: detection_stats(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
-        with pytest.raises(InputError, match="image: must be finite, got 2 of 860160 pixels NaN"):
+        with pytest.raises(InputError, match="image must be finite, got 2 of 860160 pixels NaN"):
             search(spoilt)
 
 

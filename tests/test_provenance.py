@@ -76,7 +76,7 @@ def test_commands_sign_what_they_write(tmp_path):
 
 
 def test_another_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="suffix: must be .tif.*got '.txt'"):
+    with pytest.raises(InputError, match="suffix must be .tif.*got '.txt'"):
         read_provenance(tmp_path / "a.txt")
     (tmp_path / "a.tif").write_bytes(b"no")
     with pytest.raises(InputError, match="not a whole and valid .tif file"):

@@ -168,9 +168,9 @@ def test_wrong_arguments_are_named():
 def test_what_is_not_finite_is_named(method):
     imager, grid, psf, truth, image = small()
     spoilt = image.at[0, :2].set([np.nan, np.inf])
-    with pytest.raises(InputError, match="image: must be finite, got 2 of 7680 pixels NaN"):
+    with pytest.raises(InputError, match="image must be finite, got 2 of 7680 pixels NaN"):
         reconstruct(spoilt, imager, grid, method, optics=psf)
-    with pytest.raises(InputError, match="volume: must be finite, got 1 of 144 voxels NaN"):
+    with pytest.raises(InputError, match="volume must be finite, got 1 of 144 voxels NaN"):
         forward_residual(truth.at[0, 0, 0].set(np.nan), image, imager, grid, optics=psf)
 
 

@@ -222,8 +222,8 @@ def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
     before = files(folder / "v.zarr")
     for options, words in (
         ((), "has 4 of 5 frames of an interrupted recording; give --resume"),
-        (("--resume", "--optics", "pinhole"), "optics with --resume: must be 'full', as before, got 'pinhole'"),
-        (("--resume", "--frame-interval", "2"), "frame_interval with --resume: must be 'nothing'"),
+        (("--resume", "--optics", "pinhole"), "optics with --resume must be 'full', as before, got 'pinhole'"),
+        (("--resume", "--frame-interval", "2"), "frame_interval with --resume must be 'nothing'"),
     ):
         status, _, err = run(monkeypatch, capsys, *command("frames"), *options)
         assert status == 2 and words in err
@@ -283,7 +283,7 @@ def test_it_is_compiled_once(folder, monkeypatch, capsys):
         ("no*.tif", (), "no*.tif: no captures"),
         ("capture.tif", ("--resume",), "--resume must be used with a recording, got a single capture capture.tif"),
         ("capture.tif", ("--frame-interval", "1"), "--frame-interval must be used with a recording"),
-        ("flat.zarr", (), "array: must be (t, y, x), with axes of 1 alone between t and y, got 96 x 80"),
+        ("flat.zarr", (), "array must be (t, y, x), with axes of 1 alone between t and y, got 96 x 80"),
         ("deep.zarr", (), "got 5 x 3 x 96 x 80"),
         ("double.zarr", (), "got float64"),
         ("none.zarr", (), "none.zarr"),
@@ -352,7 +352,7 @@ def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
         reconstruct_frames(VolumeSeries(tmp_path / "v.zarr", 9, grid), lambda frame: frame, make)
     series = VolumeSeries(tmp_path / "v.zarr", 9, grid, resume=True)
     assert series.finished >= set(range(5)) and series.unfinished[-3:] == [6, 7, 8]
-    with pytest.raises(InputError, match="with --resume: must be"):
+    with pytest.raises(InputError, match="with --resume must be"):
         VolumeSeries(tmp_path / "v.zarr", 8, grid, resume=True)
 
 

@@ -98,8 +98,8 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(InputError, match="voxels must not be negative, got -1"):
         simulate_volume(-np.ones((1, 3, 3), np.float32), imager(), Grid([20.0], (3, 3), 0.05), **options)
     for scene, grid, message in (
-        (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene: must be finite, got 9 of 9 voxels NaN"),
-        (np.array([[0.0, np.nan, 20.0, 1.0]]), None, "scene: must be finite, got 1 of 4 numbers NaN"),
+        (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene must be finite, got 9 of 9 voxels NaN"),
+        (np.array([[0.0, np.nan, 20.0, 1.0]]), None, "scene must be finite, got 1 of 4 numbers NaN"),
         (
             np.array([[0.0, 0.0, 20.0, 1.0], [0.0, 0.0, -20.0, 1.0]]),
             None,

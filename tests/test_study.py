@@ -56,7 +56,7 @@ def test_what_a_study_says(read):
         ("[2.0, 6.0]", "[-2.0, 6.0]", "must be above 0"),
         ("[2.0, 6.0]", "[0.0, inf]", "free.sensor_distance_mm"),
         ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
-        ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]`: must be .*, got 0.0"),
+        ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]` must be .*, got 0.0"),
         ("[18.0, 23.0]", "[18.0]", "`depths_mm"),
         ('"occupancy"', '"ocupancy"', "`terms` 1: name must be occupancy or one of 31 others, got 'ocupancy'"),
         ("at_most = 0.5", "", "one of at_most, .* must be given, got none"),
@@ -77,7 +77,7 @@ def test_what_a_study_says(read):
             "one of at_most and at_least must be given",
         ),
         ("[[stages]]", "[[terms]]\nname = 'occupancy'\nat_most = 0.4\n[[stages]]", "occupancy must be given once"),
-        ("depths_mm", "starts = 0\ndepths_mm", "`starts`: must be a whole number from 1.*, got 0"),
+        ("depths_mm", "starts = 0\ndepths_mm", "`starts` must be a whole number from 1.*, got 0"),
         ("depths_mm", "depths_mm = ", "valid TOML"),
     ],
 )

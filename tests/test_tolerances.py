@@ -309,7 +309,7 @@ def test_the_command(folder, monkeypatch, capsys):
         (("--position-um", "-1"), "must be 0 to 1000 um, got '-1'"),
         (("--index", "x"), "must be 0 to 0.1, got 'x'"),
         (("--tolerances", "wrong.toml"), "`possition_um`: no such key; did you mean `position_um`?"),
-        (("-o", "t.txt"), "suffix: must be .json, got '.txt'"),
+        (("-o", "t.txt"), "suffix must be .json, got '.txt'"),
         (("--draws", "0"), "0 is not in the range"),
         (("--positions", "places.csv"), "places.csv: every source must have x, y and z"),
         (("--min-strehl", "2"), "must be 0.001 to 1, got '2'"),

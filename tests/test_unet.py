@@ -74,7 +74,7 @@ def test_any_shape_goes_in_and_comes_out(shape):
 
 
 def test_a_volume_with_nan_is_named():
-    with pytest.raises(InputError, match="volume: must be finite, got 9 of 18 voxels NaN"):
+    with pytest.raises(InputError, match="volume must be finite, got 9 of 18 voxels NaN"):
         suppress(stack(2, 3, 3) * np.array([1, np.nan], np.float32)[:, None, None], small())
 
 

@@ -123,7 +123,7 @@ def test_what_cannot_work_is_one_line(folder, monkeypatch, capsys):
                 f"--scheduler: no Dask scheduler is reachable at {address}",
             ),
             (("--scheduler", "nowhere"), "--scheduler: no Dask scheduler is reachable at nowhere"),
-            (("--scheduler", address, "--workers", "2"), "--workers: must not be given together with --scheduler"),
+            (("--scheduler", address, "--workers", "2"), "--workers must not be given together with --scheduler"),
         ):
             status, _, err = run(monkeypatch, capsys, *command("rec.tif", *options))
             assert status == 2 and words in err and err.count("\n") == 1

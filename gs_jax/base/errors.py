@@ -39,8 +39,8 @@ class InputWarning(UserWarning):
 
 
 def input_error(name: str, allowed: object, given: object, file: object = None) -> InputError:
-    """`InputError` with the message "NAME: must be ALLOWED, got GIVEN (FILE)."."""
-    return InputError(f"{name}: must be {allowed}, got {given}{f' ({file})' if file else ''}.")
+    """`InputError` with the message "NAME must be ALLOWED, got GIVEN (FILE)."."""
+    return InputError(f"{name} must be {allowed}, got {given}{f' ({file})' if file else ''}.")
 
 
 @contextlib.contextmanager

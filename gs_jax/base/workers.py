@@ -60,7 +60,7 @@ class Workers:
 
     def __init__(self, count: int | None = None, scheduler: str | None = None):
         if count and scheduler:
-            raise InputError("--workers: must not be given together with --scheduler.")
+            raise InputError("--workers must not be given together with --scheduler.")
         self.count, self.scheduler = count, scheduler
         self._client: Any = None
         self._cluster: Any = None

@@ -207,7 +207,7 @@ def prepare(
         As for `read_corrected`, with the same errors.
     """
     if correction.dark and correction.offset:
-        raise InputError(f"--offset: must not be given with --dark, got {correction.dark}; its offset is the dark's.")
+        raise InputError(f"--offset must not be given with --dark, got {correction.dark}; its offset is the dark's.")
     bad, bad_counts = np.zeros(size, bool), []
     done, warnings = readout.describe(), []
     dark, gain = correction.offset or None, None

@@ -115,7 +115,7 @@ def _open_zarr(path: Path, page: int | str | None) -> Recording:
         from zarr import open as open_zarr
 
     if page is not None:
-        raise InputError(f"--page: must not be given for a recording in Zarr, got --page {page} ({path}).")
+        raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
     with decoding(path, "Zarr store"):
         store = open_zarr(path, mode="r")
         array = store if isinstance(store, zarr.Array) else _image_array(store)

@@ -32,7 +32,7 @@ def read_toml(path: PathLike) -> dict[str, Any]:
 
 
 def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> str:
-    """Describe the first three problems of a table as "`KEY`: must be ALLOWED, got VALUE; ...".
+    """Describe the first three problems of a table as "`KEY` must be ALLOWED, got VALUE; ...".
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
             lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, _keys(model, also))}")
         else:
             given = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
-            lines.append(f"`{_dotted(place)}`: must be {_allowed(place, model)}, got {given}")
+            lines.append(f"`{_dotted(place)}` must be {_allowed(place, model)}, got {given}")
     more = len(problems) - len(lines)
     return "; ".join([*lines, f"and {more} more problems"] if more else lines)
 
