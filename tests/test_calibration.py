@@ -441,7 +441,7 @@ def test_the_command(tmp_path):
     for more, message in (
         (
             [],
-            "p.csv: positions: every capture needs one or more sources, got 1 sources for 3 captures",
+            "positions: every capture needs one or more sources, got 1 sources for 3 captures",
         ),
         (["--from-scene"], "calibrate needs --positions"),
         (["--fit", "focus"], "must be some of sensor-distance, rotation"),

@@ -115,10 +115,10 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="cannot be read"):
         run_study(table1, study(), checkpoint=path, resume=True)
     path.write_bytes(b"{}\n")
-    with pytest.raises(InputError, match="no checkpoint of a search"):
+    with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
     path.write_bytes(b'{"format": "gs-jax checkpoint 3", "of": "", "log": {"steps": 1, "ends": 2}}\n')
-    with pytest.raises(InputError, match="no checkpoint of a search"):
+    with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
     interrupted(table1, study(), path, monkeypatch, writes=1)
     whole = path.read_bytes()

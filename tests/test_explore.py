@@ -260,7 +260,7 @@ def test_a_browser_moves_it(server, browser):
 def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "design.toml").write_text(DESIGN)
-    for arguments, message in ((("none.toml",), "none.toml"), (("design.toml", "-o", "x.html"), "allowed: .toml")):
+    for arguments, message in ((("none.toml",), "none.toml"), (("design.toml", "-o", "x.html"), "must be .toml")):
         status, out, err = run(monkeypatch, capsys, "explore", *arguments, "--no-browser")
         assert (status, out, err.count("\n")) == (2, "", 1) and message in err
 

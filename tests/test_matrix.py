@@ -250,7 +250,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
 REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "points"): "3 or more lenses must agree on a point, got 1 lens",
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
-    ("one lens", "tolerance"): "1 lenses see, allowed: 2 or more",
+    ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
     ("geomscope-table1", "calibrate"): "of 20 bright spots on lenses",
 }
 # Out of focus as printed: whatever reads the cores of spots warns of it.

@@ -325,10 +325,10 @@ def test_wrong_input_is_one_line(folder, monkeypatch, capsys, arguments, message
 
 def test_designs_that_have_no_answer(design):
     ideal = design.model_copy(update={"lens": design.lens.model_copy(update={"focal_length_mm": 3.0})})
-    with pytest.raises(InputError, match="`lens.focal_length_mm`: found 3, allowed: none"):
+    with pytest.raises(InputError, match="`lens.focal_length_mm` must be left out, .*, got 3"):
         tolerance(ideal)
     few = design.array.model_copy(update={"centers_mm": ((0.0, 0.0),)})
-    with pytest.raises(InputError, match="lenses see, allowed: 2 or more"):
+    with pytest.raises(InputError, match="2 or more lenses must see"):
         tolerance(design.model_copy(update={"array": few}))
     with pytest.raises(InputError, match="`max_width` must be positive"):
         tolerance(design, max_width=-1.0)

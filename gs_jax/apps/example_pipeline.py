@@ -70,6 +70,8 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
     InputError
         If the folder cannot be made or written to.
     """
+    with needs_extra("report"):
+        import jinja2
     folder, progress = make_folder(folder), progress or Progress()
     seconds: dict[str, float] = {}
     with progress.step("Laying out the lenses"), _timed(seconds, "design and metrics"):
@@ -94,9 +96,6 @@ def run(folder: PathLike, progress: Progress | None = None) -> Path:
         "mold": mold,
         "seconds": seconds,
     }
-    with needs_extra("report"):
-        import jinja2
-
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
     text = environment.from_string(_template("example_pipeline.md")).render(context)
     write_text(folder / "report.md", text, [".md"])

@@ -291,9 +291,9 @@ def skip_reason(name: str, side: int, last: dict[str, Any] | None, limit: float)
     method, pairs = METHODS[name], float(side) ** 4
     # The matrix, and its copy while it is made.
     if method.dense and 8 * pairs > (memory := available_memory() / 4):
-        return f"two copies of the matrix take {8 * pairs / 2**30:.3g} GiB, allowed: {memory / 2**30:.3g} GiB"
+        return f"two copies of the matrix take {8 * pairs / 2**30:.3g} GiB, more than {memory / 2**30:.3g} GiB"
     if last and (forecast := last["seconds"] * (pairs / last["pairs"]) ** method.growth) > limit:
-        return f"would take {forecast:.3g} s an image, allowed: {limit:g} s"
+        return f"would take {forecast:.3g} s an image, more than {limit:g} s"
     return None
 
 

@@ -1,7 +1,7 @@
 """The HTML report of a design and of what was imaged with it, in one file."""
 
 from collections.abc import Mapping
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,8 @@ def write_report(
         If a volume has no grid, or another shape than its grid.
     """
     path, progress = check_output(path, [".html"]), progress or Progress()
+    with needs_extra("report"):
+        import_module("jinja2")
     if volume is not None and (grid is None or volume.shape != grid.volume_shape):
         raise ValueError(f"`volume` must have the shape of `grid`, got {volume.shape}.")
     context: dict[str, Any] = {

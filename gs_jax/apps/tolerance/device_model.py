@@ -263,8 +263,8 @@ def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisibleP
     count = seen.sum(1)
     if count.min() < _MIN_LENSES:
         x, y, z = points[count.argmin()]
-        found = f"a point at x {x:.4g}, y {y:.4g}, z {z:.4g} mm that {count.min()} lenses see"
-        raise InputError(f"`array.centers_mm`: found {found}, allowed: {_MIN_LENSES} or more, to know its depth.")
+        point = f"the point at x {x:.4g}, y {y:.4g}, z {z:.4g} mm"
+        raise InputError(f"{_MIN_LENSES} or more lenses must see {point} to know its depth, got {count.min()}.")
     lenses = np.argsort(~seen, axis=1, kind="stable")[:, : count.max()]
     return VisiblePoints(jnp.asarray(points), jnp.asarray(lenses), jnp.asarray(np.take_along_axis(seen, lenses, 1)))
 

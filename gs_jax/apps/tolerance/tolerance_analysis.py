@@ -163,7 +163,7 @@ def tolerance(
     progress = progress or Progress()
     z = np.linspace(*design.imaging.working_distance_mm, _DEPTHS) if depths is None else np.array(depths, float)
     if (focal := design.lens.focal_length_mm) is not None:
-        raise InputError(f"`lens.focal_length_mm`: found {focal:g}, allowed: none, as ideal lenses have no surface.")
+        raise InputError(f"`lens.focal_length_mm` must be left out, as ideal lenses have no surface, got {focal:g}.")
     if not z.size or not np.isfinite(z).all() or not (z > 0).all():
         raise InputError(f"`depths` must be one or more positive lengths, mm, got {z.tolist()}.")
     if draws < 1:
