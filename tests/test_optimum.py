@@ -180,7 +180,10 @@ def test_depths_behind_the_array_are_refused():
 def test_objectives_of_lenses_that_differ_are_of_the_plate_of_each_type_or_of_the_best():
     scope = small(radius_of_curvature=[2.0, 2.2, 2.0])
     assert objectives.occupancy(scope, DEPTHS).shape == (3,)
-    assert objectives.lateral_resolution(scope, DEPTHS).shape == (2, 3)
+    assert objectives.lateral_resolution(scope, depths=DEPTHS).shape == (2, 3)
+    assert objectives.f_number(scope).shape == objectives.sag(scope).shape == (2,)
+    with pytest.raises(TypeError, match="depths"):
+        objectives.lateral_resolution(scope)
     widths = [objectives.spot_width(*part) for part in per_type(scope, DEPTHS)]
     np.testing.assert_allclose(objectives.spot_width(scope, DEPTHS), np.min(widths, 0), rtol=1e-12)
 

@@ -1,6 +1,7 @@
 """Conditions under which an imager is evaluated, its clear aperture, and quantities of several lens types."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
@@ -38,11 +39,12 @@ class Conditions(eqx.Module):
     largest_magnification
         An upper bound of all magnifications, for windows whose shape may not depend on traced numbers.
     directions
-        In how many directions the edge of a clear aperture is computed, where lenses differ or move.
+        Number of directions in which the edge of a clear aperture is computed, where lenses differ.
     cells
-        Neighbours of each lens, for lenses that are alike and stay about where they are: a hundred times faster.
+        Voronoi neighbours of each lens, where lenses are alike and keep them: a clear aperture is computed a hundred
+        times faster.
     clear_diameter
-        Of the lenses, mm, where it is known; it is computed from the imager by default.
+        Clear diameter of the lenses, mm, where it is known; computed from the imager by default.
     field_radius
         `sqrt(A_e / pi)`, mm, in place of the imager's own, which decides shapes and cannot be traced.
 
@@ -100,8 +102,8 @@ def by_type(function: Quantity) -> Quantity:
     """Extend a quantity of lenses that are alike to several types: one row each."""
 
     @wraps(function)
-    def of_all(imager, depths):
-        values = [function(*part) for part in per_type(imager, depths)]
+    def of_all(*args, **options):
+        values = [function(*part) for part in _parts(function, args, options)]
         return values[0] if len(values) == 1 else jnp.stack(values)
 
     return of_all
@@ -111,14 +113,21 @@ def best_type(function: Quantity, *, best: Callable[..., Array] = jnp.argmin) ->
     """Extend a quantity of lenses that are alike to several types: the value of the best type at each depth."""
 
     @wraps(function)
-    def of_best(imager, depths):
-        values = [function(*part) for part in per_type(imager, depths)]
+    def of_best(*args, **options):
+        values = [function(*part) for part in _parts(function, args, options)]
         if len(values) == 1:
             return values[0]
         stacked = jnp.stack(values)
         return jnp.take_along_axis(stacked, best(stacked, axis=0, keepdims=True), 0)[0]
 
     return of_best
+
+
+def _parts(function, args, options):
+    # The wrapped function has the names and the defaults of the arguments.
+    bound = inspect.signature(function).bind(*args, **options)
+    bound.apply_defaults()
+    return per_type(*bound.args)
 
 
 def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:

@@ -22,13 +22,13 @@ from .conditions import (
 
 
 @by_type
-def f_number(imager: Imager, depths: Depths) -> Float[Array, ""]:
+def f_number(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """F-number of the clear aperture (below Eq. 8); one a type."""
     return theory.f_number(imager.array.focal_length, clear_diameter(imager, depths))
 
 
 @by_type
-def numerical_aperture(imager: Imager, depths: Depths) -> Float[Array, ""]:
+def numerical_aperture(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Numerical aperture of the clear aperture, on the sensor's side; one a type."""
     return theory.numerical_aperture(imager.array.focal_length, clear_diameter(imager, depths))
 
