@@ -19,8 +19,13 @@ from .typing import Scalar, Scalars
 Orientation = Literal["plano", "curved"]
 # Numbers that may differ between lenses.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
-_SIZE: Rule = ("positive, or infinite", lambda x: x > 0)
 _INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
+
+
+def _as_plate(x):
+    size = as_float_or_none(x)
+    # That a plate is infinite is part of the structure, which compiled code knows.
+    return None if size is None or (not isinstance(size, Tracer) and np.isinf(size).all()) else size
 
 
 class MicrolensArray(eqx.Module):
@@ -43,7 +48,7 @@ class MicrolensArray(eqx.Module):
     thin_lens_focal_length
         Overrides the focal length that follows from the radius, mm, for a thin-lens study.
     size
-        `(x, y)` of the centred plate, mm, which truncates the outer lenses; infinite by default.
+        `(x, y)` of the centred plate, mm, which truncates the outer lenses. None, the default, is an infinite plate.
     orientation
         The side of the lenses that faces the object, `"plano"` or `"curved"`.
     conic_constant
@@ -76,7 +81,7 @@ class MicrolensArray(eqx.Module):
     aperture_diameter: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
-    size: Float[Array, "2"] = eqx.field(converter=as_float, default=(math.inf, math.inf))
+    size: Float[Array, "2"] | None = eqx.field(converter=_as_plate, default=None)
     orientation: Orientation = eqx.field(static=True, default="plano")
     conic_constant: Float[Array, "*each"] = eqx.field(converter=as_float, default=0.0)
     aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
@@ -97,22 +102,26 @@ class MicrolensArray(eqx.Module):
         for name in EACH:
             if (shape := getattr(self, name).shape) not in ((), self.centers.shape[:1]):
                 raise ValueError(f"`{name}` must be one number or {self.centers.shape[:1]}, got {shape}.")
-        if self.size.shape != (2,):
+        if self.size is not None and self.size.shape != (2,):
             raise ValueError(f"`size` must be (x, y), got {self.size.shape}.")
         if self.orientation not in ("plano", "curved"):
             raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
         check_fields(self, radius_of_curvature=POSITIVE, aperture_diameter=POSITIVE, thin_lens_focal_length=POSITIVE)
-        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE, size=_SIZE)
+        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE, size=POSITIVE)
         check_fields(self, centers=FINITE, conic_constant=FINITE, aspheric_terms=FINITE)
 
     @property
-    def half_size(self) -> Scalars:
-        """Half of `size`, in the precision of the centres."""
+    def half_plate(self) -> Scalars:
+        """Half the plate's `(x, y)`, infinite without `size`, in the precision of the centres."""
+        if self.size is None:
+            return array_namespace(self.centers).full(2, math.inf, self.centers.dtype)
         return (self.size / 2).astype(self.centers.dtype)
 
     @property
     def plate(self) -> tuple[float, float]:
-        """`size` as plain numbers. Host code."""
+        """The plate's `(x, y)` as plain numbers, infinite without `size`. Host code."""
+        if self.size is None:
+            return math.inf, math.inf
         x, y = np.asarray(self.size, float).tolist()
         return x, y
 

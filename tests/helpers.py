@@ -69,7 +69,7 @@ def aperture_edge(array, angles):
     for center in centers:
         offset = centers - center
         toward = np.concatenate([offset @ direction, direction, -direction])
-        room = [(np.array(array.size) / 2 - sign * center) for sign in (1, -1)]
+        room = [(np.array(array.plate) / 2 - sign * center) for sign in (1, -1)]
         lines = np.concatenate([np.sum(offset**2, axis=1) / 2, *room])
         distance = np.where(toward > 0, lines[:, None] / np.where(toward > 0, toward, 1), np.inf)
         edges.append(np.minimum(distance.min(axis=0), float(array.aperture_diameter) / 2))

@@ -273,7 +273,7 @@ def test_every_fidelity_reconstructs(fidelity):
 
 
 def test_an_unknown_fidelity_is_refused():
-    with pytest.raises(InputError, match="optics must be one of full, near, pinhole, got 'exact'"):
+    with pytest.raises(InputError, match="fidelity must be one of full, near, pinhole, got 'exact'"):
         make_psf_model(imager(), DEPTHS, "exact")
 
 

@@ -59,7 +59,8 @@ class Free(NamedTuple):
         imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, numbers)
         if scale is None:
             return imager
-        return eqx.tree_at(lambda i: (i.array.centers, i.array.size), imager, replace_fn=lambda length: scale * length)
+        lengths = lambda i: [i.array.centers] if i.array.size is None else [i.array.centers, i.array.size]
+        return eqx.tree_at(lengths, imager, replace_fn=lambda length: scale * length)
 
 
 def free(*names: str) -> Free:

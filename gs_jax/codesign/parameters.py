@@ -150,7 +150,7 @@ def candidate(imager: Imager, at: Conditions, values: Values) -> tuple[Imager, C
     scale = values["pitch_mm"] / _pitch(imager)
     replaced = {
         "centers": scale * values["centers_mm"],
-        "size": scale * imager.array.size,
+        "size": None if imager.array.size is None else scale * imager.array.size,
         "refractive_index": values["refractive_index"],
         "aspheric_terms": values["aspheric_terms"],
         **{name: of_lenses(imager, values[key]) for name, key in zip(EACH, LENS_KEYS, strict=True)},

@@ -14,8 +14,8 @@ from ..optics.apertures import clear_diameter
 def tables_of(imager: Imager) -> dict[str, Any]:
     """All tables of an imager; it has no working distance."""
     array, sensor = imager.array, imager.sensor
-    if not np.isfinite(array.plate).all():
-        raise InputError(f"`array.size` must be finite, got {array.plate}.")
+    if array.size is None:
+        raise InputError("`array.size` must be given: a design has a plate of finite size.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
     return {

@@ -175,7 +175,7 @@ def make_mask(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
     InputError
         If the plate is infinite, or lenses cover all of it.
     """
-    if not np.isfinite(np.asarray(array.plate, float)).all():
+    if array.size is None:
         raise InputError("`array.size_mm` must be finite, got an infinite plate.")
     lenslets, side = lenslets_of(array), np.asarray(array.plate, float)
     centers = np.stack([each.center for each in lenslets])

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields
@@ -51,7 +50,7 @@ class Conditions(eqx.Module):
     Raises
     ------
     ValueError
-        If a depth is not positive and finite.
+        If `depths` is not `(depth,)`, or a length is not positive and finite.
     """
 
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
@@ -64,7 +63,9 @@ class Conditions(eqx.Module):
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
 
     def __check_init__(self):
-        check_fields(self, depths=POSITIVE)
+        if self.depths.ndim != 1:
+            raise ValueError(f"`depths` must be (depth,), got {self.depths.shape}.")
+        check_fields(self, depths=POSITIVE, circle_of_confusion=POSITIVE, field_radius=POSITIVE)
 
     @property
     def middle(self) -> "Conditions":
@@ -159,10 +160,9 @@ def field_heights(imager: Imager, at: Conditions) -> Float[Array, " field"]:
 
 def finite_plate(imager: Imager) -> Float[Array, "2"]:
     """Size of the plate; `ValueError` if it is infinite, where lenses have no density."""
-    size = 2 * imager.array.half_size
-    if not isinstance(size, Tracer) and not np.isfinite(size).all():
-        raise ValueError(f"`imager.array.size` must be finite, got {imager.array.plate}.")
-    return size
+    if imager.array.size is None:
+        raise ValueError("`imager.array.size` must be given: the lenses of an infinite plate have no density.")
+    return 2 * imager.array.half_plate
 
 
 def field_radius(imager: Imager, at: Conditions) -> Float[Array, ""]:

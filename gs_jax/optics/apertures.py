@@ -47,7 +47,7 @@ def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Arra
         _, near = lax.top_k(-jnp.sum(offset**2, axis=1), count + 1)
         normal, height = _bisectors(offset[near], array.aperture_diameter)
         # Beyond the disc a line closes the polygon without effect, where the plate is infinite.
-        half = jnp.repeat(array.half_size, 2)
+        half = jnp.repeat(array.half_plate, 2)
         room = jnp.minimum(half - sides @ array.centers[lens], array.aperture_diameter)
         return _disc_polygon_area(jnp.concatenate([normal, sides]), jnp.concatenate([height, room]), radius)
 
@@ -66,7 +66,7 @@ def _edge_distances(array: MicrolensArray, count: int) -> Float[Array, "lens dir
         return jnp.min(jnp.where(jnp.arange(len(own)) == lens, jnp.inf, between))
 
     gaps = _map_lenses(gap, lax.stop_gradient(whole).centers) if len(own) > 1 else jnp.inf
-    discs = lambda: _disc_edges(array.centers, own[: len(array.centers)], whole.half_size, directions)
+    discs = lambda: _disc_edges(array.centers, own[: len(array.centers)], whole.half_plate, directions)
     return lax.cond(jnp.min(gaps) >= 0, discs, lambda: _envelope_edges(whole, len(array.centers), directions))
 
 
@@ -124,12 +124,9 @@ def _excess(whole: MicrolensArray, neighbours, direction, distance):
     others = jnp.where(own, -jnp.inf, jnp.minimum(2 * radius[0] * (below[0] - below), inner - apart))
     # Not `max`: recomputed for its derivatives with other rounding, it may be none of its arguments.
     most = jnp.maximum(others[jnp.argmax(others)], distance**2 - rim[0] ** 2)
-    for axis in range(2):
-        # A plate without an edge there gives no slope either, which -inf would.
-        bounded = jnp.isfinite(whole.half_size[axis])
-        half = jnp.where(bounded, whole.half_size[axis], 0)
-        beyond = jnp.abs(center[axis] + distance * direction[axis]) - half
-        most = jnp.where(bounded, jnp.maximum(most, rim[0] * beyond), most)
+    for axis in range(0 if whole.size is None else 2):
+        beyond = jnp.abs(center[axis] + distance * direction[axis]) - whole.half_plate[axis]
+        most = jnp.maximum(most, rim[0] * beyond)
     return most
 
 
@@ -214,7 +211,7 @@ def _(directions, lenses, primals, tangents):
 def _total_cell_area(array: MicrolensArray, cells: VoronoiCells):
     centers = array.centers
     sides = jnp.array([[-1, 0], [1, 0], [0, -1], [0, 1]], centers.dtype)
-    half = jnp.repeat(array.half_size, 2)
+    half = jnp.repeat(array.half_plate, 2)
     side = jnp.maximum(cells.beyond - len(centers), 0)
     own = centers[cells.lens]
     halfway, away = _bisectors(centers[jnp.minimum(cells.beyond, len(centers) - 1)] - own, array.aperture_diameter)
@@ -300,4 +297,4 @@ def clear_area(array: MicrolensArray) -> Float[Array, " lens"]:
     Glass beyond the plate's nominal size transmits light, too: in ray-traced captures of the authors' array, apertures
     that are cut there make the model 20 % too dark at the sensor's rim.
     """
-    return aperture_area(dataclasses.replace(array, size=jnp.full_like(array.size, jnp.inf)))
+    return aperture_area(dataclasses.replace(array, size=None))

@@ -69,7 +69,7 @@ def make_psf_model(
     3 None
     """
     if fidelity not in FIDELITIES:
-        raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(fidelity)}.")
+        raise InputError(f"fidelity must be one of {', '.join(FIDELITIES)}, got {short_repr(fidelity)}.")
     if fidelity == "pinhole":
         return None
     depths = np.asarray(depths)
