@@ -85,4 +85,4 @@ plt.show()
 # Points are easy: both designs find them, and the paper's lenses localise them better, because they have more light and
 # magnify more. Sharp spots pay for extended scenes: volumes at several exposures, by these two and by conics, are in
 # the [experiments](../../experiments/results/codesign.md#co-design-the-lens). To search for a design of your own, see
-# [the next tutorial](objective.md).
+# [the next tutorial](objective.py).

@@ -102,4 +102,4 @@ print(f"spacing: {series.scale[0]:g} s, {series.scale[1]:g} um in depth and {ser
 # `gs-jax info volumes.zarr` shows which command made it, from which files.
 #
 # After an interruption the same command with `--resume` computes the missing frames only. See
-# [workers](workers.md) for several processes.
+# [workers](workers.py) for several processes.

@@ -23,7 +23,7 @@ FRAMES = 4
 # %% [markdown]
 # ## Devices
 #
-# `pip install 'gs-jax[gpu]'` installs JAX for NVIDIA GPUs, best [on Python 3.12 or newer](../install.md#gpu). JAX uses
+# `pip install '.[gpu]'` installs JAX for NVIDIA GPUs, best [on Python 3.12 or newer](../install.md#gpu). JAX uses
 # a GPU if it finds one. `JAX_PLATFORMS=cpu` in the environment keeps it on the processor. This page was built on:
 
 # %%
@@ -62,7 +62,7 @@ plt.show()
 #
 # Frames of a recording, starts of a search, points of a Pareto front and training scenes are independent jobs.
 # `--workers 2` distributes them over two processes, by [Dask](https://distributed.dask.org)
-# (`pip install 'gs-jax[cluster]'`), with the same results as one process.
+# (`pip install '.[cluster]'`), with the same results as one process.
 
 # %%
 side = 400 * 0.018

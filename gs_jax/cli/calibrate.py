@@ -67,7 +67,7 @@ def calibrate_command(
     """Find the geometry of a real microscope, from CAPTURES of a pinhole or bead at known positions.
 
     Sensor distance, rotation, shift and tilt are fitted. DESIGN has the lens centres; its sensor distance may be off by
-    a fifth, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
+    a quarter, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
     with z from the plate. One capture suffices; several depths and positions are better.
     """
     from rich.console import Console

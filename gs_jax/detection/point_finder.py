@@ -79,9 +79,10 @@ def find_points(
        point is subtracted from the views of the others, by the shape of spots in this image.
     4. The search is repeated on what the image holds beside the points, for those near brighter ones.
 
-    No threshold depends on the scene, and nothing is random. Points are searched for where the bright cores of the
-    spots land, by exact rays (`gs_jax.optics.psf_core.apparent_depths`); lenses of several types are read at depths
-    where they are sharp.
+    Nothing is random. Thresholds are multiples of the image's own noise, which is taken to be at least a thousandth of
+    the brightest spot: points whose spots have less than a two-hundredth of its height are not found. Points are
+    searched for where the bright cores of the spots land, by exact rays (`gs_jax.optics.psf_core.apparent_depths`);
+    lenses of several types are read at depths where they are sharp.
 
     Parameters
     ----------
