@@ -144,7 +144,9 @@ class MicrolensArray(eqx.Module):
         """Lenses that are alike, such as those of a type, as an array whose `others` are the rest."""
         which = np.array(which)
         rest = np.setdiff1d(np.arange(len(self.centers)), which)
-        others = dataclasses.replace(self, centers=self.centers[rest], **self._numbers(rest)) if rest.size else None
+        types = None if self.types is None else tuple(np.array(self.types)[rest].tolist())
+        kept = {"centers": self.centers[rest], "types": types, **self._numbers(rest)}
+        others = dataclasses.replace(self, **kept) if rest.size else None
         return dataclasses.replace(self, centers=self.centers[which], others=others, **self._numbers(which[0]))
 
     @property
@@ -215,8 +217,12 @@ def type_of_lens(array: MicrolensArray) -> Int[np.ndarray, " lens"]:
     if array.alike:
         return np.zeros(len(array.centers), int)
     numbers = [getattr(array, name) for name in EACH]
+    if not any(isinstance(number, Tracer) for number in numbers):
+        return np.array(_types(numbers))
     # Traced numbers have no values yet: the types are those of the array that they were made from.
-    return np.array(array.types if any(isinstance(x, Tracer) for x in numbers) else _types(numbers))
+    if array.types is None:
+        raise InputError("Lens types must be known before JAX traces: start from an array whose lenses differ.")
+    return np.array(array.types)
 
 
 def _types(numbers: Sequence[Scalars]) -> tuple[int, ...]:

@@ -334,7 +334,7 @@ def test_a_scene_that_nobody_knows():
     found = self_calibrate(image, start, grid)
     check(found, actual, [name for name in NAMES if "rotation" in name or "tilt" in name])
     assert len(found.sources.points) >= 7 and found.rms < 0.2
-    with pytest.raises(InputError, match="--from-scene: only rotation, tilt and lenses can be fitted, got shift"):
+    with pytest.raises(InputError, match="fit must be some of rotation, tilt and lenses for a scene, got shift"):
         self_calibrate(image, start, grid, fit=["shift"])
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
     with pytest.raises(InputError, match="capture: a sparse scene in focus with 5 or more points is needed, got 0"):

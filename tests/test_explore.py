@@ -115,7 +115,7 @@ def test_targets_and_assumptions_in_words(design):
     start = start_of(design, STUDY)
     moves = {"sensor_distance_mm": 7.0, "pitch_mm": 1.3 * make_sliders(design)["pitch_mm"].start}
     values = complete_values(make_sliders(design), moves)
-    result = evaluate_design(start, values, evaluation.live_terms(start, STUDY))
+    result = evaluate_design(start, values, evaluation.live_terms(STUDY))
     sentences = evaluation.find_violations(design, STUDY, start, values, result)
     assert "Target missed: thickness, plate and sensor distance (thickness_mm) is 8, not <= 7." in sentences
     for word in ("lenses_per_point", "out of focus", "mask"):

@@ -58,7 +58,9 @@ def needs_extra(extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise InputError(f"{error.name} is not installed; it comes with pip install 'gs-jax[{extra}]'.") from error
+        raise InputError(
+            f"{error.name or error} is not installed; it comes with pip install 'gs-jax[{extra}]'."
+        ) from error
 
 
 def short_repr(value: object) -> str:

@@ -146,7 +146,6 @@ class Workers:
             raise ConnectionResetError(0, "the scheduler does not answer any more", self.scheduler) from error
 
     def _connect(self):
-        name = "--scheduler" if self.scheduler else "--workers"
         # In the environment, for the workers of this machine to read when they start.
         os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")
         # The resource tracker warns of what a killed process leaves behind.
@@ -168,9 +167,10 @@ class Workers:
         try:
             return Client(self._cluster or self.scheduler, timeout=_ANSWER, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(
-                f"{name}: no Dask scheduler is reachable at {self.scheduler}; give an address as tcp://HOST:8786."
-            ) from error
+            if self.scheduler is None:
+                raise InputError(f"--workers: the processes did not start: {error}.") from error
+            advice = "give an address as tcp://HOST:8786"
+            raise InputError(f"--scheduler: no Dask scheduler is reachable at {self.scheduler}; {advice}.") from error
 
 
 def dask_setup(_) -> None:

@@ -156,8 +156,10 @@ def calibrate(
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
     sources.check(len(images))
     sources.check_fit(fit)
+    if unknown_names := [name for name in fit if name not in FITTABLE]:
+        raise InputError(f"fit must be some of {', '.join(FITTABLE)}, got {', '.join(unknown_names)}.")
     for number, image in enumerate(images, 1):
-        check_finite(f"capture {number}", image)
+        _check_image(f"capture {number}", image, imager)
     counts = [int((sources.captures == number).sum()) for number in range(len(images))]
     # SciPy's filters release the GIL.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:
@@ -184,6 +186,12 @@ def _drop_unseen_lenses(result: Calibration) -> Calibration:
     array = dataclasses.replace(array, centers=array.centers[seen], **numbers)
     imager = eqx.tree_at(lambda i: i.array, result.imager, array)
     return result._replace(imager=imager, spots=result.spots._replace(lenses=lenses))
+
+
+def _check_image(name: str, image: Image, imager: Imager) -> None:
+    if image.shape != imager.sensor.shape:
+        raise InputError(f"{name} must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    check_finite(name, image)
 
 
 def refine(
@@ -279,7 +287,8 @@ def self_calibrate(
     """
     progress = progress or Progress()
     if other := [name for name in fit if name not in (*SELF_FITTED, "lenses")]:
-        raise InputError(f"--from-scene: only rotation, tilt and lenses can be fitted, got {', '.join(other)}.")
+        raise InputError(f"fit must be some of rotation, tilt and lenses for a scene, got {', '.join(other)}.")
+    _check_image("capture", image, imager)
     depths = np.asarray(grid.depths, np.float64)
     with progress.step("Searching for the rotation"):
         spots = find_spots_mm(image, imager, _ROTATION_SOURCES)

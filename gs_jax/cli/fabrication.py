@@ -36,10 +36,12 @@ def mold_command(design: Path, output: Path, positive: bool, label: bool, layer_
     name are written beside it; the mold is read back and measured.
     """
     from ..design.design import design_text, read_design
+    from ..mold.export import MESH_SUFFIXES
     from ..mold.make import make_mold, report_text
     from ..mold.solids import MoldShape
 
-    beside = (output.with_suffix(suffix) for suffix in (".png", ".json", ".txt"))
+    beside = [check_output(output.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt")]
+    check_output(output, MESH_SUFFIXES)
     check_may_write(output, *beside, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
@@ -67,7 +69,6 @@ def mask_command(design: Path, output: Path):
     .json of the same name has the provenance.
     """
     from ..design.design import design_text, read_design
-    from ..io.files import check_output
     from ..mold.export import MASK_SUFFIXES, make_mask, write_mask
 
     check_output(output, MASK_SUFFIXES)

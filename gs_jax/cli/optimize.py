@@ -91,7 +91,7 @@ def pareto_command(study: Path, out: Path, workers: Workers):
         write_json(numbers, {KEY: provenance} | as_json(front))
         partial_outputs[numbers] = PARTIAL
 
-    with Progress() as progress, workers, errors_name_file(study):
+    with Progress() as progress, workers:
         front = trade_off(parent, question, each=each, progress=progress, workers=workers)
     write_figure(drawing, picture(front))
     table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)

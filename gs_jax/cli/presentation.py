@@ -1,10 +1,11 @@
 """`gs-jax report`, `explore`, `demo` and `benchmark`: pages and figures of designs and methods."""
 
+from importlib import import_module
 from pathlib import Path
 
 import click
 
-from ..base.errors import InputError, errors_name_file
+from ..base.errors import errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
 from .files import check_may_write, provenance_of
@@ -42,9 +43,11 @@ def report_command(design: Path, volume: Path | None, output: Path, camera: Capt
     points, capture, tolerance = files["points"], files["capture"], files["tolerance"]
     inputs = (design, volume, points, capture, tolerance)
     check_output(output, [".html"])
+    with needs_extra("report"):
+        import_module("jinja2")
     check_may_write(output, inputs=(*inputs, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
-        raise InputError(f"{volume}: VOLUME must be .ome.tif or .zarr; points are given by --points.")
+        raise input_error("VOLUME", ".ome.tif or .zarr (points are given by --points)", volume.suffix, volume)
     microscope, results = read_design(design), {}
     if volume:
         results["volume"], results["grid"] = read_volume(volume)

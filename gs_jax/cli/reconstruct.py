@@ -1,12 +1,13 @@
 """`gs-jax reconstruct`: a volume, and points, from a capture or from each frame of a recording."""
 
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ..base.errors import InputError
+from ..base.errors import InputError, needs_extra
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output
@@ -123,6 +124,9 @@ def reconstruct_command(
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
+    if output.suffix.lower() == ".zarr":
+        with needs_extra("zarr"):
+            import_module("zarr")
     if points:
         check_output(points, [".csv"])
     if track:

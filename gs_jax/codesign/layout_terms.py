@@ -50,7 +50,7 @@ def shortage(imager: Imager, at: Conditions) -> Float[Array, ""]:
     plate = finite_plate(imager)
     side = jnp.linspace(-0.5, 0.5, _RASTER, dtype=plate.dtype)
     places = jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * plate[None]
-    depth = jnp.broadcast_to((at.depths[0] + at.depths[-1]) / 2, (len(places), 1))
+    depth = jnp.broadcast_to(at.middle.depths, (len(places), 1))
     return mean_inverse_views(imager, jnp.concatenate([places, depth], 1))
 
 
@@ -100,7 +100,7 @@ def log_error_for_exposure(imager: Imager, at: Conditions, key: PRNGKeyArray) ->
 
 
 def _three(at: Conditions) -> Float[Array, "3"]:
-    return jnp.stack([at.depths[0], (at.depths[0] + at.depths[-1]) / 2, at.depths[-1]])
+    return jnp.concatenate([at.depths[:1], at.middle.depths, at.depths[-1:]])
 
 
 def _voxel_pitch(imager: Imager) -> float:
@@ -130,11 +130,16 @@ def _log_error(imager: Imager, at: Conditions, key: PRNGKeyArray, **light) -> Fl
     return found * jnp.log(jnp.asarray(10.0, found.dtype)) / 20
 
 
+def _inner_plate(imager: Imager) -> Float[Array, "2"]:
+    """Size of the part of the plate a field radius from its edge, or a quarter of the plate where that is larger."""
+    plate = finite_plate(imager)
+    return jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
+
+
 def _points(imager: Imager, at: Conditions, key: PRNGKeyArray, count: int) -> Float[Array, "point 3"]:
     """Random points over the depths and the field, a field radius from the plate's edge where it is that large."""
-    plate = finite_plate(imager)
-    inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
-    middle = jnp.stack([0 * inner[0], 0 * inner[0], (at.depths[0] + at.depths[-1]) / 2])
+    inner = _inner_plate(imager)
+    middle = jnp.stack([0 * inner[0], 0 * inner[0], at.middle.depths[0]])
     size = jnp.stack([inner[0], inner[1], at.depths[-1] - at.depths[0]])
     return middle[None] + size[None] * jax.random.uniform(key, (count, 3), inner.dtype, -0.5, 0.5)
 
@@ -151,7 +156,6 @@ def crowded_precision(imager: Imager, at: Conditions) -> Float[Array, "depth 3"]
 
 def places_of(imager: Imager) -> Float[Array, "place 2"]:
     """Four points that stand for the plate, a field radius from its edge where it is that large, mm."""
-    plate = finite_plate(imager)
-    side = jnp.asarray((np.arange(_PLACES) + 0.5) / _PLACES - 0.5, plate.dtype)
-    inner = jnp.maximum(plate - 2 * imager.field_radius, plate / 4)
+    inner = _inner_plate(imager)
+    side = jnp.asarray((np.arange(_PLACES) + 0.5) / _PLACES - 0.5, inner.dtype)
     return jnp.stack(jnp.meshgrid(side, side), -1).reshape(-1, 2) * inner[None]

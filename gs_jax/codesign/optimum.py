@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -47,7 +48,8 @@ class Free(NamedTuple):
         values = {name: _leaf(imager, name) for name in self.names}
         for name in self.names:
             if (types := _types(imager, name)) is not None:
-                values[name] = values[name][np.unique(types, return_index=True)[1]]
+                # A number that all types share may differ between them in a search.
+                values[name] = jnp.broadcast_to(values[name], len(types))[np.unique(types, return_index=True)[1]]
         return values
 
     def replaced(self, imager: Imager, values: Values) -> Imager:
@@ -220,6 +222,4 @@ def _leaf(imager, name):
 
 def _types(imager, name) -> np.ndarray | None:
     """The type of each lens, where lenses have a number of their own."""
-    if name not in EACH or _leaf(imager, name).ndim == 0:
-        return None
-    return type_of_lens(imager.array)
+    return type_of_lens(imager.array) if name in EACH and not imager.array.alike else None

@@ -82,7 +82,7 @@ def evaluated(
     if "aspheric_terms" in free and not imager.array.aspheric_terms.size:
         imager = eqx.tree_at(lambda i: i.array.aspheric_terms, imager, jnp.zeros(_TERMS, dtype))
     at = Conditions(
-        _depths(jnp.asarray((near + far) / 2, dtype), jnp.asarray(far - near, dtype), depth_count),
+        depths_between(jnp.asarray((near + far) / 2, dtype), jnp.asarray(far - near, dtype), depth_count),
         circle_of_confusion,
         exposure=exposure,
         largest_magnification=_largest_magnification(design, near, far, free),
@@ -92,7 +92,8 @@ def evaluated(
     return imager, at
 
 
-def _depths(middle, span, count):
+def depths_between(middle: Float[Array, ""], span: Float[Array, ""], count: int) -> Float[Array, " depth"]:
+    """Evenly spaced depths about a middle, mm."""
     return middle + span * jnp.linspace(-0.5, 0.5, count, dtype=middle.dtype)
 
 
@@ -156,8 +157,7 @@ def candidate(imager: Imager, at: Conditions, values: Values) -> tuple[Imager, C
         **{name: of_lenses(imager, values[key]) for name, key in zip(EACH, LENS_KEYS, strict=True)},
     }
     array = dataclasses.replace(imager.array, **replaced)
-    middle = (at.depths[0] + at.depths[-1]) / 2
-    depths = _depths(middle, values["depth_span_mm"], at.depths.size)
+    depths = depths_between(at.middle.depths[0], values["depth_span_mm"], at.depths.size)
     imager = dataclasses.replace(imager, array=array, sensor_distance=values["sensor_distance_mm"])
     return imager, dataclasses.replace(at, depths=depths)
 

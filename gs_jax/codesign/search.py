@@ -32,8 +32,6 @@ from .targets import Row
 # Seconds between two checkpoints.
 _EVERY = 10.0
 
-PathLike = PathLike
-
 
 class Outcome(NamedTuple):
     """Result of a search.

@@ -18,7 +18,8 @@ from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import lenses_by_type
 from ..pictures.style import PALETTE
-from .search import Outcome, PathLike
+from ..typing import PathLike
+from .search import Outcome
 from .stages import best_end
 from .study import TermTable, labels
 from .targets import SIGNS, Row

@@ -1,5 +1,6 @@
 """What a design promises, Eqs. 1-11 over its working distance, as numbers and as tables."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -33,7 +34,11 @@ def parts_of(
     imager = design.imager()
     cells = voronoi_cells(np.array(design.array.centers_mm), design.array.size_mm) if imager.array.alike else None
     at = Conditions(depths, circle_of_confusion_of(design, circle_of_confusion), cells=cells)
-    return per_type(imager, at)
+    # Computed once for the ten quantities that follow from it.
+    return [
+        (one, dataclasses.replace(own, clear_diameter=objectives.clear_diameter(one, own)))
+        for one, own in per_type(imager, at)
+    ]
 
 
 def datasheet(

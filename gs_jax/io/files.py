@@ -44,7 +44,7 @@ def check_input(path: PathLike) -> Path:
                 return Path(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {_reason(error)}.") from error
-    raise input_error(str(path), "a file", "a folder" if stat.S_ISDIR(mode) else "not a regular file")
+    raise input_error("input", "a file", "a folder" if stat.S_ISDIR(mode) else "a device or a pipe", path)
 
 
 def read_text(path: PathLike, most: int = MAX_TEXT_BYTES) -> str:

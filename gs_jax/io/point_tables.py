@@ -288,7 +288,7 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
             return Columns(plain[:, at], names, {})
     further = {name: header.index(name) for name in also if header and name in header}
     if twice := next((name for name in further if (header or []).count(name) > 1), None):
-        raise input_error("header", f"with one column {short_repr(twice)}", "several", path)
+        raise input_error(f"column {short_repr(twice)}", "in the header once", "several", path)
     called, places = [*(names or "xy"), *further], [*at, *further.values()]
     rows = []
     for number, line in body:
@@ -339,10 +339,9 @@ def _find_columns(path: Path, header: list[str] | None, count: int, wanted: Sequ
             raise InputError(f"{path}: no header, which must name {' and '.join(map(repr, wanted))}.")
         plain, asked = (["".join(name.split()) for name in names] for names in (header, wanted))
         for name, bare in zip(wanted, asked, strict=True):
-            if plain.count(bare) != 1:
-                raise input_error(
-                    f"column {short_repr(name)}", f"one of {', '.join(map(repr, header)):.200}", "none or several", path
-                )
+            if (count := plain.count(bare)) != 1:
+                once = f"in the header once ({', '.join(map(repr, header)):.200})"
+                raise input_error(f"column {short_repr(name)}", once, f"it {count} times", path)
         return plain.index(asked[0]), plain.index(asked[1])
     found = [[i for i, name in enumerate(header or ()) if _is_called(name, pattern)] for pattern in _NAMES]
     if len(found[0]) == len(found[1]) == 1:
@@ -350,7 +349,7 @@ def _find_columns(path: Path, header: list[str] | None, count: int, wanted: Sequ
     if count == 2:
         return 0, 1
     given = f"{count} columns" + (f": {', '.join(map(repr, header)):.160}" if header else " without a header")
-    raise input_error("table", "two columns, or have names of x and y (`centers_columns`)", given, path)
+    raise input_error("columns", "two, or named x and y (`centers_columns`)", given, path)
 
 
 def _is_called(name: str, pattern: re.Pattern) -> bool:

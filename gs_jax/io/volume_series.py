@@ -136,11 +136,11 @@ class VolumeSeries:
     def _resume(self) -> None:
         head = _read_head(self.path)
         if head is None:
-            raise input_error("--resume", "with what an interrupted recording left", "another store", self.path)
+            raise input_error("store for --resume", "what an interrupted recording left", "another store", self.path)
         now, before = ({**request, "frames": str(count)} for request, count in ((self.request, self.count), head))
         for key in dict.fromkeys([*now, *before]):
             if before.get(key) != now.get(key):
-                given, allowed = (short_repr(each.get(key, "nothing")) for each in (now, before))
+                given, allowed = (short_repr(each[key]) if key in each else "none" for each in (now, before))
                 raise input_error(f"{key} with --resume", f"{allowed}, as before", given, self.path)
         journal = self.path / JOURNAL
         with open(journal, "rb") as file:

@@ -270,8 +270,10 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
     with needs_extra("zarr"):
         import zarr
 
+    if not os.path.exists(path):
+        raise InputError(f"{path}: cannot be read: no such folder.")
     if not os.path.isdir(path):
-        raise input_error("volume", "a Zarr folder", "a file" if os.path.exists(path) else "nothing", path)
+        raise input_error("volume", "a Zarr folder", "a file", path)
     with decoding(path, "OME-Zarr"):
         group = zarr.open_group(path, mode="r")
         attributes = group.attrs.asdict()

@@ -9,6 +9,7 @@ import json
 import math
 import zipfile
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -126,6 +127,13 @@ _3MF_RELATIONS = (
 MESH_SUFFIXES = (".stl", ".3mf")
 
 
+def check_mesh_reader(path: Path) -> None:
+    """`InputError` if what reads a mesh file of this suffix is not installed."""
+    if path.suffix.lower() == ".3mf":
+        with needs_extra("mold"):
+            import_module("lxml.etree")
+
+
 def read_mesh(path: PathLike) -> Mesh:
     """Reads an STL or 3MF file, in mm, and merges equal vertices.
 
@@ -139,9 +147,9 @@ def read_mesh(path: PathLike) -> Mesh:
         raise InputError(f"{path}: the suffix must be one of {', '.join(MESH_SUFFIXES)}, got {path.suffix!r}.")
     if path.stat().st_size > MAX_MESH_BYTES:
         raise InputError(f"{path}: must have at most {MAX_MESH_BYTES} bytes, got {path.stat().st_size}.")
+    check_mesh_reader(path)
     with decoding(path, "STL or 3MF file"):
-        with needs_extra("mold"):  # lxml, of 3MF
-            scene = trimesh.load_scene(path, process=False)
+        scene = trimesh.load_scene(path, process=False)
         loaded = scene.to_mesh()
         if scene.units not in (None, "mm", "millimeter", "millimeters"):
             loaded.units = scene.units

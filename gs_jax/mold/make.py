@@ -19,7 +19,7 @@ from ..io.files import atomic_write, check_output, write_figure, write_json, wri
 from ..io.provenance import KEY, Provenance
 from ..lenses import MicrolensArray
 from ..typing import PathLike
-from .export import MESH_SUFFIXES, float32_mesh, read_mesh, write_mesh
+from .export import MESH_SUFFIXES, check_mesh_reader, float32_mesh, read_mesh, write_mesh
 from .lenslets import lenslets_of, part_centers, surface_height
 from .manufacturability import CheckResult, check_design, check_solid, raise_first_error
 from .measurement import measure_lenslets, summarize
@@ -102,6 +102,7 @@ def make_mold(
     """
     progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)
+    check_mesh_reader(path)
     picture, record, text = (check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt"))
     source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
     design = design if isinstance(design, Design) else read_design(design)

@@ -59,7 +59,7 @@ class Conditions(eqx.Module):
     largest_magnification: float = eqx.field(static=True, default=math.inf)
     directions: int = eqx.field(static=True, default=512)
     cells: VoronoiCells | None = None
-    clear_diameter: Float[Array, ""] | None = None
+    clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
 
     def __check_init__(self):
@@ -78,13 +78,16 @@ Depths = Conditions | Float[ArrayLike, " depth"] | Sequence[float]
 
 def as_conditions(imager: Imager, depths: Depths) -> Conditions:
     """Depths as `Conditions`, in the imager's precision."""
-    if isinstance(depths, Conditions):
+    dtype = imager.sensor_distance.dtype
+    if not isinstance(depths, Conditions):
+        return Conditions(jnp.asarray(depths, dtype))
+    if depths.depths.dtype == dtype:
         return depths
-    return Conditions(jnp.asarray(depths, imager.sensor_distance.dtype))
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, depths)
 
 
 def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
-    """The lenses of each type alone, and their conditions with the clear diameter; one pair if all are alike."""
+    """The lenses of each type alone, and their conditions, with the clear diameter where there are several types."""
     at = as_conditions(imager, depths)
     if imager.array.alike:
         return [(imager, at)]

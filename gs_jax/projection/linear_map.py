@@ -58,7 +58,9 @@ class LinearMap:
     @property
     def T(self) -> "LinearMap":
         """The transpose."""
-        vjp = self.constants_vjp and _Swapped(self.constants_vjp)
+        vjp = self.constants_vjp
+        # A transpose of a transpose equals the map, whose compiled programs serve it.
+        vjp = vjp.constants_vjp if isinstance(vjp, _Swapped) else vjp and _Swapped(vjp)
         return LinearMap(self.transpose, self.function, vjp, (self.kernels[1], self.kernels[0]))
 
 
@@ -201,7 +203,7 @@ def cpu_kernel(name: str) -> Callable | None:
 
 @cache
 def _load(name):
-    if find_spec("numba") is None:  # there is none for the newest Python
+    if find_spec("numba") is None or find_spec(f"{__package__}.cpu") is None:
         return None
     try:
         from .cpu import dispatch

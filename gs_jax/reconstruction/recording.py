@@ -11,8 +11,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
 
-import numpy as np
-
+from ..base.arrays import check_finite
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
@@ -64,7 +63,7 @@ def reconstruct_frames(
         try:
             for frame, image in _read_ahead(reader, frames, read):
                 try:
-                    volume, note = _check_finite(*make(image.result()))
+                    volume, note = _check_volume(*make(image.result()))
                     job = partial(series.write, frame, volume, note)
                 except InputError as error:
                     job = partial(series.fail, frame, str(error))
@@ -132,7 +131,7 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
         frame, exists = item
         with lock:
             image = read(frame)
-        volume, note = _check_finite(*make(image))
+        volume, note = _check_volume(*make(image))
         if not exists:
             return volume, note
         write_frame(path, levels(), frame, volume)
@@ -141,9 +140,8 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
     return make_frame
 
 
-def _check_finite(volume, note):
-    if not np.isfinite(volume).all():
-        raise InputError("the volume must be finite, got a NaN or an infinity.")
+def _check_volume(volume, note):
+    check_finite("volume", volume, "voxels")
     return volume, note
 
 

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from ... import objectives
 from ...base.errors import InputError
-from ...codesign.parameters import candidate, evaluated, start_values
+from ...codesign.parameters import candidate, depths_between, evaluated, start_values
 from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
@@ -116,7 +116,7 @@ def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
     return complete
 
 
-def live_terms(start: Start, study: Study | None) -> tuple[str, ...]:
+def live_terms(study: Study | None) -> tuple[str, ...]:
     """Names of the study's terms that are evaluated at each move.
 
     Random terms are left out, and `lens_shortage`, which needs the field radius when it is compiled.
@@ -182,7 +182,7 @@ def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
 
 
 def _numbers_of_type(imager: Imager, at: Conditions) -> dict[str, Array]:
-    axis = aberrations.linear_rms(third_order_wavefront(imager, at, jnp.zeros(1)))[:, 0]
+    axis = aberrations.linear_rms(third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype)))[:, 0]
     return {
         "lateral_resolution_um": 1000 * objectives.lateral_resolution(imager, at),
         "axial_resolution_um": 1000 * objectives.axial_resolution(imager, at),
@@ -200,8 +200,7 @@ def _moved(start: Start, values: Mapping[str, Any]) -> tuple[Imager, Conditions]
     # A slider is the first type's number.
     own |= {name: values[name] * (first[name] / first[name].ravel()[0]) for name in _LENS_KEYS if name in values}
     imager, at = candidate(*start, own)
-    shares = jnp.linspace(-0.5, 0.5, at.depths.size, dtype=at.depths.dtype)
-    depths = (near + far) / 2 + (far - near) * shares
+    depths = depths_between((near + far) / 2, far - near, at.depths.size)
     return imager, dataclasses.replace(at, depths=depths, field_radius=values["field_radius_mm"])
 
 

@@ -74,13 +74,12 @@ class Session:
     """
 
     def __init__(self, design: Design, study: Study | None, path: Path, provenance: dict[str, str]):
-        self.design, self.study, self.path, self.provenance = design, study, path, provenance
-        self.start, self.sliders = start_of(design, study), make_sliders(design)
-        self.terms = live_terms(self.start, study)
-        self.kept: list[tuple[str, Values, Evaluation]] = []
         with needs_extra("report"):
             import jinja2
-
+        self.design, self.study, self.path, self.provenance = design, study, path, provenance
+        self.start, self.sliders = start_of(design, study), make_sliders(design)
+        self.terms = live_terms(study)
+        self.kept: list[tuple[str, Values, Evaluation]] = []
         environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
         environment.filters["number"] = lambda value: f"{value:.4g}" if np.isfinite(value) else "-"
         text = (resources.files("gs_jax") / "apps" / "explore" / "parts.html").read_text("utf-8")

@@ -168,14 +168,15 @@ def count_lenses(imager: Imager, depth: float) -> LensCounts:
     x = box[0] + (np.arange(columns) + 0.5) * (box[2] - box[0]) / columns
     y = box[1] + (np.arange(rows) + 0.5) * (box[3] - box[1]) / rows
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    centers, count = np.asarray(imager.centers, float), np.empty(len(points), int)
+    count = np.empty(len(points), int)
     for start in range(0, len(points), _BATCH):
         # The last batch is padded, so that one size is compiled.
         batch = points[np.minimum(np.arange(start, start + _BATCH), len(points) - 1)]
-        landing = np.asarray(imager.project(np.column_stack([batch, np.full(len(batch), depth)])), float)
+        views = imager.views_of_all(np.column_stack([batch, np.full(len(batch), depth)]))
+        landing, offset = np.asarray(views.spot, float), np.asarray(views.offset, float)
         seen = (landing[..., 0] >= x_left) & (landing[..., 0] <= x_right)
         seen &= (landing[..., 1] >= y_top) & (landing[..., 1] <= y_bottom)
-        seen &= ((centers[:, None] - batch[None]) ** 2).sum(-1) <= imager.field_radius**2
+        seen &= (offset**2).sum(-1) <= imager.field_radius**2
         count[start : start + _BATCH] = seen.sum(0)[: len(points) - start]
     over_plate = (np.abs(points) <= (half_x, half_y)).all(1)
     return LensCounts(count.reshape(rows, columns), box, float(count[over_plate].mean()))

@@ -126,13 +126,17 @@ def without_tolerance(deviations: Errors, name: str) -> Errors:
 
 def perturb(imager: Imager, errors: Errors) -> Imager:
     """The imager of a device with errors."""
-    array = dataclasses.replace(
-        imager.array,
-        centers=imager.array.centers + errors.centers,
-        radius_of_curvature=imager.array.radius_of_curvature * (1 + errors.radius),
-        conic_constant=imager.array.conic_constant + errors.conic,
-        refractive_index=imager.array.refractive_index + errors.index,
-    )
+
+    def printed(array: MicrolensArray) -> MicrolensArray:
+        return dataclasses.replace(
+            array,
+            radius_of_curvature=array.radius_of_curvature * (1 + errors.radius),
+            conic_constant=array.conic_constant + errors.conic,
+            refractive_index=array.refractive_index + errors.index,
+            others=None if array.others is None else printed(array.others),
+        )
+
+    array = dataclasses.replace(printed(imager.array), centers=imager.array.centers + errors.centers)
     tilt = errors.tilt if imager.tilt is None else imager.tilt + errors.tilt
     distance = imager.sensor_distance + errors.sensor_distance
     return dataclasses.replace(imager, array=array, sensor_distance=distance, tilt=tilt)

@@ -36,8 +36,6 @@ from .tolerance_spec import ToleranceSpec
 
 # Default number of depths; devices per compiled call, and those whose rays are in memory at once.
 _DEPTHS, _BATCH, _AT_ONCE = 5, 64, 8
-# Directions in which lenses that differ are cut off by their neighbours: gives the mean clear aperture to 1e-3.
-_EDGES = 64
 # Default limits, relative to the design: spot width, and Strehl ratio where that is at least so large.
 MAX_WIDTH, MIN_STREHL, LEAST_STREHL = 1.2, 0.8, 0.1
 
@@ -115,8 +113,7 @@ def make_problem(
 ) -> Problem:
     """The problem of a design at some depths, mm."""
     # Each device has clear apertures of its own.
-    changes = {"directions": _EDGES, "clear_diameter": None}
-    parts = tuple((one, dataclasses.replace(at, **changes)) for one, at in parts_of(design, depths))
+    parts = tuple((one, dataclasses.replace(at, clear_diameter=None)) for one, at in parts_of(design, depths))
     return Problem(parts, depth_arguments(design.imager(), depths, sources), jnp.asarray(pixel))
 
 
