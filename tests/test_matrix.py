@@ -56,6 +56,13 @@ def turned_round() -> Design:
     return cropped("geomscope", lens=lens, imaging={"sensor_distance_mm": 5.3})
 
 
+def combined() -> Design:
+    """The curved side in front, two lens types, and a tilt at once."""
+    lens = {"aperture_diameter_mm": 1.2, "orientation": "curved", "radius_of_curvature_mm": [2.0, 2.04] * (LENSES // 2)}
+    tilt = {"tilt_deg": (0.6, -0.4)}
+    return cropped("geomscope", lens=lens, imaging={"sensor_distance_mm": 5.3}, calibration=tilt)
+
+
 def mirrored() -> Design:
     design = cropped("geomscope")
     centers = [(-x, y) for x, y in design.array.centers_mm]
@@ -68,6 +75,7 @@ DEVICES: dict[str, Callable[[], Design]] = {
     "conic": lambda: cropped("geomscope", lens={"conic_constant": -0.6}),
     "aspheric": lambda: cropped("geomscope", lens={"conic_constant": -0.5, "aspheric_terms": [-1e-3, 2e-4]}),
     "two radii": with_two_radii,
+    "curved, tilted, two radii": combined,
     "tilted": lambda: cropped("geomscope", calibration={"tilt_deg": (1.0, -0.6)}),
     "turned": lambda: cropped("geomscope", calibration={"rotation_deg": 31.0, "shift_mm": (0.1, -0.2)}),
     "mirrored": mirrored,
