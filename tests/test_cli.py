@@ -104,6 +104,18 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
     assert volume.sum() == pytest.approx(found[3], rel=1e-5)
 
 
+@pytest.mark.integration
+@pytest.mark.parametrize("how", [("--method", "list-rl"), ("--method", "richardson-lucy"), ("--suppress", "unet")])
+def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
+    tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
+    # Quiet: a busy machine would show its progress.
+    command = (*RECONSTRUCT[:4], "18:22:1", "--voxel-um", "50", "--steps", "2", *how, "-o", "v.tif", "-q")
+    status, out, err = run(monkeypatch, capsys, *command)
+    assert (status, err) == (0, "") and out.startswith("v.tif: 5 x 39 x 33 voxels")
+    volume, _ = read_volume(folder / "v.tif")
+    assert np.isfinite(volume).all() and volume.min() >= 0
+
+
 def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
     """The default voxel is a pixel as seen at the middle depth."""
     status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")

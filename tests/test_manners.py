@@ -66,6 +66,11 @@ def test_help_imports_nothing_heavy():
         assert command and command.help and command.get_short_help_str(200).endswith(".")
 
 
+def test_without_arguments_it_shows_its_help(monkeypatch, capsys):
+    status, out, _ = run(monkeypatch, capsys)
+    assert status == 0 and out.startswith("Usage: gs-jax") and "reconstruct" in out
+
+
 @pytest.mark.integration
 def test_reconstruct_by_default_needs_no_scipy(folder):
     """Its imports took as long as the back-projection of a full sensor."""
@@ -164,6 +169,14 @@ def test_a_full_disk_is_one_line_and_status_1(small_disk, monkeypatch, capsys, n
     path = small_disk / name
     monkeypatch.setattr(commands, "main", lambda **_: WRITERS[name](path))
     status, _, err = run(monkeypatch, capsys)
+    assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
+    assert list(small_disk.iterdir()) == []
+
+
+@pytest.mark.integration
+def test_a_command_on_a_full_disk_leaves_nothing(small_disk, folder, monkeypatch, capsys):
+    path = small_disk / "v.ome.tif"
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", path)
     assert status == 1 and err.startswith(f"gs-jax: {path}: ") and err.count("\n") == 1
     assert list(small_disk.iterdir()) == []
 
@@ -335,6 +348,7 @@ def test_the_camera_of_simulate_is_free(folder, monkeypatch, capsys):
         ("zarr", "zarr", (*RECONSTRUCT, "-o", "out.zarr")),
         ("jinja2", "report", ("report", "design.toml", "-o", "out.html")),
         ("ezdxf", "mold", ("mask", "design.toml", "-o", "out.dxf")),
+        ("lxml", "mold", ("mold", "design.toml", "-o", "out.3mf")),
     ],
 )
 def test_a_missing_extra_is_named_and_nothing_is_written(module, extra, arguments, folder, monkeypatch, capsys):
@@ -342,5 +356,5 @@ def test_a_missing_extra_is_named_and_nothing_is_written(module, extra, argument
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, module, None)
     status, _, err = run(monkeypatch, capsys, *arguments)
-    assert status == 2 and f"gs-jax[{extra}]" in err and err.count("\n") == 1
+    assert status == 2 and err.endswith(f"gs-jax[{extra}]'.\n") and err.count("\n") == 1
     assert not list(Path().glob("out.*"))
