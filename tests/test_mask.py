@@ -16,12 +16,14 @@ from gs_jax.mold.export import make_mask, write_mask
 from gs_jax.mold.solids import MoldShape, alignment_marks, mold_bounds
 
 DESIGNS = Path(__file__).parents[1] / "design"
-# One alone, two that overlap, one across the edge of the plate.
+# One alone, two that overlap, one across the edge of the plate; of three sizes.
 ARRAY = MicrolensArray(
-    [[-2.0, 1.0], [1.0, 0.0], [1.6, 0.0], [0.0, -3.0]], 2.0, 1.43, [0.8, 1, 1, 1], 1.0, size=(6.0, 6.0)
+    [[-2.0, 1.0], [1.0, 0.0], [1.6, 0.0], [0.0, -3.0]], 2.0, 1.43, [0.8, 1.4, 1, 1], 1.0, size=(6.0, 6.0)
 )
-# Of two discs as far apart as 0.6 of their diameter: twice a disc less the lens that they share.
-PAIR = 2 * math.pi / 4 - (2 * 0.25 * math.acos(0.6) - 0.3 * math.sqrt(1 - 0.36))
+# Of two discs of radii 0.7 and 0.5, 0.6 apart: both less the lens that they share, of two segments on a chord.
+CHORD_AT = (0.6**2 + 0.7**2 - 0.5**2) / (2 * 0.6)
+SEGMENTS = [r**2 * math.acos(h / r) - h * math.sqrt(r**2 - h**2) for r, h in ((0.7, CHORD_AT), (0.5, 0.6 - CHORD_AT))]
+PAIR = math.pi * (0.7**2 + 0.5**2) - sum(SEGMENTS)
 
 
 def area(ring) -> float:

@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 from gs_jax import MicrolensArray
 from gs_jax.design.design import read_design
 from gs_jax.mold.export import float32_mesh
-from gs_jax.mold.lenslets import lenslet_height
+from gs_jax.mold.lenslets import lenslet_height, lenslets_of, surface_height
 from gs_jax.mold.manufacturability import check_solid
 from gs_jax.mold.measurement import measure_lenslets
 from gs_jax.mold.solids import (
@@ -89,15 +89,50 @@ def test_the_caps_volume_agrees_with_a_sum_over_directions():
     inner = (8 - (4 - edge**2) ** 1.5) / 3 - base * edge**2 / 2
     # A midpoint rule on a function with kinks: 1 / count^2.
     np.testing.assert_allclose(lenslets_volume(array), inner.sum() * 2 * math.pi / 20_000, rtol=1e-7)
+    x, y = ((np.arange(1000) + 0.5) / 1000 * side - side / 2 for side in array.size)
+    height, _ = surface_height(lenslets_of(array), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    # Rims and grooves are kinks, not steps: a midpoint rule on a million points.
+    np.testing.assert_allclose(lenslets_volume(array), height.mean() * 20.0, rtol=1e-5)
+
+
+def lens_facets(array):
+    """Corners `(facet, corner, 3)` of the facets that are not the plano face's or the sides'; doubled areas from above.
+
+    Heights are those over the base, lenses up.
+    """
+    mesh = float32_mesh(array_solid(array, CHORD))
+    corners = mesh.vertices[mesh.facets].astype(float)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    down = normal[:, 2] < -1e-5 * np.linalg.norm(normal, axis=1)
+    return corners[down] * (1, 1, -1) - (0, 0, plate_thickness(array)), -normal[down, 2]
 
 
 def test_facets_of_lenses_face_outward_and_cover_the_plate():
-    mesh = float32_mesh(array_solid(random_lenses(), CHORD))
-    corners = mesh.vertices[mesh.facets].astype(float)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    down = normal[normal[:, 2] < -1e-5 * np.linalg.norm(normal, axis=1), 2]
+    _, doubled = lens_facets(random_lenses())
     # float32, ten thousand facets; none of them is overlapped by another.
-    np.testing.assert_allclose(-down.sum() / 2, 20.0, rtol=1e-6)
+    np.testing.assert_allclose(doubled.sum() / 2, 20.0, rtol=1e-6)
+
+
+def test_facets_are_within_the_chord_error():
+    """Of whichever lens they are nearest to, to first order."""
+    array = random_lenses()
+    corners, _ = lens_facets(array)
+    points = np.einsum("qk,fkx->fqx", np.random.default_rng(1).dirichlet([1, 1, 1], 40), corners).reshape(-1, 3)
+    flat = np.repeat((corners[..., 2] < 1e-6).all(axis=1), 40)
+    distances = []
+    for lens in lenslets_of(array):
+        squared = ((points[~flat, :2] - lens.center) ** 2).sum(axis=1)
+        # The edge's corners are a little outside its circle.
+        here = squared <= (lens.semi_aperture + CHORD) ** 2
+        squared = np.where(here, squared, 0)
+        off = points[~flat, 2] - lenslet_height(array) + lens.sag(squared)
+        distances.append(np.where(here, off / np.sqrt(1 + squared * lens.sag_slope_over_r(squared) ** 2), np.inf))
+    distance = np.take_along_axis(np.array(distances), np.abs(distances).argmin(axis=0)[None], axis=0)
+    assert -CHORD < distance.min() and distance.max() < CHORD
+    # The lift makes the mean zero up to the rims, which stay in the plate's plane.
+    assert abs(distance.mean()) < CHORD / 10
+    # float32: the plate is flat.
+    assert np.abs(points[flat, 2]).max() < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -187,7 +222,7 @@ def test_two_thousand_lenses():
             eqx.tree_at(lambda array: array.centers, lenses([[0, 0]], (3.0, 3.0)), np.array([[0, math.nan]])),
             "`centers` must be finite",
         ),
-        (lenses([[2, 0], [0, 0]], (3.0, 3.0)), "1 outside"),
+        (lenses([[2, 0], [0, 0]], (3.0, 3.0)), "on a plate of 3 x 3 mm, got 1 outside"),
         (lenses([[0, 0]], (math.inf, math.inf)), "two positive lengths"),
     ],
 )
