@@ -1,3 +1,5 @@
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -6,6 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax.geometry import envelope
 
 from .helpers import backproject_loop, needs, scene
 
@@ -64,6 +67,32 @@ def test_adjoint(size, method, dtype, tolerance):
     np.testing.assert_allclose(back, forth, rtol=tolerance)
 
 
+@pytest.mark.integration
+def test_adjoint_is_the_transpose_of_a_plain_jax_version():
+    """Pixel by pixel; dense and slow, through `project`: what JAX derives by itself."""
+    imager, grid = scene(**GRIDS["coarse"])
+
+    def plain(image):
+        z, y, x = jnp.meshgrid(grid.depths, grid.y, grid.x, indexing="ij")
+
+        def voxel(point):
+            u, v = imager.sensor.to_pixels(imager.project(point[None])[:, 0]).T
+            distance2 = jnp.sum((imager.centers - point[:2]) ** 2, axis=1)
+            weight = envelope(distance2, imager.reduced_depth(point[2]), imager.field_radius)
+            inside = (u >= 0) & (u <= image.shape[0] - 1) & (v >= 0) & (v <= image.shape[1] - 1)
+            values = jax.scipy.ndimage.map_coordinates(image, [u, v], order=1)
+            return jnp.sum(jnp.where(inside, weight * values, 0))
+
+        return jax.vmap(voxel)(jnp.stack([x, y, z], -1).reshape(-1, 3)).reshape(grid.volume_shape)
+
+    volume, image = volume_of(grid), image_of(imager.sensor)
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        (expected,) = jax.linear_transpose(plain, image)(volume)
+        forth = plain(image)
+    np.testing.assert_allclose(backproject_adjoint(volume, imager, grid), expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(backproject(image, imager, grid), forth, rtol=1e-10, atol=1e-12)
+
+
 def test_adjoint_over_several_blocks_and_the_sensors_edge():
     """Sub-images wider than a block, that end off the sensor."""
     imager = Imager(MicrolensArray([[0.0, 0.0], [1.4, -1.2], [-3.0, 0.5]]), Sensor((700, 500), 0.0045), 5.8, 3.0)
@@ -118,12 +147,29 @@ def test_gradients_stay_finite_in_the_dark_and_where_nothing_is_seen(normalize):
 
 
 @pytest.mark.integration
-def test_vmap_over_imagers():
+def test_vmap_over_images_and_over_imagers():
     imager, grid = scene()
-    image, distances = image_of(imager.sensor), jnp.array([5.0, 5.8])
+    images = jnp.stack([image_of(imager.sensor, key=k) for k in range(3)])
+    batch = jax.vmap(lambda image: backproject(image, imager, grid))(images)
+    np.testing.assert_allclose(batch[2], backproject(images[2], imager, grid), rtol=1e-13)
+    image, distances = images[0], jnp.array([5.0, 5.8])
     moved = lambda v: eqx.tree_at(lambda i: i.sensor_distance, imager, v)
     slope = jax.grad(lambda v: jnp.sum(backproject(image, moved(v), grid) ** 2))
     np.testing.assert_allclose(jax.vmap(slope)(distances)[1], slope(distances[1]), rtol=1e-12)
+
+
+def test_a_changed_distance_does_not_recompile():
+    imager, grid = scene()
+    traces = []
+
+    @jax.jit
+    def run(image, imager):
+        traces.append(imager)
+        return backproject(image, imager, grid)
+
+    for distance in (5.8, 5.1):
+        run(image_of(imager.sensor), dataclasses.replace(imager, sensor_distance=distance))
+    assert len(traces) == 1
 
 
 @pytest.mark.integration
