@@ -1,4 +1,6 @@
 import math
+import os
+import time
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +44,17 @@ def test_poisson_has_its_distribution(mean, dtype):
     sample = jax.jit(poisson)(KEY, jnp.full(1_000_000, mean, dtype))
     assert sample.dtype == dtype and (sample == jnp.floor(sample)).all()
     assert chi_square_p(sample, mean) > 1e-4
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("mean", [0.5, 15.9, 16.1, 1e6])
+def test_poisson_mean_and_variance(mean, dtype):
+    n = 1_000_000
+    sample = np.asarray(poisson(KEY, jnp.full(n, mean, dtype)), float)
+    # Five standard deviations; the variance of a variance is (3 m^2 + m - m^2) / n.
+    assert abs(sample.mean() - mean) < 5 * math.sqrt(mean / n)
+    assert abs(sample.var() - mean) < 5 * math.sqrt((2 * mean**2 + mean) / n)
 
 
 @pytest.mark.parametrize("mean", [16.0, 20.0, 100.0, 1e4])
@@ -195,6 +208,19 @@ def test_memory_is_image_and_counts_and_a_small_constant():
     assert plan is not None
     assert plan.output_size_in_bytes == 2 * 5120**2
     assert plan.temp_size_in_bytes < 60 * 2**20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0", reason="compiled without optimisations")
+def test_it_is_fast_enough():
+    """A full sensor in under 3 s on two cores of 2.5 GHz or so, compiled; twice as long allowed to a busy machine."""
+    image = jnp.asarray(np.random.default_rng(0).random((5120, 5120), dtype=np.float32))
+    times = []
+    for k in range(3):
+        start = time.perf_counter()
+        expose(image, Camera(), jax.random.key(k), peak_electrons=1e4).block_until_ready()
+        times.append(time.perf_counter() - start)
+    assert min(times) < 6
 
 
 @pytest.mark.parametrize(
