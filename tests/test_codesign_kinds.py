@@ -15,7 +15,7 @@ from gs_jax.codesign.parameters import candidate, evaluated, new_design, start_v
 from gs_jax.codesign.search import initial_design, run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.study import Study
-from gs_jax.codesign.terms import TERMS
+from gs_jax.codesign.terms import _OURS, TERMS
 from gs_jax.design.builtin import geomscope
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
@@ -127,12 +127,21 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
     def terms(parent, values):
         found = candidate(*parent, values=values)
         call = lambda term: term.function(*found, key) if term.random else term.function(*found)
-        return {name: call(TERMS[name]) for name in TERMS}
+        return {name: call(term) for name, term in _OURS.items()}
 
     single, several = terms(one, {}), terms(two, alike)
-    for name in TERMS:
+    for name in _OURS:
         expected = np.broadcast_to(single[name], several[name].shape)
         np.testing.assert_allclose(several[name], expected, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["scene_error", "localization_um", "reconstruction_error"])
+def test_simulated_terms_of_kinds_that_differ_are_finite(name):
+    _, parent = two_kinds()
+    values = {"conic_constant": jnp.array([-0.7, -0.5]), "aperture_diameter_mm": jnp.array([0.8, 0.6])}
+    value = jax.jit(_OURS[name].function)(*candidate(*parent, values=values), jax.random.key(0))
+    assert np.isfinite(value).all()
 
 
 @pytest.mark.integration
