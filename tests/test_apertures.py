@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from jax.test_util import check_grads
+from scipy.spatial.distance import cdist
 
 from gs_jax import MicrolensArray
 from gs_jax.layouts import coverage, nearest_neighbour_distances
@@ -40,6 +41,19 @@ def test_areas_add_up_to_the_exact_coverage(count, seed, diameter):
     total = float(aperture_area(lenses)[:count].sum())
     # Qhull joins vertices closer than 1e-8 or so.
     np.testing.assert_allclose(total / 48, coverage(centers[:count], (8.0, 6.0), diameter=diameter), rtol=1e-7)
+
+
+def test_the_edge_is_where_points_change_hands():
+    """From a lens to another, or to none: by distances alone."""
+    lenses, angles = array(layout(32)), np.linspace(0, 2 * np.pi, 73)[:-1]
+    edges = aperture_edge(lenses, angles)[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    for factor, inside in [(1 - 1e-9, True), (1 + 1e-9, False)]:
+        points = (np.asarray(lenses.centers)[:, None] + factor * edges).reshape(-1, 2)
+        distances = cdist(points, lenses.centers)
+        outside = distances.min(axis=1) > float(lenses.aperture_diameter) / 2
+        outside |= (np.abs(points) > np.array(lenses.size) / 2).any(axis=1)
+        owner = np.where(outside, -1, distances.argmin(axis=1)).reshape(32, -1)
+        assert np.all((owner == np.arange(32)[:, None]) == inside)
 
 
 def test_area_is_the_integral_of_the_edge():
