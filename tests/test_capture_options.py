@@ -103,6 +103,12 @@ def test_a_hot_pixel_is_repaired_unless_it_is_not_wanted(folder):
     assert volume.max() > 1000 and "bad pixel" not in result.stdout
 
 
+def test_a_cameras_offset(folder):
+    volume, _, result = reconstruct("capture.tif", "--offset", "100")
+    assert "capture.tif: offset 100 taken off" in result.stdout
+    assert volume.max() < reconstruct("capture.tif")[0].max()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -209,6 +209,7 @@ def test_gradients_by_everything_that_is_continuous():
         named = [getattr(objectives, name) for name in BY_DEPTH]
         wavefront = third_order_wavefront(imager, at, jnp.array([0.0, 0.1]))
         values = [jnp.log(objectives.lateral_resolution(imager, at)), linear_rms(wavefront), pitch(centers)]
+        values += [imager.magnification(depths), imager.scale(depths)]
         return [function(imager, at) for function in named], objectives.depth_of_field(imager, at.middle), values
 
     one = jnp.array

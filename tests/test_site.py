@@ -60,18 +60,28 @@ def test_links_exist(path):
         assert (path.parent / link).exists(), link
 
 
+# Commands that a page must show, among others.
+SHOWN = {
+    "design/LAB.md": {"new-design", "calibrate", "reconstruct", "metrics", "simulate", "info"},
+    "design/CLUSTER.md": {"reconstruct", "optimize", "pareto", "train"},
+}
+
+
 @pytest.mark.parametrize("path", PAGES, ids=relative)
 def test_commands_exist_with_their_options(path):
+    shown = set()
     lines = [line.strip() for block in blocks(path) for line in block.replace("\\\n", " ").splitlines()]
     for line in lines:
         if not line.startswith("gs-jax "):
             continue
         _, name, *rest = shlex.split(line, comments=True)
         assert name in COMMANDS, line
+        shown.add(name)
         command = commands.get_command(click.Context(commands), name)
         assert command is not None
         options = {option for param in command.params for option in param.opts} | {"--help"}
         assert {word for word in rest if word.startswith("-")} <= options, line
+    assert shown >= SHOWN.get(relative(path), set())
 
 
 @pytest.mark.parametrize("path", PAGES, ids=relative)
