@@ -34,6 +34,10 @@ class InputError(ValueError):
         super().__init__(_CONTROLS.sub(" ", message).strip())
 
 
+class MissingExtraError(InputError):
+    """An optional dependency that is not installed, for which no file is to blame."""
+
+
 class InputWarning(UserWarning):
     """Input that is valid but implausible: a question in one line. The command line prints it once and continues."""
 
@@ -48,6 +52,8 @@ def errors_name_file(path: object) -> Iterator[None]:
     """Add the name of a file to each `InputError` that is raised inside."""
     try:
         yield
+    except MissingExtraError:
+        raise
     except InputError as error:
         raise InputError(f"{str(error).removesuffix('.')} ({path}).") from error
 
@@ -58,9 +64,8 @@ def needs_extra(extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"{error.name or error} is not installed; it comes with pip install 'gs-jax[{extra}]'."
-        ) from error
+        message = f"{error.name or error} is not installed; it comes with pip install 'gs-jax[{extra}]'."
+        raise MissingExtraError(message) from error
 
 
 def short_repr(value: object) -> str:
