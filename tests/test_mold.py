@@ -89,7 +89,7 @@ def test_the_caps_volume_agrees_with_a_sum_over_directions():
     inner = (8 - (4 - edge**2) ** 1.5) / 3 - base * edge**2 / 2
     # A midpoint rule on a function with kinks: 1 / count^2.
     np.testing.assert_allclose(lenslets_volume(array), inner.sum() * 2 * math.pi / 20_000, rtol=1e-7)
-    x, y = ((np.arange(1000) + 0.5) / 1000 * side - side / 2 for side in array.size)
+    x, y = ((np.arange(1000) + 0.5) / 1000 * side - side / 2 for side in array.plate)
     height, _ = surface_height(lenslets_of(array), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     # Rims and grooves are kinks, not steps: a midpoint rule on a million points.
     np.testing.assert_allclose(lenslets_volume(array), height.mean() * 20.0, rtol=1e-5)
