@@ -91,7 +91,7 @@ def test_the_saved_design_is_the_one_shown(either):
     np.testing.assert_allclose(saved.array.centers_mm, 1.2 * np.array(either.array.centers_mm), atol=1e-4)
     imager, expected = evaluation.moved_imager(start, values), saved.imager()
     np.testing.assert_allclose(imager.array.radius_of_curvature, expected.array.radius_of_curvature, atol=1e-4)
-    np.testing.assert_allclose(imager.array.size, expected.array.size, atol=1e-4)
+    np.testing.assert_allclose(imager.array.plate, expected.array.plate, atol=1e-4)
     numbers, sheet = evaluate_design(start, values).numbers, datasheet(saved)
     for name in ("occupancy", "spot_width_um", "blur_um"):
         np.testing.assert_allclose(numbers[name], sheet[name], rtol=1e-3, err_msg=name)
