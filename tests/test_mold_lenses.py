@@ -104,7 +104,7 @@ def test_facets_of_any_profile_are_within_the_chord_error(cap):
 
 def test_the_volume_of_unequal_lenses_is_that_of_the_highest():
     array = unequal()
-    x, y = ((np.arange(2400) + 0.5) / 2400 * side - side / 2 for side in array.size)
+    x, y = ((np.arange(2400) + 0.5) / 2400 * side - side / 2 for side in array.plate)
     # Walls are steps of 0.1 mm on a few hundredths of a percent of the places.
     np.testing.assert_allclose(lenslets_volume(array), heights(array, x, y).mean() * 12, rtol=2e-5)
     assert_sound(array)

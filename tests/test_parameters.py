@@ -71,7 +71,7 @@ def test_a_pitch_scales_the_pattern_and_its_plate(design, moving):
     values = {"pitch_mm": 1.1 * start_values(*parent)["pitch_mm"], "aperture_diameter_mm": jnp.array(1.3)}
     found, at = candidate(*parent, values=values)
     scaled = new_design(design, *parent, values=values)
-    np.testing.assert_allclose(found.array.size, [22.0, 22.0], rtol=1e-12)
+    np.testing.assert_allclose(found.array.plate, [22.0, 22.0], rtol=1e-12)
     np.testing.assert_allclose(pitch(found.array.centers)[0], values["pitch_mm"], rtol=1e-9)
     # The written design is rounded to 1e-4 mm.
     np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(scaled.imager().array), rtol=1e-4)

@@ -5,6 +5,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
+from typing import ParamSpec
 
 import equinox as eqx
 import jax
@@ -99,26 +100,27 @@ def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
     ]
 
 
-Quantity = Callable[[Imager, Depths], Float[Array, "..."]]
+# The arguments of a quantity: an imager, and depths or `Conditions`.
+P = ParamSpec("P")
 
 
-def by_type(function: Quantity) -> Quantity:
+def by_type(function: Callable[P, Array]) -> Callable[P, Array]:
     """Extend a quantity of lenses that are alike to several types: one row each."""
 
     @wraps(function)
-    def of_all(*args, **options):
-        values = [function(*part) for part in _parts(function, args, options)]
+    def of_all(*args: P.args, **options: P.kwargs) -> Array:
+        values = _values(function, args, options)
         return values[0] if len(values) == 1 else jnp.stack(values)
 
     return of_all
 
 
-def best_type(function: Quantity, *, best: Callable[..., Array] = jnp.argmin) -> Quantity:
+def best_type(function: Callable[P, Array], *, best: Callable[..., Array] = jnp.argmin) -> Callable[P, Array]:
     """Extend a quantity of lenses that are alike to several types: the value of the best type at each depth."""
 
     @wraps(function)
-    def of_best(*args, **options):
-        values = [function(*part) for part in _parts(function, args, options)]
+    def of_best(*args: P.args, **options: P.kwargs) -> Array:
+        values = _values(function, args, options)
         if len(values) == 1:
             return values[0]
         stacked = jnp.stack(values)
@@ -127,11 +129,11 @@ def best_type(function: Quantity, *, best: Callable[..., Array] = jnp.argmin) ->
     return of_best
 
 
-def _parts(function, args, options):
+def _values(function, args, options) -> list[Array]:
     # The wrapped function has the names and the defaults of the arguments.
     bound = inspect.signature(function).bind(*args, **options)
     bound.apply_defaults()
-    return per_type(*bound.args)
+    return [function(*part) for part in per_type(*bound.args)]
 
 
 def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
