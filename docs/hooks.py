@@ -53,14 +53,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill in the gallery and the table of modules; redirect links to a tutorial's script to its page."""
+    """Fill in the gallery and the table of modules; redirect links to the script of another tutorial to its page."""
     if page.file.src_uri == "docs/gallery.md":
         before, after = re.split("<!-- figures.*-->", markdown)
         markdown = before + reference.gallery(ROOT / "experiments") + after
     if page.file.src_uri == "docs/api/README.md":
         markdown += reference.modules()
-    is_tutorial = page.file.src_uri.startswith("docs/tutorials/") and not page.file.src_uri.endswith("README.md")
-    return markdown if is_tutorial else _SCRIPT.sub(r"\1.md)", markdown)
+    own = f"]({Path(page.file.src_uri).stem}"
+    return _SCRIPT.sub(lambda link: link[0] if link[1] == own else f"{link[1]}.md)", markdown)
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:

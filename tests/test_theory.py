@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.integrate import quad
 from scipy.optimize import brentq, root_scalar
 from scipy.special import j1
 
@@ -102,6 +103,18 @@ def test_the_airy_disc_is_as_wide_as_its_gaussian():
     half = root_scalar(lambda x: (2 * j1(x) / x) ** 2 - 0.5, bracket=(1.0, 2.0)).root
     width = 2 * half * 0.52e-3 * 5.0 / (np.pi * 1.2)
     np.testing.assert_allclose(theory.FWHM * theory.airy_sigma(0.52e-3, 5.0, 1.2), width, rtol=1e-3)
+
+
+def test_the_contrast_of_a_round_aperture():
+    """The overlap of two discs, by quadrature; nothing passes the cutoff, and the slope there is finite."""
+    cutoff = float(theory.cutoff_frequency(0.52e-3, 5.0, 1.2))
+    np.testing.assert_allclose(cutoff, 1.2 / (0.52e-3 * 5.0))
+    for share in (0.0, 0.3, 0.8):
+        overlap = 4 * quad(lambda x: np.sqrt(1 - x**2), share, 1)[0] / np.pi
+        np.testing.assert_allclose(theory.ideal_mtf(share * cutoff, cutoff), overlap, rtol=1e-9, atol=1e-12)
+    slope = jax.vmap(jax.grad(theory.ideal_mtf), (0, None))
+    np.testing.assert_allclose(theory.ideal_mtf(jnp.array([1.0, 2.0]) * cutoff, cutoff), 0, atol=1e-8)
+    assert jnp.isfinite(slope(jnp.array([0.0, 1.0, 2.0]) * cutoff, cutoff)).all()
 
 
 def test_lenses_are_counted():

@@ -35,6 +35,7 @@ from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
 from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
 from ..objectives.paraxial import occupancy
+from ..optics import theory
 from ..optics.raytrace import pupil_quadrature, trace_lenslet
 
 # Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
@@ -169,15 +170,9 @@ def transfer_power(
     found = jax.lax.map(lambda depth: jax.vmap(power, (None, 0))(depth, heights), at.depths)
     weight = envelope(heights[None] ** 2, imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
     mean = jnp.einsum("dh,dhf->df", weight / jnp.sum(weight, 1, keepdims=True), found)
-    others = _perfect(imager, at, frequencies) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
+    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, clear_diameter(imager, at))
+    others = theory.ideal_mtf(frequencies, cutoff) * jnp.sinc(frequencies * imager.sensor.pixel_pitch)
     return mean * (others**2)[None]
-
-
-def _perfect(imager: Imager, at: Conditions, frequencies):
-    """Transfer function of a round aperture without aberrations."""
-    share = frequencies * imager.wavelength * imager.reduced_sensor_distance / clear_diameter(imager, at)
-    share = jnp.minimum(share, 1 - 1e-6)  # arccos has no derivative at 1
-    return 2 / jnp.pi * (jnp.arccos(share) - share * safe_sqrt(1 - share**2))
 
 
 def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size size"]:

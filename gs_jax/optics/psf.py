@@ -21,7 +21,7 @@ from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
 from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet, vogel_spiral
-from .theory import airy_sigma
+from .theory import airy_sigma, cutoff_frequency
 
 # Rays of `geometric_psf`.
 _RAYS = 2**15
@@ -198,8 +198,8 @@ def psf_of_depth(
     size = steps * (2 * math.ceil(pixels + _WINDOW_MARGIN) + 1)
     make = PSFS[kind]
     if kind == "diffraction":  # as fine as the aperture diffracts
-        sharp = float(2 * radius * imager.sensor.pixel_pitch / (imager.wavelength * imager.reduced_sensor_distance))
-        make = partial(make, samples=math.ceil(sharp))
+        cutoff = float(cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, 2 * radius))
+        make = partial(make, samples=math.ceil(cutoff * imager.sensor.pixel_pitch))
     return lambda depth: make(imager, depth, size=size, radius=radius)
 
 

@@ -1,4 +1,4 @@
-"""The paper's formulas for resolution, depth of field and occupancy (Eqs. 4-8, 11).
+"""Formulas of resolution, depth of field and occupancy: the paper's (Eqs. 4-8, 11), and those of diffraction.
 
 Functions of numbers and arrays that broadcast, lengths in mm. Every depth, argument or result, is the reduced depth
 `z' = z + t/n` (`Imager.reduced_depth`). `diameter` is meant to be that of the clear aperture
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..base.arrays import safe_quotient
+from ..base.arrays import safe_quotient, safe_sqrt
 from ..typing import Real, Result
 
 # Full width at half maximum of a Gaussian, in standard deviations.
@@ -44,6 +44,20 @@ def lateral_resolution(wavelength: Real, numerical_aperture: Real, pixel: Real, 
 def airy_sigma(wavelength: Real, distance: Real, diameter: Real) -> Result:
     """Standard deviation of the Gaussian as wide at half its height as the Airy disc, `1.029 lambda v / D`, mm."""
     return 1.029 * jnp.asarray(wavelength) * distance / diameter / FWHM
+
+
+def cutoff_frequency(wavelength: Real, distance: Real, diameter: Real) -> Result:
+    """Highest spatial frequency that a round aperture transfers to the sensor, `D / (lambda v)`, 1/mm."""
+    return jnp.asarray(diameter) / (wavelength * distance)
+
+
+def ideal_mtf(frequency: Real, cutoff: Real) -> Result:
+    """Modulation transfer of a round aperture without aberrations, in focus; 0 from `cutoff` on.
+
+    `(2/pi) (arccos s - s sqrt(1 - s^2))` with `s = frequency / cutoff`.
+    """
+    share = jnp.minimum(jnp.asarray(frequency) / cutoff, 1 - 1e-6)  # arccos has no derivative at 1
+    return 2 / jnp.pi * (jnp.arccos(share) - share * safe_sqrt(1 - share**2))
 
 
 def axial_resolution(lateral: Real, reduced_depth: Real, field_radius: Real) -> Result:

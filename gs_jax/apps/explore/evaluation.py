@@ -25,7 +25,7 @@ from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
 from ...objectives.paraxial import third_order_wavefront
-from ...optics import aberrations
+from ...optics import aberrations, theory
 from ...optics.psf import diffraction_psf, window_fraction
 from ...optics.raytrace import GOLDEN_ANGLE, trace_lenslet
 
@@ -243,7 +243,8 @@ def pupil_samples(start: Start) -> int:
 
 def _fold(imager: Imager, diameter: float) -> float:
     """`s` of `diffraction_psf`, which folds back light outside `samples / s` windows."""
-    return diameter * imager.sensor.pixel_pitch / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
+    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
+    return imager.sensor.pixel_pitch * float(cutoff)
 
 
 def spot(unit: Imager, depth: float, height: float, radius: float, *, samples: int) -> Float[np.ndarray, "row column"]:

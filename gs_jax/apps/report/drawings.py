@@ -19,6 +19,7 @@ from ...design.design import Design
 from ...geometry import Imager
 from ...layouts import cell_edges
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
+from ...optics import theory
 from ...optics.psf import diffraction_psf, window_fraction
 from ...pictures.style import round_length
 
@@ -232,7 +233,7 @@ def simulate_psfs(imager: Imager, depths: Float[np.ndarray, " depth"], diameter:
     heights, pixel = np.array(FIELDS) * imager.field_radius, imager.sensor.pixel_pitch
     chosen = np.linspace(depths.min(), depths.max(), min(_PSF_DEPTHS, len(depths)))
     # Light outside of `samples / s` windows is aliased into them, see `diffraction_psf`.
-    s = diameter * pixel / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
+    s = pixel * float(theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter))
     samples = int(np.clip(np.ceil(1.3 * s), 2, _MAX_SAMPLES))
     size = 2 * int(np.clip(_WINDOW_RADII * radius / pixel, *_WINDOW) // 2) + 1
     images, caught = np.empty((len(chosen), len(heights), size, size)), np.empty((len(chosen), len(heights)))
@@ -261,6 +262,5 @@ def mtf(
 def ideal_mtf(frequency: Float[np.ndarray, " frequency"], imager: Imager, depth: float, diameter: float) -> np.ndarray:
     """Modulation transfer of a focused round lens without aberrations, and of square pixels."""
     on_sensor = frequency / float(imager.magnification(depth))
-    share = np.clip(on_sensor * float(imager.wavelength) * float(imager.reduced_sensor_distance) / diameter, 0, 1)
-    lens = 2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2))
-    return lens * np.abs(np.sinc(on_sensor * imager.sensor.pixel_pitch))
+    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
+    return np.asarray(theory.ideal_mtf(on_sensor, cutoff)) * np.abs(np.sinc(on_sensor * imager.sensor.pixel_pitch))
