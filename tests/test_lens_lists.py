@@ -56,7 +56,7 @@ def test_columns_of_the_centers(tmp_path):
     message_of(with_file(tmp_path, COLUMNS), *both)
     message_of(with_file(tmp_path, COLUMNS.replace("1,9", "thick")), "line 3, radius_of_curvature_mm", "thick")
     twice = COLUMNS.replace("conic_constant", "radius_of_curvature_mm")
-    message_of(with_file(tmp_path, twice), "one column 'radius_of_curvature_mm', got several")
+    message_of(with_file(tmp_path, twice), "'radius_of_curvature_mm' must be in the header once")
 
 
 WRONG = [
