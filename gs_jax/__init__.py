@@ -9,6 +9,8 @@ The microscope:
     Imager               A microlens array in front of a sensor, and the light: the one geometry of the package
     MicrolensArray       Plano-convex microlenses on one plate, their vertices in one plane
     Sensor               A camera sensor of square pixels, in the plane `z = -v` behind the lenses
+    Layers               Plane-parallel layers on top of each other
+    Sample               The medium that holds the object, such as water or a gel
     Grid                 Voxels of the object space; centred on the axis, unless it has another origin
     Design               A microscope, with the tables and keys of its file
     read_design          The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`

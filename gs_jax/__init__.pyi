@@ -15,6 +15,7 @@ from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.point_tables import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
+from .layers import Layers as Layers, Sample as Sample
 from .layouts import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
 from .metrics import localization as localization, quality as quality

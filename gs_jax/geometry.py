@@ -26,6 +26,7 @@ from .base.arrays import (
     as_shape,
     check_fields,
 )
+from .layers import Layers, Sample, depth_of_reduced, reduced_distance
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
 
@@ -180,6 +181,14 @@ class Imager(eqx.Module):
     tilt
         Slopes `(x, y)` of the array's plane toward the object along +x and +y, about the point `v` above the sensor's
         centre. None, the default, is an array parallel to the sensor.
+    filters
+        Layers on the object's side, from the array's front outward, in contact with it unless the first is of index 1.
+        They tilt with the array.
+    windows
+        Layers on the sensor's side, from the sensor toward the array: the gap to the window, the window, a filter. The
+        rest of `sensor_distance` is air.
+    sample
+        The medium that holds the object. None, the default, is air.
 
     Raises
     ------
@@ -206,6 +215,9 @@ class Imager(eqx.Module):
     shift: Float[Array, "2"] = eqx.field(converter=as_float, default=(0.0, 0.0))
     wavelength: Float[Array, ""] = eqx.field(converter=as_float, default=520e-6)
     tilt: Float[Array, "2"] | None = eqx.field(converter=as_float_or_none, default=None)
+    filters: Layers | None = None
+    windows: Layers | None = None
+    sample: Sample | None = None
 
     def __check_init__(self):
         if not self.field_radius > 0:
@@ -249,15 +261,33 @@ class Imager(eqx.Module):
     def reduced_depth(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Reduced depth `z'` from the object to the lens vertices, mm.
 
-        It is `z + t/n` with the plate in front, and `z` with the curved side in front. An imager of NumPy's
-        numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
+        It is `z + t/n` with the plate in front, and `z` with the curved side in front; filters and the sample change
+        it as `gs_jax.layers` says. An imager of NumPy's numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
         """
-        return array_namespace(self.sensor_distance).asarray(depth) + self.array.reduced_thickness_front
+        depth = array_namespace(self.sensor_distance).asarray(depth)
+        return reduced_distance(depth, self.filters, self.sample) + self.array.reduced_thickness_front
+
+    def depth_of(self, reduced_depth: Scalars) -> Scalars:
+        """Depth `z` of a reduced depth `z'`, mm."""
+        return depth_of_reduced(reduced_depth - self.array.reduced_thickness_front, self.filters, self.sample)
 
     @property
     def reduced_sensor_distance(self) -> Scalar:
-        """Reduced distance `v'` from the lens vertices to the sensor: `v`, or `v + t/n` with the plate behind."""
-        return self.sensor_distance + self.array.reduced_thickness_back
+        """Reduced distance `v'` from the lens vertices to the sensor: `v`, or `v + t/n` with the plate behind.
+
+        Windows shorten it by `t (1 - 1/n)` each.
+        """
+        return self.sensor_distance + self._behind
+
+    def sensor_distance_of(self, reduced_distance: Scalars) -> Scalars:
+        """Sensor distance `v` of a reduced distance `v'`, mm."""
+        return reduced_distance - self._behind
+
+    @property
+    def _behind(self):
+        """`v' - v`."""
+        plate = self.array.reduced_thickness_back
+        return plate if self.windows is None else plate - self.windows.shortening
 
     def magnification(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""

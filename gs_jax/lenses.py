@@ -19,7 +19,7 @@ from .typing import Scalar, Scalars
 Orientation = Literal["plano", "curved"]
 # Numbers that may differ between lenses.
 EACH = ("radius_of_curvature", "aperture_diameter", "conic_constant")
-_INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
+INDEX: Rule = ("1 or more and finite", lambda x: (x >= 1) & (x < np.inf))
 
 
 def _as_plate(x):
@@ -107,7 +107,7 @@ class MicrolensArray(eqx.Module):
         if self.orientation not in ("plano", "curved"):
             raise ValueError(f"`orientation` must be 'plano' or 'curved', got {self.orientation!r}.")
         check_fields(self, radius_of_curvature=POSITIVE, aperture_diameter=POSITIVE, thin_lens_focal_length=POSITIVE)
-        check_fields(self, refractive_index=_INDEX, substrate_thickness=NOT_NEGATIVE, size=POSITIVE)
+        check_fields(self, refractive_index=INDEX, substrate_thickness=NOT_NEGATIVE, size=POSITIVE)
         check_fields(self, centers=FINITE, conic_constant=FINITE, aspheric_terms=FINITE)
 
     @property

@@ -126,7 +126,7 @@ def plot_residuals(result: Calibration) -> Figure:
     counts.set(xlabel="distance, pixels", ylabel="spots")
     counts.set_title(f"{len(distance)} spots, {result.rms:.3f} pixels RMS", fontsize=9)
     depth, seen, fitted = pattern_scales(result).T
-    inverse = 1 / (depth + float(result.imager.reduced_depth(0.0)))
+    inverse = 1 / np.asarray(result.imager.reduced_depth(depth))
     order = np.argsort(inverse)
     lines.plot(inverse[order], fitted[order], color="0.6", label="1 + v/z'")
     lines.plot(inverse, seen, ".", label="spots of a source")

@@ -206,7 +206,7 @@ def _pose(match: Similarity, point, imager: Imager) -> Imager:
         # The complex conjugate: y becomes -y.
         array = with_centers(array, array.centers * jnp.asarray([[1.0, -1.0]], array.centers.dtype))
     reduced = imager.reduced_sensor_distance if np.isnan(z) else magnification * float(imager.reduced_depth(z))
-    distance = reduced - imager.array.reduced_thickness_back
+    distance = imager.sensor_distance_of(reduced)
     shift = (match.shift + magnification * complex(x, y)) / scale
     shift = imager.shift if np.isnan(shift) else (shift.real, shift.imag)
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift)
@@ -232,7 +232,7 @@ def _locate(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
     if np.isnan(depth):
         match = match_pattern(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
         magnification = max(abs(match.factor) - 1, 1e-3)
-        depth = max(float(imager.reduced_sensor_distance) / magnification - float(imager.reduced_depth(0.0)), 1e-3)
+        depth = max(float(imager.depth_of(imager.reduced_sensor_distance / magnification)), 1e-3)
     magnification = float(imager.magnification(depth))
     pattern = (1 + magnification) * np.asarray(imager.centers, np.float64)
     shift, _ = match_shift(spots, pattern, match_radius(imager.array.centers))
@@ -272,7 +272,7 @@ def guess_without_lenses(
     if not count or count < _MIN_SHARED * sum(map(len, spots)):
         got = f"{count} of {sum(map(len, spots))} spots on lenses that several captures show"
         raise InputError(f"captures: got {got}, half are needed; are positions and the sensor's pixels right?")
-    distance = imager.reduced_sensor_distance * step - imager.array.reduced_thickness_back
+    distance = imager.sensor_distance_of(imager.reduced_sensor_distance * step)
     types = [imager.array.lens(int(which[0])) for which in lenses_by_type(imager.array)]
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift, i.tilt)
     zero = jnp.zeros((), imager.sensor_distance.dtype)

@@ -120,7 +120,7 @@ def _sharp_range(design: Design, imager: Imager, at: Conditions) -> str:
     v, f = design.imaging.sensor_distance_mm, float(imager.array.focal_length)
     if imager.reduced_sensor_distance <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
-    in_focus = theory.depth_in_focus(f, float(imager.reduced_sensor_distance)) - imager.reduced_depth(0.0)
+    in_focus = imager.depth_of(theory.depth_in_focus(f, imager.reduced_sensor_distance))
     focused = dataclasses.replace(at, depths=in_focus[None])
     near, far = (
         max(float(objectives.near_limit(imager, focused)[0]), 0),
@@ -152,7 +152,7 @@ def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Condition
     )
     paraxial = sheet["focus_distance_mm"]
     if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:
-        image = paraxial[0] + float(array.reduced_thickness_back)
+        image = paraxial[0] + float(v - imager.sensor_distance)
         sharpest = 1 / (1 / image + 2 * float(error.spherical[0, 0]) / pupil**2)
         found.append(
             "Focus and blur are a thin lens's; spherical aberration draws the sharpest image of "

@@ -64,13 +64,13 @@ def approximate_depth_of_field(imager: Imager, depths: Depths) -> Float[Array, "
 @by_type
 def near_limit(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """The nearest depth that is in focus with a sensor focused on each depth; a row a type."""
-    return theory.near_limit(*_focus(imager, depths)) - imager.reduced_depth(0.0)
+    return imager.depth_of(theory.near_limit(*_focus(imager, depths)))
 
 
 @by_type
 def far_limit(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """The farthest depth that is in focus with a sensor focused on each depth; a row a type."""
-    return theory.far_limit(*_focus(imager, depths)) - imager.reduced_depth(0.0)
+    return imager.depth_of(theory.far_limit(*_focus(imager, depths)))
 
 
 def _focus(imager, depths):
@@ -85,7 +85,7 @@ def focus_distance(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Sensor distance `v` at which a thin lens images each depth; infinite if it does not; a row a type."""
     at = as_conditions(imager, depths)
     reduced = theory.focus_distance(imager.array.focal_length, imager.reduced_depth(at.depths))
-    return reduced - imager.array.reduced_thickness_back
+    return imager.sensor_distance_of(reduced)
 
 
 @by_type

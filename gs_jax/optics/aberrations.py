@@ -106,7 +106,7 @@ def best_focus(
     points, weights = pupil_quadrature(pupil_radius(imager, radius))
 
     def error(vergence):
-        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, 1 / vergence - imager.array.reduced_thickness_back)
+        moved = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance_of(1 / vergence))
         return _remove_tilt(wavefront(moved, depth, points, field), points, weights)
 
     # Gauss-Newton: the wavefront is all but linear in 1/v'.
@@ -116,7 +116,7 @@ def best_focus(
         value, slope = jax.jvp(error, (vergence,), (jnp.ones_like(vergence),))
         return vergence - jnp.sum(weights * value * slope) / jnp.sum(weights * slope**2)
 
-    return 1 / jax.lax.fori_loop(0, _FOCUS_STEPS, step, vergence) - imager.array.reduced_thickness_back
+    return imager.sensor_distance_of(1 / jax.lax.fori_loop(0, _FOCUS_STEPS, step, vergence))
 
 
 def _remove_tilt(error: Array, points: Array, weights: Array) -> Array:

@@ -19,7 +19,8 @@ from ..geometry import Imager, falloff
 from ..lenses import EACH, MicrolensArray, sag
 from ..typing import Coordinates, Scalars
 from .apertures import clear_area
-from .raytrace import refract, solid_angle, to_numpy, transmittance, vogel_spiral
+from .radiometry import solid_angle, transmittance
+from .raytrace import refract, to_numpy, vogel_spiral
 from .theory import airy_sigma
 
 # Radii and angles of aperture profiles.
@@ -243,8 +244,8 @@ def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Fl
         from scipy.interpolate import CubicSpline
 
         some = np.linspace(depths.min(), depths.max(), _MOST)
-        beyond = float(imager.reduced_depth(0.0))
-        return CubicSpline(some, core_magnification(imager, some) * (some + beyond))(depths) / (depths + beyond)
+        reduced = to_numpy(imager).reduced_depth
+        return CubicSpline(some, core_magnification(imager, some) * reduced(some))(depths) / reduced(depths)
     aperture, fields = aperture_profile(imager.array, by_area=False), np.linspace(0, imager.field_radius, _FIELDS + 1)
     return np.array(list(map_in_threads(lambda depth: _core(imager, float(depth), fields, aperture)[0], depths)))
 
@@ -256,7 +257,7 @@ def apparent_depths(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float
     20 mm, show 18 mm 0.16 mm too near, and 22 mm 0.09 mm too far.
     """
     reduced = float(imager.reduced_sensor_distance) / core_magnification(imager, depths)
-    return jnp.asarray(reduced - float(imager.reduced_depth(0.0)), imager.sensor_distance.dtype)
+    return jnp.asarray(to_numpy(imager).depth_of(reduced), imager.sensor_distance.dtype)
 
 
 def ensquared_light(

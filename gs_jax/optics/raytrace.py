@@ -1,10 +1,13 @@
-"""Exact rays through one plano-convex lenslet: refraction and transmitted light.
+"""Exact rays through one plano-convex lenslet and the plane layers of the imager: refraction and transmitted light.
 
 The lenslet's axis goes through its vertex. The object point is `field` beside the axis and `depth` in front of the
 first face, plano or curved; the sensor is `v` behind the other one. Vertex and plano face are `t` apart, so the glass
 is thinner off the axis. A ray is given by the point `(x, y)` where it meets the curved side; the ray through the vertex
 is the chief ray. Optical paths are differences to the chief ray's, computed as such: in float32 they are right to a
 thousandth of a wave.
+
+By Snell's law a ray has one slope `q` in all gaps of air, and `q / sqrt(n^2 + (n^2 - 1) q^2)` in a layer of index `n`.
+Slopes are those in air, whether there is air or not, so that rays must be ones that air transmits.
 
 `refract` takes arrays of JAX or of NumPy, with coordinates first: points are `(2, ...)`. Tables that are constants to
 derivatives use NumPy, which needs no compilation.
@@ -19,14 +22,15 @@ from jaxtyping import Array, Bool, Float
 
 from ..base.arrays import array_namespace
 from ..geometry import Imager, chief_ray
+from ..layers import object_slabs
 from ..lenses import MicrolensArray
-from ..typing import Coordinates, ScalarLike, Scalars
+from ..typing import Coordinates, Scalar, ScalarLike, Scalars
 
 Point = Float[Array | np.ndarray, "2"] | tuple[ScalarLike, ScalarLike]
 Module = TypeVar("Module", Imager, MicrolensArray)
 
-# Newton steps for the height of refraction at the plane. Each squares an error that starts at 1e-3.
-_NEWTON_STEPS = 3
+# Newton steps for the height of a ray. Each squares an error that starts at 1e-3, or at 1e-2 within a sample.
+_NEWTON_STEPS = 4
 # Angle between successive points of Vogel's spiral, which covers a disc evenly with any number of points.
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
@@ -35,21 +39,21 @@ class RefractedRay(NamedTuple):
     """A ray from the object through the lenslet to the sensor.
 
     `point`, `sag`, `sag_slope_over_r`: where the ray meets the curved side (mm), and the surface there (mm, 1/mm).
-    `air`: reduced distance of that point behind the array's front, mm. `slope`, `glass`, `tangent`: slopes of the ray
-    in front of, inside and behind the lenslet. `front`, `back`: cosines with the normal before and behind each face.
-    `landing`: on the sensor, mm. `valid`: False where there is no surface or total reflection; the other numbers are
-    then finite and meaningless.
+    `height`: distance in which the slope in air takes the ray from the object to that point, mm; `excess`: of the
+    height over `z'`, mm. `slope`, `glass`, `tangent`: slopes of the ray in front of, inside and behind the lenslet.
+    `curved`: cosines with the normal before and behind the curved side. `landing`: on the sensor, mm. `valid`: False
+    where there is no surface or total reflection; the other numbers are then finite and meaningless.
     """
 
     point: Coordinates
     sag: Scalars
     sag_slope_over_r: Scalars
-    air: Scalars
+    height: Scalars
+    excess: Scalars
     slope: Coordinates
     glass: Coordinates
     tangent: Coordinates
-    front: tuple[Scalars, Scalars]
-    back: tuple[Scalars, Scalars]
+    curved: tuple[Scalars, Scalars]
     landing: Coordinates
     valid: Any
 
@@ -99,25 +103,26 @@ def refract(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinat
 
 def _refract_plane_first(imager, depth, point, field) -> RefractedRay:
     array, xp = imager.array, array_namespace(point)
-    n, t = array.refractive_index, array.substrate_thickness
-    point, sag, ratio, reached = _surface(array, point)
-    air = equivalent_air(n, t - sag, depth, point - field)
-    slope = (point - field) / (depth + air)
+    n, (point, sag, ratio, reached) = array.refractive_index, _surface(array, point)
+    slabs = slabs_in_front(imager, depth, sag)
+    height, excess = _height(imager.reduced_depth(depth), -sag / n, slabs, point - field)
+    slope = (point - field) / height
     glass = slope_in_glass(n, slope)
     lateral, axial, inside, behind2 = _incidence(n, glass, point, ratio)
     valid = reached & (behind2 > 0)
     behind = xp.sqrt(xp.where(behind2 > 0, behind2, 1))
     tangent = _snell(lateral, axial, n, behind - n * inside, point, ratio, valid)
-    landing = point + (imager.sensor_distance + sag) * tangent
-    front = 1 / secant(slope), 1 / secant(glass)
-    return RefractedRay(point, sag, ratio, air, slope, glass, tangent, front, (inside, behind), landing, valid)
+    landing = point + sag * tangent + _to_sensor(imager, sag, tangent)
+    numbers = sag, ratio, height, excess
+    return RefractedRay(point, *numbers, slope, glass, tangent, (inside, behind), landing, valid)
 
 
 def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
     array, xp = imager.array, array_namespace(point)
-    n, t = array.refractive_index, array.substrate_thickness
-    point, sag, ratio, reached = _surface(array, point)
-    slope = (point - field) / (depth + sag)
+    n, (point, sag, ratio, reached) = array.refractive_index, _surface(array, point)
+    slabs = slabs_in_front(imager, depth)
+    height, excess = _height(imager.reduced_depth(depth), sag, slabs, point - field)
+    slope = (point - field) / height
     # The surface falls toward the sensor: its normal leans toward the axis.
     lateral, axial, outside, inside2 = _incidence(1 / n, slope, point, -ratio)
     inside = xp.sqrt(inside2)
@@ -129,24 +134,23 @@ def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
     valid = met & (cosine2 > 0)
     cosine = xp.sqrt(xp.where(valid, cosine2, 1))
     tangent = xp.where(valid, n * glass / secant(glass), 0) / cosine
-    landing = point + (t - sag) * glass + imager.sensor_distance * tangent
-    back = 1 / secant(glass), cosine
-    return RefractedRay(point, sag, ratio, sag, slope, glass, tangent, (outside, inside), back, landing, valid)
+    landing = point + _to_sensor(imager, sag, tangent)
+    numbers = sag, ratio, height, excess
+    return RefractedRay(point, *numbers, slope, glass, tangent, (outside, inside), landing, valid)
 
 
 def _refract_ideal(imager, depth, point, field) -> RefractedRay:
     """An ideal lens. The slope `(image - point) / v'` behind it is written with `1/v'`, which may be zero."""
     array, v, xp = imager.array, imager.reduced_sensor_distance, array_namespace(point)
-    reduced = depth + array.reduced_thickness_front
+    reduced = imager.reduced_depth(depth)
     focal_length: Scalars = array.thin_lens_focal_length
     vergence = 1 / focal_length - 1 / reduced
     slope = (point - field) / reduced
     tangent = -field / reduced - vergence * point
     landing = chief_ray(xp.zeros_like(point), field, v / reduced) + point * (1 - v * vergence)
     zero = xp.zeros_like(slope[0])
-    faces = zero + 1, zero + 1
-    air = zero + array.reduced_thickness_front
-    return RefractedRay(point, zero, zero, air, slope, slope, tangent, faces, faces, landing, zero == 0)
+    numbers = zero, zero, zero + reduced, zero
+    return RefractedRay(point, *numbers, slope, slope, tangent, (zero + 1, zero + 1), landing, zero == 0)
 
 
 def _surface(array, point):
@@ -180,61 +184,63 @@ def _normal_length(point, ratio):
     return array_namespace(point).sqrt(1 + ratio**2 * dot(point, point))
 
 
-def equivalent_air(n: Scalars, thickness: Scalars, depth: Scalars, across: Coordinates) -> Scalars:
-    """Layer of air `g` in which a ray goes as far sideways as in the glass: `across = slope (depth + g)`."""
-    square, xp = dot(across, across), array_namespace(across)
-    g = thickness / n
+def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> tuple[Scalars, Scalars]:
+    """Distance `h` in which a ray's slope in air takes it as far sideways as all it crosses: `across = slope h`.
+
+    `slabs` are thickness and index of what is not air; `reduced + paraxial` is their reduced thickness and that of the
+    air, to which a ray near the axis is due. The second result is `h - reduced`, with the precision of the difference.
+    """
+    square, excess = dot(across, across), paraxial + 0 * across[0]
     for _ in range(_NEWTON_STEPS):
-        h = depth + g
-        flat = n**2 + (n**2 - 1) * square / h**2
-        in_air = thickness / xp.sqrt(flat)
-        g = g - (g - in_air) / (1 - in_air * (n**2 - 1) * square / (h**3 * flat))
-    return g
+        h = reduced + excess
+        off, change = paraxial, 0.0
+        for thickness, n in slabs:
+            flat, root = square_and_root(n, square / h**2)
+            # Of t / sqrt(flat) over t / n.
+            off = off - thickness * (n**2 - 1) * square / h**2 / (n * root * (n + root))
+            change = change + thickness * (n**2 - 1) * square / (h**3 * flat * root)
+        excess = excess - (excess - off) / (1 - change)
+    return reduced + excess, excess
+
+
+def square_and_root(n, square):
+    """`n^2 + (n^2 - 1) q^2` and its root: a slope in a layer is that in air over the root."""
+    flat = n**2 + (n**2 - 1) * square
+    return flat, array_namespace(flat).sqrt(flat)
+
+
+def slabs_in_front(imager: Imager, depth: Scalars, sag: Scalars = 0.0) -> list[tuple[Scalars, Scalar]]:
+    """Thickness and index of all but air between an object at a depth and a point of the curved side."""
+    slabs, plate = object_slabs(depth, imager.filters, imager.sample), _plate(imager, sag)
+    return [*slabs, plate] if imager.array.orientation == "plano" else slabs
+
+
+def slabs_behind(imager: Imager, sag: Scalars = 0.0) -> list[tuple[Scalars, Scalar]]:
+    """Thickness and index of all but air between a point of the curved side and the sensor."""
+    windows, plate = [] if imager.windows is None else imager.windows.slabs, _plate(imager, sag)
+    return windows if imager.array.orientation == "plano" else [plate, *windows]
+
+
+def _plate(imager: Imager, sag: Scalars) -> tuple[Scalars, Scalar]:
+    return imager.array.substrate_thickness - sag, imager.array.refractive_index
+
+
+def _to_sensor(imager: Imager, sag: Scalars, tangent: Coordinates) -> Coordinates:
+    """How far sideways a ray goes from the array's vertices, or from the curved side in glass, to the sensor."""
+    across = _air_behind(imager) * tangent
+    for thickness, n in slabs_behind(imager, sag):
+        across = across + thickness * slope_in_glass(n, tangent)
+    return across
+
+
+def _air_behind(imager: Imager) -> Scalar:
+    """Thickness of the air between the array's back and the sensor."""
+    return imager.sensor_distance - (0 if imager.windows is None else imager.windows.total)
 
 
 def slope_in_glass(n: Scalars, slope: Coordinates) -> Coordinates:
     """Snell's law at the plane for slopes: `sin = slope / sqrt(1 + slope^2)` over `n`."""
     return slope / array_namespace(slope).sqrt(n**2 + (n**2 - 1) * dot(slope, slope))
-
-
-def solid_angle(imager: Imager, depth: Scalars, ray: RefractedRay) -> Scalars:
-    """Solid angle that the lens takes of an object point's light, per area of its curved side, 1/mm^2.
-
-    The Jacobian of the slope `q = a / h` by the point, times `(1 + q^2)^(-3/2)`, with the lateral distance `a` and the
-    reduced depth `h`: `|1 - a . grad h / h| / h^2`. With the plane in front `grad h` follows from the equation of
-    `equivalent_air`; with the curve in front `h` grows by the sag; for an ideal lens `h` is constant.
-    """
-    h = depth + ray.air
-    tilt = secant(ray.slope) ** -3 / h**2
-    array = imager.array
-    if array.thin_lens_focal_length is not None:
-        return tilt
-    n, xp = array.refractive_index, array_namespace(ray.slope)
-    steeper = dot(ray.slope, ray.point) * ray.sag_slope_over_r
-    if array.orientation == "curved":
-        return abs(1 - steeper) * tilt
-    square = dot(ray.slope, ray.slope)
-    flat = n**2 + (n**2 - 1) * square
-    thick = array.substrate_thickness - ray.sag
-    change = thick * (n**2 - 1) * square / (flat * xp.sqrt(flat))
-    # The glass is thinner farther out.
-    along = -(change + h * steeper / xp.sqrt(flat)) / (1 - change / h)
-    return abs(1 - along / h) * tilt
-
-
-def transmittance(imager: Imager, ray: RefractedRay) -> Scalars:
-    """Fraction of the light that both faces transmit: Fresnel's equations, unpolarised; 1 for an ideal lens."""
-    if imager.array.thin_lens_focal_length is not None:
-        return ray.front[0]
-    n = imager.array.refractive_index
-    (before, in_front), (at_back, behind) = ray.front, ray.back
-    return _fresnel(1, before, n, in_front) * _fresnel(n, at_back, 1, behind)
-
-
-def _fresnel(n_in, cos_in, n_out, cos_out):
-    across = (n_in * cos_in - n_out * cos_out) / (n_in * cos_in + n_out * cos_out)
-    along = (n_out * cos_in - n_in * cos_out) / (n_out * cos_in + n_in * cos_out)
-    return 1 - (across**2 + along**2) / 2
 
 
 @jax.jit
@@ -278,37 +284,42 @@ def _trace(imager: Imager, depth: Array, point: Array, field: Array) -> LensletR
 
 
 def _thick_path(imager: Imager, depth: Array, ray: RefractedRay, field: Array) -> Array:
-    """Optical path less the chief ray's (`_chief`), which leaves as it came: at the vertex both faces are parallel."""
-    array, v = imager.array, imager.sensor_distance
-    n, t = array.refractive_index, array.substrate_thickness
-    plane_first = array.orientation == "plano"
-    air_chief = equivalent_air(n, t, depth, -field) if plane_first else jnp.zeros_like(ray.air)
-    h, h_chief = depth + ray.air, depth + air_chief
-    q, q_chief = ray.slope, -field / h_chief
-    change = ray.point / h + field * (ray.air - air_chief) / (h * h_chief)
-    s_chief, s_glass = secant(q_chief), secant(ray.glass)
-    glass_chief = slope_in_glass(n, q_chief)
-    squares = dot(change, q + q_chief)
-    path = depth * squares / (secant(q) + s_chief)
-    s = secant(ray.tangent)
-    if plane_first:
-        # Snell's law for the square of the slope in glass; see `slope_in_glass`.
-        flat, flat_chief = n**2 + (n**2 - 1) * dot(q, q), n**2 + (n**2 - 1) * dot(q_chief, q_chief)
-        glass_squares, in_air = n**2 * squares / (flat * flat_chief), s
-    else:
-        glass_squares, in_air = dot(ray.glass - glass_chief, ray.glass + glass_chief), secant(q)
-    path = path + n * t * glass_squares / (s_glass + secant(glass_chief))
+    """Optical path less the chief ray's, which leaves as it came: at the vertex both faces are parallel."""
+    reduced, zero = imager.reduced_depth(depth), jnp.zeros_like(depth)
+    h_chief, excess_chief = _height(reduced, zero, slabs_in_front(imager, depth), -field)
+    q_chief = -field / h_chief
+    change = ray.point / ray.height + field * (ray.excess - excess_chief) / (ray.height * h_chief)
+    in_front = ray.slope, q_chief, dot(change, ray.slope + q_chief)
+    behind = ray.tangent, q_chief, dot(ray.tangent - q_chief, ray.tangent + q_chief)
+    air = depth - sum(thickness for thickness, _ in object_slabs(depth, imager.filters, imager.sample))
+    path = _longer(air, 1, *in_front) + _longer(_air_behind(imager), 1, *behind)
+    for thickness, n in slabs_in_front(imager, depth):
+        path = path + _longer(thickness, n, *in_front)
+    for thickness, n in slabs_behind(imager):
+        path = path + _longer(thickness, n, *behind)
     # Off the axis there is air in place of glass.
-    path = path + ray.sag * (in_air - n * s_glass)
-    return path + v * dot(ray.tangent - q_chief, ray.tangent + q_chief) / (s + s_chief)
+    array = imager.array
+    in_air = secant(ray.tangent if array.orientation == "plano" else ray.slope)
+    return path + ray.sag * (in_air - array.refractive_index * secant(ray.glass))
+
+
+def _longer(thickness, n, slope, slope_chief, squares):
+    """Optical path through a layer less the chief ray's, by slopes in air and the difference of their squares."""
+    flat, flat_chief = (square_and_root(n, dot(q, q))[0] for q in (slope, slope_chief))
+    longer = secant(slope_in_glass(n, slope)) + secant(slope_in_glass(n, slope_chief))
+    return n**3 * thickness * squares / (flat * flat_chief * longer)
 
 
 def chief_ray_length(imager: Imager, chief: LensletRay) -> Float[Array, ""]:
     """Length of the chief ray from the vertex, as seen from the sensor, to the sensor, mm."""
-    squared, n, behind = jnp.sum(chief.tangent**2), imager.array.refractive_index, imager.array.reduced_thickness_back
-    if imager.array.thin_lens_focal_length is None:  # with the ray's own angle, as in `equivalent_air`
-        behind = behind * n / jnp.sqrt(n**2 + (n**2 - 1) * squared)
-    return (imager.sensor_distance + behind) * jnp.sqrt(1 + squared)
+    squared = jnp.sum(chief.tangent**2)
+    if imager.array.thin_lens_focal_length is not None:
+        return imager.reduced_sensor_distance * jnp.sqrt(1 + squared)
+    # With the ray's own angle, as in `_height`.
+    behind = _air_behind(imager)
+    for thickness, n in slabs_behind(imager):
+        behind = behind + thickness / square_and_root(n, squared)[1]
+    return behind * jnp.sqrt(1 + squared)
 
 
 def pupil_radius(imager: Imager, radius: ScalarLike | None = None) -> Float[Array, ""]:

@@ -62,7 +62,7 @@ def _cores_image(volume, imager, grid, optics):
         depth, voxels, distortion, light, _, _ = plane
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * distortion[number]
-        at = grid.at(imager.reduced_sensor_distance / magnification - imager.reduced_depth(0.0))
+        at = grid.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
         if imager.tilt is not None:
             # The distortion is about the lens's axis, which is tilted.
             offset = (1 / distortion[number] - 1) * imager.axis_offset(depth[None])[0]
