@@ -14,6 +14,7 @@ ORDER = [
     "typing",
     "base",
     "lenses",
+    "layers",
     "geometry",
     "grid",
     "metrics",
