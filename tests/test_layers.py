@@ -2,15 +2,15 @@
 
 import dataclasses
 
-import gs_jax as gs
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
+
+import gs_jax as gs
 from gs_jax.optics import aberrations
 from gs_jax.optics.radiometry import solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
-from jax.test_util import check_grads
 
 FILTER, WINDOW = gs.Layers([2.0], [1.52]), gs.Layers([0.6, 0.55], [1.0, 1.51])
 SAMPLES = {
@@ -35,9 +35,9 @@ def media(scope, depth):
     n, t = float(scope.array.refractive_index), float(scope.array.substrate_thickness)
     top = t if scope.array.orientation == "plano" else 0.0
     at = top
-    for thickness, index in zip(*map(np.asarray, (scope.filters.thickness, scope.filters.refractive_index)), strict=True):
-        at += thickness
-        front.append((index, at))
+    for thickness, index in scope.filters.slabs:
+        at += float(thickness)
+        front.append((float(index), at))
     medium = 1.0
     if scope.sample is not None:
         medium = float(scope.sample.refractive_index)
@@ -123,3 +123,73 @@ def up(scope, place, height):
 def bend(direction, normal, cosine, ratio):
     out = np.sqrt(1 - ratio**2 * (1 - cosine**2))
     return ratio * direction + (ratio * cosine - out) * normal, out
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_rays_near_the_axis_go_by_reduced_distances(sample):
+    scope = layered(sample=sample)
+    near = 1e-3 * np.array([[0.0, 0.0], [0.3, 0.1]])
+    landing = np.asarray(trace_lenslet(scope, 21.0, near, (2e-3, -1e-3)).landing)
+    np.testing.assert_allclose(landing[0], -scope.magnification(21.0) * np.array([2e-3, -1e-3]), rtol=1e-6)
+    assert float(scope.depth_of(scope.reduced_depth(21.0))) == pytest.approx(21.0)
+    assert float(scope.sensor_distance_of(scope.reduced_sensor_distance)) == pytest.approx(6.0)
+    focus = float(aberrations.best_focus(scope, 21.0, radius=0.05))
+    vergence = 1 / scope.array.focal_length - 1 / scope.reduced_depth(21.0)
+    assert float(scope.sensor_distance_of(1 / vergence)) == pytest.approx(focus, rel=1e-3)
+
+
+def test_layers_of_index_one_are_air():
+    scope = layered(sample="air")
+    air = dataclasses.replace(
+        scope, filters=gs.Layers([2.0], [1.0]), windows=None, sample=gs.Sample(1.0, 19.0, gs.Layers([0.17], [1.0]))
+    )
+    without = dataclasses.replace(air, filters=None, sample=None)
+    points = np.array([[0.1, 0.2], [-0.5, 0.4]])
+    for one, other in zip(*(trace_lenslet(each, 21.0, points, FIELD) for each in (air, without)), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+    field, hosts = np.array(FIELD)[:, None], [to_numpy(each) for each in (air, without)]
+    light = [solid_angle(host, 21.0, refract(host, 21.0, points.T, field)) for host in hosts]
+    np.testing.assert_allclose(*light, rtol=1e-12)
+
+
+def test_derivatives_by_thickness_index_and_gap():
+    grid = gs.Grid([20.5, 22.0], (9, 9), 0.2)
+    scope = layered()
+    values = np.random.default_rng(0).random(grid.volume_shape)
+
+    def of(numbers):
+        filters, window, index, surface = numbers
+        sample = gs.Sample(index, surface, scope.sample.layers)
+        return dataclasses.replace(
+            scope, filters=gs.Layers(filters, [1.52]), windows=gs.Layers([0.6, 0.55], window), sample=sample
+        )
+
+    def spots(numbers):
+        rays = trace_lenslet(of(numbers), 21.0, np.array([[0.0, 0.0], [0.4, -0.2]]), FIELD)
+        return rays.landing, 1e3 * rays.path
+
+    def wavefront(numbers):
+        return 1e3 * aberrations.wavefront_rms(of(numbers), 21.0, radius=0.4)
+
+    start = jnp.array([2.0]), jnp.array([1.05, 1.51]), jnp.array(1.43), jnp.array(19.0)
+    check_grads(spots, (start,), order=1, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
+    check_grads(wavefront, (start,), order=1, modes=("rev",), atol=1e-4, rtol=1e-4)
+    image = lambda numbers: jnp.vdot(pattern, gs.forward(values, of(numbers), grid))
+    rows, columns = np.ogrid[:600, :600]
+    pattern = np.sin(rows / 40) * np.cos(columns / 50)
+    check_grads(image, (start,), order=1, modes=("rev",), eps=1e-5, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: gs.Layers([1.0], [1.5, 1.6]), r"must be \(layer,\)"),
+        (lambda: gs.Layers([-1.0], [1.5]), "`thickness` must be finite and not negative, got -1.0"),
+        (lambda: gs.Layers([1.0], [0.5]), "`refractive_index` must be 1 or more"),
+        (lambda: gs.Sample(0.9), "`refractive_index` must be 1 or more"),
+        (lambda: gs.Sample(1.3, surface=-2.0), "`surface` must be finite and not negative"),
+    ],
+)
+def test_layers_that_cannot_be(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
