@@ -50,6 +50,26 @@ Pixels (`"px"`) are those of a capture: (0, 0) is the centre of the first pixel,
 the plate over about its y axis, x to -x; turning it over about its x axis is the same plus half a turn.
 `gs-jax calibrate` detects mirroring itself, and estimates rotation and shift.
 
+## Filters, windows and samples
+
+```toml
+[[layers.object]]                    # on the plate: an emission filter
+thickness_mm = 2.0
+refractive_index = "fused silica"
+[[layers.sensor]]                    # the gap between the chip and its window
+thickness_mm = 0.6
+[[layers.sensor]]
+thickness_mm = 0.55
+refractive_index = "BK7"
+[samples.gel]                        # gs-jax reconstruct capture.tif my.toml --sample gel ...
+refractive_index = "PDMS"
+surface_mm = 19.67
+layers = [{ name = "cover slip", thickness_mm = 0.17, refractive_index = 1.523 }]
+```
+
+Depths and the sensor distance stay lengths as a ruler measures them. A material's index follows the wavelength; it is
+relative to air. The order of layers counts for reflection losses alone.
+
 ## In an editor
 
 `gs-jax new-design --schema > gs-jax.schema.json` writes the JSON schema of design files. With the first line
@@ -66,14 +86,19 @@ def page() -> str:
     lines = [HEAD]
     for table, keys in tables.items():
         shown = [key for key in keys if key.allowed != "a table"]
-        lines += [f"## `[{table}]`" if table else "## At the top", ""]
+        lines += [f"## `{_heading(table)}`" if table else "## At the top", ""]
         if table:
             lines += [f"{design_keys()[table].meaning.capitalize()}.", ""]
         lines += ["| key | unit | meaning | allowed | usual |", "|---|---|---|---|---|"]
         lines += [_row(key) for key in shown]
         lines.append("")
+    lines.append(f"`[samples.NAME]`: {design_keys()['samples'].meaning}.\n")
     lines.append(f"`[provenance]`: {design_keys()['provenance'].meaning}.")
     return "\n".join(lines) + "\n" + TAIL
+
+
+def _heading(table: str) -> str:
+    return f"[[{table}]]" if design_keys()[table].allowed == "a list of tables" else f"[{table}]"
 
 
 def _row(key: Key) -> str:

@@ -52,7 +52,7 @@ def run() -> list[tuple[str, float, float]]:
     """Return for each mistake its name, the residual in pixels RMS, and the error of the sensor distance in um."""
     design = geomscope()
     v, pixel = design.imaging.sensor_distance_mm, design.sensor.pixel_pitch_um / 1000
-    plate = design.array.substrate_thickness_mm / design.lens.refractive_index
+    plate = design.array.substrate_thickness_mm / design.refractive_index
     believed = Device(np.array(design.array.centers_mm), PLACES, plate)
     seen = np.hypot(*(believed.centers[None] - PLACES[:, None, :2]).transpose(2, 0, 1)) < REACH
     rng = np.random.default_rng(0)

@@ -32,7 +32,7 @@ from gs_jax.codesign.search import initial_design
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design, read_design
-from gs_jax.design.validation import reduced_thicknesses
+from gs_jax.design.light_path import reduced_depth
 from gs_jax.pictures.style import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"
@@ -83,9 +83,8 @@ def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
 
 def limits_of(light: float, span: tuple[float, float], design: Design) -> tuple[float, float]:
     """Lower limit (farthest depth) and upper limit (nearest depth) of the light, %, for a share at `MIDDLE`."""
-    lens = design.lens
-    front, _ = reduced_thicknesses(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
-    near, far = (light * ((MIDDLE + front) / (depth + front)) ** 2 for depth in span)
+    middle = reduced_depth(design, MIDDLE)
+    near, far = (light * (middle / reduced_depth(design, depth)) ** 2 for depth in span)
     return far, MORE * near
 
 

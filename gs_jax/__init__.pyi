@@ -18,6 +18,7 @@ from .io.volumes import read_volume as read_volume, write_volume as write_volume
 from .layers import Layers as Layers, Sample as Sample
 from .layouts import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
+from .materials import refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .pictures.volume_pictures import show as show

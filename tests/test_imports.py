@@ -15,6 +15,7 @@ ORDER = [
     "base",
     "lenses",
     "layers",
+    "materials",
     "geometry",
     "grid",
     "metrics",

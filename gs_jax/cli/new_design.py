@@ -135,7 +135,7 @@ def new_design_command(output: Path, centers: Path | None, name: str | None, for
             f"left out: {left_out} lenses beyond the sensor's reach; the plate is {_format(known['size_mm'])} mm"
         )
     radius, lenses = known["radius_of_curvature_mm"], len(design.array.centers_mm)
-    lens = f"f = {radius / (design.lens.refractive_index - 1):.4g} mm (R = {radius:.4g} mm)"
+    lens = f"f = {radius / (design.refractive_index - 1):.4g} mm (R = {radius:.4g} mm)"
     sensor = f"sensor at {design.imaging.sensor_distance_mm:g} mm"
     click.echo(f"{output}: {lenses} lenses of {lens}, {sensor}; see gs-jax metrics {output}")
 

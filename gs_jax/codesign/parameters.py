@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
 from ..design.design import Design
-from ..design.validation import reduced_thicknesses
+from ..design.light_path import reduced_depth, reduced_sensor_distance
 from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH, type_of_lens
@@ -103,11 +103,10 @@ def _largest_magnification(design: Design, near: float, far: float, free: Mappin
     least = lambda name, own: min(own, free.get(name, (own, own))[0])
     # Of an index that is free the one that makes it largest: the plate is in front, or behind.
     in_front = design.lens.orientation == "plano"
-    index = (most if in_front else least)("refractive_index", design.lens.refractive_index)
-    front, back = reduced_thicknesses(design.array.substrate_thickness_mm, index, design.lens.orientation)
+    index = (most if in_front else least)("refractive_index", design.refractive_index)
     nearest = (near + far - most("depth_span_mm", far - near)) / 2
     distance = most("sensor_distance_mm", design.imaging.sensor_distance_mm)
-    return (distance + back) / (nearest + front)
+    return reduced_sensor_distance(design, distance, index) / reduced_depth(design, nearest, index)
 
 
 def start_values(imager: Imager, at: Conditions) -> Values:

@@ -18,7 +18,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design, read_design
-from ..design.validation import reduced_thicknesses
+from ..design.light_path import reduced_depth, reduced_sensor_distance
 from ..lenses import lenses_by_type
 from ..optics.lens_types import interleave
 from ..typing import PathLike
@@ -196,11 +196,9 @@ def initial_design(design: Design, study: Study) -> Design:
 def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
     """Focal lengths of thin lenses focused on equal parts of the depths, in vergence, relative to the middle's."""
     near, far = study.depths_mm or design.imaging.working_distance_mm
-    lens, array = design.lens, design.array
-    front, back = reduced_thicknesses(array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
-    ends = 1 / (near + front), 1 / (far + front)
+    ends = 1 / reduced_depth(design, near), 1 / reduced_depth(design, far)
     share = (np.arange(types) + 0.5) / types
-    behind = 1 / (design.imaging.sensor_distance_mm + back)
+    behind = 1 / reduced_sensor_distance(design, design.imaging.sensor_distance_mm)
     return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
 
 

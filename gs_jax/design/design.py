@@ -12,14 +12,26 @@ import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
-from ..geometry import Imager, Sensor
+from ..geometry import LONGEST, SHORTEST, Imager, Sensor
 from ..io.files import write_text
 from ..io.toml import Table, one_line, read_toml
+from ..layers import Sample
 from ..lenses import MicrolensArray
+from ..materials import index_of
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .imagers import sharp_depths, tables_of
-from .tables import ArrayTable, CalibrationTable, ImagingTable, LensTable, SensorTable
+from .light_path import NO_SAMPLE, chosen_sample, layers_of, object_begins, plate_index
+from .tables import (
+    ArrayTable,
+    CalibrationTable,
+    ImagingTable,
+    LayersTable,
+    LayerTable,
+    LensTable,
+    SampleTable,
+    SensorTable,
+)
 from .validation import check_whole, doubts, of_each, slips
 
 
@@ -42,6 +54,17 @@ class Design(Table):
     lens: LensTable = Field(title="plano-convex microlenses, alike or not", description="a table")
     array: ArrayTable = Field(title="the plate, and where its lenses are", description="a table")
     imaging: ImagingTable = Field(title="where the sensor and the object are, and the light", description="a table")
+    layers: LayersTable = Field(
+        default=LayersTable(), title="filters and windows in the light's path", description="a table"
+    )
+    sample: SampleTable = Field(
+        default=NO_SAMPLE, title="the medium that holds the object; air by default", description="a table"
+    )
+    samples: dict[str, SampleTable] = Field(
+        default={},
+        title="other samples by name, each a table like `[sample]`, for `--sample NAME`",
+        description="a table of tables",
+    )
     calibration: CalibrationTable = Field(
         default=CalibrationTable(),
         title="the array as found on the sensor; `gs-jax calibrate` writes it",
@@ -63,28 +86,67 @@ class Design(Table):
         )
         count = len(set(zip(*(of_each(self, key) for key in LENS_KEYS), strict=True)))
         of_types = f" of {count} types" if count > 1 else ""
+        media = [
+            f"  {side}: {', '.join(f'{layer.thickness_mm:g} mm of n = {_index(layer)}' for layer in layers)}"
+            for side, layers in (("in front", self.layers.object), ("on the sensor", self.layers.sensor))
+            if layers
+        ]
+        if self.sample != NO_SAMPLE:
+            media.append(f"  objects in n = {_index(self.sample)}, from z = {object_begins(self):g} mm")
         return "\n".join(
             [
                 f"Design {self.name!r}",
-                f"  {len(array.centers_mm)} lenses{of_types}, {focal}{_shape(lens)}, n = {lens.refractive_index:g}, "
+                f"  {len(array.centers_mm)} lenses{of_types}, {focal}{_shape(lens)}, n = {self.refractive_index:g}, "
                 f"D = {span_of(lens.aperture_diameter_mm)} mm, on {array.size_mm[0]:g} x {array.size_mm[1]:g} mm, "
                 f"{array.substrate_thickness_mm:g} mm thick",
                 f"  sensor of {sensor.shape[0]} x {sensor.shape[1]} pixels of {sensor.pixel_pitch_um:g} um "
                 f"at v = {imaging.sensor_distance_mm:g} mm",
                 f"  objects at z = {imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm, "
                 f"{imaging.wavelength_nm:g} nm, field radius {imaging.field_radius_mm:g} mm",
+                *media,
             ]
         )
 
     __str__ = __repr__
 
-    def imager(self) -> Imager:
-        """The geometry of this design: mm and radians."""
+    @property
+    def refractive_index(self) -> float:
+        """Index of lenses and plate at the design's wavelength."""
+        return plate_index(self)
+
+    def imager(self, sample: str | Sample | None = None, wavelength_nm: float | None = None) -> Imager:
+        """The geometry of this design: mm and radians.
+
+        Parameters
+        ----------
+        sample
+            What holds the object: the name of one of `[samples]`, "air" for none, or a `Sample`. By default that of
+            `[sample]`, or air.
+        wavelength_nm
+            Of the light, if it is another than the design's, nm. Indices of materials follow.
+
+        Raises
+        ------
+        InputError
+            If there is no such sample, or the wavelength is beyond the range of designs or of a material.
+
+        Examples
+        --------
+        >>> import gs_jax as gs
+        >>> gel = gs.Sample(1.43, surface=19.0)
+        >>> scope = gs.geomscope().imager(gel, wavelength_nm=590.0)
+        >>> print(round(float(scope.reduced_depth(21.0)), 3))  # 19 mm of air, 2 mm of gel, 1 mm of plate
+        21.098
+        """
         lens, imaging, calibration = self.lens, self.imaging, self.calibration
+        wavelength = imaging.wavelength_nm if wavelength_nm is None else wavelength_nm
+        if not 1e6 * SHORTEST <= wavelength <= 1e6 * LONGEST:
+            allowed = f"a number of nanometres from {1e6 * SHORTEST:g} to {1e6 * LONGEST:g}"
+            raise InputError(f"`wavelength_nm` must be {allowed}, got {wavelength}.")
         array = MicrolensArray(
             np.array(self.array.centers_mm),
             radius_of_curvature=_one_if_alike(lens.radius_of_curvature_mm),
-            refractive_index=lens.refractive_index,
+            refractive_index=index_of(lens.refractive_index, wavelength),
             aperture_diameter=_one_if_alike(lens.aperture_diameter_mm),
             substrate_thickness=self.array.substrate_thickness_mm,
             thin_lens_focal_length=lens.focal_length_mm,
@@ -98,10 +160,13 @@ class Design(Table):
             Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
             sensor_distance=imaging.sensor_distance_mm,
             field_radius=imaging.field_radius_mm,
-            wavelength=imaging.wavelength_nm / 1e6,
+            wavelength=wavelength / 1e6,
             rotation=math.radians(calibration.rotation_deg),
             shift=calibration.shift_mm,
             tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
+            filters=layers_of(self.layers.object, wavelength),
+            windows=layers_of(self.layers.sensor, wavelength),
+            sample=chosen_sample(self, sample, wavelength),
         )
 
     @classmethod
@@ -143,6 +208,7 @@ class Design(Table):
         ----------
         **values
             By key, without the name of its table: `centers_mm`, `sensor_distance_mm`, `shape`, ... Lists may be arrays.
+            `layers`, `sample`, `samples` and `provenance` are replaced as a whole.
 
         Raises
         ------
@@ -160,7 +226,7 @@ class Design(Table):
             value = value.tolist() if hasattr(value, "tolist") else value
             if key in tables:
                 data[tables[key]][key] = value
-            elif key in ("name", "provenance"):
+            elif key in _WHOLE:
                 data[key] = value
             else:
                 nearest = difflib.get_close_matches(key, tables, n=3) or sorted(tables)
@@ -168,8 +234,9 @@ class Design(Table):
         return _validated(data)
 
 
-# Whose keys all differ.
+# Whose keys all differ, and what is replaced as a whole.
 _TABLES = ("sensor", "lens", "array", "imaging", "calibration")
+_WHOLE = ("name", "layers", "sample", "samples", "provenance")
 
 
 def _fields(table: str):
@@ -187,6 +254,11 @@ def _validated(data: dict[str, Any]) -> Design:
 
 def _one_if_alike(numbers: float | tuple[float, ...]) -> float | tuple[float, ...]:
     return numbers[0] if isinstance(numbers, tuple) and len(set(numbers)) == 1 else numbers
+
+
+def _index(table: LayerTable | SampleTable) -> str:
+    index = table.refractive_index
+    return index if isinstance(index, str) else f"{index:g}"
 
 
 def span_of(numbers: float | tuple[float, ...]) -> str:
@@ -238,7 +310,7 @@ def checked_design(path: PathLike, data: dict[str, Any]) -> Design:
         # A slip of a unit is why lenses are beside the sensor, and comes first.
         problems = [*slips(data), one_line(error, Design, {"array": list(CentersTable.model_fields)})]
         raise InputError(f"{' '.join(problems)} ({path}).") from error
-    for question in doubts(data):
+    for question in doubts(data, design):
         warnings.warn(f"{path}: {question}", InputWarning, stacklevel=3)
     return design
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..geometry import Imager
+from ..layers import Layers, Sample
 from ..lenses import lenses_by_type
 from ..optics import theory
 from ..optics.apertures import clear_diameter
@@ -48,6 +49,22 @@ def tables_of(imager: Imager) -> dict[str, Any]:
             "shift_mm": _decimal(imager.shift),
             "tilt_deg": tilt,
         },
+        "layers": {"object": _layers(imager.filters), "sensor": _layers(imager.windows)},
+    } | ({} if imager.sample is None else {"sample": _sample(imager.sample)})
+
+
+def _layers(layers: Layers | None) -> list[dict[str, float]]:
+    if layers is None:
+        return []
+    numbers = zip(_decimal(layers.thickness), _decimal(layers.refractive_index), strict=True)
+    return [{"thickness_mm": thickness, "refractive_index": index} for thickness, index in numbers]
+
+
+def _sample(sample: Sample) -> dict[str, Any]:
+    return {
+        "refractive_index": _decimal(sample.refractive_index),
+        "surface_mm": None if sample.surface is None else _decimal(sample.surface),
+        "layers": _layers(sample.layers)[::-1],
     }
 
 

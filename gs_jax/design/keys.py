@@ -5,10 +5,11 @@ All of it is read from the fields of the tables, whose titles are meanings and w
 
 import textwrap
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from ..io.toml import table_of
 from .centers import LENS_KEYS, CentersTable
 from .design import Design, as_toml
 from .validation import USUAL, unit_of
@@ -66,8 +67,14 @@ def commented(design: Design) -> str:
         if table == "provenance":
             lines.append(as_toml({table: data[table]}).partition("\n")[2].rstrip())
             continue
+        if table == "samples":
+            lines[-1] = as_toml({table: data[table]}).rstrip()
+            continue
         for name, value in data[table].items():
-            lines += [*_comment(_comment_text(known[f"{table}.{name}"])), as_toml({name: value}).rstrip()]
+            lines += _comment(_comment_text(known[f"{table}.{name}"]))
+            inner = [key for key in known.values() if key.table == f"{table}.{name}"]
+            lines += [line for key in inner for line in _comment(f"{key.name}: {_comment_text(key)}")]
+            lines.append(as_toml({name: value}).rstrip())
     return "\n".join(lines) + "\n"
 
 
@@ -90,10 +97,13 @@ def schema() -> dict[str, Any]:
     return {"$schema": "http://json-schema.org/draft-07/schema#"} | _for_toml(made) | {"title": "A design of gs-jax"}
 
 
-def _models() -> dict[str, type[BaseModel]]:
-    tables = {name: field.annotation for name, field in Design.model_fields.items()}
-    inner = {name: model for name, model in tables.items() if isinstance(model, type) and issubclass(model, BaseModel)}
-    return {"": Design} | inner
+def _models(table: str = "", model: type[BaseModel] = Design) -> dict[str, type[BaseModel]]:
+    """A table and those in it by their names; those of `[samples]` have the keys of `[sample]`."""
+    found = {table: model}
+    for name, field in model.model_fields.items():
+        if get_origin(field.annotation) is not dict and (inner := table_of(field.annotation)):
+            found |= _models(f"{table}.{name}".removeprefix("."), inner)
+    return found
 
 
 def _all_keys() -> Iterator[Key]:
@@ -128,7 +138,7 @@ def _for_toml(node: Any) -> Any:
         return [_for_toml(each) for each in node]
     if not isinstance(node, dict):
         return node
-    node = {key: _for_toml(value) for key, value in node.items() if not (key == "default" and value is None)}
+    node = {key: _for_toml(value) for key, value in node.items() if value is not None}
     choices = [each for each in node.get("anyOf", ()) if each != {"type": "null"}]
     if len(choices) == 1:
         node = {key: value for key, value in node.items() if key != "anyOf"} | choices[0]

@@ -1,12 +1,13 @@
 """Tables of a design file, with the type, range and meaning of each key."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, Tag
 
 from ..geometry import LONGEST, SHORTEST
-from ..io.toml import EACH, ONE, Table, one_or_each
+from ..io.toml import EACH, NAME, ONE, Table, number_or_name, one_or_each
 from ..lenses import Orientation
+from ..materials import MATERIALS
 from .centers import MAX_LENSES
 
 # Descriptions are the allowed values, titles the meaning of a key. Error messages, comments in files, the schema for
@@ -34,6 +35,17 @@ _ForEach = Field(strict=False, min_length=1, max_length=MAX_LENSES)
 Lengths = Annotated[Annotated[Length, Tag(ONE)] | Annotated[tuple[Length, ...], _ForEach, Tag(EACH)], one_or_each]
 Conics = Annotated[Annotated[Conic, Tag(ONE)] | Annotated[tuple[Conic, ...], _ForEach, Tag(EACH)], one_or_each]
 _ONE_EACH = "or a list with one for each lens, in the order of the centres"
+Material = Literal["air", "PDMS", "PMMA", "BK7", "fused silica", "water"]
+_NAMES = ", ".join(f'"{name}"' for name in MATERIALS if name != "air")
+Index = Annotated[
+    Annotated[Material, Tag(NAME)] | Annotated[float, Field(ge=1, le=5), Tag(ONE)],
+    number_or_name,
+    Field(description=f"a number from 1 to 5, or one of {_NAMES}"),
+]
+LensIndex = Annotated[
+    Annotated[Material, Tag(NAME)] | Annotated[float, Field(gt=1, le=5), Tag(ONE)],
+    number_or_name,
+]
 Slope = Annotated[float, Field(ge=-10, le=10)]
 Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
 Centers = Annotated[
@@ -79,11 +91,9 @@ class LensTable(Table):
         title="R of the curved side at its vertex, positive; a focal length f in air is R = f (n - 1)",
         description=f"a number of mm from 1e-6 to 1e4, {_ONE_EACH}",
     )
-    refractive_index: float = Field(
-        gt=1,
-        le=5,
+    refractive_index: LensIndex = Field(
         title="n of lenses and plate at the wavelength: PDMS 1.43, fused silica 1.46, acrylic 1.49, BK7 1.52",
-        description="a number above 1, up to 5",
+        description=f"a number above 1, up to 5, or one of {_NAMES}",
     )
     aperture_diameter_mm: Lengths = Field(
         title="D of each lens, before neighbours clip it; at most 2 R of a sphere",
@@ -135,6 +145,59 @@ class ImagingTable(Table):
     wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
     field_radius_mm: Length = Field(
         title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
+    )
+
+
+class LayerTable(Table):
+    """A plane layer that light crosses."""
+
+    name: str = Field(default="", title="what it is, for people", description="a string")
+    thickness_mm: Length = Field(title="thickness")
+    refractive_index: Index = Field(
+        default=1.0,
+        title="n at the wavelength; 1, air, by default",
+        description=f"a number from 1 to 5, or one of {_NAMES}",
+    )
+
+
+LayerTables = Annotated[tuple[LayerTable, ...], Field(strict=False, description="a list of tables")]
+
+
+class LayersTable(Table):
+    """`[layers]`: filters and windows, in `[[layers.object]]` and `[[layers.sensor]]`.
+
+    Each begins where the last ends. Those on the object's side tilt with the array. What is left of the sensor distance
+    is air.
+    """
+
+    object: LayerTables = Field(
+        default=(), title="layers on the object's side, from the array's front outward", description="a list of tables"
+    )
+    sensor: LayerTables = Field(
+        default=(),
+        title="layers on the sensor's side, from the sensor toward the array: the gap to the window, the window",
+        description="a list of tables",
+    )
+
+
+class SampleTable(Table):
+    """`[sample]`: the medium that holds the object, or `[samples.NAME]`."""
+
+    refractive_index: Index = Field(
+        title="n of the object's medium at the wavelength; 1, air, is no sample",
+        description=f"a number from 1 to 5, or one of {_NAMES}",
+    )
+    surface_mm: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e4,
+        title="depth at which the medium begins, from the array's front; without it the medium begins where layers end",
+        description="a number of mm from 0 to 1e4",
+    )
+    layers: LayerTables = Field(
+        default=(),
+        title="cover slips and the like of this sample, from the array outward; they end where the medium begins",
+        description="a list of tables",
     )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..lenses import sag_slope_over_r
 from .centers import LENS_KEYS, other_reading
+from .light_path import check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
 
 MIN_SPACING_MM = 1e-3
 # Radii at which the slope of a lens is checked.
@@ -21,7 +22,7 @@ _RADII = 64
 
 def check_whole(design) -> None:
     """Raise `ValueError` unless the numbers, the plate, the lenses and the sensor of a design fit together."""
-    for check in (_check_numbers, _check_lenses, _check_plate, _check_spacing, _check_reach):
+    for check in (_check_numbers, _check_lenses, check_path, _check_plate, _check_spacing, _check_reach):
         check(design)
 
 
@@ -65,12 +66,6 @@ def _check_lenses(design) -> None:
 def widest_diameter(radius: float, conic_constant: float) -> float:
     """Largest diameter of a conic surface, mm; infinite for paraboloids and hyperboloids."""
     return 2 * radius / math.sqrt(1 + conic_constant) if conic_constant > -1 else math.inf
-
-
-def reduced_thicknesses(thickness: float, refractive_index: float, orientation: str) -> tuple[float, float]:
-    """Reduced thickness `t/n` of the plate in front of the lens vertices and behind them, mm; one of them is 0."""
-    reduced = thickness / refractive_index
-    return (reduced, 0.0) if orientation == "plano" else (0.0, reduced)
 
 
 def _check_plate(design) -> None:
@@ -127,11 +122,9 @@ def reach(design) -> tuple[Float[np.ndarray, " lens"], float]:
     centers = np.array(design.array.centers_mm) @ rotation.T + calibration.shift_mm
     middle = np.array(design.sensor.origin_mm or (0.0, 0.0))
     distance = beside_sensor(centers - middle, design.sensor.shape, design.sensor.pixel_pitch_um)
-    lens = design.lens
-    front, back = reduced_thicknesses(design.array.substrate_thickness_mm, lens.refractive_index, lens.orientation)
-    near, v = imaging.working_distance_mm[0] + front, imaging.sensor_distance_mm + back
-    radius = v / near * imaging.field_radius_mm
-    return distance, radius
+    nearest = max(imaging.working_distance_mm[0], object_begins(design))
+    magnification = reduced_sensor_distance(design, imaging.sensor_distance_mm) / reduced_depth(design, nearest)
+    return distance, magnification * imaging.field_radius_mm
 
 
 def beside_sensor(
@@ -159,6 +152,11 @@ USUAL: dict[str, tuple[float, float]] = {
     "imaging.working_distance_mm": (0.2, 2000.0),
     "imaging.wavelength_nm": (150.0, 15_000.0),
     "imaging.field_radius_mm": (0.02, 200.0),
+    "layers.object.thickness_mm": (0.01, 100.0),
+    "layers.sensor.thickness_mm": (0.01, 20.0),
+    "sample.refractive_index": (1.0, 2.0),
+    "sample.surface_mm": (0.0, 2000.0),
+    "sample.layers.thickness_mm": (0.01, 100.0),
 }
 _FACTORS = (1e-3, 1e3, 1e-6, 1e6, 1e9)
 _LADDER = ("nm", "um", "mm", "m")
@@ -183,16 +181,17 @@ def slips(data: Mapping[str, Any]) -> list[str]:
     data
         The tables of a file; entries that are not numbers are ignored.
     """
-    return [question for key in USUAL if (question := slip(key, _value(data, key)))]
+    found = [(key, place, value) for key in USUAL for place, value in _values(data, key)]
+    return [question for key, place, value in found if (question := slip(key, value, place))]
 
 
-def slip(key: str, value: Any) -> str | None:
-    """The question about a value of a key; None if it is usual, or not a positive number."""
+def slip(key: str, value: Any, place: str | None = None) -> str | None:
+    """The question about a value of a key, which is called `place`; None if it is usual, or not a positive number."""
     numbers = _positive(value)
     low, high = USUAL[key]
     if not numbers or all(low <= each <= high for each in numbers):
         return None
-    found, unit = f"{key} = {_numbers(numbers)}", unit_of(key)
+    found, unit = f"{place or key} = {_numbers(numbers)}", unit_of(key)
     if (other := _other(key, numbers)) is None:
         return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
     meant, their_unit = other
@@ -207,9 +206,9 @@ def meant(key: str, value: Any) -> float | list[float] | None:
     return other[0] if isinstance(value, list | tuple) else other[0][0]
 
 
-def doubts(data: Mapping[str, Any]) -> list[str]:
-    """Questions about valid tables of a design: those of `slips`, or else unlikely combinations."""
-    return slips(data) or list(_unlikely(data))
+def doubts(data: Mapping[str, Any], design) -> list[str]:
+    """Questions about a design and its tables in a file: those of `slips`, or else unlikely combinations."""
+    return slips(data) or list(_unlikely(design))
 
 
 def unit_of(key: str) -> str:
@@ -238,13 +237,27 @@ def _other(key: str, numbers: list[float]) -> tuple[list[float], str | None] | N
     return None
 
 
-def _value(data: Mapping[str, Any], key: str) -> Any:
+def _values(data: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
+    """All values of a key, with what each is called; those of `[sample]` in `[samples]` too."""
     table, _, name = key.partition(".")
     inner = data.get(table)
-    found = inner.get(name) if isinstance(inner, Mapping) else None
-    if table == "lens" and (numbers := sorted(set(_positive(found)))):
-        return [numbers[0], numbers[-1]] if len(numbers) > 1 else numbers[0]  # one number a lens: the extremes
-    return found
+    if table == "lens" and isinstance(inner, Mapping) and (numbers := sorted(set(_positive(inner.get(name))))):
+        yield key, numbers if len(numbers) == 1 else [numbers[0], numbers[-1]]  # one number a lens: the extremes
+    else:
+        yield from _within(data, key.split("."), "")
+    if table == "sample" and isinstance(named := data.get("samples"), Mapping):
+        for each, one in named.items():
+            yield from _within(one, name.split("."), f"samples.{each}")
+
+
+def _within(node: Any, steps: list[str], place: str) -> Iterator[tuple[str, Any]]:
+    if not steps:
+        yield place, node
+    elif isinstance(node, Mapping) and steps[0] in node:
+        yield from _within(node[steps[0]], steps[1:], f"{place}.{steps[0]}".removeprefix("."))
+    elif isinstance(node, list | tuple):
+        for i, each in enumerate(node):
+            yield from _within(each, steps, f"{place}[{i}]")
 
 
 def _numbers(values: list[float]) -> str:
@@ -252,31 +265,34 @@ def _numbers(values: list[float]) -> str:
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
 
 
-def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
-    lens, array, imaging = data["lens"], data["array"], data["imaging"]
-    near, far = imaging["working_distance_mm"]
-    kind = lens.get("orientation", "plano")
-    front, back = reduced_thicknesses(array["substrate_thickness_mm"], lens["refractive_index"], kind)
-    v = imaging["sensor_distance_mm"]
-    radius, diameters = (np.array(lens[key], float) for key in ("radius_of_curvature_mm", "aperture_diameter_mm"))
-    f = np.array(lens.get("focal_length_mm") or radius / (lens["refractive_index"] - 1))
+def _unlikely(design) -> Iterator[str]:
+    lens, array, imaging = design.lens, design.array, design.imaging
+    near, far = imaging.working_distance_mm
+    if near < (begins := object_begins(design)):
+        said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
+        yield f"{said} The object's medium begins at {begins:g} mm."
+    v = imaging.sensor_distance_mm
+    behind = reduced_sensor_distance(design, v) - v
+    radius, diameters = np.array(lens.radius_of_curvature_mm, float), np.array(lens.aperture_diameter_mm, float)
+    f = np.array(lens.focal_length_mm or radius / (plate_index(design) - 1))
     least, most = float(f.min()), float(f.max())
     focal = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
     depths = f"{near:g} to {far:g} mm"
-    if near + front <= least:
+    if reduced_depth(design, near) <= least:
         said = f"imaging.working_distance_mm = [{near:g}, {far:g}]: is it meant?"
         yield f"{said} Nearer than the focal length, {focal} mm, no real image forms."
     else:
-        image = lambda f, depth: 1 / (1 / f - 1 / (depth + front)) - back if depth + front > f else math.inf
-        longest, shortest = image(most, near), image(least, far)
+        nearest, farthest = reduced_depth(design, near), reduced_depth(design, far)
+        image = lambda f, reduced: 1 / (1 / f - 1 / reduced) - behind if reduced > f else math.inf
+        longest, shortest = image(most, nearest), image(least, farthest)
         if not shortest / _OFF <= v <= longest * _OFF:
             said = f"imaging.sensor_distance_mm = {v:g}: is it meant?"
             yield f"{said} Lenses of f = {focal} mm image {depths} at {shortest:.4g} to {longest:.4g} mm."
-    if (field := imaging["field_radius_mm"]) > _WIDEST * far:
+    if (field := imaging.field_radius_mm) > _WIDEST * far:
         yield f"imaging.field_radius_mm = {field:g}: is it meant? A lens sees so far beside its axis at {depths}."
-    if (diameter := float(diameters.max())) > 2 * (plate_size := max(array["size_mm"])):
+    if (diameter := float(diameters.max())) > 2 * (plate_size := max(array.size_mm)):
         yield f"lens.aperture_diameter_mm = {diameter:g}: is it meant? The whole plate is {plate_size:g} mm."
-    pitch = _pitch(np.array(array["centers_mm"], float))
+    pitch = _pitch(np.array(array.centers_mm, float))
     if pitch < diameter / _CLOSEST:
         yield (
             f"array.centers_mm: lenses of {diameter:g} mm are {pitch:.3g} mm apart; did you mean "
@@ -284,7 +300,7 @@ def _unlikely(data: Mapping[str, Any]) -> Iterator[str]:
         )
     half = np.minimum(np.minimum(diameters, pitch) / 2, radius)
     height = float(np.max(radius - np.sqrt(radius**2 - half**2)))  # of spheres, which others are not far from
-    if 0 < (thickness := array["substrate_thickness_mm"]) < height and not lens.get("focal_length_mm"):
+    if 0 < (thickness := array.substrate_thickness_mm) < height and not lens.focal_length_mm:
         said = f"array.substrate_thickness_mm = {thickness:g}: is it meant?"
         yield f"{said} It counts to the vertices of the lenses, which alone are {height:.3g} mm high."
 

@@ -3,7 +3,7 @@
 import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Discriminator, ValidationError
 
@@ -12,8 +12,10 @@ from .files import PathLike, read_text
 
 Place = tuple[int | str, ...]
 # Tags of a union of one number and several; pydantic lists them among the keys of an error.
-ONE, EACH = "one number", "one for each"
+ONE, EACH, NAME = "one number", "one for each", "a name"
+_TAGS = (ONE, EACH, NAME)
 one_or_each = Discriminator(lambda value: EACH if isinstance(value, list | tuple) else ONE)
+number_or_name = Discriminator(lambda value: NAME if isinstance(value, str) else ONE)
 
 
 class Table(BaseModel):
@@ -53,7 +55,7 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
         if not place:
             lines.append(problem["msg"].removeprefix("Value error, "))
         elif problem["type"] == "extra_forbidden":
-            lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, _keys(model, also))}")
+            lines.append(f"`{_dotted(place)}`: no such key; {_nearest(place, model, _keys(model, also))}")
         else:
             given = "nothing" if problem["type"] == "missing" else short_repr(problem["input"])
             lines.append(f"`{_dotted(place)}` must be {_allowed(place, model)}, got {given}")
@@ -62,12 +64,15 @@ def one_line(error: ValidationError, model: type[BaseModel], also: Mapping[str, 
 
 
 def _dotted(place: Place) -> str:
-    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place if step not in (ONE, EACH))
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place if step not in _TAGS)
     return "".join(steps).removeprefix(".")
 
 
-def _table(annotation: Any) -> type[BaseModel] | None:
-    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+def table_of(annotation: Any) -> type[BaseModel] | None:
+    """The table that a field is, or has a list or a dictionary of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((table for part in get_args(annotation) if (table := table_of(part))), None)
 
 
 def _allowed(place: Place, model: type[BaseModel]) -> str:
@@ -75,27 +80,37 @@ def _allowed(place: Place, model: type[BaseModel]) -> str:
     description = ""
     for step in place:
         field = model.model_fields.get(str(step))
-        if field is None:
-            break
+        if field is None:  # an index of a list, or a name
+            continue
         description = field.description or description
-        model = _table(field.annotation) or model
+        model = table_of(field.annotation) or model
     return description
+
+
+def _innermost(tables: Sequence[str], model: type[BaseModel]) -> type[BaseModel]:
+    for name in tables:
+        if field := model.model_fields.get(name):
+            model = table_of(field.annotation) or model
+    return model
 
 
 def _keys(model: type[BaseModel], also: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     """Return the keys of each inner table, and those of the top level as ''."""
     keys = {"": list(model.model_fields)}
     for name, field in model.model_fields.items():
-        if table := _table(field.annotation):
+        if table := table_of(field.annotation):
             keys[name] = [*table.model_fields, *also.get(name, ())]
     return keys
 
 
-def _nearest(place: Place, keys: Mapping[str, Sequence[str]]) -> str:
+def _nearest(place: Place, model: type[BaseModel], keys: Mapping[str, Sequence[str]]) -> str:
     """Suggest the same key of another table, a similar key, or else every key of this table."""
     *tables, wrong = (str(step) for step in place)
-    here = keys.get(".".join(tables), [])
-    everywhere = {key: f"{table}.{key}".removeprefix(".") for table, names in keys.items() for key in names}
+    here = keys.get(".".join(tables)) or list(_innermost(tables, model).model_fields)
+    everywhere = {}
+    for table, names in keys.items():
+        for key in names:
+            everywhere.setdefault(key, f"{table}.{key}".removeprefix("."))
     if wrong in everywhere:
         return f"did you mean `{everywhere[wrong]}`, in its own table?"
     if near := difflib.get_close_matches(wrong, here, n=1):

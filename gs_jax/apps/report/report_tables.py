@@ -79,7 +79,7 @@ def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str
     sensor, lens, array, imaging = design.sensor, design.lens, design.array, design.imaging
     rows, columns = sensor.shape
     height, width = (f"{n * sensor.pixel_pitch_um / 1000:.4g}" for n in sensor.shape)
-    shape = f"radius {span_of(lens.radius_of_curvature_mm)} mm, index {lens.refractive_index:g}"
+    shape = f"radius {span_of(lens.radius_of_curvature_mm)} mm, index {design.refractive_index:g}"
     if lens.focal_length_mm is not None:
         shape = "ideal, thin"
     conic = f", conic constant {span_of(lens.conic_constant)}" if lens.conic_constant else ""

@@ -1,0 +1,143 @@
+"""The layers and the sample of a design, as the geometry takes them."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from ..base.errors import InputError, short_repr
+from ..layers import Layers, Sample, object_surface, reduced_distance
+from ..materials import index_of
+from .tables import ArrayTable, ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
+
+# The name of no sample, and the table of none.
+AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
+
+
+class Path(Protocol):
+    """What of a design the light crosses."""
+
+    @property
+    def lens(self) -> LensTable: ...
+    @property
+    def array(self) -> ArrayTable: ...
+    @property
+    def imaging(self) -> ImagingTable: ...
+    @property
+    def layers(self) -> LayersTable: ...
+    @property
+    def sample(self) -> SampleTable: ...
+    @property
+    def samples(self) -> dict[str, SampleTable]: ...
+
+
+def layers_of(tables: Sequence[LayerTable], wavelength_nm: float) -> Layers | None:
+    """Layers of tables, in their order; None without any."""
+    if not tables:
+        return None
+    indices = [index_of(table.refractive_index, wavelength_nm) for table in tables]
+    return Layers([table.thickness_mm for table in tables], indices)
+
+
+def sample_of(table: SampleTable, wavelength_nm: float) -> Sample | None:
+    """The sample of a table; None for air."""
+    index = index_of(table.refractive_index, wavelength_nm)
+    if index == 1 and not table.layers and table.surface_mm is None:
+        return None
+    # In files layers go outward, as those on the array; a `Sample` has them from the medium.
+    return Sample(index, table.surface_mm, layers_of(table.layers[::-1], wavelength_nm))
+
+
+def chosen_sample(design: Path, sample: str | Sample | None, wavelength_nm: float) -> Sample | None:
+    """The sample of a name, or the default one (None); "air" is none."""
+    if isinstance(sample, Sample):
+        return sample
+    if sample == AIR:
+        return None
+    if sample is None:
+        return sample_of(design.sample, wavelength_nm)
+    if sample not in design.samples:
+        names = ", ".join([*design.samples, AIR])
+        raise InputError(f"`sample` must be one of [samples] in the design, {names}, got {short_repr(sample)}.")
+    return sample_of(design.samples[sample], wavelength_nm)
+
+
+def plate_index(design: Path) -> float:
+    """Index of lenses and plate at the design's wavelength."""
+    return index_of(design.lens.refractive_index, design.imaging.wavelength_nm)
+
+
+def reduced_depth(design: Path, depth: float, index: float | None = None) -> float:
+    """Reduced depth `z'` in the default sample, mm, of lenses of the design's index or another."""
+    wavelength = design.imaging.wavelength_nm
+    filters, sample = layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength)
+    in_front = _plate(design, index) if design.lens.orientation == "plano" else 0.0
+    return float(reduced_distance(depth, filters, sample)) + in_front
+
+
+def reduced_sensor_distance(design: Path, distance: float, index: float | None = None) -> float:
+    """Reduced sensor distance `v'`, mm, of lenses of the design's index or another."""
+    windows = layers_of(design.layers.sensor, design.imaging.wavelength_nm)
+    behind = _plate(design, index) if design.lens.orientation == "curved" else 0.0
+    return distance - (0.0 if windows is None else float(windows.shortening)) + behind
+
+
+def object_begins(design: Path) -> float:
+    """Depth at which the default sample begins, or air beyond the filters, mm."""
+    wavelength = design.imaging.wavelength_nm
+    begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength))
+    return float(f"{float(begins):.9g}")
+
+
+def check_path(design: Path) -> None:
+    """Raise `ValueError` unless the layers and samples have room, and their materials are known at the wavelength."""
+    wavelength = design.imaging.wavelength_nm
+    for key, material in _materials(design):
+        try:
+            index = index_of(material, wavelength)
+        except InputError as error:
+            raise ValueError(f"`imaging.wavelength_nm` and `{key}`: {str(error).removesuffix('.')}") from error
+        if key == "lens.refractive_index" and not index > 1:
+            raise ValueError(f'`lens.refractive_index` must be above 1, got "{material}"')
+    if AIR in design.samples:
+        raise ValueError('`samples.air` must have another name: "air" is no sample')
+    behind, v = _total(design.layers.sensor), design.imaging.sensor_distance_mm
+    if behind > v:
+        raise ValueError(f"`layers.sensor` must be at most `imaging.sensor_distance_mm`, {v:g} mm, got {behind:g} mm")
+    _check_sample(design, "sample", design.sample)
+    for name, table in design.samples.items():
+        _check_sample(design, f"samples.{name}", table)
+    begins, working = object_begins(design), list(design.imaging.working_distance_mm)
+    if working[1] <= begins:
+        allowed = f"beyond {begins:g} mm, where layers end and the object's medium begins"
+        raise ValueError(f"`imaging.working_distance_mm` must be {allowed}, got {working}")
+
+
+def _check_sample(design: Path, key: str, table: SampleTable) -> None:
+    if sample_of(table, design.imaging.wavelength_nm) is None:
+        return
+    inside = _total(design.layers.object) + _total(table.layers)
+    if table.surface_mm is not None and table.surface_mm < inside * (1 - 1e-9):
+        parts = f"the thickness of `layers.object` and `{key}.layers`"
+        raise ValueError(f"`{key}.surface_mm` must be {inside:g} mm or more, {parts}, got {table.surface_mm:g}")
+    if design.lens.orientation == "curved" and not (table.surface_mm or inside):
+        raise ValueError(f"`{key}.surface_mm` must be given with the curved side in front, got a sample in contact")
+
+
+def _total(layers: Sequence[LayerTable]) -> float:
+    return sum(layer.thickness_mm for layer in layers)
+
+
+def _plate(design: Path, index: float | None) -> float:
+    return design.array.substrate_thickness_mm / (plate_index(design) if index is None else index)
+
+
+def _materials(design: Path) -> list[tuple[str, Any]]:
+    """All indices by their keys."""
+    layers = {"layers.object": design.layers.object, "layers.sensor": design.layers.sensor}
+    found: list[tuple[str, Any]] = [("lens.refractive_index", design.lens.refractive_index)]
+    samples = {"sample": design.sample} | {f"samples.{name}": table for name, table in design.samples.items()}
+    for key, table in samples.items():
+        found.append((f"{key}.refractive_index", table.refractive_index))
+        layers[f"{key}.layers"] = table.layers
+    for key, tables in layers.items():
+        found += [(f"{key}[{i}].refractive_index", layer.refractive_index) for i, layer in enumerate(tables)]
+    return found

@@ -1,0 +1,154 @@
+"""Layers, samples and materials in design files."""
+
+import dataclasses
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+import gs_jax as gs
+from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.design.design import Design, checked_design
+from gs_jax.design.keys import commented
+
+from .test_designs import edited
+
+FILTER = {"name": "filter", "thickness_mm": 2.0, "refractive_index": 1.52}
+SLIP = {"thickness_mm": 0.17, "refractive_index": 1.523}
+STACK = {
+    "imaging.working_distance_mm": [19.7, 30.0],
+    "layers.object": [FILTER],
+    "layers.sensor": [{"thickness_mm": 0.6}, {"thickness_mm": 0.55, "refractive_index": "BK7"}],
+    "sample": {"refractive_index": "water", "surface_mm": 19.67, "layers": [{"thickness_mm": 1.0}, SLIP]},
+    "samples": {"gel": {"refractive_index": 1.43, "layers": [SLIP]}},
+}
+
+
+def design_of(changes) -> Design:
+    return checked_design("design.toml", edited(changes))
+
+
+@pytest.mark.parametrize(
+    ("material", "wavelength", "index"),
+    [
+        ("BK7", 587.56, 1.51680),
+        ("BK7", 486.13, 1.52238),
+        ("fused silica", 587.56, 1.45846),
+        ("PMMA", 587.56, 1.4911),
+        ("water", 589.3, 1.3332),
+        ("PDMS", 589.3, 1.4118),  # data sheet of Sylgard 184
+        ("air", 520.0, 1.0),
+    ],
+)
+def test_indices_of_materials_are_the_published_ones(material, wavelength, index):
+    last_digit = {"BK7": 1e-5, "fused silica": 1e-5, "air": 0}.get(material, 6e-4)
+    assert gs.refractive_index(material, wavelength) == pytest.approx(index, abs=last_digit)
+
+
+@pytest.mark.parametrize(
+    ("material", "wavelength", "words"),
+    [("PMMA", 400.0, "436.8 to 1052 nm for the index of PMMA, got 400"), ("glass", 520.0, "fused silica, water, got")],
+)
+def test_indices_that_are_not_known(material, wavelength, words):
+    with pytest.raises(InputError, match=words):
+        gs.refractive_index(material, wavelength)
+
+
+def test_the_imager_has_the_layers_of_the_file():
+    design = design_of(STACK)
+    water, scope = gs.refractive_index("water", 520.0), design.imager()
+    by_hand = 19.67 - 2.0 * (1 - 1 / 1.52) - 0.17 * (1 - 1 / 1.523) + 1.33 / water + 1.0 / 1.43
+    assert float(scope.reduced_depth(21.0)) == pytest.approx(by_hand)
+    assert float(scope.reduced_sensor_distance) == pytest.approx(
+        5.8 - 0.55 * (1 - 1 / gs.refractive_index("BK7", 520.0))
+    )
+    in_contact = 2.17 - 2.0 * (1 - 1 / 1.52) - 0.17 * (1 - 1 / 1.523) + (21 - 2.17) / 1.43 + 1.0 / 1.43
+    assert float(design.imager("gel").reduced_depth(21.0)) == pytest.approx(in_contact)
+    assert design.imager("air").sample is None
+    red = design.imager(wavelength_nm=650.0)
+    assert float(red.wavelength) == pytest.approx(650e-6)
+    assert float(red.sample.refractive_index) == pytest.approx(gs.refractive_index("water", 650.0))
+    assert float(design.imager(gs.Sample(1.5)).sample.refractive_index) == 1.5
+
+
+def test_an_imager_with_layers_makes_the_same_design(tmp_path):
+    scope = dataclasses.replace(
+        gs.geomscope().imager(),
+        filters=gs.Layers([2.0, 0.5], [1.52, 1.0]),
+        windows=gs.Layers([0.6, 0.55], [1.0, 1.51]),
+        sample=gs.Sample(1.43, surface=19.0, layers=gs.Layers([0.17, 0.5], [1.523, 1.33])),
+    )
+    design = Design.from_imager(scope, name="stack", working_distance_mm=(19.5, 24.0))
+    gs.write_design(tmp_path / "stack.toml", design)
+    (tmp_path / "commented.toml").write_text(commented(design.replace(samples=design_of(STACK).samples)))
+    assert gs.read_design(tmp_path / "stack.toml") == design
+    assert gs.read_design(tmp_path / "commented.toml").samples == design_of(STACK).samples
+    same = jax.tree.map(lambda a, b: np.array_equal(a, b), design.imager(), scope)
+    assert all(jax.tree.leaves(same))
+    assert "2 mm of n = 1.52" in str(design) and "n = 1.43, from z = 19 mm" in str(design)
+    assert design.replace(sample={"refractive_index": 1.0}, layers={}).imager().filters is None
+
+
+# Each: what is changed in a file, and what the line says.
+WRONG = [
+    ({"layers.sensor": [{"thickness_mm": 7.0}]}, "`layers.sensor` must be at most `imaging.sensor_distance_mm`, 5.8"),
+    ({"layers.object": [{"thickness_mm": 40.0}]}, "`imaging.working_distance_mm` must be beyond 40 mm"),
+    ({"layers.object": [{"thickness_mm": 2.0, "refractive_index": 0.9}]}, "from 1 to 5, or one of"),
+    ({"layers.object": [{"thickness_mm": 2.0, "refractive_index": "glass"}]}, "`layers.object[0].refractive_index`"),
+    ({"layers.object": [{"thicknes_mm": 2.0}]}, "did you mean `thickness_mm`"),
+    ({"layers.object": [{"thickness_mm": 2.0, "surface_mm": 2.0}]}, "`sample.surface_mm`"),
+    ({"layers.object": {"thickness_mm": 2.0}}, "`layers.object` must be a list of tables"),
+    (
+        {"layers.sensor": [{"thickness_mm": 550.0}]},
+        "layers.sensor[0].thickness_mm = 550: did you mean 0.55 mm (550 um)",
+    ),
+    ({"sample": {"surface_mm": 19.0}}, "`sample.refractive_index` must be"),
+    ({"sample": {"refractive_index": 1.43, "surface_mm": 31.0}}, "must be beyond 31 mm, where layers end"),
+    (STACK | {"sample": {"refractive_index": 1.43, "surface_mm": 1.0}}, "`sample.surface_mm` must be 2 mm or more"),
+    ({"lens.orientation": "curved", "sample": {"refractive_index": 1.33}}, "curved side in front, got a sample in"),
+    ({"lens.orientation": "curved", "samples": {"gel": {"refractive_index": 1.33}}}, "`samples.gel.surface_mm`"),
+    ({"samples": {"air": {"refractive_index": 1.33}}}, "`samples.air` must have another name"),
+    ({"samples": {"gel": 1.33}}, "`samples.gel` must be a table"),
+    ({"lens.refractive_index": "air"}, "`lens.refractive_index` must be above 1"),
+    ({"lens.refractive_index": "PMMA", "imaging.wavelength_nm": 400.0}, "`imaging.wavelength_nm` and `lens.refrac"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), WRONG, ids=[words for _, words in WRONG])
+def test_files_that_are_refused(changes, words):
+    with pytest.raises(InputError) as caught, warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        design_of(changes)
+    assert words in str(caught.value) and str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sample": {"refractive_index": 2.4}}, "sample.refractive_index = 2.4: is it meant? Usual is 1 to 2."),
+        (
+            {"samples": {"gel": {"refractive_index": 1.3, "layers": [{"thickness_mm": 170.0}]}}},
+            "samples.gel.layers[0].thickness_mm = 170: did you mean 0.17 mm (170 um)?",
+        ),
+        ({"sample": {"refractive_index": 1.43, "surface_mm": 19.0}}, "The object's medium begins at 19 mm."),
+    ],
+)
+def test_questions(changes, words):
+    with pytest.warns(InputWarning) as said:
+        design_of(changes)
+    assert len(said) == 1 and words in str(said[0].message)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"sample": "jelly"}, "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
+        ({"wavelength_nm": 0.52}, "`wavelength_nm` must be a number of nanometres from 10 to 100000, got 0.52"),
+        ({"wavelength_nm": 2000.0}, "the wavelength must be 182 to 1129 nm for the index of water, got 2000"),
+    ],
+)
+def test_imagers_that_cannot_be(how, words):
+    with pytest.raises(InputError) as caught:
+        design_of(STACK).imager(**how)
+    assert words in str(caught.value)
