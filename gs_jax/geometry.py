@@ -26,7 +26,7 @@ from .base.arrays import (
     as_shape,
     check_fields,
 )
-from .layers import Layers, Sample, depth_of_reduced, reduced_distance
+from .layers import Layers, Sample, check_room, depth_of_reduced, reduced_distance
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
 
@@ -193,8 +193,8 @@ class Imager(eqx.Module):
     Raises
     ------
     ValueError
-        If `field_radius` or `sensor_distance` is not positive, a number is not finite, or `wavelength` is not one in mm
-        (traced values are not checked).
+        If `field_radius` or `sensor_distance` is not positive, a number is not finite, `wavelength` is not one in mm,
+        or layers are thicker than the room for them (traced values are not checked).
 
     Examples
     --------
@@ -223,6 +223,7 @@ class Imager(eqx.Module):
         if not self.field_radius > 0:
             raise ValueError(f"`field_radius` must be positive, got {self.field_radius}.")
         check_fields(self, sensor_distance=POSITIVE, rotation=FINITE, shift=FINITE, wavelength=_WAVELENGTH, tilt=FINITE)
+        check_room(self.sensor_distance, self.filters, self.windows, self.sample, self.array.orientation)
 
     @property
     def centers(self) -> Scalars:

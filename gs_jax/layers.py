@@ -6,6 +6,9 @@ reduced thickness. Lengths are in millimetres.
 """
 
 import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .base.arrays import NOT_NEGATIVE, array_namespace, as_float, as_float_or_none, check_fields
@@ -103,6 +106,11 @@ class Sample(eqx.Module):
         check_fields(self, refractive_index=INDEX, surface=NOT_NEGATIVE)
 
 
+def object_index(sample: Sample | None) -> Scalar | float:
+    """Index of the object's medium: an object that moves by `dz` moves by `dz / index` of reduced depth."""
+    return 1 if sample is None else sample.refractive_index
+
+
 def object_surface(filters: Layers | None, sample: Sample | None) -> Scalar:
     """Depth at which the object's medium begins, mm; if that is air, where the filters end."""
     if sample is not None and sample.surface is not None:
@@ -124,7 +132,29 @@ def reduced_distance(depth: Scalars, filters: Layers | None, sample: Sample | No
 def depth_of_reduced(reduced: Scalars, filters: Layers | None, sample: Sample | None) -> Scalars:
     """Depth in the object's medium at a reduced distance from the array's front, mm: inverts `reduced_distance`."""
     at_zero = reduced_distance(array_namespace(reduced).zeros((), reduced.dtype), filters, sample)
-    return (reduced - at_zero) * (1 if sample is None else sample.refractive_index)
+    return (reduced - at_zero) * object_index(sample)
+
+
+def check_room(
+    sensor_distance: Scalar, filters: Layers | None, windows: Layers | None, sample: Sample | None, orientation: str
+) -> None:
+    """Raise `ValueError` unless layers fit where they are to be; traced values are not checked."""
+    leaves = jax.tree.leaves((sensor_distance, filters, windows, sample))
+    if not all(isinstance(leaf, Array | np.ndarray) and not isinstance(leaf, Tracer) for leaf in leaves):
+        return
+    # On the host: JAX would compile a sum for each shape.
+    total = lambda *parts: float(sum(np.sum(np.asarray(part.thickness)) for part in parts if part is not None))
+    needs = [("sensor_distance", float(sensor_distance), total(windows), "the windows are")]
+    if sample is not None:
+        front = total(filters, sample.layers)
+        begins = front if sample.surface is None else float(sample.surface)
+        needs.append(("surface", begins, front, "the layers in front of the medium are"))
+        if orientation == "curved" and not begins and float(sample.refractive_index) != 1:
+            raise ValueError("`sample` must begin beyond the lenses where their curved side is in front, got contact.")
+    for name, found, needed, what in needs:
+        # Less a rounding: what touches fits.
+        if found < needed * (1 - 1e-6):
+            raise ValueError(f"`{name}` must be {needed:.6g} mm, as thick as {what}, or more, got {found:.6g} mm.")
 
 
 def object_slabs(depth: Scalars, filters: Layers | None, sample: Sample | None) -> list[tuple[Scalars, Scalar]]:

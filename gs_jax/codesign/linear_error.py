@@ -20,8 +20,8 @@ parts of a pixel. For sparse scenes, solvers with a positivity constraint do bet
 has no such measure.
 
 An exposure is a time and a brightness, the same for all candidates: the electrons that each mm^2 of clear aperture at a
-distance of 20 mm collects from an emitter of 40 um x 40 um. So a smaller aperture pays for its sharpness with light,
-and a magnification for its detail.
+distance of 20 mm in air collects from an emitter of 40 um x 40 um. So a smaller aperture pays for its sharpness with
+light, and a magnification for its detail.
 """
 
 from collections.abc import Sequence
@@ -33,6 +33,7 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
+from ..layers import object_index
 from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
 from ..objectives.paraxial import occupancy
 from ..optics import theory
@@ -199,7 +200,9 @@ def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size
 def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
-    return at.exposure * area * (AWAY / imager.reduced_depth(at.depths)) ** 2
+    # In a medium the lens takes a smaller solid angle.
+    away = object_index(imager.sample) * imager.reduced_depth(at.depths)
+    return at.exposure * area * (AWAY / away) ** 2
 
 
 def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
+from ..layers import check_room
 from ..lenses import EACH, type_of_lens
 from ..optics.apertures import pitch
 from .lbfgsb import LBFGSB
@@ -32,6 +33,14 @@ _OF_ARRAY = (
     "size",
 )
 _OF_IMAGER = ("sensor_distance", "rotation", "shift", "tilt", "wavelength")
+_OF_LAYERS = (
+    "filters.thickness",
+    "filters.refractive_index",
+    "windows.thickness",
+    "windows.refractive_index",
+    "sample.refractive_index",
+    "sample.surface",
+)
 
 
 class Free(NamedTuple):
@@ -77,7 +86,9 @@ def free(*names: str) -> Free:
         `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
         `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`, `"size"`. Where lenses differ, radius,
         aperture and conic constant are free for each lens type, and the type of each lens stays. `"pitch"` is the mean
-        distance of nearest neighbours: it scales the pattern and the plate.
+        distance of nearest neighbours: it scales the pattern and the plate. Of layers, one number each:
+        `"filters.thickness"`, `"windows.thickness"`, and with `"refractive_index"` in place of that; of the medium
+        `"sample.refractive_index"`, `"sample.surface"`.
 
     Raises
     ------
@@ -90,7 +101,7 @@ def free(*names: str) -> Free:
     >>> gs.free("centers", "sensor_distance").names
     ('centers', 'sensor_distance')
     """
-    known = (*_OF_IMAGER, *_OF_ARRAY, "pitch")
+    known = (*_OF_IMAGER, *_OF_ARRAY, *_OF_LAYERS, "pitch")
     if wrong := [name for name in names if name not in known]:
         raise InputError(f"free: names must be among {', '.join(known)}, got {wrong[0]!r}.")
     if not names:
@@ -150,7 +161,7 @@ def optimize(
     ------
     InputError
         If an argument is of another kind, a bound is of what is not free or is not below the other, `LBFGSB` lacks a
-        bound, or `loss` is one number and the solver is one of least squares.
+        bound, `loss` is one number and the solver is one of least squares, or layers have no room in the imager found.
 
     Examples
     --------
@@ -180,7 +191,12 @@ def optimize(
     state, reason = run(steps_of, steps_of.begin(start, None), None, limit=steps, enough=-math.inf, each=after)
     results = {CONVERGED: optx.RESULTS.successful, NOT_FINITE: optx.RESULTS.nonlinear_divergence}
     result = results.get(reason, optx.RESULTS.nonlinear_max_steps_reached)
-    return Optimum(at(state.free), state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
+    found = at(state.free)
+    try:
+        check_room(found.sensor_distance, found.filters, found.windows, found.sample, found.array.orientation)
+    except ValueError as error:
+        raise InputError(f"optimize: other bounds are needed: {error}") from error
+    return Optimum(found, state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
 
 
 def _check(imager, free, solver, steps):
@@ -217,7 +233,10 @@ def _map(name, free, bounds, box):
 def _leaf(imager, name):
     if name == "pitch":
         return pitch(imager.array.centers)[0]
-    return getattr(imager.array if name in _OF_ARRAY else imager, name)
+    at: Any = imager.array if name in _OF_ARRAY else imager
+    for part in name.split("."):
+        at = None if at is None else getattr(at, part)
+    return at
 
 
 def _types(imager, name) -> np.ndarray | None:

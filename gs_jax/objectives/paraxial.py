@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
+from ..layers import object_index
 from ..optics import aberrations, theory
 from ..optics.aberrations import WavefrontCoefficients
 from .conditions import (
@@ -46,19 +47,19 @@ def axial_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Axial resolution in focus, without aberrations (Eq. 6); a row a type."""
     at = as_conditions(imager, depths)
     lateral, reduced = lateral_resolution(imager, at), imager.reduced_depth(at.depths)
-    return theory.axial_resolution(lateral, reduced, field_radius(imager, at))
+    return theory.axial_resolution(lateral, reduced, field_radius(imager, at)) * object_index(imager.sample)
 
 
 @by_type
 def depth_of_field(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Depth of field of a sensor that is focused on each depth (Eq. 8); infinite beyond the hyperfocal distance."""
-    return theory.depth_of_field(*_focus(imager, depths))
+    return theory.depth_of_field(*_focus(imager, depths)) * object_index(imager.sample)
 
 
 @by_type
 def approximate_depth_of_field(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Depth of field by the approximation of Eq. 7; a row a type."""
-    return theory.approximate_depth_of_field(*_focus(imager, depths))
+    return theory.approximate_depth_of_field(*_focus(imager, depths)) * object_index(imager.sample)
 
 
 @by_type
@@ -135,9 +136,13 @@ def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
 
 
 def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """Share of a point's light that its `N_e` lenses collect, `N_e pi a^2 / (4 pi z'^2)` for a clear radius `a`."""
+    """Share of a point's light that its `N_e` lenses collect, `N_e pi a^2 / (4 pi n^2 z'^2)` for a clear radius `a`.
+
+    `n` is the index of the object's medium.
+    """
     at = as_conditions(imager, depths)
-    return lenses_per_point(imager, at) * (clear_diameter(imager, at) / 4 / imager.reduced_depth(at.depths)) ** 2
+    away = object_index(imager.sample) * imager.reduced_depth(at.depths)
+    return lenses_per_point(imager, at) * (clear_diameter(imager, at) / 4 / away) ** 2
 
 
 def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
@@ -149,8 +154,9 @@ def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
 
 
 def thickness(imager: Imager) -> Float[Array, ""]:
-    """Distance from the array's front to the sensor, `t + v`."""
-    return imager.sensor_distance + imager.array.substrate_thickness
+    """Thickness of the device: from its front, that of the array or of the filters on it, to the sensor."""
+    thickness = imager.sensor_distance + imager.array.substrate_thickness
+    return thickness if imager.filters is None else thickness + imager.filters.total
 
 
 def third_order_wavefront(imager: Imager, depths: Depths, heights: Float[Array, " field"]) -> WavefrontCoefficients:

@@ -17,6 +17,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from ...base.errors import needs_extra
 from ...design.design import Design
 from ...geometry import Imager
+from ...layers import object_surface
 from ...layouts import cell_edges
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
@@ -102,7 +103,7 @@ def _ticks(low: float, high: float, log: bool) -> list[float]:
 
 
 def draw_section(design: Design) -> str:
-    """The microscope in section through the lens nearest to the axis, to scale, as SVG.
+    """The microscope in section through the lens nearest to the axis, to scale, as SVG, with the layers and the sample.
 
     Chief rays start at a point on the axis in the middle of the working distance.
     """
@@ -123,6 +124,7 @@ def draw_section(design: Design) -> str:
         sensor=(middle - half_sensor, middle + half_sensor),
         glass=_glass(design, imager, plano, thickness, width),
         rays=_chief_rays(imager, (near + far) / 2, thickness if plano else 0.0, end),
+        layers=_layers(design, imager, end, far),
         bar=round_length(1.1 * (far + end) / 8),
     )
 
@@ -140,15 +142,73 @@ def _glass(design: Design, imager: Imager, plano: bool, thickness: float, width:
     return " ".join(f"{z:.4f},{at:.4f}" for z, at in corners)
 
 
+class _Face(NamedTuple):
+    """A plane face: its distance from where counting begins, and the reduced distance, mm."""
+
+    at: float
+    reduced: float
+
+
+def _faces(slabs: Sequence[tuple[Any, Any]]) -> list[_Face]:
+    faces = [_Face(0.0, 0.0)]
+    for thickness, index in slabs:
+        at, reduced = faces[-1]
+        faces.append(_Face(at + float(thickness), reduced + float(thickness) / float(index)))
+    return faces
+
+
+def _slabs(imager: Imager) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
+    """Thickness and index of all layers: from the array's front to the object's medium, and from the sensor."""
+    filters, windows, sample = imager.filters, imager.windows, imager.sample
+    front, behind = ([] if part is None else part.slabs for part in (filters, windows))
+    if sample is not None:
+        cover = [] if sample.layers is None else sample.layers.slabs[::-1]
+        thickness = sum(float(each) for each, _ in [*front, *cover])
+        gap = float(object_surface(filters, sample)) - thickness
+        front = [*front, (max(gap, 0.0), 1.0), *cover]
+    return front, behind
+
+
+def _layers(design: Design, imager: Imager, end: float, far: float) -> list[tuple[float, float, str]]:
+    """Begin and end of each layer that is not air, along the drawing, and what it is."""
+    front, behind = _slabs(imager)
+    on_array, cover = design.layers.object, design.sample.layers
+    names = [each.name for each in on_array] + [""] * (len(front) - len(on_array) - len(cover))
+    names += [each.name for each in cover]
+    faces, found = _faces(front), []
+    for k, ((thickness, index), name) in enumerate(zip(front, names, strict=True)):
+        found.append((-faces[k + 1].at, -faces[k].at, _label(name or "layer", index, thickness), float(index)))
+    if imager.sample is not None and faces[-1].at < far:
+        index = imager.sample.refractive_index
+        found.append((-far, -faces[-1].at, _label("sample", index), float(index)))
+    faces = _faces(behind)
+    for k, ((thickness, index), table) in enumerate(zip(behind, design.layers.sensor, strict=True)):
+        label = _label(table.name or "layer", index, thickness)
+        found.append((end - faces[k + 1].at, end - faces[k].at, label, float(index)))
+    return [(start, stop, label) for start, stop, label, index in found if index > 1]
+
+
+def _label(name: str, index: Any, thickness: Any = None) -> str:
+    size = "" if thickness is None else f"{float(thickness):.4g} mm, "
+    return f"{name}, {size}n = {float(index):.4g}"
+
+
 def _chief_rays(imager: Imager, depth: float, vertex: float, end: float) -> str:
+    """Paths of chief rays, with the bends at layers to first order; without layers straight on both sides."""
+    front, behind = (_faces(slabs) if slabs else [] for slabs in _slabs(imager))
+    plate, v, z = (float(x) for x in (imager.array.reduced_thickness_front, imager.reduced_sensor_distance, imager.reduced_depth(depth)))
     centers = np.asarray(imager.centers, float)
     landing = np.asarray(imager.project(np.array([[0.0, 0.0, depth]])), float)[:, 0]
     pitch = np.sqrt(np.prod(imager.array.plate) / len(centers))
     near = (np.hypot(*centers.T) <= imager.field_radius) & (np.abs(centers[:, 1]) <= _SECTION_WIDTH * pitch)
-    return "".join(
-        f"M{-depth:.4g} 0L{vertex:.4g} {center:.4g}L{end:.4g} {spot:.4g}"
-        for center, spot in zip(centers[near, 0], landing[near, 0], strict=True)
-    )
+
+    def path(center, spot):
+        before = [(-face.at, center * (1 - (face.reduced + plate) / z)) for face in reversed(front) if face.at < depth]
+        after = [(end - face.at, spot + (center - spot) * face.reduced / v) for face in reversed(behind[1:])]
+        points = [(-depth, 0.0), *before, (vertex, center), *after, (end, spot)]
+        return "M" + "L".join(f"{x:.4g} {y:.4g}" for x, y in points)
+
+    return "".join(path(*each) for each in zip(centers[near, 0], landing[near, 0], strict=True))
 
 
 class LensCounts(NamedTuple):

@@ -1,0 +1,142 @@
+"""What follows from plane layers: derived quantities, terms of studies, searches, and the grid of `find_points`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gs_jax as gs
+from gs_jax import InputError, objectives
+from gs_jax.codesign.fisher import crowded_bound
+from gs_jax.codesign.linear_error import lens_electrons
+from gs_jax.detection.view_samples import COARSE, search_grid
+from gs_jax.objectives.conditions import Conditions
+from gs_jax.optics.radiometry import solid_angle
+from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
+
+DEPTHS, INDEX = np.array([20.0, 21.5, 23.0]), 1.43
+QUANTITIES = (
+    "axial_resolution",
+    "depth_of_field",
+    "approximate_depth_of_field",
+    "near_limit",
+    "far_limit",
+    "focus_distance",
+    "focus_offset",
+    "lateral_resolution",
+    "light",
+    "occupancy",
+    "spot_width",
+    "wavefront_error",
+)
+
+
+def with_layers(**layers) -> gs.Imager:
+    return dataclasses.replace(gs.geomscope().imager(), **layers)
+
+
+def in_gel() -> gs.Imager:
+    sample = gs.Sample(INDEX, surface=19.67, layers=gs.Layers([0.17], [1.523]))
+    windows = gs.Layers([0.6, 0.55], [1.0, 1.51])
+    return with_layers(filters=gs.Layers([2.0], [1.52]), windows=windows, sample=sample)
+
+
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_layers_of_air_change_nothing(name):
+    air = with_layers(
+        filters=gs.Layers([2.0], [1.0]),
+        windows=gs.Layers([0.6], [1.0]),
+        sample=gs.Sample(1.0, 19.0, gs.Layers([0.2], [1.0])),
+    )
+    quantity = getattr(objectives, name)
+    np.testing.assert_allclose(quantity(air, DEPTHS), quantity(gs.geomscope().imager(), DEPTHS), rtol=1e-12)
+
+
+def test_lengths_along_z_are_real_ones():
+    """A spot moves by `M` lateral resolutions when its point moves by the axial one, by exact rays."""
+    scope, step = in_gel(), 1e-4
+    rays = lambda z: trace_lenslet(scope, z, np.zeros((1, 2)), (scope.field_radius, 0.0)).landing[0, 0]
+    lateral, axial = (
+        quantity(scope, DEPTHS) for quantity in (objectives.lateral_resolution, objectives.axial_resolution)
+    )
+    moves = np.array([float(rays(z + step) - rays(z - step)) / (2 * step) for z in DEPTHS])
+    np.testing.assert_allclose(axial * moves, lateral * scope.magnification(DEPTHS), rtol=0.03)
+    near, far = (limit(scope, DEPTHS) for limit in (objectives.near_limit, objectives.far_limit))
+    np.testing.assert_allclose(objectives.depth_of_field(scope, DEPTHS), far - near, rtol=1e-9)
+    # By the rim of the lens: at the limits a sensor that is focused on the middle has the circle of confusion.
+    middle = DEPTHS[1:2]
+    focused = dataclasses.replace(scope, sensor_distance=objectives.focus_distance(scope, middle)[0])
+    blurs = [objectives.sensor_blur(focused, end) for end in (near[1:2], far[1:2])]
+    np.testing.assert_allclose(blurs, 2 * scope.sensor.pixel_pitch, rtol=1e-6)
+
+
+def test_a_medium_takes_light():
+    """As much as exact rays near the axis say; the exposure is that of an emitter in air."""
+    scope, host = in_gel(), to_numpy(in_gel())
+    ray = refract(host, DEPTHS, np.full((2, 1), 1e-4), np.zeros((2, 1)))
+    diameter = float(objectives.clear_diameter(scope, DEPTHS))
+    share = solid_angle(host, DEPTHS, ray) * np.pi * diameter**2 / 4 / (4 * np.pi)
+    each = objectives.light(scope, DEPTHS) / objectives.lenses_per_point(scope)
+    np.testing.assert_allclose(each, share, rtol=1e-6)
+    per_solid_angle = lens_electrons(scope, Conditions(DEPTHS)) / share
+    np.testing.assert_allclose(per_solid_angle, 4 * np.pi * 1e4 * 20.0**2, rtol=1e-6)
+
+
+def test_the_bound_of_points_in_a_medium():
+    """Air at the same reduced depths with as much light, but for lengths along z; beside the layers' aberrations."""
+    scope = with_layers(sample=gs.Sample(INDEX, surface=17.0))
+    at = Conditions(jnp.array([20.0, 22.0]), exposure=1e4)
+    reduced = scope.reduced_depth(at.depths) - scope.array.reduced_thickness_front
+    air = Conditions(reduced, exposure=1e4 / INDEX**2)
+    places = jnp.array([[0.3, -0.2]])
+    wet, dry = crowded_bound([(scope, at)], places), crowded_bound([(gs.geomscope().imager(), air)], places)
+    np.testing.assert_allclose(wet, np.asarray(dry) * (1.0, 1.0, INDEX), rtol=0.02)
+
+
+def test_planes_of_the_search_for_points():
+    """A point at the field radius moves from plane to plane as from voxel to voxel."""
+    scope = in_gel()
+    planes = np.asarray(search_grid(scope, gs.Grid([20.0, 23.0], (9, 9), 0.1)).depths)
+    middle = len(planes) // 2
+    x = float(scope.centers[0, 0]) + scope.field_radius
+    points = np.array([[x, float(scope.centers[0, 1]), z] for z in planes[middle : middle + 2]])
+    moved = np.diff(np.asarray(scope.project(points))[0, :, 0])
+    np.testing.assert_allclose(abs(moved), COARSE * scope.sensor.pixel_pitch, rtol=0.03)
+
+
+def test_searches_of_layers():
+    scope = in_gel()
+    bounds = {
+        "filters.thickness": (0.5, 4.0),
+        "windows.refractive_index": (np.array([1.0, 1.4]), np.array([1.1, 1.6])),
+        "sample.surface": (15.0, 20.0),
+        "sample.refractive_index": (1.3, 1.6),
+    }
+    start, loss = float(scope.magnification(21.0)), lambda scope: (scope.magnification(21.0) - 0.275) ** 2
+    found = gs.optimize(loss, scope, free=gs.free(*bounds), bounds=bounds, steps=20).imager
+    assert abs(float(found.magnification(21.0)) - 0.275) < 1e-3 < abs(start - 0.275)
+    changed = (found.filters.thickness, found.sample.surface, found.sample.refractive_index)
+    assert all(np.any(a != b) for a, b in zip(changed, (2.0, 19.67, INDEX), strict=True))
+    with pytest.raises(InputError, match="sample.surface must be a number of the imager .* got None"):
+        gs.optimize(loss, gs.geomscope().imager(), free=gs.free("sample.surface"))
+
+
+def test_layers_need_room():
+    thin = in_gel().windows
+    with pytest.raises(
+        ValueError, match="`sensor_distance` must be 1.15 mm, as thick as the windows are, or more, got 1"
+    ):
+        dataclasses.replace(in_gel(), sensor_distance=1.0)
+    with pytest.raises(ValueError, match="`surface` must be 2.17 mm, as thick as the layers in front .* got 2 mm"):
+        dataclasses.replace(in_gel(), sample=dataclasses.replace(in_gel().sample, surface=2.0))
+    with pytest.raises(ValueError, match="`sample` must begin beyond the lenses where their curved side is in front"):
+        turned = dataclasses.replace(in_gel().array, orientation="curved")
+        with_layers(array=turned, sample=gs.Sample(1.33))
+    toward = lambda scope: (scope.sensor_distance - 1.0) ** 2
+    with pytest.raises(InputError, match="other bounds are needed: `sensor_distance` must be 1.15 mm"):
+        gs.optimize(toward, in_gel(), free=gs.free("sensor_distance"))
+    # Numbers that JAX traces are let through.
+    total = jax.jit(lambda scope: objectives.thickness(dataclasses.replace(scope, windows=thin)))(in_gel())
+    assert float(total) == pytest.approx(5.8 + 1.0 + 2.0)
