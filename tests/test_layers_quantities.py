@@ -1,6 +1,7 @@
 """What follows from plane layers: derived quantities, terms of studies, searches, and the grid of `find_points`."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,11 @@ import pytest
 
 import gs_jax as gs
 from gs_jax import InputError, objectives
+from gs_jax.apps.explore.evaluation import make_sliders
+from gs_jax.apps.report.drawings import draw_section
 from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.codesign.linear_error import lens_electrons
+from gs_jax.codesign.study import Study
 from gs_jax.detection.view_samples import COARSE, search_grid
 from gs_jax.objectives.conditions import Conditions
 from gs_jax.optics.radiometry import solid_angle
@@ -123,6 +127,61 @@ def test_searches_of_layers():
         gs.optimize(loss, gs.geomscope().imager(), free=gs.free("sample.surface"))
 
 
+def wet_design() -> gs.Design:
+    """A device with a filter and a window, used in air or in water behind a cover slip."""
+    slip = {"name": "cover slip", "thickness_mm": 0.17, "refractive_index": "BK7"}
+    return gs.geomscope().replace(
+        layers={
+            "object": [{"name": "filter", "thickness_mm": 2.0, "refractive_index": "fused silica"}],
+            "sensor": [{"thickness_mm": 0.6}, {"name": "window", "thickness_mm": 0.55, "refractive_index": 1.51}],
+        },
+        samples={"water": {"refractive_index": "water", "surface_mm": 17.0, "layers": [slip]}},
+        refractive_index="PDMS",
+    )
+
+
+def focus_study(**tables) -> Study:
+    return Study.model_validate(
+        {
+            "depths_mm": (18.0, 22.0),
+            "free": {"sensor_distance_mm": (4.0, 8.0)},
+            "terms": ({"name": "focus_offset", "minimise": 1.0},),
+            "stages": ({"solver": "levenberg-marquardt", "steps": 20},),
+        }
+        | tables
+    )
+
+
+def test_a_study_in_a_sample():
+    """The sensor is where the middle of the depths is in focus, in water; the new design is one in water."""
+    design = wet_design()
+    found = gs.run_study(design, focus_study(sample="water")).design
+    assert found.sample == found.samples["water"] and found.layers == design.layers and found.lens == design.lens
+    assert list(found.imaging.working_distance_mm) == [18.0, 22.0]
+    assert float(objectives.focus_offset(found.imager(), [18.0, 22.0])) < 1e-3
+    dry = gs.run_study(design, focus_study()).design
+    assert dry.sample == design.sample and abs(dry.imaging.sensor_distance_mm - found.imaging.sensor_distance_mm) > 0.05
+    for tables, words in (
+        ({"sample": "oil"}, "`sample` must be one of .samples. in the design, water, air, got 'oil'"),
+        (
+            {"sample": "water", "depths_mm": (16.0, 22.0)},
+            "`depths_mm` must be 17 mm or more, where the object's medium",
+        ),
+        ({"free": {"sensor_distance_mm": (1.0, 8.0)}}, "must be 1.15 or more, as thick as the windows, got .1.0, 8.0"),
+        (
+            {"sample": "water", "free": {"depth_span_mm": (1.0, 7.0)}},
+            "`free.depth_span_mm` must be below 6, twice the middle of the depths from 17 mm on, got",
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            gs.run_study(design, focus_study(**tables))
+
+
+def test_sliders_leave_room_for_layers():
+    sliders = make_sliders(wet_design().replace(sample={"refractive_index": 1.33, "surface_mm": 17.0}))
+    assert (sliders["near_mm"].low, sliders["sensor_distance_mm"].low) == (17.0, 0.6 * 5.8)
+
+
 def test_layers_need_room():
     thin = in_gel().windows
     with pytest.raises(
@@ -140,3 +199,24 @@ def test_layers_need_room():
     # Numbers that JAX traces are let through.
     total = jax.jit(lambda scope: objectives.thickness(dataclasses.replace(scope, windows=thin)))(in_gel())
     assert float(total) == pytest.approx(5.8 + 1.0 + 2.0)
+
+
+def test_the_drawing_shows_the_stack():
+    wet = wet_design()
+    svg = draw_section(wet.replace(sample=wet.samples["water"].model_dump()))
+    for label in (
+        "filter, 2 mm, n = 1.461",
+        "cover slip, 0.17 mm, n = 1.52",
+        "sample, n = 1.33",
+        "window, 0.55 mm, n = 1.51",
+    ):
+        assert label in svg
+    # Four of the layers are not air; rays bend at each face.
+    assert svg.count('class="layer"') == 4
+    path = re.search('class="ray" d="M([^M"]*)', svg).group(1).split("L")
+    assert len(path) == 1 + len((17.0, 16.83, 2.0, 0.0)) + len(("vertex", "window's front", "window's back", "sensor"))
+    # A ray that leaves the filter goes on as it came.
+    places = np.array([[float(x) for x in point.split()] for point in path])
+    slopes = np.diff(places[:, 1]) / np.diff(places[:, 0])
+    np.testing.assert_allclose(slopes[[2, 5, 7]], slopes[2], rtol=0.03)
+    np.testing.assert_allclose(slopes[0], slopes[2] / 1.3355, rtol=0.03)

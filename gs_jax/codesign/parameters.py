@@ -189,7 +189,9 @@ def new_design(design: Design, imager: Imager, at: Conditions, values: Values) -
     working = [round(middle + sign * numbers["depth_span_mm"] / 2, _DIGITS) for sign in (-1, 1)]
     data = design.model_dump()
     data["lens"] |= {name: _of_lenses_rounded(imager, name, values[name]) for name in LENS_KEYS}
-    data["lens"] |= {"refractive_index": numbers["refractive_index"]}
+    # A material stays unless its index was searched for.
+    if not isinstance(design.lens.refractive_index, str) or values["refractive_index"] != imager.array.refractive_index:
+        data["lens"] |= {"refractive_index": numbers["refractive_index"]}
     data["lens"] |= {"aspheric_terms": significant(values["aspheric_terms"]).tolist()}
     data["array"] |= {"size_mm": size, "centers_mm": centers.tolist()}
     data["imaging"] |= {"sensor_distance_mm": numbers["sensor_distance_mm"], "working_distance_mm": working}

@@ -18,6 +18,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design
+from ..design.light_path import object_begins
 from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
@@ -73,13 +74,30 @@ def _check_free(design: Design, study: Study) -> None:
         raise InputError(f"`lens`: a search takes up to {MOST_TYPES} lens types, got {count}.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
-    twice = sum(study.depths_mm or design.imaging.working_distance_mm)
-    if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
-        bounds = list(study.free["depth_span_mm"])
-        raise InputError(f"`free.depth_span_mm` must be below {twice:g}, twice the middle of the depths, got {bounds}.")
+    _check_room(design, study)
     of_lens = {"radius_of_curvature_mm", "refractive_index", "conic_constant", "aspheric_terms"} & set(study.free)
     if design.lens.focal_length_mm is not None and of_lens:
         raise InputError(f"`free.{min(of_lens)}` needs a design without `lens.focal_length_mm`.")
+
+
+def _check_room(design: Design, study: Study) -> None:
+    """Raise `InputError` if depths may come to lie before the object's medium, or the sensor within its windows."""
+    begins, (near, far) = object_begins(design), study.depths_mm or design.imaging.working_distance_mm
+    if near < begins:
+        raise InputError(
+            f"`depths_mm` must be {begins:g} mm or more, where the object's medium begins, got {near:g} mm."
+        )
+    twice = near + far - 2 * begins
+    if "depth_span_mm" in study.free and study.free["depth_span_mm"][1] >= twice:
+        bounds, from_there = list(study.free["depth_span_mm"]), f" from {begins:g} mm on" if begins else ""
+        allowed = f"below {twice:g}, twice the middle of the depths{from_there}"
+        raise InputError(f"`free.depth_span_mm` must be {allowed}, got {bounds}.")
+    windows = sum(layer.thickness_mm for layer in design.layers.sensor)
+    if "sensor_distance_mm" in study.free and study.free["sensor_distance_mm"][0] < windows:
+        bounds = list(study.free["sensor_distance_mm"])
+        raise InputError(
+            f"`free.sensor_distance_mm` must be {windows:g} or more, as thick as the windows, got {bounds}."
+        )
 
 
 def make_stage(problem: Problem, index: int) -> Stage:

@@ -21,6 +21,7 @@ from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
 from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design
+from ...design.light_path import object_begins
 from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
@@ -92,7 +93,16 @@ def make_sliders(design: Design) -> dict[str, Slider]:
         del ranges["radius_of_curvature_mm"]
     if len(design.array.centers_mm) < 2:
         del ranges["pitch_mm"]
-    return {name: Slider(title, low * at, high * at, at) for name, (title, low, high, at) in ranges.items()}
+    begins = object_begins(design)
+    least = {
+        "sensor_distance_mm": sum(layer.thickness_mm for layer in design.layers.sensor),
+        "near_mm": begins,
+        "far_mm": begins,
+    }
+    lowest = lambda name, low: max(low, least.get(name, 0.0))
+    return {
+        name: Slider(title, lowest(name, low * at), high * at, at) for name, (title, low, high, at) in ranges.items()
+    }
 
 
 def complete_values(sliders: dict[str, Slider], values: Values) -> Values:

@@ -196,7 +196,10 @@ def _label(name: str, index: Any, thickness: Any = None) -> str:
 def _chief_rays(imager: Imager, depth: float, vertex: float, end: float) -> str:
     """Paths of chief rays, with the bends at layers to first order; without layers straight on both sides."""
     front, behind = (_faces(slabs) if slabs else [] for slabs in _slabs(imager))
-    plate, v, z = (float(x) for x in (imager.array.reduced_thickness_front, imager.reduced_sensor_distance, imager.reduced_depth(depth)))
+    plate, v, z = (
+        float(x)
+        for x in (imager.array.reduced_thickness_front, imager.reduced_sensor_distance, imager.reduced_depth(depth))
+    )
     centers = np.asarray(imager.centers, float)
     landing = np.asarray(imager.project(np.array([[0.0, 0.0, depth]])), float)[:, 0]
     pitch = np.sqrt(np.prod(imager.array.plate) / len(centers))
