@@ -69,9 +69,10 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
         from optiland.rays.real_rays import RealRays
 
         array, optic = imager.array, Optic()
-        glass = IdealMaterial(n=float(array.refractive_index))
-        curved = 1 if array.orientation == "curved" else 2
-        toward = 1 if curved == 1 else -1
+        before, layers = _layers(imager, depth)
+        after = [] if imager.windows is None else imager.windows.slabs[::-1]
+        curved = len(layers) + (1 if array.orientation == "curved" else 2)
+        toward = 1 if array.orientation == "curved" else -1
         shape = dict(
             radius=toward * float(array.radius_of_curvature),
             conic=float(array.conic_constant),
@@ -80,19 +81,22 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
             surface_type="even_asphere",
             tol=1e-14,
         )
-        faces = {curved: shape, 3 - curved: {}}
-        optic.surfaces.add(index=0, thickness=depth)
-        thickness = float(array.substrate_thickness)
-        optic.surfaces.add(index=1, thickness=thickness, material=glass, is_stop=True, **faces[1])
-        optic.surfaces.add(index=2, thickness=float(imager.sensor_distance), **faces[2])
-        optic.surfaces.add(index=3)
+        air = float(imager.sensor_distance) - sum(float(thickness) for thickness, _ in after)
+        plate = float(array.substrate_thickness), float(array.refractive_index)
+        gaps = [before, *layers, plate, (air, 1.0), *after, (0.0, 1.0)]
+        for index, (thickness, n) in enumerate(gaps):
+            more = {"is_stop": True} if index == 1 else {}
+            more |= shape if index == curved else {}
+            optic.surfaces.add(index=index, thickness=float(thickness), material=IdealMaterial(n=float(n)), **more)
         optic.wavelengths.add(1000 * WAVELENGTH, is_primary=True)
         entry, one = np.array(points, float), np.ones(len(points))
-        for _ in range(30):
+        start = float(before[0])
+        for _ in range(60):
+            # Aimed at the array as if all were of the object's medium.
             x, y = entry.T - [[field], [0]]
             length = np.sqrt(x**2 + y**2 + depth**2)
             cosines = (x / length, y / length, depth / length)
-            rays = RealRays(field * one, 0 * one, -depth * one, *cosines, one, 1000 * WAVELENGTH * one)
+            rays = RealRays(field * one, 0 * one, -start * one, *cosines, one, 1000 * WAVELENGTH * one)
             optic.surfaces.trace(rays)
             slopes = np.column_stack([rays.L, rays.M]) / rays.N[:, None]
             result = np.column_stack([rays.x, rays.y]), slopes, np.asarray(rays.opd)
@@ -101,6 +105,18 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
                 return result
             entry += miss
         raise RuntimeError("no rays through the points")
+
+
+def _layers(imager: Imager, depth: float) -> tuple[tuple[float, float], list[tuple[float, float]]]:
+    """Thickness and index of the object's medium in front of the point, and of what follows up to the array."""
+    sample, layers = imager.sample, [] if imager.filters is None else imager.filters.slabs[::-1]
+    cover = [] if sample is None or sample.layers is None else sample.layers.slabs
+    filled = sum(float(thickness) for thickness, _ in (*layers, *cover))
+    if sample is None or sample.surface is None:
+        index = 1.0 if sample is None else float(sample.refractive_index)
+        return (depth - filled, index), [*cover, *layers]
+    surface = float(sample.surface)
+    return (depth - surface, float(sample.refractive_index)), [*cover, (surface - filled, 1.0), *layers]
 
 
 def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) -> dict:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from experiments.optics_check import SHAPES, breakdown, compare, curves, run, spots, summary
-from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax import Imager, Layers, MicrolensArray, Sample, Sensor
 
 from .helpers import needs
 
@@ -29,6 +29,29 @@ def test_optiland_has_the_same_rays_through_aspheres_with_either_side_in_front(l
     array = MicrolensArray([[0.0, 0.0]], refractive_index=1.5, substrate_thickness=0.7, **lens)
     row = compare(Imager(array, Sensor((3, 3), 0.0045), 4.2, 3.0), 17.0, field, radius=0.8)
     # Optiland meets an asphere by Newton's steps.
+    assert row["landing_difference_nm"] < 1e-3
+    assert row["path_difference_waves"] < 1e-6
+    np.testing.assert_allclose(row["spot_rms_um"], row["spot_rms_optiland_um"], rtol=1e-8)
+    np.testing.assert_allclose(row["wavefront_rms_waves"], row["wavefront_rms_optiland_waves"], rtol=1e-6)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("field", [0.0, 3.0])
+@pytest.mark.parametrize("orientation", ["plano", "curved"])
+def test_optiland_has_the_same_rays_through_layers(orientation, field):
+    """A filter, a window before the sensor, and a cover slip on water."""
+    pytest.importorskip("optiland")
+    array = MicrolensArray([[0.0, 0.0]], refractive_index=1.5, substrate_thickness=0.7, orientation=orientation)
+    scope = Imager(
+        array,
+        Sensor((3, 3), 0.0045),
+        4.2,
+        3.0,
+        filters=Layers([0.4, 2.0], [1.0, 1.52]),
+        windows=Layers([0.6, 0.55], [1.0, 1.51]),
+        sample=Sample(1.33, 15.0, Layers([0.17], [1.523])),
+    )
+    row = compare(scope, 18.0, field, radius=0.6)
     assert row["landing_difference_nm"] < 1e-3
     assert row["path_difference_waves"] < 1e-6
     np.testing.assert_allclose(row["spot_rms_um"], row["spot_rms_optiland_um"], rtol=1e-8)
