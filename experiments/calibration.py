@@ -29,7 +29,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate, spot_residuals
-from gs_jax.calibration.spot_model import FITTABLE
+from gs_jax.calibration.spot_model import OF_DEVICE
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization
@@ -53,7 +53,7 @@ def on_captures(data: Path, progress: Progress) -> tuple[dict, Calibration]:
     begun = time.monotonic()
     whole = calibrate(images, points, imager, progress=progress)
     seconds = time.monotonic() - begun
-    every = calibrate(images, points, imager, fit=FITTABLE, progress=progress)
+    every = calibrate(images, points, imager, fit=OF_DEVICE, progress=progress)
     held_out = {}
     for depth in DEPTHS:
         others, these = np.flatnonzero(points[:, 2] != depth), np.flatnonzero(points[:, 2] == depth)

@@ -33,13 +33,15 @@ from gs_jax.base.progress import Progress
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses, match_pattern, match_shift
-from gs_jax.calibration.spot_model import FITTABLE, FITTED, core_offsets
+from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
 from gs_jax.calibration.spots import Sources, Spots, find_spots
 from gs_jax.cli.calibrate import _NAMES
 from gs_jax.design.builtin import geomscope
 from gs_jax.io.camera import Readout
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
+from gs_jax.lenses import lenses_by_type, type_of_lens
+from gs_jax.optics.lens_types import split_by_type
 
 from .helpers import needs
 
@@ -69,8 +71,8 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     steepest = np.append(tilt, 0) / max(np.linalg.norm(tilt), 1e-12)
     turn = Rotation.from_rotvec(np.arctan(np.linalg.norm(tilt)) * np.cross(steepest, [0, 0, 1]))
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
-    front, v = float(imager.reduced_depth(0.0)), float(imager.sensor_distance)
-    source = turn.inv().apply([*point[:2], point[2] + front])
+    v = float(imager.reduced_sensor_distance)
+    source = turn.inv().apply([*point[:2], float(imager.reduced_depth(point[2]))])
     centers = np.asarray(level.centers)
     beside = source[:2] - centers
     field = np.hypot(*beside.T)
@@ -78,7 +80,10 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     order = order[field[order] < 1.1 * imager.field_radius][1:]
     centers, beside, field = centers[order], beside[order], field[order]
     some = np.linspace(0, 1.1 * imager.field_radius, 13)
-    offset = np.interp(field, some, core_offsets(level, source[2:] - front, some)[0])
+    depth = np.asarray(level.depth_of(jnp.asarray(source[2:])))
+    types = split_by_type(level, lenses_by_type(level.array))
+    offsets = [np.interp(field, some, core_offsets(one, depth, some)[0]) for one in types]
+    offset = np.choose(type_of_lens(level.array)[order], offsets)
     landing = centers - v / source[2] * beside + (offset / np.maximum(field, 1e-12))[:, None] * beside
     vertices = turn.apply(np.column_stack([centers, 0 * field]))
     onward = turn.apply(np.column_stack([landing, 0 * field - v])) - vertices
@@ -270,7 +275,7 @@ def test_scale_offset_and_each_lens():
     actual, design, _ = device(7)
     moves = np.random.default_rng(0).normal(0, 0.008, design.array.centers.shape)
     actual = eqx.tree_at(lambda i: i.array.centers, actual, 1.004 * actual.array.centers + moves)
-    found = calibrate(captures(actual, MANY), MANY - [0, 0, 0.15], design, fit=FITTABLE)
+    found = calibrate(captures(actual, MANY), MANY - [0, 0, 0.15], design, fit=OF_DEVICE)
     check(found, actual, scale=1.004, depth_offset_mm=0.15)
     seen = np.unique(found.spots.lenses)
     away = np.asarray(found.imager.centers - actual.centers)[seen]
@@ -334,7 +339,7 @@ def test_a_scene_that_nobody_knows():
     found = self_calibrate(image, start, grid)
     check(found, actual, [name for name in NAMES if "rotation" in name or "tilt" in name])
     assert len(found.sources.points) >= 7 and found.rms < 0.2
-    with pytest.raises(InputError, match="fit must be some of rotation, tilt and lenses for a scene, got shift"):
+    with pytest.raises(InputError, match="fit must be some of rotation, .* and sample_index for a scene, got shift"):
         self_calibrate(image, start, grid, fit=["shift"])
     blank = np.random.default_rng(0).normal(100, 2, design.sensor.shape)
     with pytest.raises(InputError, match="capture: a sparse scene in focus with 5 or more points is needed, got 0"):
@@ -367,7 +372,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
 def test_numbers_that_the_spots_do_not_determine_are_refused():
     actual, design, _ = device(0)
     with pytest.raises(InputError, match="spots do not determine sensor_distance_mm.*depth_offset"):
-        calibrate(captures(actual)[1:2], POINTS[1:2], design, fit=FITTABLE[:-1])
+        calibrate(captures(actual)[1:2], POINTS[1:2], design, fit=OF_DEVICE[:-1])
 
 
 def test_a_displaced_pattern():

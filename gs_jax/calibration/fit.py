@@ -22,7 +22,8 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .initial_guess import guess_from_pattern, guess_without_lenses
+from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses
+from .sample import OF_SAMPLE, check_fitted_sample, with_surface
 from .spot_model import (
     FITTABLE,
     FITTED,
@@ -53,10 +54,13 @@ _THREADS = 2
 _MAX_STEPS = 300
 # Numbers of spots are padded to a multiple of this, so that few shapes are compiled.
 _MULTIPLE = 256
+# What is guessed from the pattern of the lenses, if it is fitted.
+_POSE = ("sensor_distance", "rotation", "shift")
 # What self-calibration fits: an unknown scene determines neither sensor distance nor shift.
 SELF_FITTED = ("rotation", "tilt")
-# Most and fewest points that self-calibration uses.
-_MOST_POINTS, _MIN_POINTS = 60, 5
+_SELF_FITTABLE = (*SELF_FITTED, "lenses", *OF_SAMPLE)
+# Most points that self-calibration uses, also where little is known of a sample by each; and fewest.
+_MOST_POINTS, _MOST_FOR_SAMPLE, _MIN_POINTS = 60, 200, 5
 # Range on either side and step of the search for the rotation, radians, and number of bright sources that it uses.
 _ROTATION, _ROTATION_STEP, _ROTATION_SOURCES = np.radians(5.0), np.radians(0.4), 5
 # Distance on the sensor within which rays meet in a point, over `match_radius`.
@@ -124,7 +128,9 @@ def calibrate(
         Image of each source, from 0; by default one source in each, in their order.
     fit
         Of `sensor_distance`, `rotation`, `shift`, `tilt`, `scale` of the array, `depth_offset` of all sources, and
-        `lenses`, each of which is within about 10 um of its listed position.
+        `lenses`, each of which is within about 10 um of its listed position. Of the imager's sample, `sample_at`, the
+        depth at which it begins, and `sample_index`. Both need points of known depths, and the sensor's distance from a
+        calibration in air. Without `sensor_distance`, `rotation` and `shift` the imager's pose is trusted.
     find_lenses
         Find the lenses themselves, whatever positions the design lists, and fit only sensor distance and depth offset
         of `fit`: the lenses' positions contain rotation, shift, scale and tilt. Needs known points. If the design has
@@ -154,10 +160,10 @@ def calibrate(
     progress = progress or Progress()
     captures = np.arange(len(points)) if captures is None else captures
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
-    sources.check(len(images))
-    sources.check_fit(fit)
     if unknown_names := [name for name in fit if name not in FITTABLE]:
         raise InputError(f"fit must be some of {', '.join(FITTABLE)}, got {', '.join(unknown_names)}.")
+    sources.check(len(images), imager, fit)
+    imager = with_surface(imager, fit)
     for number, image in enumerate(images, 1):
         _check_image(f"capture {number}", image, imager)
     counts = [int((sources.captures == number).sum()) for number in range(len(images))]
@@ -169,8 +175,13 @@ def calibrate(
     with progress.step("Matching lenses"):
         if find_lenses:
             guess = guess_without_lenses(spots, sources, imager, images)
+        elif set(fit).isdisjoint(_POSE):
+            guess = guess_from_pose(spots, sources, imager)
         else:
             guess = guess_from_pattern(spots, sources, imager)
+        held = [name for name in _POSE[: 1 if find_lenses else None] if name not in fit]
+        where = lambda i: [getattr(i, name) for name in held]
+        guess = guess._replace(imager=eqx.tree_at(where, guess.imager, where(imager)) if held else guess.imager)
     if not find_lenses:
         result = refine(spots, guess.imager, guess.sources, unknown, fit, progress=progress)
         return result._replace(mirrored=guess.mirrored)
@@ -213,7 +224,7 @@ def refine(
     current, points, state = imager, sources.points, None
     assigned = data = None
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
-        offsets = trace_core_offsets(current, points[:, 2])
+        offsets = trace_core_offsets(current, points[:, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
         data = _observations(imager, sources.points, unknown, assigned, offsets)
         state = state or initial_unknowns(fit, data)
@@ -226,6 +237,7 @@ def refine(
             raise InputError("captures: no geometry explains the spots; are they those of the given sources?")
         current, points = apply_to_imager(state, imager), np.asarray(source_points(state, data), np.float64)
     assert state is not None and assigned is not None and data is not None
+    check_fitted_sample(current)
     off = np.asarray(residuals(state, data), np.float64)[: len(assigned.lenses)]
     errors = standard_errors(state, data, lens_sd, estimate_noise(off, state, assigned.lenses))
     check_determined(errors, radius)
@@ -265,9 +277,14 @@ def self_calibrate(
 ) -> Calibration:
     """Find rotation and tilt in a capture of unknown points, from a design that is right to some degrees.
 
-    The rotation at which most rays of several lenses meet is searched for. `find_points` finds points with it, then
-    their positions and the geometry are fitted to the spots together (bundle adjustment). Sensor distance, shift and
-    scale are the design's, as any others explain the same capture by another scene.
+    The rotation at which most rays of several lenses meet is searched for, if it is fitted. `find_points` finds points,
+    then their positions and the geometry are fitted to the spots together (bundle adjustment). Sensor distance, shift
+    and scale are the design's, as any others explain the same capture by another scene.
+
+    To first order that holds for a sample, too: its surface and its index only stretch and move the depths of points
+    that nobody knows. Just the aberration of oblique rays tells them apart. A hundred points in 4 mm of gel give its
+    surface to 0.3 mm, which is 0.1 mm in the points' depths, and its index to 0.15, which is refused. Points of known
+    depths give both, to 3 um and 0.001: see `calibrate`.
 
     Parameters
     ----------
@@ -276,24 +293,27 @@ def self_calibrate(
     grid
         The box of these voxels contains the scene.
     fit
-        Of `rotation`, `tilt` and `lenses`.
+        Of `rotation`, `tilt`, `lenses`, `sample_at` and `sample_index`.
     progress
         Shows how far the work is.
 
     Raises
     ------
     InputError
-        If fewer than five points are found, or something else is to be fitted.
+        If fewer than five points are found, something else is to be fitted, or the spots do not determine it.
     """
     progress = progress or Progress()
-    if other := [name for name in fit if name not in (*SELF_FITTED, "lenses")]:
-        raise InputError(f"fit must be some of rotation, tilt and lenses for a scene, got {', '.join(other)}.")
+    if other := [name for name in fit if name not in _SELF_FITTABLE]:
+        allowed = f"{', '.join(_SELF_FITTABLE[:-1])} and {_SELF_FITTABLE[-1]}"
+        raise InputError(f"fit must be some of {allowed} for a scene, got {', '.join(other)}.")
+    imager = with_surface(imager, fit)
     _check_image("capture", image, imager)
     depths = np.asarray(grid.depths, np.float64)
     with progress.step("Searching for the rotation"):
         spots = find_spots_mm(image, imager, _ROTATION_SOURCES)
-        rotated = _search_rotation(spots, imager, (depths.min(), depths.max()))
-    points = find_points(image, rotated, grid, progress=progress)[:_MOST_POINTS, :3]
+        rotated = _search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
+    most = _MOST_POINTS if set(fit).isdisjoint(OF_SAMPLE) else _MOST_FOR_SAMPLE
+    points = find_points(image, rotated, grid, progress=progress)[:most, :3]
     if len(points) < _MIN_POINTS:
         needs = f"a sparse scene in focus with {_MIN_POINTS} or more points is needed"
         raise InputError(f"capture: {needs}, got {len(points)} on which the lenses agree.")

@@ -183,6 +183,11 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager) -> In
     return guesses[0] if len(guesses) == 1 else max(guesses, key=lambda guess: _explained(spots, guess))
 
 
+def guess_from_pose(spots: SpotLists, sources: Sources, imager: Imager) -> InitialGuess:
+    """The imager as it is, and the sources whose coordinates are unknown where it sees them."""
+    return InitialGuess(imager, False, _locate_sources(spots, sources, imager))
+
+
 def _scale(imager: Imager, depth: float) -> tuple[float, float]:
     """Expected scale of the pattern on the sensor, and its relative error."""
     if np.isnan(depth):

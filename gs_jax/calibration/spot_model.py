@@ -20,10 +20,11 @@ from ..layouts import nearest_neighbour_distances
 from ..lenses import MicrolensArray, lenses_by_type, type_of_lens
 from ..optics.lens_types import split_by_type
 from ..optics.psf_core import PupilSamples, aperture_profile, sample_pupil
+from .sample import OF_SAMPLE, number
 
 # Fields at which exact rays are traced, degree of the polynomial through them, and number of depths at most.
 _FIELDS, _DEGREE, _DEPTHS = 13, 7, 5
-# Relative step of the sensor distance for the derivative of core offsets.
+# Relative step of a number of the imager for the derivative of core offsets by it.
 _STEP = 1e-2
 # Rays of a spot, and distance from its chief ray within which its core lies, pixels.
 _RAYS, _REACH = 8192, 40
@@ -44,12 +45,17 @@ _NAMES = {
     "tilt": {"tilt_x_deg": 0.5, "tilt_y_deg": 0.5},
     "scale": {"scale": 0.02},
     "depth_offset": {"depth_offset_mm": 8.33},
+    "sample_at": {"sample_at_mm": 8.33},
+    "sample_index": {"sample_index": 0.05},
 }
 # A spot is at a lens within this distance, in pitches of the array: 0.06 mm on the paper's plate.
 _MATCH_RADIUS = 0.0488
 
 FITTED = ("sensor_distance", "rotation", "shift", "tilt")
-FITTABLE = (*FITTED, "scale", "depth_offset", "lenses")
+OF_DEVICE = (*FITTED, "scale", "depth_offset", "lenses")
+FITTABLE = (*OF_DEVICE, *OF_SAMPLE)
+# What core offsets depend on in one step of a fit, beside depth and field.
+_TRACED = ("sensor_distance", *OF_SAMPLE)
 
 
 class Unknowns(eqx.Module):
@@ -57,6 +63,7 @@ class Unknowns(eqx.Module):
 
     `scale` is that of the array about its center, `depth_offset` is added to the depths of all sources, mm, `lenses`
     are deviations of the centers in the array's frame, mm, and `coordinates` the unknown ones of the sources, mm.
+    `sample_at` is the depth at which the sample begins, mm, `sample_index` its refractive index.
     """
 
     sensor_distance: Float[Array, ""] | None = None
@@ -66,19 +73,22 @@ class Unknowns(eqx.Module):
     scale: Float[Array, ""] | None = None
     depth_offset: Float[Array, ""] | None = None
     lenses: Float[Array, "lens 2"] | None = None
+    sample_at: Float[Array, ""] | None = None
+    sample_index: Float[Array, ""] | None = None
     coordinates: Float[Array, " unknown"] | None = None
 
 
 class CoreOffsets(NamedTuple):
     """Distance of cores from chief rays at some depths: coefficients of odd powers of the field, mm.
 
-    `slope` is the derivative by the sensor distance at `sensor_distance`. `type_of` is each lens's type.
+    `slopes` are the derivatives by numbers of the imager at `values`, by their names in `Unknowns`. `type_of` is each
+    lens's type.
     """
 
     depths: Float[Array, " depth"]
     offset: Float[Array, "type depth power"]
-    slope: Float[Array, "type depth power"]
-    sensor_distance: Float[Array, ""]
+    slopes: dict[str, Float[Array, "type depth power"]]
+    values: dict[str, Float[Array, ""]]
     type_of: Int[Array, " lens"]
 
 
@@ -108,16 +118,14 @@ def initial_unknowns(names: Sequence[str], data: Observations) -> Unknowns:
     imager, dtype = data.imager, data.positions.dtype
     zero = jnp.zeros((), dtype)
     values = {
-        "sensor_distance": imager.sensor_distance,
-        "rotation": imager.rotation,
-        "shift": imager.shift,
         "tilt": jnp.zeros(2, dtype) if imager.tilt is None else imager.tilt,
         "scale": zero + 1,
         "depth_offset": zero,
         "lenses": jnp.zeros(imager.array.centers.shape, dtype),
     }
     coordinates = data.points[data.unknown[:, 0], data.unknown[:, 1]] if len(data.unknown) else None
-    return Unknowns(**{name: values[name].astype(dtype) for name in names}, coordinates=coordinates)
+    initial = {name: values[name] if name in values else number(imager, name) for name in names}
+    return Unknowns(**{name: value.astype(dtype) for name, value in initial.items()}, coordinates=coordinates)
 
 
 def apply_to_imager(unknowns: Unknowns, imager: Imager) -> Imager:
@@ -126,8 +134,8 @@ def apply_to_imager(unknowns: Unknowns, imager: Imager) -> Imager:
     if unknowns.scale is not None or unknowns.lenses is not None:
         centers = array.centers if unknowns.scale is None else array.centers * unknowns.scale
         array = with_centers(array, centers if unknowns.lenses is None else centers + unknowns.lenses)
-    values = {name: value for name in FITTED if (value := getattr(unknowns, name)) is not None}
-    where = lambda i: (i.array, *(getattr(i, name) for name in values))
+    values = {name: value for name in (*FITTED, *OF_SAMPLE) if (value := getattr(unknowns, name)) is not None}
+    where = lambda i: (i.array, *(number(i, name) for name in values))
     return eqx.tree_at(where, imager, (array, *values.values()), is_leaf=lambda leaf: leaf is None)
 
 
@@ -170,8 +178,9 @@ def _predict(imager: Imager, points, lenses, offsets: CoreOffsets) -> Float[Arra
     at = lambda columns: of_type(columns)[offsets.type_of[lenses], jnp.arange(len(lenses))]
     radial = jnp.zeros_like(field2)
     for power in reversed(range(offsets.offset.shape[2])):
-        offset, slope = at(offsets.offset[..., power]), at(offsets.slope[..., power])
-        radial = radial * field2 + offset + (imager.sensor_distance - offsets.sensor_distance) * slope
+        radial = radial * field2 + at(offsets.offset[..., power])
+        for name, slope in offsets.slopes.items():
+            radial = radial + (number(imager, name) - offsets.values[name]) * at(slope[..., power])
     return views.spot + views.offset / imager.field_radius * radial[:, None]
 
 
@@ -185,17 +194,19 @@ def predict_spots(
     return jax.lax.map(of_source, jnp.asarray(points, dtype))
 
 
-def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"]) -> CoreOffsets:
-    """Trace core offsets at these depths, or at a few that span them."""
+def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"], fit: Sequence[str] = ()) -> CoreOffsets:
+    """Trace core offsets at these depths, or a few that span them, with derivatives by what is fitted of `_TRACED`."""
     nodes = np.unique(depths)
     if len(nodes) > _DEPTHS:
         nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
-    v = float(imager.sensor_distance)
-    farther = eqx.tree_at(lambda i: i.sensor_distance, imager, imager.sensor_distance * (1 + _STEP))
-    offset, beyond = (core_polynomials(each, nodes) for each in (imager, farther))
-    tables = nodes, offset, (beyond - offset) / (v * _STEP), v
-    tables = (jnp.asarray(table, imager.sensor_distance.dtype) for table in tables)
-    return CoreOffsets(*tables, jnp.asarray(type_of_lens(imager.array)))
+    offset, slopes = core_polynomials(imager, nodes), {}
+    values = {name: number(imager, name) for name in _TRACED if name in fit}
+    for name, value in values.items():
+        beyond = eqx.tree_at(lambda i, name=name: number(i, name), imager, value * (1 + _STEP))
+        slopes[name] = (core_polynomials(beyond, nodes) - offset) / (float(value) * _STEP)
+    typed = lambda tables: jax.tree.map(lambda table: jnp.asarray(table, imager.sensor_distance.dtype), tables)
+    types = jnp.asarray(type_of_lens(imager.array))
+    return CoreOffsets(typed(nodes), typed(offset), typed(slopes), typed(values), types)
 
 
 def core_polynomials(imager: Imager, depths: Float[np.ndarray, " depth"]) -> Float[np.ndarray, "type depth power"]:
@@ -301,4 +312,6 @@ def check_determined(errors: dict[str, float], radius: float) -> None:
     ]
     if unknown:
         remedy = "use sources at more depths and positions, or known ones, or hold some of these"
+        if any(name.startswith("sample") for name in unknown):
+            remedy = "give the depths of points in the sample, hold the other numbers, or fit one of the sample's"
         raise InputError(f"captures: the spots do not determine {', '.join(unknown)}; {remedy}.")

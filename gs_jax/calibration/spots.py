@@ -15,6 +15,7 @@ from skimage.feature import peak_local_max
 from ..base.errors import InputError
 from ..detection.background import subtract_background
 from ..geometry import Imager
+from ..layers import object_surface
 from ..optics.lens_types import FIELDS
 from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
@@ -41,8 +42,11 @@ class Sources(NamedTuple):
     points: Float64[np.ndarray, "source 3"]
     captures: Int[np.ndarray, " source"]
 
-    def check(self, count: int) -> None:
-        """`InputError` unless each of `count` captures has a source, and every depth is positive."""
+    def check(self, count: int, imager: Imager, fit: Sequence[str]) -> None:
+        """`InputError` unless each of `count` captures has a source where the imager's object may be.
+
+        Nor if the known coordinates cannot determine what is to be fitted, whatever the spots are.
+        """
         without = sorted(set(range(count)) - set(self.captures.tolist()))
         if not count or without or len(self.points) != len(self.captures):
             which = f", none in capture {without[0] + 1}" if without else ""
@@ -54,9 +58,15 @@ class Sources(NamedTuple):
         depths = self.points[:, 2]
         if (depths <= 0).any():
             raise InputError(f"positions: depths must be positive, got {np.nanmin(depths):g} mm.")
+        begins = float(object_surface(imager.filters, imager.sample))
+        # Where the sample begins may be a guess.
+        if "sample_at" not in fit and (depths < begins).any():
+            what = "filters end" if imager.sample is None else "sample begins"
+            needs = f"depths must be {begins:g} mm, where the {what}, or more"
+            raise InputError(f"positions: {needs}, got {np.nanmin(depths):g} mm.")
+        self._check_fit(fit)
 
-    def check_fit(self, fit: Sequence[str]) -> None:
-        """`InputError` if the known coordinates cannot determine what is to be fitted, whatever the spots are."""
+    def _check_fit(self, fit):
         of_depth = [name for name in ("sensor_distance", "depth_offset") if name in fit]
         if of_depth and np.isnan(self.points[:, 2]).all():
             remedy = f"give the depth of a source, or hold {of_depth[0]}"

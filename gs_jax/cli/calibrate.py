@@ -10,7 +10,10 @@ from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
 from .options import DESIGN, CaptureOptions, capture_options
 
-_NAMES = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
+_NAMES = (
+    *("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses"),
+    *("sample-at", "sample-index"),
+)
 
 
 class _Names(click.ParamType):
@@ -21,7 +24,7 @@ class _Names(click.ParamType):
     def convert(self, value, param, ctx):
         if isinstance(value, tuple):
             return value
-        names = tuple(name.strip() for name in value.split(","))
+        names = tuple(name.strip().replace("_", "-") for name in value.split(","))
         if wrong := [name for name in names if name not in _NAMES]:
             self.fail(f"must be some of {', '.join(_NAMES)}, got {wrong[0]!r}.", param, ctx)
         return tuple(name.replace("-", "_") for name in names)
@@ -103,8 +106,7 @@ def calibrate_command(
             points, of = read_positions(positions, captures)
             sources = Sources(points, of)
             with errors_name_file(positions):
-                sources.check(len(captures))
-                sources.check_fit(names)
+                sources.check(len(captures), imager, names)
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             options = {"captures": of, "fit": names, "find_lenses": find_lenses}
             outcome = calibrate(images, points, imager, **options, progress=progress)
