@@ -23,23 +23,31 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
 
-# Programs take memory, and memory maps, of which Linux gives a process 65,530: in a worker, what it may hold.
-_MOST_BYTES, _MOST_MAPS = 1.1e9, 30_000
+# Programs take memory, and memory maps, of which Linux gives a process 65,530: in a worker, what it may hold, and by
+# how much memory has to grow before it is worth the seconds to look for some again.
+_MOST_BYTES, _MOST_MAPS, _GROWTH = 1.1e9, 30_000, 0.3e9
+_held_after_the_last_time = 0
 
 
 @pytest.fixture(autouse=True)
 def _compiled_code_is_dropped():
     """Forget compiled programs where a process has too many: they are read from the cache when they are needed."""
     yield
-    if not (process := Path("/proc/self")).exists():
+    global _held_after_the_last_time
+    if not Path("/proc/self").exists():
         return
-    resident = int((process / "statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
-    if resident > _MOST_BYTES or (process / "maps").read_bytes().count(b"\n") > _MOST_MAPS:
+    many = Path("/proc/self/maps").read_bytes().count(b"\n") > _MOST_MAPS
+    if many or _resident() > max(_MOST_BYTES, _held_after_the_last_time + _GROWTH):
         jax.clear_caches()
         gc.collect()
         # The C library keeps what was freed.
         if hasattr(library := ctypes.CDLL(None), "malloc_trim"):
             library.malloc_trim(0)
+        _held_after_the_last_time = _resident()
+
+
+def _resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
 
 @pytest.fixture(autouse=True)
