@@ -26,7 +26,7 @@ from .base.arrays import (
     as_shape,
     check_fields,
 )
-from .layers import Layers, Sample, check_room, depth_of_reduced, reduced_distance
+from .layers import Layers, Sample, check_room, depth_of_reduced, object_surface, reduced_distance
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
 
@@ -271,6 +271,15 @@ class Imager(eqx.Module):
     def depth_of(self, reduced_depth: Scalars) -> Scalars:
         """Depth `z` of a reduced depth `z'`, mm."""
         return depth_of_reduced(reduced_depth - self.array.reduced_thickness_front, self.filters, self.sample)
+
+    @property
+    def sample_surface(self) -> Scalar:
+        """Depth at which the object's medium begins, mm: the sample's surface, or where filters end.
+
+        A depth within the sample, counted from its surface, is this much less than the depth `z`.
+        """
+        zero = array_namespace(self.sensor_distance).zeros((), self.sensor_distance.dtype)
+        return zero + object_surface(self.filters, self.sample)
 
     @property
     def reduced_sensor_distance(self) -> Scalar:

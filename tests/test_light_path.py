@@ -143,8 +143,12 @@ def test_questions(changes, words):
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"sample": "jelly"}, "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
+        ({"sample": "jelly"}, "the sample must be one of [samples] in the design, gel, air, got 'jelly'"),
         ({"wavelength_nm": 0.52}, "`wavelength_nm` must be a number of nanometres from 10 to 100000, got 0.52"),
+        (
+            {"sample": gs.Sample(1.4, 1.0)},
+            "`surface` must be 2 mm, as thick as the layers in front of the medium are, or more",
+        ),
         ({"wavelength_nm": 2000.0}, "the wavelength must be 182 to 1129 nm for the index of water, got 2000"),
     ],
 )

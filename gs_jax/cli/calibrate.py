@@ -8,6 +8,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
+from .light import Light, light_options
 from .options import DESIGN, CaptureOptions, capture_options
 
 _NAMES = (
@@ -53,6 +54,7 @@ class _Names(click.ParamType):
 @click.option(
     "-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of the residuals is written beside it."
 )
+@light_options
 @capture_options
 @force_option
 def calibrate_command(
@@ -65,13 +67,15 @@ def calibrate_command(
     from_scene: bool,
     output: Path,
     force: bool,
+    light: Light,
     camera: CaptureOptions,
 ):
     """Find the geometry of a real microscope, from CAPTURES of a pinhole or bead at known positions.
 
     Sensor distance, rotation, shift and tilt are fitted. DESIGN has the lens centres; its sensor distance may be off by
     a quarter, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
-    with z from the plate. One capture suffices; several depths and positions are better.
+    with z from the array, or from the sample. Calibrate with what held the source: --sample air, if the object's
+    medium was away. One capture suffices; several depths and positions are better.
     """
     from rich.console import Console
 
@@ -93,23 +97,25 @@ def calibrate_command(
     inputs = (design, *captures, *([positions] if positions else []), *camera.files)
     check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
-    imager = camera.imager(microscope.imager())
+    imager = camera.imager(light.imager(microscope))
     names = [name for name in (*(SELF_FITTED if from_scene else FITTED), *fit) if name not in hold]
     with Progress() as progress:
         if positions is None:
             capture = next(iter(captures))
             image = camera.read(capture)
-            grid = voxel_grid(imager, list(microscope.imaging.working_distance_mm))
+            grid = voxel_grid(imager, list(light.working_distance(microscope, imager)))
             with errors_name_file(capture):
                 outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
         else:
             points, of = read_positions(positions, captures)
+            points[:, 2] += light.origin(imager) or 0.0
             sources = Sources(points, of)
             with errors_name_file(positions):
                 sources.check(len(captures), imager, names)
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             options = {"captures": of, "fit": names, "find_lenses": find_lenses}
             outcome = calibrate(images, points, imager, **options, progress=progress)
+    microscope = light.found(microscope, outcome.imager, names)
     write_design(output, apply_calibration(microscope, outcome, camera.recorded(provenance_of(*inputs))))
     write_figure(drawing, plot_residuals(outcome))
     camera.print_corrections()

@@ -6,6 +6,7 @@ import click
 
 from ..io.files import check_output, write_json
 from .files import check_may_write, force_option, provenance_of
+from .light import Light, check_beyond, sample_options
 from .options import DESIGN, MM, UM, Depths, shipped_designs
 
 
@@ -39,14 +40,17 @@ def layout_command(
 @click.option("--json", "output", type=Path, help="Also write the numbers to this file.")
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm.  [default: seven in the working distance]")
 @click.option("--confusion-um", type=UM, help="Diameter of the circle of confusion, um.  [default: two pixels]")
-def metrics_command(design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None):
+@sample_options
+def metrics_command(
+    design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None, light: Light
+):
     """Show the datasheet of the microscope of DESIGN (the paper's Eqs. 1-11), and its problems.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
     from rich.console import Console
 
-    from ..design.datasheets import datasheet, summary, tables
+    from ..design.datasheets import datasheet, path_in_words, summary, tables
     from ..design.design import read_design
     from ..design.diagnostics import findings
 
@@ -54,11 +58,15 @@ def metrics_command(design: Path, output: Path | None, depths: list[float] | Non
         check_output(output, [".json"])
         check_may_write(output, inputs=(design,))
     circle_of_confusion = confusion_um and confusion_um / 1000
-    microscope = read_design(design)
+    microscope = light.design(read_design(design))
+    if depths:
+        check_beyond(microscope.imager(), depths, "--depths")
     sheet = datasheet(microscope, depths, circle_of_confusion=circle_of_confusion)
     if output:
         write_json(output, sheet)
     click.echo(summary(microscope, sheet))
+    if words := path_in_words(sheet):
+        click.echo(f"  {words}")
     click.echo(_calibration(microscope.provenance))
     console = Console()
     for table in tables(sheet):

@@ -11,6 +11,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
 from .files import check_may_write, provenance_of
+from .light import Light, check_beyond, sample_options
 from .options import DESIGN, UM, Depths, Number
 
 SMALL_UM, FEATURE_UM = Number(1e-3, 1e3, "um"), Number(1e-2, 1e3, "um")
@@ -111,6 +112,7 @@ def _options(command):
 @click.option("--positions", type=Path, help="POINTS.csv: x_mm,y_mm,z_mm of calibration sources.  [default: four]")
 @click.option("--draws", type=click.IntRange(1, 10**6), default=1000, help="Random devices.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the devices.")
+@sample_options
 def tolerance_command(
     design: Path,
     output: Path | None,
@@ -122,6 +124,7 @@ def tolerance_command(
     positions: Path | None,
     draws: int,
     seed: int,
+    light: Light,
     **tolerances: Any,
 ):
     """Show the effect of tolerances on the spots and depths of the microscope of DESIGN, and the yield.
@@ -155,7 +158,8 @@ def tolerance_command(
         sources, _ = read_positions(positions, [])
         if not len(sources) or np.isnan(sources).any() or not (sources[:, 2] > 0).all():
             raise InputError(f"{positions}: every source must have x, y and z > 0, got one without.")
-    microscope = read_design(design)
+    microscope = light.design(read_design(design))
+    check_beyond(microscope.imager(), [*(depths or ()), *([] if sources is None else sources[:, 2])], "depths")
     um = lambda value: value and value / 1000
     targets = {"max_width": um(max_width_um), "min_strehl": min_strehl, "max_depth_error": um(max_depth_error_um)}
     with Progress() as progress, errors_name_file(design):

@@ -10,6 +10,7 @@ from ..base.progress import Progress
 from ..io.files import check_output, make_folder
 from .files import check_may_write, provenance_of
 from .interrupt import PARTIAL, partial_outputs
+from .light import Light, sample_options
 from .options import DESIGN, CaptureOptions, capture_options
 
 
@@ -23,8 +24,11 @@ from .options import DESIGN, CaptureOptions, capture_options
 @click.option("--points", type=Path, help="POINTS.csv: points for a table and a 3-D view.")
 @click.option("--capture", type=Path, help="CAPTURE.tif: the capture of VOLUME.")
 @click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
+@sample_options
 @capture_options
-def report_command(design: Path, volume: Path | None, output: Path, camera: CaptureOptions, **files: Path | None):
+def report_command(
+    design: Path, volume: Path | None, output: Path, light: Light, camera: CaptureOptions, **files: Path | None
+):
     """Write one page, for any browser and without a network, about the microscope of DESIGN and a reconstruction.
 
     VOLUME is an output of `gs-jax reconstruct`. The page has the device to scale, the datasheet and violated
@@ -48,7 +52,7 @@ def report_command(design: Path, volume: Path | None, output: Path, camera: Capt
     check_may_write(output, inputs=(*inputs, *camera.files))
     if volume and volume.suffix.lower() in (".csv", ".toml"):
         raise input_error("VOLUME", ".ome.tif or .zarr (points are given by --points)", volume.suffix, volume)
-    microscope, results = read_design(design), {}
+    microscope, results = light.design(read_design(design)), {}
     if volume:
         results["volume"], results["grid"] = read_volume(volume)
     if points:
@@ -74,7 +78,8 @@ def report_command(design: Path, volume: Path | None, output: Path, camera: Capt
 )
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0 takes a free one.")
 @click.option("--browser/--no-browser", default=True, help="Open the page in a browser.")
-def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool):
+@sample_options
+def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool, light: Light):
     """Change sensor distance, curvature, aperture, pitch, depths and field of DESIGN by sliders in a browser.
 
     The page shows violated targets, spots, the layout with ghosts, the datasheet and a small simulated reconstruction.
@@ -90,7 +95,7 @@ def explore_command(design: Path, study: Path | None, output: Path | None, port:
 
     saves = output or Path(f"{design.stem}-new.toml")
     check_output(saves, [".toml"])
-    microscope, targets = read_design(design), read_study(study) if study else None
+    microscope, targets = light.design(read_design(design)), read_study(study) if study else None
     with Progress() as progress:
         with progress.step("Compiling"):
             session = Session(microscope, targets, saves, provenance_of(design, study))

@@ -12,6 +12,7 @@ from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output
 from .files import check_may_write, force_option, provenance_of
+from .light import Light, light_options
 from .options import (
     DESIGN,
     FIDELITIES,
@@ -35,7 +36,7 @@ from .recording_command import check_recording, reconstruct_recording, recording
 @click.argument("capture", type=Path)
 @click.argument("design", type=DESIGN)
 @click.option(
-    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the plate, STOP included; or one depth."
+    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the array, STOP included; or one depth."
 )
 @click.option(
     "--voxel-um",
@@ -78,6 +79,7 @@ from .recording_command import check_recording, reconstruct_recording, recording
 @click.option(
     "--points", type=Path, help="POINTS.csv: also write the points in the capture; of a recording with their frame."
 )
+@light_options
 @recording_options
 @worker_options
 @capture_options
@@ -94,6 +96,7 @@ def reconstruct_command(
     frame_interval: float | None,
     track: float | None,
     resume: bool,
+    light: Light,
     camera: CaptureOptions,
     workers: Workers,
     **method_options: Any,
@@ -117,6 +120,7 @@ def reconstruct_command(
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..design.design import design_text, read_design
+    from ..io.depth_frames import DepthFrame
     from ..io.point_tables import write_points
     from ..io.recordings import open_recording
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
@@ -139,7 +143,9 @@ def reconstruct_command(
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
-    text, imager = design_text(microscope), camera.imager(microscope.imager())
+    text, imager = design_text(microscope), camera.imager(light.imager(microscope))
+    frame, shown = DepthFrame(light.origin(imager)), depths
+    depths = light.from_array(depths, imager)
     method_options |= {"points": points is not None, "weights": weights}
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     with open_recording(capture, page=camera.page) as recording, Progress() as progress:
@@ -148,6 +154,7 @@ def reconstruct_command(
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
             files = {"design_text": text, "capture": capture, "camera": camera, "points": points}
+            files |= {"frame": frame}
             how = {"track": track, "interval": frame_interval, "resume": resume}
             with workers:
                 return reconstruct_recording(
@@ -162,13 +169,14 @@ def reconstruct_command(
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=text))
-            write_volume(output, result.volume, plan.grid, provenance)
+            provenance |= frame.note if imager.sample is not None else {}
+            write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if points and result.points is not None:
-                write_points(points, result.points, result.statistics, provenance=provenance)
+                write_points(points, *frame.points(result.points, result.statistics), provenance=provenance)
     camera.print_corrections()
     z, y, x = result.volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
-    click.echo(f"{output}: {size}, {depth_range(depths)}")
+    click.echo(f"{output}: {size}, {depth_range(shown)}")
     if residual:
         click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
     if result.points is not None:

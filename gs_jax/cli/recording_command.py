@@ -114,6 +114,7 @@ def reconstruct_recording(
     interval: float | None,
     resume: bool,
     workers: Workers,
+    frame,
 ) -> int:
     """Make and write all frames, print a summary, and return the exit status: 1 if a frame failed."""
     from ..io.volume_series import VolumeSeries
@@ -131,8 +132,10 @@ def reconstruct_recording(
     request = _request(names, provenance)
     provenance[f"input {capture.name}"] = f"{len(names)} frames, {names[0]} to {names[-1]}"
     provenance = camera.recorded(provenance)
+    provenance |= frame.note if plan.imager.sample is not None else {}
+    grid = frame.grid(plan.grid)
     described = {"interval": interval, "request": request, "provenance": provenance}
-    series = VolumeSeries(output, len(names), plan.grid, **described, resume=resume)
+    series = VolumeSeries(output, len(names), grid, **described, resume=resume)
     partial_outputs[output] = RESUMABLE
     before, began = len(series.finished), time.monotonic()
     # Printed when a frame succeeds: if all fail, the error says the reason once.
@@ -153,14 +156,14 @@ def reconstruct_recording(
     run(series, on_failure=on_failure, progress=progress)
     print_messages()
     seconds, new = time.monotonic() - began, len(series.finished) - before
-    written = _write_points(points, series, track, provenance) if points else ""
+    written = _write_points(points, series, track, provenance, frame) if points else ""
     camera.print_corrections()
     check = _print_notes(series)
     size = " x ".join(map(str, (series.count, *plan.grid.volume_shape)))
     rest = f"; {before} were there" if before else ""
     rate = f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
     voxels = f"{size} voxels (t, z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
-    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(plan.grid))}")
+    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}")
     click.echo(f"{output}: {rate}")
     if check:
         click.echo(f"{output}: {check}")
@@ -190,7 +193,7 @@ def _request(names, provenance) -> dict[str, str]:
     return request
 
 
-def _write_points(path, series, track, provenance) -> str:
+def _write_points(path, series, track, provenance, frame) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
     from ..detection.tracking import track as track_particles
     from ..io.point_tables import write_points_in_time
@@ -199,12 +202,12 @@ def _write_points(path, series, track, provenance) -> str:
 
     def count(frames):
         nonlocal points, particles
-        for frame, columns in frames:
+        for number, columns in frames:
             points += len(columns["x_mm"])
-            particles = max([particles, *(1 + number for number in columns.get("particle", ()))])
-            yield frame, columns
+            particles = max([particles, *(1 + particle for particle in columns.get("particle", ()))])
+            yield number, columns
 
-    frames = ((frame, note["points"]) for frame, note in series.notes())
+    frames = ((number, frame.columns(note["points"])) for number, note in series.notes())
     if track:
         frames = track_particles(frames, track / 1000)
     write_points_in_time(path, count(frames), provenance=provenance)

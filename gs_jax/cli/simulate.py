@@ -9,6 +9,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
 from .files import check_may_write, provenance_of
+from .light import Light, check_beyond, light_options
 from .options import DESIGN, PSFS, SIMULATED, Number
 
 PEAK = Number(1.0, 1e6, "electrons")
@@ -37,6 +38,7 @@ COUNTS = Number(0.0, 65535.0, "counts")
 @click.option("--bits", type=click.IntRange(1, 16), default=16, help="Bits of the converter.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the noise.")
 @click.option("-o", "--output", type=Path, required=True, help="CAPTURE.tif, .png or .npy.")
+@light_options
 def simulate_command(
     scene: Path,
     design: Path,
@@ -51,6 +53,7 @@ def simulate_command(
     bits: int,
     seed: int,
     output: Path,
+    light: Light,
 ):
     """Simulate the capture of SCENE by the microscope of the file DESIGN.
 
@@ -73,9 +76,10 @@ def simulate_command(
         raise InputError(f"--psf {psf} must be used with --optics near, which has one PSF for all lenses.")
     microscope = read_design(design)
     with Progress() as progress:
-        light, grid = read_scene(scene)
+        imager = light.imager(microscope)
         with errors_name_file(scene):
-            image = simulate(light, microscope.imager(), grid, optics=optics, psf=psf, progress=progress)
+            objects, grid = _placed(scene, *read_scene(scene), light, imager)
+            image = simulate(objects, imager, grid, optics=optics, psf=psf, progress=progress)
         if noise:
             with progress.step("Exposing"):
                 camera = Camera(gain, offset, read_noise, math.inf if full_well is None else full_well, bits)
@@ -84,3 +88,23 @@ def simulate_command(
             write_capture(output, image, provenance_of(scene, design=design_text(microscope)))
     size = " x ".join(map(str, image.shape))
     click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}")
+
+
+def _placed(scene: Path, objects, grid, light: Light, imager):
+    """A scene with depths from the array: what says that it counts from the sample is so already."""
+    import numpy as np
+
+    from ..io.depth_frames import frame_of
+
+    origin, said = light.origin(imager), frame_of(scene)
+    if origin is not None and said == "array":
+        raise InputError(
+            "--depths-from must be array for depths that count from the array, as the file says, got sample."
+        )
+    moved = (origin or 0.0) if said is None else 0.0
+    if grid is None:
+        objects = objects + np.array([0, 0, moved, 0])
+    elif moved:
+        grid = grid.at(np.round(np.asarray(grid.depths, float) + moved, 6))
+    check_beyond(imager, objects[:, 2] if grid is None else np.asarray(grid.depths), "depths")
+    return objects, grid

@@ -16,7 +16,7 @@ from ..geometry import Imager
 from ..layouts import check_positive, nearest_neighbour_distances
 from ..objectives.conditions import Conditions, per_type
 from ..objectives.paraxial import third_order_wavefront
-from ..optics import aberrations
+from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
 from .design import Design
 
@@ -90,9 +90,51 @@ def datasheet(
         "pitch_mm": _round(float(distances.mean())),
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
+        **_light_path(design),
         "coverage": _round(sum(float(objectives.coverage(*part)) for part in parts)),
         **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
     }
+
+
+def _light_path(design: Design) -> dict[str, Any]:
+    """Layers and sample: thicknesses, what they are of air, and by how much they move the depth in focus."""
+    imager = design.imager()
+    found: dict[str, Any] = {}
+    for side, layers in (("object", imager.filters), ("sensor", imager.windows)):
+        if layers is not None:
+            thickness = float(layers.total)
+            found |= {
+                f"{side}_layers_mm": _round(thickness),
+                f"{side}_layers_reduced_mm": _round(thickness - float(layers.shortening)),
+            }
+    if imager.sample is not None:
+        found["sample_index"] = _round(float(imager.sample.refractive_index))
+        found["sample_surface_mm"] = _round(float(imager.sample_surface))
+    if found and imager.array.alike:
+        air = dataclasses.replace(imager, filters=None, windows=None, sample=None)
+        shift = _depth_in_focus(imager) - _depth_in_focus(air)
+        found["focus_shift_mm"] = _round(shift)
+    return found
+
+
+def _depth_in_focus(imager: Imager) -> float:
+    focal_length, v = imager.array.focal_length, imager.reduced_sensor_distance
+    return float(imager.depth_of(theory.depth_in_focus(focal_length, v))) if v > focal_length else math.inf
+
+
+def path_in_words(sheet: dict[str, Any]) -> str:
+    """Layers and sample of a datasheet in one line; empty without any."""
+    words = [
+        f"{_plain(sheet[f'{side}_layers_mm'])} mm of layers {where} are {_plain(sheet[f'{side}_layers_reduced_mm'])} "
+        "mm of air"
+        for side, where in (("object", "before the array"), ("sensor", "before the sensor"))
+        if f"{side}_layers_mm" in sheet
+    ]
+    if "sample_index" in sheet:
+        words.append(f"objects in n = {_plain(sheet['sample_index'])} from {_plain(sheet['sample_surface_mm'])} mm")
+    if sheet.get("focus_shift_mm") is not None:
+        words.append(f"together they move the depth in focus by {sheet['focus_shift_mm']:+.3g} mm")
+    return "; ".join(words)
 
 
 def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -21,13 +21,12 @@ from ..materials import index_of
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .imagers import sharp_depths, tables_of
-from .light_path import NO_SAMPLE, chosen_sample, layers_of, object_begins, plate_index
+from .light_path import NO_SAMPLE, chosen_sample, layers_of, path_in_words, plate_index
 from .tables import (
     ArrayTable,
     CalibrationTable,
     ImagingTable,
     LayersTable,
-    LayerTable,
     LensTable,
     SampleTable,
     SensorTable,
@@ -86,13 +85,6 @@ class Design(Table):
         )
         count = len(set(zip(*(of_each(self, key) for key in LENS_KEYS), strict=True)))
         of_types = f" of {count} types" if count > 1 else ""
-        media = [
-            f"  {side}: {', '.join(f'{layer.thickness_mm:g} mm of n = {_index(layer)}' for layer in layers)}"
-            for side, layers in (("in front", self.layers.object), ("on the sensor", self.layers.sensor))
-            if layers
-        ]
-        if self.sample != NO_SAMPLE:
-            media.append(f"  objects in n = {_index(self.sample)}, from z = {object_begins(self):g} mm")
         return "\n".join(
             [
                 f"Design {self.name!r}",
@@ -103,7 +95,7 @@ class Design(Table):
                 f"at v = {imaging.sensor_distance_mm:g} mm",
                 f"  objects at z = {imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm, "
                 f"{imaging.wavelength_nm:g} nm, field radius {imaging.field_radius_mm:g} mm",
-                *media,
+                *path_in_words(self),
             ]
         )
 
@@ -155,19 +147,22 @@ class Design(Table):
             conic_constant=_one_if_alike(lens.conic_constant),
             aspheric_terms=lens.aspheric_terms,
         )
-        return Imager(
-            array,
-            Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
-            sensor_distance=imaging.sensor_distance_mm,
-            field_radius=imaging.field_radius_mm,
-            wavelength=wavelength / 1e6,
-            rotation=math.radians(calibration.rotation_deg),
-            shift=calibration.shift_mm,
-            tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
-            filters=layers_of(self.layers.object, wavelength),
-            windows=layers_of(self.layers.sensor, wavelength),
-            sample=chosen_sample(self, sample, wavelength),
-        )
+        try:
+            return Imager(
+                array,
+                Sensor(self.sensor.shape, self.sensor.pixel_pitch_um / 1000, self.sensor.origin_mm or (0.0, 0.0)),
+                sensor_distance=imaging.sensor_distance_mm,
+                field_radius=imaging.field_radius_mm,
+                wavelength=wavelength / 1e6,
+                rotation=math.radians(calibration.rotation_deg),
+                shift=calibration.shift_mm,
+                tilt=np.tan(np.radians(calibration.tilt_deg)) if any(calibration.tilt_deg) else None,
+                filters=layers_of(self.layers.object, wavelength),
+                windows=layers_of(self.layers.sensor, wavelength),
+                sample=chosen_sample(self, sample, wavelength),
+            )
+        except ValueError as error:  # of a `Sample` that is given: the rest is checked
+            raise InputError(str(error)) from error
 
     @classmethod
     def from_imager(
@@ -254,11 +249,6 @@ def _validated(data: dict[str, Any]) -> Design:
 
 def _one_if_alike(numbers: float | tuple[float, ...]) -> float | tuple[float, ...]:
     return numbers[0] if isinstance(numbers, tuple) and len(set(numbers)) == 1 else numbers
-
-
-def _index(table: LayerTable | SampleTable) -> str:
-    index = table.refractive_index
-    return index if isinstance(index, str) else f"{index:g}"
 
 
 def span_of(numbers: float | tuple[float, ...]) -> str:

@@ -50,14 +50,17 @@ def chosen_sample(design: Path, sample: str | Sample | None, wavelength_nm: floa
     """The sample of a name, or the default one (None); "air" is none."""
     if isinstance(sample, Sample):
         return sample
-    if sample == AIR:
-        return None
-    if sample is None:
-        return sample_of(design.sample, wavelength_nm)
-    if sample not in design.samples:
+    return sample_of(sample_table(design, sample), wavelength_nm)
+
+
+def sample_table(design: Path, name: str | None) -> SampleTable:
+    """The sample of a name, or the default one (None), as the file has it."""
+    if name is None:
+        return design.sample
+    if name != AIR and name not in design.samples:
         names = ", ".join([*design.samples, AIR])
-        raise InputError(f"`sample` must be one of [samples] in the design, {names}, got {short_repr(sample)}.")
-    return sample_of(design.samples[sample], wavelength_nm)
+        raise InputError(f"the sample must be one of [samples] in the design, {names}, got {short_repr(name)}.")
+    return NO_SAMPLE if name == AIR else design.samples[name]
 
 
 def plate_index(design: Path) -> float:
@@ -85,6 +88,20 @@ def object_begins(design: Path) -> float:
     wavelength = design.imaging.wavelength_nm
     begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength))
     return float(f"{float(begins):.9g}")
+
+
+def path_in_words(design: Path) -> list[str]:
+    """Layers and sample, a line each."""
+    index = lambda table: str(table.refractive_index)
+    sides = (("in front", design.layers.object), ("on the sensor", design.layers.sensor))
+    lines = [
+        f"  {side}: {', '.join(f'{layer.thickness_mm:g} mm of n = {index(layer)}' for layer in layers)}"
+        for side, layers in sides
+        if layers
+    ]
+    if design.sample != NO_SAMPLE:
+        lines.append(f"  objects in n = {index(design.sample)}, from z = {object_begins(design):g} mm")
+    return lines
 
 
 def check_path(design: Path) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Float64, Int, Shaped
 
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike, Points
+from .depth_frames import SURFACE
 from .files import MAX_TEXT_BYTES, atomic_write, check_input, check_output, read_text, write_text
 from .provenance import Provenance, write_sidecar
 
@@ -34,7 +35,8 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
 
     *File.*
 
-    Further columns after these are left out.
+    Further columns after these are left out. Depths are from the array: of a file that counts them from the sample's
+    surface, the column `sample_surface_mm` is added.
 
     Raises
     ------
@@ -51,7 +53,10 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
     with check_input(path).open("rb") as file:
         first = file.readline(_MAX_HEADER).decode("utf-8-sig", "replace").rstrip("\r\n")
     header = first if first.startswith(f"{POINTS_HEADER},") else POINTS_HEADER
-    points = np.ascontiguousarray(read_table(path, header, MAX_POINTS)[:, :4])
+    table, names = read_table(path, header, MAX_POINTS), header.split(",")
+    points = np.ascontiguousarray(table[:, :4])
+    if SURFACE in names:
+        points[:, 2] += table[:, names.index(SURFACE)]
     for column, name, wrong, allowed in (
         (2, "z_mm", points[:, 2] <= 0, "above 0"),
         (3, "intensity", points[:, 3] < 0, "0 or more"),

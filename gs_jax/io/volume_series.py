@@ -20,8 +20,9 @@ from jaxtyping import Float32
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
+from .depth_frames import surface_of
 from .files import JOURNAL, atomic_write, decoding, disk_errors_name
-from .ngff import CHUNK, frame_shards, image_attributes, plain_depths
+from .ngff import CHUNK, frame_shards, image_attributes, plain_depths, um
 from .provenance import Provenance
 
 Note = dict[str, Any]
@@ -215,7 +216,9 @@ def read_series(path: PathLike) -> Series | None:
         scale, first = image["datasets"][0]["coordinateTransformations"]
         interval = scale["scale"][0] if "unit" in image["axes"][0] else None
         levels = [group[each["path"]] for each in image["datasets"]]
-        return Series(levels, scale["scale"], first["translation"], interval, (window["start"], window["end"]))
+        time, z, *rest = first["translation"]
+        places = [time, z + um(surface_of(path)), *rest]
+        return Series(levels, scale["scale"], places, interval, (window["start"], window["end"]))
 
 
 def check_replaceable(path: Path) -> None:

@@ -27,6 +27,7 @@ from jaxtyping import Array, Shaped
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
+from .depth_frames import from_array
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
 from .provenance import NAMESPACE, Provenance
@@ -89,6 +90,8 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
 
     *File.*
 
+    Depths are from the array, also those of a file that says it counts from the sample's surface.
+
     Raises
     ------
     InputError
@@ -105,6 +108,7 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     ((3, 41, 41), 0.1)
     """
     voxels, grid = _FORMATS[check_suffix(path, VOLUME_SUFFIXES)].read(Path(path))
+    grid = from_array(path, grid)
     if not np.isfinite(voxels).all():
         raise input_error("voxels", "finite", "a NaN or an infinity", path)
     return voxels, grid

@@ -1,0 +1,124 @@
+"""Options of the light's path that several commands share: the sample, the wavelength and the origin of depths."""
+
+import functools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import click
+
+from ..base.errors import InputError
+from .options import Number
+
+_NM, _SURFACE = Number(10.0, 1e5, "nm"), Number(0.0, 1e4, "mm")
+# By how much rounding may put a depth before the surface, mm.
+_ROUNDING = 1e-5
+
+
+class Light(NamedTuple):
+    """What holds the object, at which wavelength it is seen, and what depths count from."""
+
+    sample: str | None
+    refractive_index: float | None
+    surface: float | None
+    wavelength_nm: float | None
+    depths_from: str = "array"
+
+    def imager(self, design) -> Any:
+        """The geometry of a design with these."""
+        from ..layers import Sample
+
+        sample = self.sample if self.refractive_index is None else Sample(self.refractive_index, self.surface)
+        return design.imager(sample, self.wavelength_nm)
+
+    def design(self, design) -> Any:
+        """The design with these in place of its own, whose working distance begins in the object's medium."""
+        from ..design.light_path import object_begins, sample_table
+
+        changes: dict[str, Any] = {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
+        if self.sample is not None:
+            changes["sample"] = sample_table(design, self.sample)
+        if self.refractive_index is not None:
+            changes["sample"] = {"refractive_index": self.refractive_index, "surface_mm": self.surface}
+        changed = design.replace(**changes) if changes else design
+        begins, (near, far) = object_begins(changed), changed.imaging.working_distance_mm
+        return changed if near >= begins else changed.replace(working_distance_mm=(begins, far))
+
+    def working_distance(self, design, imager) -> tuple[float, float]:
+        """Nearest and farthest object of a design, in this medium, mm."""
+        near, far = design.imaging.working_distance_mm
+        return max(near, float(str(imager.sample_surface))), far
+
+    def found(self, design, imager, fitted: Iterable[str]) -> Any:
+        """The design with what was fitted of the sample in the table that it is from; of options, in `[sample]`."""
+        from ..design.light_path import sample_table
+
+        keys = {"sample_index": "refractive_index", "sample_at": "surface_mm"}
+        numbers = {"sample_index": "refractive_index", "sample_at": "surface"}
+        new = {keys[one]: float(f"{float(getattr(imager.sample, numbers[one])):.9g}") for one in fitted if one in keys}
+        if not new:
+            return design
+        if self.refractive_index is not None:
+            return design.replace(sample={"refractive_index": self.refractive_index, "surface_mm": self.surface} | new)
+        table = sample_table(design, self.sample).model_dump() | new
+        if self.sample is None:
+            return design.replace(sample=table)
+        return design.replace(samples={**design.samples, self.sample: table})
+
+    def origin(self, imager) -> float | None:
+        """Depth from which depths count, mm; None if it is the array."""
+        if self.depths_from == "array":
+            return None
+        if imager.sample is None:
+            raise InputError("--depths-from sample must be used with a sample, got air.")
+        return float(str(imager.sample_surface))
+
+    def from_array(self, depths: list[float], imager) -> list[float]:
+        """Depths of the command line, counted from the array."""
+        origin = self.origin(imager)
+        moved = depths if origin is None else [round(depth + origin, 9) for depth in depths]
+        check_beyond(imager, moved, "--depths")
+        return moved
+
+
+def check_beyond(imager, depths: Iterable[float], name: str) -> None:
+    """Raise `InputError` unless the depths, from the array, are where the object can be."""
+    begins, nearest = float(imager.sample_surface), min(map(float, depths), default=None)
+    if nearest is not None and nearest < begins - _ROUNDING:
+        allowed = f"{begins:.6g} mm or more, where layers end and the object's medium begins"
+        raise InputError(f"{name} must be {allowed}, got {nearest:.6g}.")
+
+
+def sample_options(command):
+    """Add the options of sample and wavelength; the command receives `light`, a `Light`."""
+
+    @functools.wraps(command)
+    def wrapper(*args, sample, sample_index, sample_at, wavelength_nm, depths_from="array", **kwargs):
+        if (sample_index is None) != (sample_at is None):
+            given, other = ("--sample-at", "--sample-index")[:: 1 if sample_index is None else -1]
+            raise InputError(f"{given} must be used with {other}.")
+        if sample is not None and sample_index is not None:
+            raise InputError("--sample must be used without --sample-index and --sample-at.")
+        light = Light(sample, sample_index, sample_at, wavelength_nm, depths_from)
+        return command(*args, light=light, **kwargs)
+
+    for option in reversed(_SAMPLE_OPTIONS):
+        wrapper = option(wrapper)
+    return wrapper
+
+
+_SAMPLE_OPTIONS = (
+    click.option("--sample", help="NAME of one of [samples] in DESIGN, or air.  [default: DESIGN's [sample]]"),
+    click.option("--sample-index", type=Number(1.0, 5.0), help="Refractive index of the object's medium."),
+    click.option("--sample-at", type=_SURFACE, help="Depth at which that medium begins."),
+    click.option("--wavelength-nm", type=_NM, help="Wavelength of the light.  [default: DESIGN's]"),
+)
+
+
+def light_options(command):
+    """As `sample_options`, with `--depths-from`."""
+    return click.option(
+        "--depths-from",
+        type=click.Choice(["array", "sample"]),
+        default="array",
+        help="What depths count from: the array's front, or the sample's surface. Files say which.",
+    )(sample_options(command))

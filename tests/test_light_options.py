@@ -1,0 +1,117 @@
+"""`--sample`, `--wavelength-nm` and `--depths-from`: a capture of a gel, and points in it from either origin."""
+
+import json
+
+import numpy as np
+import pytest
+
+import gs_jax as gs
+from gs_jax.io.depth_frames import frame_of
+from gs_jax.io.napari import reader
+
+from .test_cli import run
+
+SURFACE = 19.0
+TRUTH = np.array([[0.2, -0.2, 20.5, 1.0], [-0.5, 0.4, 21.5, 1.0]])
+GEL = {"refractive_index": 1.43, "surface_mm": SURFACE, "layers": [{"thickness_mm": 0.17, "refractive_index": 1.523}]}
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """A folder to work in, with a design that knows a gel, and points in it."""
+    monkeypatch.chdir(tmp_path)
+    layout = gs.random_layout(16, (5.0, 5.0), pitch=1.2, seed=1).round(3)
+    filters = [{"thickness_mm": 2.0, "refractive_index": 1.52}]
+    sizes = {"shape": (320, 320), "pixel_pitch_um": 16.0, "centers_mm": layout, "size_mm": (5.0, 5.0)}
+    design = gs.geomscope().replace(**sizes, layers={"object": filters}, samples={"gel": GEL}, sensor_distance_mm=6.0)
+    gs.write_design("lab.toml", design)
+    gs.write_points("points.csv", TRUTH)
+    gs.write_points("in-gel.csv", TRUTH - [0, 0, SURFACE, 0])
+    return tmp_path
+
+
+def found_by(monkeypatch, capsys, *options, depths="20:22:0.5"):
+    how = ("--depths", depths, "--voxel-um", 80, "--suppress", "points", "--points", "found.csv", "--force")
+    status, _, err = run(monkeypatch, capsys, "reconstruct", "gel.tif", "lab.toml", *options, *how, "-o", "found.tif")
+    assert status == 0, err
+    points = gs.read_points("found.csv")
+    return points[np.argsort(points[:, 2])]
+
+
+@pytest.mark.integration
+def test_points_in_a_gel(lab, monkeypatch, capsys):
+    assert run(monkeypatch, capsys, "simulate", "points.csv", "lab.toml", "--sample", "gel", "-o", "gel.tif")[0] == 0
+    inside = ("--sample", "gel", "--depths-from", "sample")
+    assert run(monkeypatch, capsys, "simulate", "in-gel.csv", "lab.toml", *inside, "-o", "same.npy")[0] == 0
+    np.testing.assert_array_equal(gs.read_capture("same.npy"), gs.read_capture("gel.tif"))
+    found = found_by(monkeypatch, capsys, "--sample", "gel")
+    # 16 lenses on pixels of 16 um say no more.
+    np.testing.assert_allclose(found[:, :2], TRUTH[:, :2], atol=0.02)
+    np.testing.assert_allclose(found[:, 2], TRUTH[:, 2], atol=0.25)
+    assert frame_of("found.csv") == frame_of("found.tif") == "array"
+    # In air the points seem nearer than they are.
+    in_air = found_by(monkeypatch, capsys, "--sample", "air", depths="19:22:0.5")
+    assert (found[:, 2] - in_air[:, 2] > 0.4).all()
+    # Files that count from the surface say so, and are read as those that do not.
+    from_surface = found_by(monkeypatch, capsys, *inside, depths="1:3:0.5")
+    np.testing.assert_allclose(from_surface[:, 2], found[:, 2], atol=0.02)
+    header, first = np.loadtxt("found.csv", str, delimiter=",", max_rows=2)
+    row = dict(zip(header, map(float, first), strict=True))
+    assert row["sample_surface_mm"] == SURFACE and 1 < row["z_mm"] < 3
+    assert frame_of("found.csv") == frame_of("found.tif") == "sample"
+    np.testing.assert_allclose(gs.read_volume("found.tif")[1].depths, [20, 20.5, 21, 21.5, 22])
+    # Read again they are where they were, from whatever depths count.
+    for options in (("--sample", "gel"), inside):
+        status, _, err = run(monkeypatch, capsys, "simulate", "found.csv", "lab.toml", *options, "-o", "again.npy")
+        assert status == 0, err
+    layers = reader("found.tif")("found.tif")
+    assert layers[0][1]["translate"][0] == pytest.approx(20_000)
+
+
+SIMULATE, METRICS = ("simulate", "points.csv", "lab.toml"), ("metrics", "lab.toml")
+RECONSTRUCT = ("reconstruct", "capture.npy", "lab.toml", "--depths", "18:22:1")
+WRONG = [
+    ((*METRICS, "--sample", "jelly"), "the sample must be one of [samples] in the design, gel, air, got 'jelly'"),
+    ((*METRICS, "--sample-index", "1.4"), "--sample-index must be used with --sample-at"),
+    ((*METRICS, "--sample-at", "19"), "--sample-at must be used with --sample-index"),
+    ((*METRICS, "--sample", "gel", "--sample-index", "1.4", "--sample-at", "19"), "--sample must be used without"),
+    ((*METRICS, "--wavelength-nm", "0.52"), "must be 10 to 100000 nm, got '0.52'"),
+    ((*METRICS, "--sample", "gel", "--depths", "18"), "--depths must be 19 mm or more, where layers end"),
+    ((*METRICS, "--sample-index", "1.4", "--sample-at", "1"), "`sample.surface_mm` must be 2 mm or more"),
+    (
+        (*SIMULATE, "--sample-index", "1.4", "--sample-at", "1", "-o", "a.tif"),
+        "`surface` must be 2 mm, as",
+    ),
+    ((*SIMULATE, "--depths-from", "sample", "-o", "a.tif"), "--depths-from sample must be used with a sample, got air"),
+    (("simulate", "in-gel.csv", "lab.toml", "--sample", "gel", "-o", "a.tif"), "depths must be 19 mm or more"),
+    ((*RECONSTRUCT, "--sample", "gel", "-o", "v.tif"), "--depths must be 19 mm or more, where layers end"),
+    ((*RECONSTRUCT, "--depths-from", "plate", "-o", "v.tif"), "is not one of 'array', 'sample'"),
+    (("tolerance", "lab.toml", "--sample", "gel", "--depths", "18"), "depths must be 19 mm or more"),
+    (("report", "lab.toml", "--sample", "jelly", "-o", "a.html"), "the sample must be one of"),
+    (("explore", "lab.toml", "--sample", "jelly"), "the sample must be one of"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[words for _, words in WRONG])
+def test_what_does_not_go_together(lab, monkeypatch, capsys, arguments, words):
+    np.save("capture.npy", np.ones((320, 320), np.uint16))
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2 and words in err and err.count("\n") == 1, err
+
+
+def test_a_file_that_says_array_is_not_taken_for_another(lab, monkeypatch, capsys):
+    gs.write_points("points.csv", TRUTH, provenance={"depths_from": "array"})
+    how = ("--sample", "gel", "--depths-from", "sample", "-o", "a.tif")
+    status, _, err = run(monkeypatch, capsys, *SIMULATE, *how)
+    assert status == 2 and "--depths-from must be array for depths that count from the array" in err
+
+
+def test_metrics_show_the_path_of_the_light(lab, monkeypatch, capsys):
+    status, out, err = run(monkeypatch, capsys, *METRICS, "--sample", "gel", "--json", "m.json")
+    sheet = json.loads((lab / "m.json").read_text())
+    assert status == 0 and "2 mm of layers before the array are 1.316 mm of air" in out, err
+    assert (sheet["sample_index"], sheet["sample_surface_mm"], sheet["depth_mm"][0]) == (1.43, 19, 19)
+    scope = gs.read_design("lab.toml").imager("gel")
+    focus = 1 / (1 / scope.array.focal_length - 1 / scope.sensor_distance)
+    air = focus - scope.array.reduced_thickness_front
+    assert sheet["focus_shift_mm"] == pytest.approx(float(scope.depth_of(focus) - air), abs=1e-3)
