@@ -71,7 +71,7 @@ def test_points_in_a_gel(lab, monkeypatch, capsys):
 SIMULATE, METRICS = ("simulate", "points.csv", "lab.toml"), ("metrics", "lab.toml")
 RECONSTRUCT = ("reconstruct", "capture.npy", "lab.toml", "--depths", "18:22:1")
 WRONG = [
-    ((*METRICS, "--sample", "jelly"), "the sample must be one of [samples] in the design, gel, air, got 'jelly'"),
+    ((*METRICS, "--sample", "jelly"), "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
     ((*METRICS, "--sample-index", "1.4"), "--sample-index must be used with --sample-at"),
     ((*METRICS, "--sample-at", "19"), "--sample-at must be used with --sample-index"),
     ((*METRICS, "--sample", "gel", "--sample-index", "1.4", "--sample-at", "19"), "--sample must be used without"),
@@ -87,8 +87,8 @@ WRONG = [
     ((*RECONSTRUCT, "--sample", "gel", "-o", "v.tif"), "--depths must be 19 mm or more, where layers end"),
     ((*RECONSTRUCT, "--depths-from", "plate", "-o", "v.tif"), "is not one of 'array', 'sample'"),
     (("tolerance", "lab.toml", "--sample", "gel", "--depths", "18"), "depths must be 19 mm or more"),
-    (("report", "lab.toml", "--sample", "jelly", "-o", "a.html"), "the sample must be one of"),
-    (("explore", "lab.toml", "--sample", "jelly"), "the sample must be one of"),
+    (("report", "lab.toml", "--sample", "jelly", "-o", "a.html"), "`sample` must be one of"),
+    (("explore", "lab.toml", "--sample", "jelly"), "`sample` must be one of"),
 ]
 
 

@@ -143,7 +143,7 @@ def test_questions(changes, words):
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"sample": "jelly"}, "the sample must be one of [samples] in the design, gel, air, got 'jelly'"),
+        ({"sample": "jelly"}, "`sample` must be one of [samples] in the design, gel, air, got 'jelly'"),
         ({"wavelength_nm": 0.52}, "`wavelength_nm` must be a number of nanometres from 10 to 100000, got 0.52"),
         (
             {"sample": gs.Sample(1.4, 1.0)},

@@ -59,7 +59,7 @@ def sample_table(design: Path, name: str | None) -> SampleTable:
         return design.sample
     if name != AIR and name not in design.samples:
         names = ", ".join([*design.samples, AIR])
-        raise InputError(f"the sample must be one of [samples] in the design, {names}, got {short_repr(name)}.")
+        raise InputError(f"`sample` must be one of [samples] in the design, {names}, got {short_repr(name)}.")
     return NO_SAMPLE if name == AIR else design.samples[name]
 
 
