@@ -50,7 +50,7 @@ def tables_of(imager: Imager) -> dict[str, Any]:
             "tilt_deg": tilt,
         },
         "layers": {"object": _layers(imager.filters), "sensor": _layers(imager.windows)},
-    } | ({} if imager.sample is None else {"sample": _sample(imager.sample)})
+    } | ({} if imager.sample is None else {"sample": sample_tables(imager.sample)})
 
 
 def _layers(layers: Layers | None) -> list[dict[str, float]]:
@@ -60,7 +60,8 @@ def _layers(layers: Layers | None) -> list[dict[str, float]]:
     return [{"thickness_mm": thickness, "refractive_index": index} for thickness, index in numbers]
 
 
-def _sample(sample: Sample) -> dict[str, Any]:
+def sample_tables(sample: Sample) -> dict[str, Any]:
+    """The table of a sample."""
     return {
         "refractive_index": _decimal(sample.refractive_index),
         "surface_mm": None if sample.surface is None else _decimal(sample.surface),
