@@ -5,9 +5,11 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import gs_jax as gs
 from experiments.calibration import device
+from gs_jax.__main__ import commands
 from gs_jax.calibration.fit import calibrate, self_calibrate
 
 from .test_calibration import MANY, captures, check
@@ -82,3 +84,32 @@ def test_what_cannot_be_fitted_of_a_sample_is_refused_in_words(sample, fit, dept
     scope = dataclasses.replace(layered("plano")[0], sample=sample)
     with pytest.raises(gs.InputError, match=words):
         calibrate([np.zeros(scope.sensor.shape)], np.array([[0.0, 0.0, depth]]), scope, fit=[fit])
+
+
+@pytest.mark.integration
+def test_the_command_takes_sources_in_air_and_then_a_gel(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    actual, listed = (dataclasses.replace(one, sensor=gs.Sensor((2400, 2400), 0.006)) for one in layered("plano"))
+    listed = dataclasses.replace(listed, array=dataclasses.replace(listed.array, size=(14.0, 14.0)))
+    gel = {"refractive_index": 1.38, "surface_mm": 16.5, "layers": [{"thickness_mm": 0.17, "refractive_index": 1.523}]}
+    design = gs.Design.from_imager(listed, name="small", working_distance_mm=(18.0, 30.0))
+    gs.write_design("small.toml", design.replace(samples={"gel": gel}))
+    scenes = {"air.tif": actual, "gel.tif": dataclasses.replace(actual, sample=GEL)}
+    for name, scope in scenes.items():
+        gs.write_capture(name, captures(scope, MANY, SCENE)[0].astype(np.float32))
+    lines = [f"1,{x},{y},{z}" for x, y, z in MANY]
+    (tmp_path / "p.csv").write_text("\n".join(["capture,x_mm,y_mm,z_mm", *lines]) + "\n")
+    run = lambda *options: CliRunner().invoke(commands, ["calibrate", *options, "--positions", "p.csv"])
+    told = run("small.toml", "air.tif", "-o", "found.toml")
+    assert "sources in air, behind 2 mm of n = 1.52; if they were in a sample: --sample gel" in told.stdout
+    found = gs.read_design("found.toml")
+    assert found.samples == gs.read_design("small.toml").samples
+    assert found.imaging.sensor_distance_mm == pytest.approx(float(actual.sensor_distance), abs=5e-3)
+    held = ("--hold", "sensor_distance,rotation,shift,tilt", "--fit", "sample_at,sample_index")
+    told = run("found.toml", "gel.tif", "--sample", "gel", *held, "-o", "gel.toml")
+    assert "sources in n = 1.4" in told.stdout and "sample_index" in told.stdout
+    new = gs.read_design("gel.toml")
+    # It moves by eight times the error of the sensor's distance.
+    assert new.samples["gel"].surface_mm == pytest.approx(17.0, abs=0.05)
+    assert new.samples["gel"].refractive_index == pytest.approx(1.43, abs=0.01)
+    assert new.imaging == found.imaging and new.sample == found.sample

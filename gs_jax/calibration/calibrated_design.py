@@ -13,6 +13,7 @@ from ..design.centers import LENS_KEYS
 from ..design.design import Design
 from ..design.tables import CalibrationTable
 from ..design.validation import reach
+from ..geometry import Imager
 from ..io.provenance import Provenance
 from ..io.toml import one_line
 from ..lenses import EACH, MicrolensArray
@@ -49,6 +50,7 @@ def apply_calibration(design: Design, result: Calibration, provenance: Provenanc
         "calibrated_rms_pixels": round(result.rms, 4),
         "calibrated_spots": len(result.residuals),
         "calibrated_captures": len(np.unique(result.sources.captures[result.spots.sources])),
+        "calibrated_in": medium_in_words(imager),
         "mirrored": result.mirrored,
         "calibrated_values": {name: float(f"{value:.9g}") for name, value in result.values.items()},
         "standard_deviations": {name: float(f"{sd:.3g}") for name, sd in result.deviations.items()},
@@ -69,14 +71,25 @@ def apply_calibration(design: Design, result: Calibration, provenance: Provenanc
         raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
 
 
+def medium_in_words(imager: Imager) -> str:
+    """What holds the object, and the layers between it and the array."""
+    sample, slabs = imager.sample, [] if imager.filters is None else imager.filters.slabs
+    medium = "air"
+    if sample is not None:
+        medium = f"n = {float(sample.refractive_index):.4g} from z = {float(imager.sample_surface):.5g} mm"
+        slabs = slabs + ([] if sample.layers is None else sample.layers.slabs[::-1])
+    layers = [f"{float(t):g} mm of n = {float(n):g}" for t, n in slabs if float(n) != 1]
+    return f"{medium}, behind {' and '.join(layers)}" if layers else medium
+
+
 def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:
     """Keys of `[lens]` with a number for each lens, by the fewest decimals that give the array's numbers."""
     numbers = {key: np.asarray(getattr(array, name)) for key, name in zip(LENS_KEYS, EACH, strict=True)}
     return {key: tuple(float(str(one)) for one in value) for key, value in numbers.items() if value.ndim}
 
 
-def summary_table(design: Design, result: Calibration) -> Table:
-    """Designed and calibrated values, with standard errors."""
+def summary_table(design: Design, result: Calibration, start: Imager) -> Table:
+    """Designed and calibrated values, with standard errors; `start` is the imager that the calibration was given."""
     table = Table("", "design", "found", "SD", box=None, pad_edge=False)
     pose = design.calibration
     before = {
@@ -86,6 +99,8 @@ def summary_table(design: Design, result: Calibration) -> Table:
         **dict(zip(("tilt_x_deg", "tilt_y_deg"), pose.tilt_deg, strict=True)),
         "scale": 1.0,
         "depth_offset_mm": 0.0,
+        **({} if start.sample is None else {"sample_at_mm": float(start.sample_surface)}),
+        **({} if start.sample is None else {"sample_index": float(start.sample.refractive_index)}),
     }
     for name, value in result.values.items():
         table.add_row(name, f"{before[name]:.6g}", f"{value:.6g}", f"{result.deviations[name]:.2g}")

@@ -59,8 +59,8 @@ _POSE = ("sensor_distance", "rotation", "shift")
 # What self-calibration fits: an unknown scene determines neither sensor distance nor shift.
 SELF_FITTED = ("rotation", "tilt")
 _SELF_FITTABLE = (*SELF_FITTED, "lenses", *OF_SAMPLE)
-# Most points that self-calibration uses, also where little is known of a sample by each; and fewest.
-_MOST_POINTS, _MOST_FOR_SAMPLE, _MIN_POINTS = 60, 200, 5
+# Most and fewest points that self-calibration uses.
+_MOST_POINTS, _MIN_POINTS = 60, 5
 # Range on either side and step of the search for the rotation, radians, and number of bright sources that it uses.
 _ROTATION, _ROTATION_STEP, _ROTATION_SOURCES = np.radians(5.0), np.radians(0.4), 5
 # Distance on the sensor within which rays meet in a point, over `match_radius`.
@@ -129,8 +129,9 @@ def calibrate(
     fit
         Of `sensor_distance`, `rotation`, `shift`, `tilt`, `scale` of the array, `depth_offset` of all sources, and
         `lenses`, each of which is within about 10 um of its listed position. Of the imager's sample, `sample_at`, the
-        depth at which it begins, and `sample_index`. Both need points of known depths, and the sensor's distance from a
-        calibration in air. Without `sensor_distance`, `rotation` and `shift` the imager's pose is trusted.
+        depth at which it begins, and `sample_index`: both need points of known depths, and a sensor distance from a
+        calibration in air, whose error they multiply (`sample_at` by about eight; standard errors take what is not
+        fitted as exact). Without `sensor_distance`, `rotation` and `shift` the imager's pose is trusted.
     find_lenses
         Find the lenses themselves, whatever positions the design lists, and fit only sensor distance and depth offset
         of `fit`: the lenses' positions contain rotation, shift, scale and tilt. Needs known points. If the design has
@@ -282,7 +283,7 @@ def self_calibrate(
     and scale are the design's, as any others explain the same capture by another scene.
 
     To first order that holds for a sample, too: its surface and its index only stretch and move the depths of points
-    that nobody knows. Just the aberration of oblique rays tells them apart. A hundred points in 4 mm of gel give its
+    that nobody knows. Just the aberration of oblique rays tells them apart. Sixty points in 4 mm of gel give its
     surface to 0.3 mm, which is 0.1 mm in the points' depths, and its index to 0.15, which is refused. Points of known
     depths give both, to 3 um and 0.001: see `calibrate`.
 
@@ -312,8 +313,7 @@ def self_calibrate(
     with progress.step("Searching for the rotation"):
         spots = find_spots_mm(image, imager, _ROTATION_SOURCES)
         rotated = _search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
-    most = _MOST_POINTS if set(fit).isdisjoint(OF_SAMPLE) else _MOST_FOR_SAMPLE
-    points = find_points(image, rotated, grid, progress=progress)[:most, :3]
+    points = find_points(image, rotated, grid, progress=progress)[:_MOST_POINTS, :3]
     if len(points) < _MIN_POINTS:
         needs = f"a sparse scene in focus with {_MIN_POINTS} or more points is needed"
         raise InputError(f"capture: {needs}, got {len(points)} on which the lenses agree.")

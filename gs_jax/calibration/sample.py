@@ -40,8 +40,7 @@ def with_surface(imager: Imager, fit: Sequence[str]) -> Imager:
         raise InputError("fit: sample_at needs a sample behind a gap of air, got one in contact with what is there.")
     # Layers of a sample go from the medium to the array.
     behind = [*([] if sample.layers is None else sample.layers.slabs), *filters.slabs[: gaps[-1] : -1]]
-    surface = object_surface(filters, sample)
-    sample = dataclasses.replace(sample, surface=surface, layers=_layers(behind))
+    sample = dataclasses.replace(sample, surface=imager.sample_surface, layers=_layers(behind))
     return dataclasses.replace(imager, filters=_layers(filters.slabs[: gaps[-1]]), sample=sample)
 
 

@@ -15,7 +15,6 @@ from skimage.feature import peak_local_max
 from ..base.errors import InputError
 from ..detection.background import subtract_background
 from ..geometry import Imager
-from ..layers import object_surface
 from ..optics.lens_types import FIELDS
 from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
@@ -58,9 +57,9 @@ class Sources(NamedTuple):
         depths = self.points[:, 2]
         if (depths <= 0).any():
             raise InputError(f"positions: depths must be positive, got {np.nanmin(depths):g} mm.")
-        begins = float(object_surface(imager.filters, imager.sample))
+        begins = float(imager.sample_surface)
         # Where the sample begins may be a guess.
-        if "sample_at" not in fit and (depths < begins).any():
+        if "sample_at" not in fit and (depths < begins * (1 - 1e-6)).any():
             what = "filters end" if imager.sample is None else "sample begins"
             needs = f"depths must be {begins:g} mm, where the {what}, or more"
             raise InputError(f"positions: {needs}, got {np.nanmin(depths):g} mm.")

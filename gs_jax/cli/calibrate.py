@@ -74,13 +74,18 @@ def calibrate_command(
 
     Sensor distance, rotation, shift and tilt are fitted. DESIGN has the lens centres; its sensor distance may be off by
     a quarter, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
-    with z from the array, or from the sample. Calibrate with what held the source: --sample air, if the object's
-    medium was away. One capture suffices; several depths and positions are better.
+    with z from the array, or from the sample. One capture suffices; several depths and positions are better.
+
+    DESIGN's layers are in place. Sources at --positions are in air, unless --sample says what held them (`--sample
+    sample` for DESIGN's [sample]) or a number of the sample is fitted; a scene is in DESIGN's [sample]. Points of known
+    depths in a sample show where it begins and its index: --fit sample-at,sample-index, with --hold
+    sensor-distance,rotation,shift,tilt. Those of a scene that nobody knows hardly show.
     """
     from rich.console import Console
 
-    from ..calibration.calibrated_design import apply_calibration, plot_residuals, summary_table
+    from ..calibration.calibrated_design import apply_calibration, medium_in_words, plot_residuals, summary_table
     from ..calibration.fit import SELF_FITTED, calibrate, self_calibrate
+    from ..calibration.sample import OF_SAMPLE, with_surface
     from ..calibration.spot_model import FITTED
     from ..calibration.spots import Sources
     from ..design.design import read_design, write_design
@@ -97,8 +102,10 @@ def calibrate_command(
     inputs = (design, *captures, *([positions] if positions else []), *camera.files)
     check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
-    imager = camera.imager(light.imager(microscope))
     names = [name for name in (*(SELF_FITTED if from_scene else FITTED), *fit) if name not in hold]
+    of_sample = from_scene or light.depths_from == "sample" or not set(names).isdisjoint(OF_SAMPLE)
+    light = _with_sample(light, microscope, default="sample" if of_sample else "air")
+    imager = camera.imager(light.imager(microscope))
     with Progress() as progress:
         if positions is None:
             capture = next(iter(captures))
@@ -115,11 +122,26 @@ def calibrate_command(
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             options = {"captures": of, "fit": names, "find_lenses": find_lenses}
             outcome = calibrate(images, points, imager, **options, progress=progress)
-    microscope = light.found(microscope, outcome.imager, names)
-    write_design(output, apply_calibration(microscope, outcome, camera.recorded(provenance_of(*inputs))))
+    found = light.found(microscope, outcome.imager, names)
+    write_design(output, apply_calibration(found, outcome, camera.recorded(provenance_of(*inputs))))
     write_figure(drawing, plot_residuals(outcome))
     camera.print_corrections()
-    Console().print(summary_table(microscope, outcome))
+    Console().print(summary_table(microscope, outcome, with_surface(imager, names)))
     mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
     lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
+    click.echo(f"sources in {medium_in_words(outcome.imager)}{_other_samples(light, microscope)}")
     click.echo(f"{output}: {len(outcome.residuals)} spots, {outcome.rms:.3f} pixels RMS{mirrored}{lenses}")
+
+
+def _with_sample(light: Light, design, default: str) -> Light:
+    """The light with the sample that is meant; "sample" is the design's `[sample]`, if no other has this name."""
+    name = light.sample or (default if light.refractive_index is None else None)
+    return light._replace(sample=None if name == "sample" and name not in design.samples else name)
+
+
+def _other_samples(light: Light, design) -> str:
+    """The names of a design's samples, if the sources are taken to be in air."""
+    from ..design.light_path import AIR, NO_SAMPLE
+
+    names = [*(["sample"] if design.sample != NO_SAMPLE else []), *design.samples]
+    return f"; if they were in a sample: --sample {' or '.join(names)}" if light.sample == AIR and names else ""
