@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array
 
 from ..base.errors import InputError
 from ..geometry import Imager
@@ -15,7 +14,7 @@ from ..layers import Layers, object_surface
 OF_SAMPLE = ("sample_at", "sample_index")
 
 
-def number(imager: Imager, name: str) -> Array:
+def number(imager: Imager, name: str) -> Any:
     """A number of the imager, or of its sample by a name of `OF_SAMPLE`."""
     sample: Any = imager.sample
     of_sample = {"sample_at": "surface", "sample_index": "refractive_index"}

@@ -1,7 +1,7 @@
 """The layers and the sample of a design, as the geometry takes them."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from ..base.errors import InputError, short_repr
 from ..layers import Layers, Sample, object_surface, reduced_distance
@@ -12,6 +12,7 @@ from .tables import ArrayTable, ImagingTable, LayersTable, LayerTable, LensTable
 AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
 
 
+@runtime_checkable
 class Path(Protocol):
     """What of a design the light crosses."""
 
@@ -140,7 +141,7 @@ def _check_sample(design: Path, key: str, table: SampleTable) -> None:
 
 
 def _total(layers: Sequence[LayerTable]) -> float:
-    return sum(layer.thickness_mm for layer in layers)
+    return sum((layer.thickness_mm for layer in layers), 0.0)
 
 
 def _plate(design: Path, index: float | None) -> float:
