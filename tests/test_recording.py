@@ -223,7 +223,7 @@ def test_an_unfinished_recording_is_not_lost(folder, monkeypatch, capsys):
     for options, words in (
         ((), "has 4 of 5 frames of an interrupted recording; give --resume"),
         (("--resume", "--optics", "pinhole"), "optics with --resume must be 'full', as before, got 'pinhole'"),
-        (("--resume", "--frame-interval", "2"), "frame_interval with --resume must be 'nothing'"),
+        (("--resume", "--frame-interval", "2"), "frame_interval with --resume must be none"),
     ):
         status, _, err = run(monkeypatch, capsys, *command("frames"), *options)
         assert status == 2 and words in err
