@@ -12,6 +12,7 @@ The microscope:
     Layers               Plane-parallel layers on top of each other
     Sample               The medium that holds the object, such as water or a gel
     refractive_index     The refractive index of a material, relative to air
+    EmissionBand         Wavelengths that stand for an emission band, by their shares of the light that is detected
     Grid                 Voxels of the object space; centred on the axis, unless it has another origin
     Design               A microscope, with the tables and keys of its file
     read_design          The design in a TOML file. A `centers_file`, relative to it, is read in place of `centers_mm`

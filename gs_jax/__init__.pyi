@@ -10,6 +10,7 @@ from .design.builtin import geomscope as geomscope
 from .design.design import Design as Design, read_design as read_design, write_design as write_design
 from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
+from .emission import EmissionBand as EmissionBand
 from .geometry import Imager as Imager, Sensor as Sensor
 from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture

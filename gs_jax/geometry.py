@@ -26,6 +26,7 @@ from .base.arrays import (
     as_shape,
     check_fields,
 )
+from .emission import EmissionBand
 from .layers import Layers, Sample, check_room, depth_of_reduced, object_surface, reduced_distance
 from .lenses import MicrolensArray
 from .typing import Scalar, Scalars
@@ -189,6 +190,8 @@ class Imager(eqx.Module):
         rest of `sensor_distance` is air.
     sample
         The medium that holds the object. None, the default, is air.
+    band
+        Wavelengths over which PSFs are means. None, the default, is light of `wavelength` alone.
 
     Raises
     ------
@@ -218,6 +221,7 @@ class Imager(eqx.Module):
     filters: Layers | None = None
     windows: Layers | None = None
     sample: Sample | None = None
+    band: EmissionBand | None = None
 
     def __check_init__(self):
         if not self.field_radius > 0:

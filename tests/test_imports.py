@@ -15,6 +15,7 @@ ORDER = [
     "base",
     "lenses",
     "layers",
+    "emission",
     "materials",
     "geometry",
     "grid",

@@ -20,6 +20,7 @@ from ..geometry import Imager, chief_ray
 from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
+from .emission_lines import emission_lines
 from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet, vogel_spiral
 from .theory import airy_sigma, cutoff_frequency
 
@@ -170,7 +171,7 @@ def psf_of_depth(
     Parameters
     ----------
     imager
-        The PSF is that of its mean clear aperture.
+        The PSF is that of its mean clear aperture, and the mean over its emission band.
     depths
         Their range, mm.
     kind
@@ -186,11 +187,12 @@ def psf_of_depth(
     radius = clear_diameter(imager.array) / 2
     # All zones: near the focus of the rim's rays those of other zones land farther out.
     fan = radius * jnp.linspace(0, 1, _FAN)[:, None] * jnp.array([[1.0, 0.0]])
-    ends = [trace_lenslet(imager, depth, fan) for depth in (min(depths), max(depths))]
-    reaches = [float(jnp.where(rays.valid, jnp.abs(rays.landing[:, 0]), 0).max()) for rays in ends]
+    lines, ends = emission_lines(imager), (min(depths), max(depths))
+    rays = [[trace_lenslet(one, depth, fan) for _, one in lines] for depth in ends]
+    reaches = [max(float(jnp.where(r.valid, jnp.abs(r.landing[:, 0]), 0).max()) for r in each) for each in rays]
     pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
     if not pixels <= _FARTHEST:
-        depth = (min(depths), max(depths))[int(np.argmax(reaches))]
+        depth = ends[int(np.argmax(reaches))]
         raise InputError(
             f"blur must reach at most {_FARTHEST} pixels of the sensor each way, got {pixels:.3g} for an object at "
             f"{depth:g} mm."
@@ -200,7 +202,9 @@ def psf_of_depth(
     if kind == "diffraction":  # as fine as the aperture diffracts
         cutoff = float(cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, 2 * radius))
         make = partial(make, samples=math.ceil(cutoff * imager.sensor.pixel_pitch))
-    return lambda depth: make(imager, depth, size=size, radius=radius)
+    if len(lines) == 1:
+        return lambda depth: make(imager, depth, size=size, radius=radius)
+    return lambda depth: sum(weight * make(one, depth, size=size, radius=radius) for weight, one in lines)
 
 
 def _pixel_energy(imager, depth, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:

@@ -19,6 +19,7 @@ from ..geometry import Imager, falloff
 from ..lenses import EACH, MicrolensArray, sag
 from ..typing import Coordinates, Scalars
 from .apertures import clear_area
+from .emission_lines import emission_lines
 from .radiometry import solid_angle, transmittance
 from .raytrace import refract, to_numpy, vogel_spiral
 from .theory import airy_sigma
@@ -116,7 +117,17 @@ class PupilSamples(NamedTuple):
 def sample_pupil(
     imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: ApertureProfile, count: int
 ) -> PupilSamples:
-    """Trace `count` rays, evenly over the lens's disc, for each field."""
+    """Trace `count` rays, evenly over the lens's disc, for each field; a band's wavelengths share them equally."""
+    lines = emission_lines(imager)
+    parts = [_one_colour(one, depth, fields, aperture, count // len(lines)) for _, one in lines]
+    if len(parts) == 1:
+        return parts[0]
+    light = [[float(weight) * part for part in each[1:]] for (weight, _), each in zip(lines, parts, strict=True)]
+    landing = np.concatenate([part.landing for part in parts], 1)
+    return PupilSamples(landing, *(np.concatenate(part, 1) for part in zip(*light, strict=True)))
+
+
+def _one_colour(imager, depth, fields, aperture, count) -> PupilSamples:
     order, rim = np.arange(count) + 0.5, float(imager.array.aperture_diameter) / 2
     radius = rim * np.sqrt(order / count)
     points = vogel_spiral(radius, order)
