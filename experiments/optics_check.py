@@ -85,7 +85,7 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
         plate = float(array.substrate_thickness), float(array.refractive_index)
         gaps = [before, *layers, plate, (air, 1.0), *after, (0.0, 1.0)]
         for index, (thickness, n) in enumerate(gaps):
-            more = {"is_stop": True} if index == 1 else {}
+            more: dict[str, Any] = {"is_stop": True} if index == 1 else {}
             more |= shape if index == curved else {}
             optic.surfaces.add(index=index, thickness=float(thickness), material=IdealMaterial(n=float(n)), **more)
         optic.wavelengths.add(1000 * WAVELENGTH, is_primary=True)

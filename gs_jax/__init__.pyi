@@ -11,7 +11,7 @@ from .design.design import Design as Design, read_design as read_design, write_d
 from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
 from .emission import EmissionBand as EmissionBand
-from .geometry import Imager as Imager, Sensor as Sensor
+from .geometry import Imager as Imager
 from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.point_tables import read_points as read_points, write_points as write_points
@@ -33,6 +33,7 @@ from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.residual import forward_residual as forward_residual
+from .sensor import Sensor as Sensor
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
 from .solvers.admm import ADMM as ADMM

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .base.arrays import FINITE, POSITIVE, as_float, as_shape, check_fields
-from .geometry import Sensor
+from .sensor import Sensor
 
 
 class Grid(eqx.Module):

@@ -15,7 +15,7 @@ from gs_jax import MicrolensArray
 from gs_jax.layouts import coverage, nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.apertures import _edge_distances, aperture_area, clear_area, clear_diameter, pitch
-from gs_jax.optics.psf_core import aperture_profile
+from gs_jax.optics.pupil import aperture_profile
 
 from .helpers import aperture_edge
 

@@ -29,16 +29,14 @@ from gs_jax.geometry import falloff
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
 from gs_jax.optics.psf_core import (
-    aperture_profile,
     apparent_depths,
     core_magnification,
     render_kernel,
     ring_edges,
     ring_window,
     sample_profile,
-    sample_pupil,
-    trace_light,
 )
+from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy

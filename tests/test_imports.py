@@ -14,6 +14,7 @@ ORDER = [
     "typing",
     "base",
     "lenses",
+    "sensor",
     "layers",
     "emission",
     "materials",

@@ -8,6 +8,7 @@ import pytest
 from jax.test_util import check_grads
 
 import gs_jax as gs
+from gs_jax.lenses import Orientation
 from gs_jax.optics import aberrations
 from gs_jax.optics.radiometry import solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
@@ -21,7 +22,7 @@ SAMPLES = {
 FIELD = (1.3, -2.1)
 
 
-def layered(orientation="plano", sample="gel", **numbers) -> gs.Imager:
+def layered(orientation: Orientation = "plano", sample="gel", **numbers) -> gs.Imager:
     lens = {"radius_of_curvature": 2.0, "refractive_index": 1.43, "substrate_thickness": 1.0}
     array = gs.MicrolensArray([[0.0, 0.0]], **lens, orientation=orientation, **numbers)
     filters = gs.Layers([0.3, 2.0], [1.0, 1.52]) if orientation == "curved" else FILTER
@@ -154,12 +155,12 @@ def test_layers_of_index_one_are_air():
 
 def test_derivatives_by_thickness_index_and_gap():
     grid = gs.Grid([20.5, 22.0], (9, 9), 0.2)
-    scope = layered()
+    scope, cover = layered(), gs.Layers([0.17], [1.523])
     values = np.random.default_rng(0).random(grid.volume_shape)
 
     def of(numbers):
         filters, window, index, surface = numbers
-        sample = gs.Sample(index, surface, scope.sample.layers)
+        sample = gs.Sample(index, surface, cover)
         return dataclasses.replace(
             scope, filters=gs.Layers(filters, [1.52]), windows=gs.Layers([0.6, 0.55], window), sample=sample
         )

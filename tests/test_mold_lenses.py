@@ -246,8 +246,8 @@ def test_what_neighbours_hide_is_not_facetted():
 class UnequalDesign(Design):
     """A design of lenses that differ, as far as the part is concerned."""
 
-    def imager(self):
-        imager = super().imager()
+    def imager(self, sample=None, wavelength_nm=None):
+        imager = super().imager(sample, wavelength_nm)
         own = {"radius_of_curvature": [2.0, 1.7], "conic_constant": [0.0, -1.0], "aperture_diameter": [1.4, 1.0]}
         return dataclasses.replace(imager, array=dataclasses.replace(imager.array, **own))
 

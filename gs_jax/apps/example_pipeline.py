@@ -22,7 +22,6 @@ from ..design.design import Design, write_design
 from ..design.diagnostics import findings
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
-from ..geometry import Sensor
 from ..grid import Grid
 from ..io.captures import write_capture
 from ..io.files import make_folder, write_figure, write_json, write_text
@@ -32,6 +31,7 @@ from ..layouts import nearest_neighbour_distances
 from ..metrics import Localization, Quality, localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
+from ..sensor import Sensor
 from ..simulation.phantoms import letters, random_points, rasterize
 from ..simulation.synthetic import Camera, expose, simulate
 from ..solvers.richardson_lucy import RichardsonLucy

@@ -36,7 +36,7 @@ from ..design.builtin import geomscope
 from ..detection.clusters import find_clusters
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
-from ..geometry import Imager, Sensor
+from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import MicrolensArray
 from ..metrics import localization, quality
@@ -47,6 +47,7 @@ from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import subtract_offset
 from ..reconstruction.methods import BackProjection, PinholeRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
+from ..sensor import Sensor
 from ..simulation.synthetic import Camera, electrons, expose, simulate_points
 from ..solvers.admm import ADMM
 from ..solvers.base import lambda_max, solve

@@ -19,7 +19,7 @@ from ..geometry import Imager
 from ..layouts import nearest_neighbour_distances
 from ..lenses import MicrolensArray, lenses_by_type, type_of_lens
 from ..optics.lens_types import split_by_type
-from ..optics.psf_core import PupilSamples, aperture_profile, sample_pupil
+from ..optics.pupil import PupilSamples, aperture_profile, sample_pupil
 from .sample import OF_SAMPLE, number
 
 # Fields at which exact rays are traced, degree of the polynomial through them, and number of depths at most.

@@ -23,19 +23,8 @@ from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
-from .psf_core import (
-    RINGS,
-    ApertureProfile,
-    PsfCores,
-    add_diffraction,
-    aperture_profile,
-    render_kernel,
-    ring_edges,
-    ring_light,
-    sample_profile,
-    sample_pupil,
-    trace_cores,
-)
+from .psf_core import RINGS, PsfCores, render_kernel, ring_edges, ring_light, sample_profile, trace_cores
+from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
 
 # Reach of a core's kernel, in pixels of stray light: what is wider is smooth enough for these.
 CORE_REACH = 5

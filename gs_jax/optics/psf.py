@@ -21,7 +21,8 @@ from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
 from .emission_lines import emission_lines
-from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet, vogel_spiral
+from .pupil import vogel_spiral
+from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet
 from .theory import airy_sigma, cutoff_frequency
 
 # Rays of `geometric_psf`.
@@ -204,7 +205,12 @@ def psf_of_depth(
         make = partial(make, samples=math.ceil(cutoff * imager.sensor.pixel_pitch))
     if len(lines) == 1:
         return lambda depth: make(imager, depth, size=size, radius=radius)
-    return lambda depth: sum(weight * make(one, depth, size=size, radius=radius) for weight, one in lines)
+
+    def mean_psf(depth):
+        each = [weight * make(one, depth, size=size, radius=radius) for weight, one in lines]
+        return jnp.sum(jnp.stack(each), 0)
+
+    return mean_psf
 
 
 def _pixel_energy(imager, depth, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:

@@ -16,16 +16,9 @@ from jaxtyping import Array, ArrayLike, Float, Float64
 from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager, falloff
-from ..lenses import EACH, MicrolensArray, sag
-from ..typing import Coordinates, Scalars
-from .apertures import clear_area
-from .emission_lines import emission_lines
-from .radiometry import solid_angle, transmittance
-from .raytrace import refract, to_numpy, vogel_spiral
-from .theory import airy_sigma
+from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil, vogel_spiral
+from .raytrace import to_numpy
 
-# Radii and angles of aperture profiles.
-_RADII, _ANGLES = 64, 64
 # Outer radii of the rings of the field, in field radii. Farther out cores are as wide as the pixels of stray light.
 RINGS = (1.0, 1.33, 1.67, 2.0, 2.5, 3.0)
 # Degree of a ring's light in the squared field; field points in a field radius, and rays of each.
@@ -37,120 +30,6 @@ _FARTHEST, _STEPS, _SPARSE, _FINE = 0.08, 81, 8, 1e-4
 _SHARP, _MOST = 0.006, 9
 # Radial bins in a pixel, which are fine beside the nodes of stray light, and samples of a rendered kernel.
 _BINS, _SAMPLES = 16, 2**17
-
-
-class ApertureProfile(NamedTuple):
-    """Clear apertures by radius, averaged over lenses and angles.
-
-    `radius`, mm. `open`: fraction of the circle that is clear. `by_area`: change of that with a lens's clear area,
-    1/mm^2, by linear regression over the lenses; 0 if they are identical.
-    """
-
-    radius: Float64[np.ndarray, " radius"]
-    open: Float64[np.ndarray, " radius"]
-    by_area: Float64[np.ndarray, " radius"]
-
-
-def aperture_profile(array: MicrolensArray, *, by_area: bool = True) -> ApertureProfile:
-    """Trace the profile of the clear apertures; without `by_area` that of the mean lens alone."""
-    radius, fractions = _open_fractions(array)
-    slope = np.zeros(_RADII)
-    if by_area:
-        areas = np.asarray(clear_area(array), np.float64)
-        excess = areas - areas.mean()
-        if (spread := (excess**2).sum()) > 1e-6 * (areas**2).sum():
-            slope = excess @ fractions / spread
-    return ApertureProfile(radius, fractions.mean(0), slope)
-
-
-def _open_fractions(array):
-    """Radii, and the clear fraction of each lens's circle at each radius."""
-    array.check_alike()
-    centers = np.asarray(array.centers, np.float64)
-    diameter = float(array.aperture_diameter)
-    radius = (np.arange(_RADII) + 0.5) * diameter / 2 / _RADII
-    angle = 2 * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
-    points = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    covered = _covered_by_identical(centers, diameter) if array.others is None else _covered_by_others(array)
-    return radius, np.stack([1 - covered(lens, points).mean(1) for lens in range(len(centers))])
-
-
-def _covered_by_identical(centers, diameter) -> Callable:
-    def covered(lens, points):
-        offsets = np.delete(centers, lens, 0) - centers[lens]
-        offsets = offsets[(offsets**2).sum(1) <= diameter**2]
-        return (points @ offsets.T > (offsets**2).sum(1) / 2).any(-1)
-
-    return covered
-
-
-def _covered_by_others(array) -> Callable:
-    """Function of a lens and points: whether a point is in the disc of a neighbour whose surface is higher there."""
-    whole, mine = to_numpy(array.whole), to_numpy(array)
-    radius, diameter, conic = (getattr(whole, name) for name in EACH)
-    rim, own = diameter / 2, float(mine.aperture_diameter) / 2
-
-    def covered(lens, points):
-        offsets, squared = whole.centers - whole.centers[lens], (points**2).sum(-1)
-        here, found = mine.sag(np.minimum(squared, own**2)), np.zeros(squared.shape, bool)
-        for j in np.flatnonzero(np.hypot(*offsets.T) <= rim + own):
-            apart = ((points - offsets[j]) ** 2).sum(-1)
-            its = sag(np.minimum(apart, rim[j] ** 2), radius[j], conic[j], mine.aspheric_terms)
-            found |= (j != lens) & (apart <= rim[j] ** 2) & (its < here)
-        return found
-
-    return covered
-
-
-class PupilSamples(NamedTuple):
-    """Rays from points at `(field, 0)` beside a lens's axis, at one depth, to the sensor.
-
-    `landing`: from the axis, mm. `light`: fraction of the light that the point emits in all directions, for the mean
-    lens; `light_per_area`: change of that with a lens's clear area, 1/mm^2.
-    """
-
-    landing: Float64[np.ndarray, "field ray 2"]
-    light: Float64[np.ndarray, "field ray"]
-    light_per_area: Float64[np.ndarray, "field ray"]
-
-
-def sample_pupil(
-    imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], aperture: ApertureProfile, count: int
-) -> PupilSamples:
-    """Trace `count` rays, evenly over the lens's disc, for each field; a band's wavelengths share them equally."""
-    lines = emission_lines(imager)
-    parts = [_one_colour(one, depth, fields, aperture, count // len(lines)) for _, one in lines]
-    if len(parts) == 1:
-        return parts[0]
-    light = [[float(weight) * part for part in each[1:]] for (weight, _), each in zip(lines, parts, strict=True)]
-    landing = np.concatenate([part.landing for part in parts], 1)
-    return PupilSamples(landing, *(np.concatenate(part, 1) for part in zip(*light, strict=True)))
-
-
-def _one_colour(imager, depth, fields, aperture, count) -> PupilSamples:
-    order, rim = np.arange(count) + 0.5, float(imager.array.aperture_diameter) / 2
-    radius = rim * np.sqrt(order / count)
-    points = vogel_spiral(radius, order)
-    host, landing, light = to_numpy(imager), np.empty((len(fields), count, 2)), np.empty((len(fields), count))
-    # Field by field: the data of each stays in the processor's cache.
-    for k, field in enumerate(fields):
-        at, light[k] = trace_light(host, float(depth), points.T, np.array([[field], [0.0]]))
-        landing[k] = at.T
-    light *= np.pi * rim**2 / count
-    share, slope = (np.interp(radius, aperture.radius, part) for part in (aperture.open, aperture.by_area))
-    return PupilSamples(landing, light * share, light * slope)
-
-
-def trace_light(
-    imager: Imager, depth: Scalars, points: Coordinates, field: Coordinates
-) -> tuple[Coordinates, Float64[np.ndarray, " point"]]:
-    """Where rays land, and the fraction of the point's light in them, per area of the curved side (1/mm^2).
-
-    Coordinates come first and are NumPy's, as the imager's numbers (`to_numpy`).
-    """
-    ray = refract(imager, depth, points, field)
-    light = solid_angle(imager, depth, ray) * transmittance(imager, ray) / (4 * np.pi)
-    return ray.landing, np.where(ray.valid, light, 0)
 
 
 class PsfCores(NamedTuple):
@@ -289,13 +168,6 @@ def _core(imager: Imager, depth: float, fields: Float64[np.ndarray, " field"], a
     rays = sample_pupil(imager, depth, fields, aperture, _RAYS)
     chief = float(imager.magnification(depth))
     return chief * _sharpest(rays, fields, fields, chief, imager.sensor.pixel_pitch), rays
-
-
-def add_diffraction(imager: Imager, rays: PupilSamples) -> PupilSamples:
-    """Move rays by Gaussian random numbers (fixed seed) as wide as the Airy disc."""
-    width = float(airy_sigma(imager.wavelength, imager.reduced_sensor_distance, imager.array.aperture_diameter))
-    moves = np.random.default_rng(0).normal(0, width, rays.landing.shape[1:])
-    return rays._replace(landing=rays.landing + moves)
 
 
 def _distance_from_core(rays: PupilSamples, fields, magnification) -> np.ndarray:

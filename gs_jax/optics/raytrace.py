@@ -6,8 +6,8 @@ is thinner off the axis. A ray is given by the point `(x, y)` where it meets the
 is the chief ray. Optical paths are differences to the chief ray's, computed as such: in float32 they are right to a
 thousandth of a wave.
 
-By Snell's law a ray has one slope `q` in all gaps of air, and `q / sqrt(n^2 + (n^2 - 1) q^2)` in a layer of index `n`.
-Slopes are those in air, whether there is air or not, so that rays must be ones that air transmits.
+By Snell's law a ray of the slope `q` in air has `q / sqrt(n^2 + (n^2 - 1) q^2)` in a layer of index `n`. Slopes are
+those in air, whether there is air or not.
 
 `refract` takes arrays of JAX or of NumPy, with coordinates first: points are `(2, ...)`. Tables that are constants to
 derivatives use NumPy, which needs no compilation.
@@ -31,8 +31,6 @@ Module = TypeVar("Module", Imager, MicrolensArray)
 
 # Newton steps for the height of a ray. Each squares an error that starts at 1e-3, or at 1e-2 within a sample.
 _NEWTON_STEPS = 4
-# Angle between successive points of Vogel's spiral, which covers a disc evenly with any number of points.
-GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 
 class RefractedRay(NamedTuple):
@@ -341,11 +339,6 @@ def pupil_quadrature(radius: ScalarLike, rings: int = 8) -> tuple[Float[Array, "
     unit = np.sqrt((nodes + 1) / 2)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     points = jnp.asarray(unit.reshape(-1, 2), radius.dtype) * radius
     return points, jnp.asarray(np.repeat(weights / (2 * around), around), radius.dtype)
-
-
-def vogel_spiral(radius: Float[np.ndarray, " k"], order: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:
-    """Points of Vogel's spiral with these radii and numbers: evenly spread angles."""
-    return radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)
 
 
 def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:

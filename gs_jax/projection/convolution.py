@@ -12,8 +12,9 @@ import numpy as np
 from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager, Sensor
+from ..geometry import Imager
 from ..optics.diffraction import phasor
+from ..sensor import Sensor
 from .linear_map import LinearMap
 
 

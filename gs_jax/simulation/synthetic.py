@@ -15,7 +15,7 @@ from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..geometry import Imager, Sensor
+from ..geometry import Imager
 from ..grid import Grid
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
@@ -25,6 +25,7 @@ from ..optics.lens_types import relative_areas, split_by_type
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps
+from ..sensor import Sensor
 from ..typing import Number, PathLike
 
 Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]

@@ -28,7 +28,8 @@ from ...objectives.conditions import Conditions, per_type
 from ...objectives.paraxial import third_order_wavefront
 from ...optics import aberrations, theory
 from ...optics.psf import diffraction_psf, window_fraction
-from ...optics.raytrace import GOLDEN_ANGLE, trace_lenslet
+from ...optics.pupil import GOLDEN_ANGLE
+from ...optics.raytrace import trace_lenslet
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.signal import fftconvolve
 
-from ...geometry import Imager, Sensor, envelope
+from ...geometry import Imager, envelope
 from ...grid import Grid
 from ...optics.raytrace import to_numpy
+from ...sensor import Sensor
 from ...simulation.phantoms import random_points
 from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples, spot
 
