@@ -20,9 +20,9 @@ from ..geometry import Imager, chief_ray
 from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
-from .emission_lines import emission_lines
 from .pupil import vogel_spiral
 from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet
+from .spectrum import emission_lines
 from .theory import airy_sigma, cutoff_frequency
 
 # Rays of `geometric_psf`.

@@ -10,9 +10,9 @@ from ..geometry import Imager
 from ..lenses import EACH, MicrolensArray, sag
 from ..typing import Coordinates, Scalars
 from .apertures import clear_area
-from .emission_lines import emission_lines
 from .radiometry import solid_angle, transmittance
 from .raytrace import refract, to_numpy
+from .spectrum import emission_lines
 from .theory import airy_sigma
 
 # Radii and angles of aperture profiles.
