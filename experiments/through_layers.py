@@ -3,7 +3,8 @@
 Another group's tracer made the captures with the authors' lenses: the gel (PDMS) begins at 19.67 mm and holds 100
 points, or three planes of words. The geometry is the device's own; "layers ignored" is the same in air, focused where
 the layers focus it. Columns are as in `experiments/true_image.py` and `experiments/fig9_benchmark.py`: the model's
-image, binned by 4, against the capture; points that `find_points` detects; PSNR of the words above an empty volume.
+image, binned by 4, against the capture; points that `find_points` detects; PSNR of the words above an empty volume, on
+planes 0.8 mm apart: 0.56 mm of reduced depth, as planes 0.5 mm apart are in `experiments/fig9_benchmark.py`.
 
     python -m experiments.through_layers DATA [--out DIR] [--methods richardson-lucy,unrolled]
 
@@ -42,7 +43,7 @@ from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
 
 # Fine voxels of the strokes, mm; planes of a reconstruction from word to word; steps of iterative methods.
-_FINE, _PLANES, STEPS = 0.012, 4, 20
+_FINE, _PLANES, STEPS = 0.012, 2, 20
 
 
 def scope_of(data: Path, truth: dict) -> Imager:

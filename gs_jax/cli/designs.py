@@ -50,7 +50,7 @@ def metrics_command(
     """
     from rich.console import Console
 
-    from ..design.datasheets import datasheet, path_in_words, summary, tables
+    from ..design.datasheets import band_in_words, datasheet, path_in_words, summary, tables
     from ..design.design import read_design
     from ..design.diagnostics import findings
 
@@ -65,7 +65,7 @@ def metrics_command(
     if output:
         write_json(output, sheet)
     click.echo(summary(microscope, sheet))
-    if words := path_in_words(sheet):
+    for words in filter(None, (path_in_words(sheet), band_in_words(sheet))):
         click.echo(f"  {words}")
     click.echo(_calibration(microscope.provenance))
     console = Console()

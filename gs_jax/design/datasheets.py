@@ -18,6 +18,7 @@ from ..objectives.conditions import Conditions, per_type
 from ..objectives.paraxial import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
+from ..optics.spectrum import emission_lines
 from .design import Design
 
 # Depths of a datasheet whose caller names none.
@@ -91,6 +92,7 @@ def datasheet(
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
         **_light_path(design),
+        **_over_the_band(design, depths[len(depths) // 2]),
         "coverage": _round(sum(float(objectives.coverage(*part)) for part in parts)),
         **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
     }
@@ -115,6 +117,33 @@ def _light_path(design: Design) -> dict[str, Any]:
         shift = _depth_in_focus(imager) - _depth_in_focus(air)
         found["focus_shift_mm"] = _round(shift)
     return found
+
+
+def _over_the_band(design: Design, depth: float) -> dict[str, Any]:
+    """By how much focus and width of the spot differ over the emission band, at a depth."""
+    imager = design.imager()
+    if imager.band is None:
+        return {}
+    each = [one for _, one in emission_lines(imager)]
+    at = Conditions([depth])
+    focus = [float(jnp.ravel(objectives.focus_distance(one, at))[0]) for one in each]
+    width = [1000 * float(jnp.min(objectives.spot_width(one, at))) for one in each]
+    return {
+        "band_nm": [_round(1e6 * float(one.wavelength)) for one in each],
+        "band_depth_mm": _round(depth),
+        "band_focus_distance_mm": [_round(value) for value in focus],
+        "band_spot_width_um": [_round(value) for value in width],
+    }
+
+
+def band_in_words(sheet: dict[str, Any]) -> str:
+    """The emission band of a datasheet in one line; empty without one."""
+    if "band_nm" not in sheet:
+        return ""
+    focus, width = sheet["band_focus_distance_mm"], sheet["band_spot_width_um"]
+    moved = "" if None in focus else f"the image moves by {1000 * (max(focus) - min(focus)):.3g} um and "
+    ends = f"{min(sheet['band_nm']):.4g} to {max(sheet['band_nm']):.4g} nm"
+    return f"from {ends}, {moved}spots are {_plain(min(width))} to {_plain(max(width))} um wide in the object"
 
 
 def _depth_in_focus(imager: Imager) -> float:

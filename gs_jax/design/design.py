@@ -20,9 +20,10 @@ from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..sensor import Sensor
 from ..typing import PathLike
+from .band import emission_band, inline_spectrum
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .imagers import sharp_depths, tables_of
-from .light_path import NO_SAMPLE, chosen_sample, layers_of, path_in_words, plate_index
+from .light_path import NO_SAMPLE, chosen_sample, layers_of, path_in_words, plate_index, sample_table
 from .tables import (
     ArrayTable,
     CalibrationTable,
@@ -116,7 +117,8 @@ class Design(Table):
             What holds the object: the name of one of `[samples]`, "air" for none, or a `Sample`. By default that of
             `[sample]`, or air.
         wavelength_nm
-            Of the light, if it is another than the design's, nm. Indices of materials follow.
+            Of the light, if it is another than the design's, nm. Indices of materials follow; the design's emission
+            band does not count.
 
         Raises
         ------
@@ -161,9 +163,15 @@ class Design(Table):
                 filters=layers_of(self.layers.object, wavelength),
                 windows=layers_of(self.layers.sensor, wavelength),
                 sample=chosen_sample(self, sample, wavelength),
+                band=self._band(sample) if wavelength_nm is None else None,
             )
         except ValueError as error:  # of a `Sample` that is given: the rest is checked
             raise InputError(str(error)) from error
+
+    def _band(self, sample: str | Sample | None):
+        """The emission band, with the indices of the materials of the lenses, the layers and a sample."""
+        table = sample if isinstance(sample, Sample) else sample_table(self, sample)
+        return emission_band(self.imaging, self.lens, self.layers, table)
 
     @classmethod
     def from_imager(
@@ -290,6 +298,7 @@ def read_design(path: PathLike) -> Design:
     """
     data = read_toml(path)
     inline_centers(Path(path), data)
+    inline_spectrum(Path(path), data)
     return checked_design(path, data)
 
 

@@ -17,6 +17,8 @@ def tables_of(imager: Imager) -> dict[str, Any]:
     array, sensor = imager.array, imager.sensor
     if array.size is None:
         raise InputError("`array.size` must be given: a design has a plate of finite size.")
+    if imager.band is not None:
+        raise InputError("`band` must be None: a design makes its own, of its materials and `imaging.bandwidth_nm`.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
     return {

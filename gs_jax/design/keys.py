@@ -85,6 +85,7 @@ def schema() -> dict[str, Any]:
     array["properties"] |= more["properties"]
     array["required"].remove("centers_mm")
     array["oneOf"] = [{"required": [name]} for name in ("centers_mm", "centers_file")]
+    made["$defs"]["ImagingTable"]["properties"]["spectrum_file"] = {"type": "string", "minLength": 1}
     # The centres file may have these columns.
     lens = made["$defs"]["LensTable"]
     lens["required"] = [name for name in lens["required"] if name not in LENS_KEYS]

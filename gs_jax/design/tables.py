@@ -46,6 +46,11 @@ LensIndex = Annotated[
     Annotated[Material, Tag(NAME)] | Annotated[float, Field(gt=1, le=5), Tag(ONE)],
     number_or_name,
 ]
+_Line = Annotated[tuple[Wavelength, Annotated[float, Field(ge=0, le=1e30)]], Field(strict=False)]
+Spectrum = Annotated[
+    tuple[_Line, ...],
+    Field(strict=False, max_length=100_000, description="[[nanometres, light], ...], the light in any unit"),
+]
 Slope = Annotated[float, Field(ge=-10, le=10)]
 Tilt = Annotated[tuple[Slope, Slope], Field(strict=False, description="[x, y] in degrees, each from -10 to 10")]
 Centers = Annotated[
@@ -143,6 +148,18 @@ class ImagingTable(Table):
         title="nearest and farthest object: depths z from the array's front, plano face or lens vertices, positive"
     )
     wavelength_nm: Wavelength = Field(title="wavelength of the light that is detected, in air")
+    bandwidth_nm: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e4,
+        title="full width of an even emission band about `wavelength_nm`, over which PSFs are means; 0 for none",
+        description="a number of nanometres from 0 to 1e4",
+    )
+    spectrum_nm: Spectrum = Field(
+        default=(),
+        title="in place of `bandwidth_nm`: pairs of a wavelength and its light, between which it is linear; "
+        "`spectrum_file` names a CSV file with the header `wavelength_nm,light` that is read in its place",
+    )
     field_radius_mm: Length = Field(
         title="how far beside its axis, in the object, a lens still counts as seeing a point; sqrt(A_e / pi)"
     )

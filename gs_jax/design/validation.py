@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..lenses import sag_slope_over_r
+from .band import check_band
 from .centers import LENS_KEYS, other_reading
 from .light_path import check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
 
@@ -30,6 +31,7 @@ _CENTERS = "`array.centers_mm`"
 
 
 def _check_numbers(design) -> None:
+    check_band(design.imaging)
     near, far = design.imaging.working_distance_mm
     if not near < far:
         raise ValueError(f"`imaging.working_distance_mm` must be [near, far], near below far, got [{near}, {far}]")
