@@ -77,6 +77,75 @@ def chief_ray() -> str:
     return svg(640, 345, parts)
 
 
+# Of `light_path`, along x: media other than air, as left and right edge, refractive index, label and colour.
+_MEDIA = (
+    (105.0, 127.0, 1.51, "window", "#b0bec5"),
+    (235.0, 265.0, 1.43, "array", GLASS),
+    (265.0, 310.0, 1.52, "filter", "#ffe0b2"),
+    (520.0, 534.0, 1.52, "cover slip", "#b0bec5"),
+    (534.0, 760.0, 1.43, "gel", "#e8f5e9"),
+)
+
+
+def light_path() -> str:
+    """Side view of layers and a sample, by their tables in a design file, and where a point seems to be."""
+    axis, top, bottom = 185.0, 75.0, 295.0
+    sensor, vertex, front, cover, surface, point = 80.0, 235.0, 265.0, 520.0, 534.0, 700.0
+    seems = surface + _reduced(point) - _reduced(surface)
+    faces = sorted({sensor, vertex, point, *(x for edges in _MEDIA for x in edges[:2] if x < point)})
+    parts = [
+        f'<rect x="{left}" y="{top}" width="{right - left}" height="{bottom - top}" fill="{color}" stroke="{FAINT}"/>'
+        for left, right, _, _, color in _MEDIA
+    ]
+    parts += [
+        f'<path d="M {vertex} {y - 28} Q {vertex - 22} {y} {vertex} {y + 28} Z" fill="{GLASS}" stroke="{FAINT}"/>'
+        for y in (axis - 80, axis - 24, axis + 24, axis + 80)
+    ]
+    parts += [
+        line(40, axis, 780, axis, FAINT, 1, "6 4"),
+        f'<rect x="{sensor - 8}" y="{top}" width="8" height="{bottom - top}" fill="{INK}"/>',
+    ]
+    for lens in (-80.0, 80.0):
+        # A chief ray is straight along the reduced distance.
+        slope = lens / (_reduced(point) - _reduced(vertex))
+        y = {x: axis + slope * (_reduced(point) - _reduced(x)) for x in faces}
+        corners = " ".join(f"{x:.1f},{y[x]:.1f}" for x in faces)
+        parts += [
+            f'<polyline points="{corners}" fill="none" stroke="{RAY}" stroke-width="1.8"/>',
+            line(surface, y[surface], seems, axis, RAY, 1.2, "4 4"),
+            dot(sensor, y[sensor]),
+        ]
+    parts += [
+        dot(point, axis, 5),
+        f'<circle cx="{seems:.1f}" cy="{axis}" r="5" fill="white" stroke="{RAY}" stroke-width="1.5"/>',
+        text(point + 8, axis - 12, "a point"),
+        text(seems + 4, axis + 42, "seems to be here", anchor="middle"),
+        line(seems, axis + 28, seems, axis + 8, FAINT),
+        text(sensor + 4, top - 10, "sensor", anchor="end"),
+        *(text((left + right) / 2, top - 10, name, anchor="middle") for left, right, _, name, _ in _MEDIA),
+        *(text(x, top - 10, "air", anchor="middle") for x in (181, 415)),
+        *_pointer(sensor, 127, 36, "[[layers.sensor]]"),
+        *_pointer(front, 310, 36, "[[layers.object]]"),
+        *_pointer(cover, surface, 36, "layers of [sample]"),
+        text(650, 23, "[sample]", anchor="middle"),
+        *measure(sensor, vertex, 320, "sensor_distance_mm"),
+        *measure(front, surface, 320, "surface_mm"),
+        *measure(front, point, 360, "depth z"),
+    ]
+    return svg(800, 390, parts)
+
+
+def _reduced(x: float) -> float:
+    """Return the reduced distance from the left."""
+    return x - sum((min(max(x, left), right) - left) * (1 - 1 / n) for left, right, n, *_ in _MEDIA)
+
+
+def _pointer(start: float, stop: float, y: float, words: str) -> list[str]:
+    """Return an arrow along x, from where layers are listed to where they end, with a label above."""
+    tips = [line(stop, y, stop - 6, y + side, FAINT, 1.5) for side in (-4, 4)]
+    return [line(start, y, stop, y, FAINT, 1.5), *tips, text((start + stop) / 2, y - 13, words, anchor="middle")]
+
+
 def field() -> str:
     """A point seen along the axis: the lenses within the field radius, and its image, their pattern magnified."""
     random, centers = 7, []
@@ -189,7 +258,13 @@ def imports_drawing() -> str:
     return svg(wide, 40 + high * len(rows) - 10, parts)
 
 
-DRAWINGS = {"chief-ray": chief_ray, "field": field, "stray-light": stray_light, "imports": imports_drawing}
+DRAWINGS = {
+    "chief-ray": chief_ray,
+    "light-path": light_path,
+    "field": field,
+    "stray-light": stray_light,
+    "imports": imports_drawing,
+}
 
 
 def main() -> None:

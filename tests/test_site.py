@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 import pytest
 
+import gs_jax as gs
 from experiments.calibration_errors import run
 from gs_jax.__main__ import COMMANDS, commands
 from gs_jax.codesign.study import Study
@@ -117,11 +118,12 @@ def test_readme_is_short_and_its_python_runs(tmp_path):
 def test_python_of_the_python_page_runs(tmp_path):
     """In a folder with a design and a capture, here of a small microscope."""
     printed = blocks(DOCS / "howto" / "python.md", "python")
-    assert len(printed) == 3
+    assert len(printed) == 4
     design_and_capture(tmp_path)
     checks = (
         "assert volume.shape == clean.shape == grid.volume_shape and estimate.shape == (3, *grid.shape)",
         "assert len(points) == 5 and jnp.isfinite(estimate).all()",
+        "assert wet.depth_of(wet.reduced_depth(21.0)) > 20.99",
         "assert jnp.abs(gradient.array.centers).max() > 0 and gradient.sensor_distance != 0",
     )
     subprocess.run([sys.executable, "-c", "\n".join([*printed, *checks])], cwd=tmp_path, check=True)
@@ -131,6 +133,12 @@ def test_python_of_the_python_page_runs(tmp_path):
 def test_study_of_the_first_ten_minutes_is_valid():
     (study,) = blocks(DOCS / "start.md", "toml")
     assert Study.model_validate(tomllib.loads(study)).name == "focused"
+
+
+def test_layers_of_the_page_of_samples_are_valid():
+    (layers,) = blocks(DOCS / "howto" / "samples.md", "toml")
+    design = gs.geomscope().replace(**tomllib.loads(layers))
+    assert float(design.imager("gel").sample_surface) == pytest.approx(19.67)
 
 
 def test_page_of_keys_is_up_to_date():
@@ -150,7 +158,7 @@ def test_drawing_of_keys_is_small(tmp_path, monkeypatch):
         assert 10_000 < path.stat().st_size < 200_000
 
 
-@pytest.mark.parametrize("name", ["chief-ray", "field", "stray-light", "imports"])
+@pytest.mark.parametrize("name", ["chief-ray", "light-path", "field", "stray-light", "imports"])
 def test_drawings_are_up_to_date(name):
     """`python docs/drawings.py` draws them; that of imports depends on the modules."""
     drawing = (DOCS / "drawings" / f"{name}.svg").read_text(encoding="utf-8")
