@@ -117,7 +117,7 @@ def test_targets_and_assumptions_in_words(design):
     values = complete_values(make_sliders(design), moves)
     result = evaluate_design(start, values, evaluation.live_terms(STUDY))
     sentences = evaluation.find_violations(design, STUDY, start, values, result)
-    assert "Target missed: thickness, plate and sensor distance (thickness_mm) is 8, not <= 7." in sentences
+    assert "Target missed: thickness: filters, plate and sensor distance (thickness_mm) is 8, not <= 7." in sentences
     for word in ("lenses_per_point", "out of focus", "mask"):
         assert any(word in each for each in sentences)
     assert not any("ghosts" in each for each in sentences)

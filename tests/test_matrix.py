@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,32 @@ def combined() -> Design:
     return cropped("geomscope", lens=lens, imaging={"sensor_distance_mm": 5.3}, calibration=tilt)
 
 
+def stack(surface: float, gap: float = 0.0) -> dict[str, Any]:
+    """A filter, a gap and a window on the sensor, and a gel behind a cover slip."""
+    glass = {"name": "filter", "thickness_mm": 2.0, "refractive_index": 1.52}
+    slip = {"name": "cover slip", "thickness_mm": 0.17, "refractive_index": 1.523}
+    window = {"name": "window", "thickness_mm": 0.55, "refractive_index": 1.51}
+    return {
+        "layers": {
+            "object": [{"thickness_mm": gap}, glass] if gap else [glass],
+            "sensor": [{"thickness_mm": 0.6}, window],
+        },
+        "sample": {"refractive_index": 1.43, "surface_mm": surface, "layers": [slip]},
+    }
+
+
+def layered() -> Design:
+    """A filter, a window and a gel, in focus where the paper's device is."""
+    return cropped("geomscope", imaging={"sensor_distance_mm": 6.12, "working_distance_mm": (18.0, 23.0)}).replace(
+        **stack(17.5)
+    )
+
+
+def layered_combined() -> Design:
+    """The same over a curved side, with two lens types and a tilt."""
+    return combined().replace(sensor_distance_mm=5.64, working_distance_mm=(18.0, 23.0), **stack(17.5, gap=0.3))
+
+
 def mirrored() -> Design:
     design = cropped("geomscope")
     centers = [(-x, y) for x, y in design.array.centers_mm]
@@ -76,6 +103,8 @@ DEVICES: dict[str, Callable[[], Design]] = {
     "aspheric": lambda: cropped("geomscope", lens={"conic_constant": -0.5, "aspheric_terms": [-1e-3, 2e-4]}),
     "two radii": with_two_radii,
     "curved, tilted, two radii": combined,
+    "layers": layered,
+    "curved, tilted, two radii, layers": layered_combined,
     "tilted": lambda: cropped("geomscope", calibration={"tilt_deg": (1.0, -0.6)}),
     "turned": lambda: cropped("geomscope", calibration={"rotation_deg": 31.0, "shift_mm": (0.1, -0.2)}),
     "mirrored": mirrored,

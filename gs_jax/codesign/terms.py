@@ -75,7 +75,7 @@ TERMS: dict[str, Term] = {
     "occupancy": Term("occupancy V (Eq. 11)", objectives.occupancy),
     "light_percent": Term("share of a point's light that is used", _scaled(100, objectives.light)),
     "field_of_view_mm": Term("width of the field of view", objectives.field_of_view),
-    "thickness_mm": Term("thickness, plate and sensor distance", _of_imager(objectives.thickness)),
+    "thickness_mm": Term("thickness: filters, plate and sensor distance", _of_imager(objectives.thickness)),
     "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", _scaled(UM, objectives.spot_width)),
     "encircled_radius_um": Term("radius of 80 % of the rays, in the object", _scaled(UM, objectives.encircled_radius)),
     "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),

@@ -35,7 +35,7 @@ class Conditions(eqx.Module):
     circle_of_confusion
         Diameter of the circle of confusion, mm; two pixels by default.
     exposure
-        Electrons that a mm^2 of clear aperture at a distance of 20 mm collects from an emitter of 40 um x 40 um.
+        Electrons that a mm^2 of clear aperture collects from an emitter of 40 um x 40 um, 20 mm away in air.
     largest_magnification
         An upper bound of all magnifications, for windows whose shape may not depend on traced numbers.
     directions

@@ -1,8 +1,9 @@
 """Formulas of resolution, depth of field and occupancy: the paper's (Eqs. 4-8, 11), and those of diffraction.
 
 Functions of numbers and arrays that broadcast, lengths in mm. Every depth, argument or result, is the reduced depth
-`z' = z + t/n` (`Imager.reduced_depth`). `diameter` is meant to be that of the clear aperture
-(`apertures.clear_diameter`); the paper takes the lens's 2 mm in Eqs. 7 and 8, and the pitch in its numerical aperture.
+`z' = z + t/n` (`Imager.reduced_depth`); in a medium of index n real lengths along z are n times as large. `diameter` is
+meant to be that of the clear aperture (`apertures.clear_diameter`); the paper takes the lens's 2 mm in Eqs. 7 and 8,
+and the pitch in its numerical aperture.
 """
 
 import math

@@ -100,10 +100,8 @@ def make_sliders(design: Design) -> dict[str, Slider]:
         "near_mm": begins,
         "far_mm": begins,
     }
-    lowest = lambda name, low: max(low, least.get(name, 0.0))
-    return {
-        name: Slider(title, lowest(name, low * at), high * at, at) for name, (title, low, high, at) in ranges.items()
-    }
+    lowest = lambda name, low, at: min(max(low * at, least.get(name, 0.0)), at)
+    return {n: Slider(title, lowest(n, low, at), high * at, at) for n, (title, low, high, at) in ranges.items()}
 
 
 def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
