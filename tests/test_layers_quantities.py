@@ -81,7 +81,7 @@ def test_a_medium_takes_light():
     scope, host = in_gel(), to_numpy(in_gel())
     ray = refract(host, DEPTHS, np.full((2, 1), 1e-4), np.zeros((2, 1)))
     diameter = float(objectives.clear_diameter(scope, DEPTHS))
-    share = solid_angle(host, DEPTHS, ray) * np.pi * diameter**2 / 4 / (4 * np.pi)
+    share = solid_angle(host, ray) * np.pi * diameter**2 / 4 / (4 * np.pi)
     each = objectives.light(scope, DEPTHS) / objectives.lenses_per_point(scope)
     np.testing.assert_allclose(each, share, rtol=1e-6)
     per_solid_angle = lens_electrons(scope, Conditions(DEPTHS)) / share

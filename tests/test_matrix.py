@@ -66,9 +66,8 @@ def combined() -> Design:
 
 def stack(surface: float, gap: float = 0.0) -> dict[str, Any]:
     """A filter, a gap and a window on the sensor, and a gel behind a cover slip."""
-    glass = {"name": "filter", "thickness_mm": 2.0, "refractive_index": 1.52}
-    slip = {"name": "cover slip", "thickness_mm": 0.17, "refractive_index": 1.523}
-    window = {"name": "window", "thickness_mm": 0.55, "refractive_index": 1.51}
+    glass, slip = {"thickness_mm": 2.0, "refractive_index": 1.52}, {"thickness_mm": 0.17, "refractive_index": 1.523}
+    window = {"thickness_mm": 0.55, "refractive_index": 1.51}
     return {
         "layers": {
             "object": [{"thickness_mm": gap}, glass] if gap else [glass],

@@ -131,7 +131,7 @@ def trace_light(
     Coordinates come first and are NumPy's, as the imager's numbers (`to_numpy`).
     """
     ray = refract(imager, depth, points, field)
-    light = solid_angle(imager, depth, ray) * transmittance(imager, ray) / (4 * np.pi)
+    light = solid_angle(imager, ray) * transmittance(imager, ray) / (4 * np.pi)
     return ray.landing, np.where(ray.valid, light, 0)
 
 

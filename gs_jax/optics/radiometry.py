@@ -1,13 +1,21 @@
 """How much of a point's light a ray carries: solid angle, and Fresnel losses at every face. Shapes are `refract`'s."""
 
+import numpy as np
+
 from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..layers import object_indices
 from ..typing import Coordinates, Scalar, Scalars
-from .raytrace import RefractedRay, dot, secant, slabs_in_front, square_and_root
+from .raytrace import RefractedRay, dot, secant, square_and_root
+
+# Rays for which a polynomial is fitted, and the squared sine up to which it serves; its nodes, and the coefficients by
+# values there.
+_MANY, _STEEP = 256, 0.5
+_NODES = np.cos(np.pi * (np.arange(11) + 0.5) / 11)
+_FIT = np.linalg.inv(np.vander(_NODES, increasing=True))
 
 
-def solid_angle(imager: Imager, depth: Scalars, ray: RefractedRay) -> Scalars:
+def solid_angle(imager: Imager, ray: RefractedRay) -> Scalars:
     """Solid angle that the lens takes of an object point's light, per area of its curved side, 1/mm^2.
 
     In air it is the Jacobian of the slope `q = a / h` by the point, times `(1 + q^2)^(-3/2)`, with the lateral distance
@@ -18,18 +26,16 @@ def solid_angle(imager: Imager, depth: Scalars, ray: RefractedRay) -> Scalars:
     h, square, array = ray.height, dot(ray.slope, ray.slope), imager.array
     along = 0 * h
     if array.thin_lens_focal_length is None:
-        growing, change = h * dot(ray.slope, ray.point) * ray.sag_slope_over_r, 0.0
+        growing = h * dot(ray.slope, ray.point) * ray.sag_slope_over_r
         if array.orientation == "plano":
             growing = -growing / square_and_root(array.refractive_index, square)[1]
-        for thickness, n in slabs_in_front(imager, depth, ray.sag):
-            flat, root = square_and_root(n, square)
-            change = change + thickness * (n**2 - 1) * square / (flat * root)
-        along = (growing - change) / (1 - change / h)
-    angle = abs(1 - along / h) * secant(ray.slope) ** -3 / h**2
+        along = (growing - ray.lengthening * h) / (1 - ray.lengthening)
+    longer = secant(ray.slope)
+    angle = abs(1 - along / h) / (longer * longer * longer * h * h)
     if imager.sample is None:
         return angle
     n = imager.sample.refractive_index
-    return angle / (n**2 * _cosine(n, square) * secant(ray.slope))
+    return angle / (n**2 * _cosine(n, square) * longer)
 
 
 def transmittance(imager: Imager, ray: RefractedRay) -> Scalars:
@@ -48,9 +54,27 @@ def transmittance(imager: Imager, ray: RefractedRay) -> Scalars:
 
 
 def _through(indices, slope: Coordinates) -> Scalars:
-    """Light that plane faces between media of these indices transmit; `slope` is the ray's in air."""
-    square, light = dot(slope, slope), 1.0
-    cosines = [_cosine(n, square) for n in indices]
+    """Light that plane faces between media of these indices transmit; `slope` is the ray's in air.
+
+    Many rays on the host, through several faces, take it from a polynomial in the squared sine, to 1e-8.
+    """
+    square = dot(slope, slope)
+    if len(indices) < 3 or not isinstance(square, np.ndarray) or square.size < _MANY:
+        return _through_faces(indices, square)
+    sine2 = square / (1 + square)
+    half = sine2.max() / 2
+    if not 0 < half < _STEEP / 2:
+        return _through_faces(indices, square)
+    nodes = half * (1 + _NODES)
+    *lower, light = _FIT @ _through_faces(indices, nodes / (1 - nodes))
+    away = sine2 / half - 1
+    for coefficient in lower[::-1]:
+        light = light * away + coefficient
+    return light
+
+
+def _through_faces(indices, square: Scalars) -> Scalars:
+    light, cosines = 1.0, [_cosine(n, square) for n in indices]
     for k in range(len(indices) - 1):
         light = light * _fresnel(indices[k], cosines[k], indices[k + 1], cosines[k + 1])
     return light

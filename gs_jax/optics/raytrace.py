@@ -30,7 +30,7 @@ Point = Float[Array | np.ndarray, "2"] | tuple[ScalarLike, ScalarLike]
 Module = TypeVar("Module", Imager, MicrolensArray)
 
 # Newton steps for the height of a ray. Each squares an error that starts at 1e-3, or at 1e-2 within a sample.
-_NEWTON_STEPS = 4
+_NEWTON_STEPS, _LAST_STEP = 4, 1e-8
 
 
 class RefractedRay(NamedTuple):
@@ -38,9 +38,10 @@ class RefractedRay(NamedTuple):
 
     `point`, `sag`, `sag_slope_over_r`: where the ray meets the curved side (mm), and the surface there (mm, 1/mm).
     `height`: distance in which the slope in air takes the ray from the object to that point, mm; `excess`: of the
-    height over `z'`, mm. `slope`, `glass`, `tangent`: slopes of the ray in front of, inside and behind the lenslet.
-    `curved`: cosines with the normal before and behind the curved side. `landing`: on the sensor, mm. `valid`: False
-    where there is no surface or total reflection; the other numbers are then finite and meaningless.
+    height over `z'`, mm; `lengthening`: derivative by the height of what the layers make of it. `slope`, `glass`,
+    `tangent`: slopes of the ray in front of, inside and behind the lenslet. `curved`: cosines with the normal before
+    and behind the curved side. `landing`: on the sensor, mm. `valid`: False where there is no surface or total
+    reflection; the other numbers are then finite and meaningless.
     """
 
     point: Coordinates
@@ -48,6 +49,7 @@ class RefractedRay(NamedTuple):
     sag_slope_over_r: Scalars
     height: Scalars
     excess: Scalars
+    lengthening: Scalars
     slope: Coordinates
     glass: Coordinates
     tangent: Coordinates
@@ -103,7 +105,7 @@ def _refract_plane_first(imager, depth, point, field) -> RefractedRay:
     array, xp = imager.array, array_namespace(point)
     n, (point, sag, ratio, reached) = array.refractive_index, _surface(array, point)
     slabs = slabs_in_front(imager, depth, sag)
-    height, excess = _height(imager.reduced_depth(depth), -sag / n, slabs, point - field)
+    height, excess, lengthening = _height(imager.reduced_depth(depth), -sag / n, slabs, point - field)
     slope = (point - field) / height
     glass = slope_in_glass(n, slope)
     lateral, axial, inside, behind2 = _incidence(n, glass, point, ratio)
@@ -111,7 +113,7 @@ def _refract_plane_first(imager, depth, point, field) -> RefractedRay:
     behind = xp.sqrt(xp.where(behind2 > 0, behind2, 1))
     tangent = _snell(lateral, axial, n, behind - n * inside, point, ratio, valid)
     landing = point + sag * tangent + _to_sensor(imager, sag, tangent)
-    numbers = sag, ratio, height, excess
+    numbers = sag, ratio, height, excess, lengthening
     return RefractedRay(point, *numbers, slope, glass, tangent, (inside, behind), landing, valid)
 
 
@@ -119,7 +121,7 @@ def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
     array, xp = imager.array, array_namespace(point)
     n, (point, sag, ratio, reached) = array.refractive_index, _surface(array, point)
     slabs = slabs_in_front(imager, depth)
-    height, excess = _height(imager.reduced_depth(depth), sag, slabs, point - field)
+    height, excess, lengthening = _height(imager.reduced_depth(depth), sag, slabs, point - field)
     slope = (point - field) / height
     # The surface falls toward the sensor: its normal leans toward the axis.
     lateral, axial, outside, inside2 = _incidence(1 / n, slope, point, -ratio)
@@ -133,7 +135,7 @@ def _refract_curve_first(imager, depth, point, field) -> RefractedRay:
     cosine = xp.sqrt(xp.where(valid, cosine2, 1))
     tangent = xp.where(valid, n * glass / secant(glass), 0) / cosine
     landing = point + _to_sensor(imager, sag, tangent)
-    numbers = sag, ratio, height, excess
+    numbers = sag, ratio, height, excess, lengthening
     return RefractedRay(point, *numbers, slope, glass, tangent, (outside, inside), landing, valid)
 
 
@@ -147,7 +149,7 @@ def _refract_ideal(imager, depth, point, field) -> RefractedRay:
     tangent = -field / reduced - vergence * point
     landing = chief_ray(xp.zeros_like(point), field, v / reduced) + point * (1 - v * vergence)
     zero = xp.zeros_like(slope[0])
-    numbers = zero, zero, zero + reduced, zero
+    numbers = zero, zero, zero + reduced, zero, zero
     return RefractedRay(point, *numbers, slope, slope, tangent, (zero + 1, zero + 1), landing, zero == 0)
 
 
@@ -182,23 +184,31 @@ def _normal_length(point, ratio):
     return array_namespace(point).sqrt(1 + ratio**2 * dot(point, point))
 
 
-def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> tuple[Scalars, Scalars]:
+def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> tuple[Scalars, Scalars, Scalars]:
     """Distance `h` in which a ray's slope in air takes it as far sideways as all it crosses: `across = slope h`.
 
     `slabs` are thickness and index of what is not air; `reduced + paraxial` is their reduced thickness and that of the
-    air, to which a ray near the axis is due. The second result is `h - reduced`, with the precision of the difference.
+    air, to which a ray near the axis is due. The second result is `h - reduced`, with the precision of the
+    difference, the third the derivative by `h` of what the layers make of it, before the last step.
     """
-    square, excess = dot(across, across), paraxial + 0 * across[0]
+    square, excess, change = dot(across, across), paraxial + 0 * across[0], 0.0
     for _ in range(_NEWTON_STEPS):
         h = reduced + excess
-        off, change = paraxial, 0.0
+        slope2 = square / (h * h)
+        off, change = 0.0, 0.0
         for thickness, n in slabs:
-            flat, root = square_and_root(n, square / h**2)
+            flat, root = square_and_root(n, slope2)
+            share = thickness * (n**2 - 1) / root
             # Of t / sqrt(flat) over t / n.
-            off = off - thickness * (n**2 - 1) * square / h**2 / (n * root * (n + root))
-            change = change + thickness * (n**2 - 1) * square / (h**3 * flat * root)
-        excess = excess - (excess - off) / (1 - change)
-    return reduced + excess, excess
+            off = off + share / (n * (n + root))
+            change = change + share / flat
+        change = slope2 * change / h
+        step = (excess - paraxial + slope2 * off) / (1 - change)
+        excess = excess - step
+        # On the host, as soon as the next step would be below the rounding.
+        if isinstance(step, np.ndarray) and (np.abs(step) < _LAST_STEP * reduced).all():
+            break
+    return reduced + excess, excess, change
 
 
 def square_and_root(n, square):
@@ -225,10 +235,10 @@ def _plate(imager: Imager, sag: Scalars) -> tuple[Scalars, Scalar]:
 
 def _to_sensor(imager: Imager, sag: Scalars, tangent: Coordinates) -> Coordinates:
     """How far sideways a ray goes from the array's vertices, or from the curved side in glass, to the sensor."""
-    across = _air_behind(imager) * tangent
+    square, along = dot(tangent, tangent), _air_behind(imager)
     for thickness, n in slabs_behind(imager, sag):
-        across = across + thickness * slope_in_glass(n, tangent)
-    return across
+        along = along + thickness / square_and_root(n, square)[1]
+    return along * tangent
 
 
 def _air_behind(imager: Imager) -> Scalar:
@@ -284,7 +294,7 @@ def _trace(imager: Imager, depth: Array, point: Array, field: Array) -> LensletR
 def _thick_path(imager: Imager, depth: Array, ray: RefractedRay, field: Array) -> Array:
     """Optical path less the chief ray's, which leaves as it came: at the vertex both faces are parallel."""
     reduced, zero = imager.reduced_depth(depth), jnp.zeros_like(depth)
-    h_chief, excess_chief = _height(reduced, zero, slabs_in_front(imager, depth), -field)
+    h_chief, excess_chief, _ = _height(reduced, zero, slabs_in_front(imager, depth), -field)
     q_chief = -field / h_chief
     change = ray.point / ray.height + field * (ray.excess - excess_chief) / (ray.height * h_chief)
     in_front = ray.slope, q_chief, dot(change, ray.slope + q_chief)
