@@ -7,6 +7,8 @@ plate's plano face or, with the curved side in front, the lens vertices; the sen
 the array's back, the other of these two. Bare equation numbers mean the GEOMScope paper (Tian, Hu, Yang).
 """
 
+import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,6 +25,7 @@ from .base.arrays import (
     as_float_or_none,
     check_fields,
 )
+from .base.errors import input_error
 from .emission import EmissionBand
 from .layers import Layers, Sample, check_room, depth_of_reduced, object_surface, reduced_distance
 from .lenses import MicrolensArray
@@ -35,6 +38,9 @@ _WAVELENGTH: Rule = (
     f"{SHORTEST:g} to {LONGEST:g} mm (520 nm are 520e-6 mm)",
     lambda x: (x >= SHORTEST) & (x <= LONGEST),
 )
+
+# By how much a rounding may put a depth before the object's medium, mm.
+_ROUNDING = 1e-5
 
 # Half the width of the envelope's falloff, as a fraction of the squared field radius: wide enough for a gradient, and
 # so narrow that it adds 5 % to the radius in which lenses see a point.
@@ -310,3 +316,13 @@ class Imager(eqx.Module):
     def brightness(self, views: Views) -> Scalars:
         """The envelope C of views."""
         return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)
+
+
+def check_beyond(imager: Imager, depths: Iterable[float], name: str) -> None:
+    """Raise `InputError` unless depths, mm from the array, are where layers leave room for the object. Host code."""
+    if imager.filters is None and imager.sample is None:
+        return
+    begins, nearest = float(imager.sample_surface), min(map(float, depths), default=math.inf)
+    if nearest < begins - _ROUNDING:
+        allowed = f"{begins:.6g} mm or more, where layers end and the object's medium begins"
+        raise input_error(name, allowed, f"{nearest:.6g}")

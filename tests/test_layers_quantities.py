@@ -12,6 +12,7 @@ import gs_jax as gs
 from gs_jax import InputError, objectives
 from gs_jax.apps.explore.evaluation import make_sliders
 from gs_jax.apps.report.drawings import draw_section
+from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.codesign.linear_error import lens_electrons
 from gs_jax.codesign.study import Study
@@ -180,6 +181,22 @@ def test_a_study_in_a_sample():
 def test_sliders_leave_room_for_layers():
     sliders = make_sliders(wet_design().replace(sample={"refractive_index": 1.33, "surface_mm": 17.0}))
     assert (sliders["near_mm"].low, sliders["sensor_distance_mm"].low) == (17.0, 0.6 * 5.8)
+
+
+def test_objects_are_in_their_medium():
+    scope, grid = in_gel(), gs.Grid([19.0, 21.0], (9, 9), 0.1)
+    image = np.zeros(scope.sensor.shape, np.float32)
+    for call in (
+        lambda: gs.simulate(np.array([[0.0, 0.0, 19.0, 1.0]]), scope),
+        lambda: gs.simulate(np.zeros(grid.volume_shape), scope, grid),
+        lambda: gs.reconstruct(image, scope, grid),
+        lambda: gs.find_points(image, scope, grid),
+    ):
+        with pytest.raises(InputError, match="must be 19.67 mm or more, where layers end .* medium begins, got 19"):
+            call()
+    wet = wet_design()
+    with pytest.raises(InputError, match="`depths` must be 17 mm or more, .* got 16"):
+        tolerance(wet.replace(sample=wet.samples["water"].model_dump()), depths=[16.0, 20.0])
 
 
 def test_layers_need_room():

@@ -10,8 +10,6 @@ from ..base.errors import InputError
 from .options import Number
 
 _NM, _SURFACE = Number(10.0, 1e5, "nm"), Number(0.0, 1e4, "mm")
-# By how much rounding may put a depth before the surface, mm.
-_ROUNDING = 1e-5
 
 
 class Light(NamedTuple):
@@ -87,11 +85,10 @@ class Light(NamedTuple):
 
 
 def check_beyond(imager, depths: Iterable[float], name: str) -> None:
-    """Raise `InputError` unless the depths, from the array, are where the object can be."""
-    begins, nearest = float(imager.sample_surface), min(map(float, depths), default=None)
-    if nearest is not None and nearest < begins - _ROUNDING:
-        allowed = f"{begins:.6g} mm or more, where layers end and the object's medium begins"
-        raise InputError(f"{name} must be {allowed}, got {nearest:.6g}.")
+    """As `gs_jax.geometry.check_beyond`, whose import takes long."""
+    from ..geometry import check_beyond
+
+    check_beyond(imager, depths, name)
 
 
 def sample_options(command):

@@ -18,7 +18,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..design.design import Design, read_design
-from ..design.light_path import AIR, NO_SAMPLE, chosen_sample, reduced_depth, reduced_sensor_distance
+from ..design.light_path import reduced_depth, reduced_sensor_distance, sample_table
 from ..lenses import lenses_by_type
 from ..optics.lens_types import interleave
 from ..typing import PathLike
@@ -177,8 +177,7 @@ def initial_design(design: Design, study: Study) -> Design:
         thin lenses, which have no radii.
     """
     if study.sample is not None:
-        chosen_sample(design, study.sample, design.imaging.wavelength_nm)
-        table = NO_SAMPLE if study.sample == AIR else design.samples[study.sample]
+        table = sample_table(design, study.sample)
         depths = study.depths_mm or design.imaging.working_distance_mm
         design = design.replace(sample=table.model_dump(), working_distance_mm=depths)
     if study.orientation is not None:

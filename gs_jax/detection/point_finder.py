@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..geometry import Imager
+from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
 from ..optics.psf_core import apparent_depths, ensquared_light
@@ -131,6 +131,7 @@ def find_points(
     if (lenses := len(imager.array.centers)) < _MIN_LENSES:
         number = f"{lenses} lens" if lenses == 1 else f"{lenses} lenses"
         raise InputError(f"points: {_MIN_LENSES} or more lenses must agree on a point, got {number}.")
+    check_beyond(imager, np.asarray(grid.depths), "points: depths")
     if detection.light.shape != imager.sensor.shape:
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {detection.light.shape}.")
     if not isinstance(image, DetectionImage):

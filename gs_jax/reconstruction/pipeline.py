@@ -15,7 +15,7 @@ from ..base.arrays import check_finite
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..geometry import Imager
+from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject
@@ -171,6 +171,7 @@ def reconstructor(
     """
     by_name = isinstance(optics, str)
     _check(method, optics, imager, grid)
+    check_beyond(imager, np.asarray(grid.depths), "grid: depths")
     on_cores = by_name and optics != "pinhole"
     views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager, grid),)
     if isinstance(method, BackProjection):

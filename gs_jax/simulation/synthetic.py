@@ -15,7 +15,7 @@ from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..geometry import Imager
+from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
@@ -82,8 +82,9 @@ def simulate(
     Raises
     ------
     InputError
-        If an option does not exist, a voxel is negative, a number is not finite, a point's depth is not positive, the
-        work does not fit into the memory, or a depth is blurred over more than 128 pixels each way ("near").
+        If an option does not exist, a voxel is negative, a number is not finite, a point's depth is not positive, a
+        depth is before the object's medium, the work does not fit into the memory, or a depth is blurred over more than
+        128 pixels each way ("near").
 
     Examples
     --------
@@ -103,6 +104,7 @@ def simulate(
         raise InputError(f'`psf` needs optics "near", which has one PSF; got {short_repr(psf)} with "full".')
     if psf not in (None, *PSFS):
         raise InputError(f"`psf` must be one of {', '.join(PSFS)}, got {short_repr(psf)}.")
+    check_beyond(imager, np.asarray(scene)[:, 2] if grid is None else np.asarray(grid.depths), "scene: depths")
     kind = "full" if optics == "full" else psf or "diffraction"
 
     def image_of(imager):

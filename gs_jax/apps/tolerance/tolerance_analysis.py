@@ -14,7 +14,7 @@ from ...base.errors import InputError
 from ...base.progress import Progress
 from ...design.datasheets import parts_of
 from ...design.design import Design
-from ...geometry import Imager
+from ...geometry import Imager, check_beyond
 from ...layouts import check_positive
 from ...objectives.conditions import Conditions
 from ...objectives.paraxial import axial_resolution
@@ -163,6 +163,7 @@ def tolerance(
         raise InputError(f"`lens.focal_length_mm` must be left out, as ideal lenses have no surface, got {focal:g}.")
     if not z.size or not np.isfinite(z).all() or not (z > 0).all():
         raise InputError(f"`depths` must be one or more positive lengths, mm, got {z.tolist()}.")
+    check_beyond(design.imager(), [*z, *([] if sources is None else sources[:, 2])], "`depths`")
     if draws < 1:
         raise InputError(f"`draws` must be one or more, got {draws}.")
     targets = {"max_width": max_width, "min_strehl": min_strehl, "max_depth_error": max_depth_error}
