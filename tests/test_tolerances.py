@@ -91,7 +91,7 @@ def outcome(design) -> Outcome:
 def pinholes(design):
     """Arguments of `depth_errors` for lenses whose cores are on their chief rays, which have closed forms."""
     imager, cores, sources, points = depth_arguments(design.imager(), np.array(DEPTHS))
-    zero = cores.offsets._replace(offset=0 * cores.offsets.offset, slope=0 * cores.offsets.slope)
+    zero = cores.offsets._replace(offset=0 * cores.offsets.offset, slopes={})
     return imager, cores._replace(offsets=zero, slopes=0 * cores.slopes), sources, points
 
 
