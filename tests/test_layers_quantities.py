@@ -12,10 +12,12 @@ import gs_jax as gs
 from gs_jax import InputError, objectives
 from gs_jax.apps.explore.evaluation import make_sliders
 from gs_jax.apps.report.drawings import draw_section
+from gs_jax.apps.report.report_tables import device_rows
 from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.codesign.linear_error import lens_electrons
 from gs_jax.codesign.study import Study
+from gs_jax.design.datasheets import datasheet
 from gs_jax.detection.view_samples import COARSE, search_grid
 from gs_jax.objectives.conditions import Conditions
 from gs_jax.optics.radiometry import solid_angle
@@ -218,9 +220,12 @@ def test_layers_need_room():
     assert float(total) == pytest.approx(5.8 + 1.0 + 2.0)
 
 
-def test_the_drawing_shows_the_stack():
+def test_the_report_shows_the_stack():
     wet = wet_design()
-    svg = draw_section(wet.replace(sample=wet.samples["water"].model_dump()))
+    wet = wet.replace(sample=wet.samples["water"].model_dump())
+    rows = dict(device_rows(wet, datasheet(wet)))
+    assert rows["on the array"] == "filter, 2 mm, n = fused silica" and rows["objects in"] == "n = water from 17 mm"
+    svg = draw_section(wet)
     for label in (
         "filter, 2 mm, n = 1.461",
         "cover slip, 0.17 mm, n = 1.52",

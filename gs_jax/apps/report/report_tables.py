@@ -10,6 +10,7 @@ from ...base.errors import InputError
 from ...base.machine import describe
 from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design, span_of
+from ...design.light_path import NO_SAMPLE, object_begins
 from ...io.files import read_text
 from ...typing import PathLike
 
@@ -94,10 +95,21 @@ def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str
         ("plate", f"{array.substrate_thickness_mm:g} mm thick, {100 * sheet['coverage']:.1f} % covered by lenses"),
         ("sensor", f"{rows} x {columns} pixels of {sensor.pixel_pitch_um:g} um: {height} x {width} mm"),
         ("sensor distance", f"{imaging.sensor_distance_mm:g} mm"),
+        *_path_rows(design),
         ("objects at", f"{imaging.working_distance_mm[0]:g} to {imaging.working_distance_mm[1]:g} mm"),
         ("light", f"{imaging.wavelength_nm:g} nm"),
         ("field radius", f"{imaging.field_radius_mm:g} mm"),
     ]
+
+
+def _path_rows(design: Design) -> list[tuple[str, str]]:
+    layers, sample = design.layers, design.sample
+    sides = {"on the array": layers.object, "before the object": sample.layers, "on the sensor": layers.sensor}
+    words = lambda each: f"{each.name or 'layer'}, {each.thickness_mm:g} mm, n = {each.refractive_index}"
+    rows = [(side, "; ".join(map(words, parts))) for side, parts in sides.items() if parts]
+    if sample == NO_SAMPLE:
+        return rows
+    return [*rows, ("objects in", f"n = {sample.refractive_index} from {object_begins(design):g} mm")]
 
 
 def calibration_rows(design: Design) -> list[tuple[str, str, str]]:
