@@ -1,6 +1,7 @@
 """Emission bands: their wavelengths, and PSFs that are means over them."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +34,7 @@ def design(**values) -> gs.Design:
 
 
 def test_an_even_band_has_its_mean_and_variance():
-    band = design(bandwidth_nm=40.0).imager().band
+    band: Any = design(bandwidth_nm=40.0).imager().band
     weights, wavelengths = np.asarray(band.weights), 1e6 * np.asarray(band.wavelengths)
     assert weights.sum() == pytest.approx(1)
     assert weights @ wavelengths == pytest.approx(520.0)
@@ -51,7 +52,7 @@ def test_a_spectrum_of_a_file(tmp_path):
     (tmp_path / "gfp.csv").write_text(f"wavelength_nm,light\n{rows}\n")
     text = (tmp_path / "plain.toml").read_text().replace("[imaging]", '[imaging]\nspectrum_file = "gfp.csv"')
     (tmp_path / "mine.toml").write_text(text)
-    band = gs.read_design(tmp_path / "mine.toml").imager().band
+    band: Any = gs.read_design(tmp_path / "mine.toml").imager().band
     mean = (wavelength * light).sum() / light.sum()
     assert float(1e6 * band.weights @ band.wavelengths) == pytest.approx(mean, abs=0.2)
     np.testing.assert_allclose(band.weights, 0.2, atol=0.01)

@@ -123,6 +123,7 @@ def test_searches_of_layers():
     }
     start, loss = float(scope.magnification(21.0)), lambda scope: (scope.magnification(21.0) - 0.275) ** 2
     found = gs.optimize(loss, scope, free=gs.free(*bounds), bounds=bounds, steps=20).imager
+    assert found.filters is not None and found.sample is not None
     assert abs(float(found.magnification(21.0)) - 0.275) < 1e-3 < abs(start - 0.275)
     changed = (found.filters.thickness, found.sample.surface, found.sample.refractive_index)
     assert all(np.any(a != b) for a, b in zip(changed, (2.0, 19.67, INDEX), strict=True))
@@ -208,7 +209,7 @@ def test_layers_need_room():
     ):
         dataclasses.replace(in_gel(), sensor_distance=1.0)
     with pytest.raises(ValueError, match="`surface` must be 2.17 mm, as thick as the layers in front .* got 2 mm"):
-        dataclasses.replace(in_gel(), sample=dataclasses.replace(in_gel().sample, surface=2.0))
+        dataclasses.replace(in_gel(), sample=gs.Sample(1.43, surface=2.0, layers=gs.Layers([0.17], [1.523])))
     with pytest.raises(ValueError, match="`sample` must begin beyond the lenses where their curved side is in front"):
         turned = dataclasses.replace(in_gel().array, orientation="curved")
         with_layers(array=turned, sample=gs.Sample(1.33))
@@ -235,7 +236,7 @@ def test_the_report_shows_the_stack():
         assert label in svg
     # Four of the layers are not air; rays bend at each face.
     assert svg.count('class="layer"') == 4
-    path = re.search('class="ray" d="M([^M"]*)', svg).group(1).split("L")
+    path = re.findall('class="ray" d="M([^M"]*)', svg)[0].split("L")
     assert len(path) == 1 + len((17.0, 16.83, 2.0, 0.0)) + len(("vertex", "window's front", "window's back", "sensor"))
     # A ray that leaves the filter goes on as it came.
     places = np.array([[float(x) for x in point.split()] for point in path])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +66,8 @@ def test_points_in_a_gel(lab, monkeypatch, capsys):
     for options in (("--sample", "gel"), inside):
         status, _, err = run(monkeypatch, capsys, "simulate", "found.csv", "lab.toml", *options, "-o", "again.npy")
         assert status == 0, err
-    layers = reader("found.tif")("found.tif")
+    read: Any = reader("found.tif")
+    layers = read("found.tif")
     assert layers[0][1]["translate"][0] == pytest.approx(20_000)
 
 

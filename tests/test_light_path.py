@@ -66,10 +66,11 @@ def test_the_imager_has_the_layers_of_the_file():
     in_contact = 2.17 - 2.0 * (1 - 1 / 1.52) - 0.17 * (1 - 1 / 1.523) + (21 - 2.17) / 1.43 + 1.0 / 1.43
     assert float(design.imager("gel").reduced_depth(21.0)) == pytest.approx(in_contact)
     assert design.imager("air").sample is None
-    red = design.imager(wavelength_nm=650.0)
+    red, thick = design.imager(wavelength_nm=650.0), design.imager(gs.Sample(1.5))
+    assert red.sample is not None and thick.sample is not None
     assert float(red.wavelength) == pytest.approx(650e-6)
     assert float(red.sample.refractive_index) == pytest.approx(gs.refractive_index("water", 650.0))
-    assert float(design.imager(gs.Sample(1.5)).sample.refractive_index) == 1.5
+    assert float(thick.sample.refractive_index) == 1.5
 
 
 def test_an_imager_with_layers_makes_the_same_design(tmp_path):
