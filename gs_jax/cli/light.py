@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import click
 
 from ..base.errors import InputError
-from .options import Number
+from .options import NEAREST, Number
 
 _NM, _SURFACE = Number(10.0, 1e5, "nm"), Number(0.0, 1e4, "mm")
 
@@ -80,6 +80,8 @@ class Light(NamedTuple):
         """Depths of the command line, counted from the array."""
         origin = self.origin(imager)
         moved = depths if origin is None else [round(depth + origin, 9) for depth in depths]
+        if min(moved) < NEAREST:
+            raise InputError(f"--depths must be {NEAREST:g} mm or more from the array, got {min(moved):g}.")
         check_beyond(imager, moved, "--depths")
         return moved
 

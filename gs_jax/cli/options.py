@@ -16,7 +16,7 @@ from ..base.workers import Workers
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000
 # Nearest depth that a file of volumes may have, mm.
-_NEAREST = 1e-6
+NEAREST = 1e-6
 
 METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
 SUPPRESSIONS = ("none", "points", "clusters", "unet")
@@ -49,6 +49,9 @@ class Depths(click.ParamType):
 
     name = "start:stop:step"
 
+    def __init__(self, least: float = NEAREST):
+        self.least = least
+
     def convert(self, value, param, ctx):
         if isinstance(value, list):
             return value
@@ -56,8 +59,8 @@ class Depths(click.ParamType):
             start, stop, step = map(float, value.split(":") if ":" in value else (value, value, 1))
         except ValueError:
             self.fail(f"must be START:STOP:STEP in mm, such as 18:22:0.25, or one depth, got {value!r}.", param, ctx)
-        if not all(map(math.isfinite, (start, stop, step))) or not _NEAREST <= start <= stop or not step > 0:
-            self.fail(f"must have {_NEAREST:g} <= START <= STOP and STEP > 0, in mm, got {value!r}.", param, ctx)
+        if not all(map(math.isfinite, (start, stop, step))) or not self.least <= start <= stop or not step > 0:
+            self.fail(f"must have {self.least:g} <= START <= STOP and STEP > 0, in mm, got {value!r}.", param, ctx)
         # A step that misses STOP by rounding alone falls on it.
         count = (stop - start) / step + 1 + 1e-6
         if count > _MAX_DEPTHS + 1:

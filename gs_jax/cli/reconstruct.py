@@ -36,7 +36,11 @@ from .recording_command import check_recording, reconstruct_recording, recording
 @click.argument("capture", type=Path)
 @click.argument("design", type=DESIGN)
 @click.option(
-    "--depths", type=Depths(), required=True, help="START:STOP:STEP in mm from the array, STOP included; or one depth."
+    # From the sample's surface, 0 is a depth.
+    "--depths",
+    type=Depths(0.0),
+    required=True,
+    help="START:STOP:STEP in mm from the array, STOP included; or one depth.",
 )
 @click.option(
     "--voxel-um",
