@@ -218,9 +218,10 @@ WRONG_ARGUMENTS = [
     ((*RECONSTRUCT, "-o", "v.tif", "surplus"), "surplus"),
     *(
         ((*RECONSTRUCT[:4], depths, "-o", "v.tif"), f"got {depths!r}")
-        for depths in ("", "18:22", "18:22:0", "18:22:-1", "22:18:1", "0:5:1", "-5:5:1", "a:b:c", "18:nan:1",
+        for depths in ("", "18:22", "18:22:0", "18:22:-1", "22:18:1", "-5:5:1", "a:b:c", "18:nan:1",
                        "18:inf:1", "18:22:1e-9", "18:22:1:1", "18,22,1")
     ),
+    ((*RECONSTRUCT[:4], "0:5:1", "-o", "v.tif"), "from the array, got 0"),
     ((*RECONSTRUCT, "-o", "v.tif", "--method", "admm", "--suppress", "unet"), "--method backproject, got admm"),
     ((*RECONSTRUCT, "-o", "v.tif", "--suppress", "cluster"), "'cluster' is not one of 'none', 'points', 'clusters'"),
     (
