@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from ..base.progress import Progress
 from ..geometry import Imager
+from ..layers import object_index
 from ..optics.field_varying import CORE_REACH, kernel_size, make_polar_grid, trace_stray_light
 from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
@@ -27,7 +28,7 @@ STEPS = 5
 _POINTS, _SPOTS = 2048, 32768
 # Side, in pixels, of the tiles in which the image is summed; they stay in the CPU's cache.
 _TILE = 512
-# Distance of the depths of stray light, mm; cores are computed half-way, too.
+# Distance of the reduced depths of stray light, mm; cores are computed half-way, too.
 _STEP = 0.5
 # Edges of the rings with a stamp each, in field radii: narrower than those of volumes, as they cost points nothing.
 _RINGS = tuple(np.arange(1, 29) / 8)
@@ -193,8 +194,9 @@ def full_image_of_points(
 ) -> Float[np.ndarray, "row column"]:
     """The image of points with the field-varying PSF, as `forward` computes it for voxels.
 
-    Cores are stamps in narrow rings of the field, interpolated between depths that are 0.25 mm apart; stray light is
-    interpolated between depths that are 0.5 mm apart. Nearer depths do not change the image of 120 ray-traced points.
+    Cores are stamps in narrow rings of the field, interpolated between reduced depths that are 0.25 mm apart; stray
+    light is interpolated between some that are 0.5 mm apart. Nearer depths do not change the image of 120 ray-traced
+    points.
 
     Parameters
     ----------
@@ -206,7 +208,7 @@ def full_image_of_points(
         Shows how much is done.
     """
     depths = np.unique(points[:, 2])
-    steps = math.ceil((depths[-1] - depths[0]) / _STEP)
+    steps = math.ceil((depths[-1] - depths[0]) / _STEP / float(object_index(imager.sample)))
     few = depths.size <= steps + 1
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2

@@ -19,6 +19,7 @@ from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
+from ..layers import object_index
 from ..lenses import lenses_by_type
 from ..optics.field_varying import field_varying_psf, make_polar_grid
 from ..optics.lens_types import relative_areas, split_by_type
@@ -32,8 +33,8 @@ Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "r
 
 # Chief rays alone make no image of a point.
 OPTICS = tuple(level for level in FIDELITIES if level != "pinhole")
-# Spacing of the depths at which the PSF of points is computed, mm: between, it changes by less than a pixel's width;
-# and the number of these depths held in memory at once.
+# Spacing of the reduced depths at which the PSF of points is computed, mm: between, it changes by less than a pixel's
+# width; and the number of these depths held in memory at once.
 _STEP, _SLAB = 0.1, 48
 # Mean from which `poisson` uses an expansion. The first term of the sum below is larger than `_poisson_by_sum` needs.
 EXPANDED = 16.0
@@ -179,7 +180,7 @@ def simulate_points(
         return full_image_of_points(points, imager, progress)
     near, far = points[:, 2].min(), points[:, 2].max()
     depths = np.unique(points[:, 2])
-    if depths.size > (count := math.ceil((far - near) / _STEP) + 1):
+    if depths.size > (count := math.ceil((far - near) / _STEP / float(object_index(imager.sample))) + 1):
         depths = np.linspace(near, far, count)
     sensor = Sensor(imager.sensor.shape, imager.sensor.pixel_pitch / STEPS, imager.sensor.origin)
     kernel = psf_of_depth(eqx.tree_at(lambda i: i.sensor, imager, sensor), depths, kind, STEPS)
