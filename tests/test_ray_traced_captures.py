@@ -1,6 +1,7 @@
 import pytest
 
 from experiments.ray_traced_captures import run
+from experiments.through_layers import on_points
 from gs_jax.base.progress import Progress
 
 from .helpers import needs
@@ -20,3 +21,13 @@ def test_every_one_of_120_ray_traced_points_is_a_peak():
     assert many["points_that_are_peaks"] >= 0.95 * many["points"]
     assert many["points_among_as_many_brightest_peaks"] >= 0.9 * many["points"]
     assert many["lateral_rmse_um"] <= 20  # half a voxel's diagonal is 21
+
+
+def test_points_in_a_gel_are_where_they_are():
+    """By another group's tracer, through a filter, a window and a cover slip; without them nothing is right."""
+    needs("geomscope/centers.csv")
+    result = on_points(needs("oracle/layers/L_points.tif").parent, Progress())
+    found = result["with layers"]
+    assert found["f1"] >= 0.99 and found["lateral_rmse_um"] <= 4 and found["axial_rmse_um"] <= 30
+    assert result["model"]["bin_4"]["correlation"] >= 0.97 and abs(result["model"]["light"] - 1) <= 0.05
+    assert result["layers ignored"]["axial_rmse_um"] > 1000
