@@ -30,7 +30,7 @@ Point = Float[Array | np.ndarray, "2"] | tuple[ScalarLike, ScalarLike]
 Module = TypeVar("Module", Imager, MicrolensArray)
 
 # Newton steps for the height of a ray. Each squares an error that starts at 1e-3, or at 1e-2 within a sample.
-_NEWTON_STEPS, _LAST_STEP = 4, 1e-8
+_NEWTON_STEPS, _LAST_STEP = 4, 1e-10
 
 
 class RefractedRay(NamedTuple):
@@ -192,6 +192,12 @@ def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> 
     difference, the third the derivative by `h` of what the layers make of it, before the last step.
     """
     square, excess, change = dot(across, across), paraxial + 0 * across[0], 0.0
+    on_host = isinstance(square, np.ndarray)
+    if on_host:
+        # To third order, and bounded.
+        slope2 = square / (reduced * reduced)
+        third = sum(thickness * (n**2 - 1) / (2 * n**3) for thickness, n in slabs)
+        excess = excess - slope2 / (1 + slope2 / 2) * third
     for _ in range(_NEWTON_STEPS):
         h = reduced + excess
         slope2 = square / (h * h)
@@ -205,8 +211,8 @@ def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> 
         change = slope2 * change / h
         step = (excess - paraxial + slope2 * off) / (1 - change)
         excess = excess - step
-        # On the host, as soon as the next step would be below the rounding.
-        if isinstance(step, np.ndarray) and (np.abs(step) < _LAST_STEP * reduced).all():
+        # As soon as the next step would be 1e-10 of the height: rays land within a tenth of a picometre.
+        if on_host and (step * step * change <= _LAST_STEP * h * h).all():
             break
     return reduced + excess, excess, change
 
