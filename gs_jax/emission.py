@@ -25,6 +25,15 @@ class EmissionBand(eqx.Module):
     ------
     ValueError
         If the numbers are not one for each wavelength, or out of range.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> band = gs.EmissionBand([0.25, 0.5, 0.25], [505e-6, 520e-6, 535e-6], lens=[0.0008, 0.0, -0.0008])
+    >>> len(band)
+    3
+    >>> gs.geomscope().replace(bandwidth_nm=40.0, refractive_index="PDMS").imager().band.wavelengths.shape
+    (3,)
     """
 
     weights: Float[Array, " line"] = eqx.field(converter=as_float)

@@ -318,7 +318,7 @@ class Imager(eqx.Module):
         return envelope((views.offset**2).sum(-1), views.reduced_depth, self.field_radius)
 
 
-def check_beyond(imager: Imager, depths: Iterable[float], name: str) -> None:
+def check_beyond(imager: Imager, depths: Iterable[float] | Float[Array | np.ndarray, "..."], name: str) -> None:
     """Raise `InputError` unless depths, mm from the array, are where layers leave room for the object. Host code."""
     if imager.filters is None and imager.sample is None:
         return
