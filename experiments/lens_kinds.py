@@ -29,7 +29,7 @@ from gs_jax.design.design import Design, design_text, read_design
 from gs_jax.geometry import envelope
 from gs_jax.optics.apertures import clear_diameter
 from gs_jax.optics.psf import diffraction_psf
-from gs_jax.optics.raytrace import pupil_quadrature
+from gs_jax.optics.pupil import pupil_quadrature
 
 FOLDER = Path(__file__).parents[1] / "design"
 # Orientation, and whether the conic constant is free.

@@ -34,7 +34,8 @@ from gs_jax.optics.aberrations import best_focus, independent_rms, seidel_of_arr
 from gs_jax.optics.apertures import aperture_area
 from gs_jax.optics.diffraction import strehl
 from gs_jax.optics.psf import diffraction_psf, geometric_psf
-from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
+from gs_jax.optics.pupil import pupil_quadrature
+from gs_jax.optics.raytrace import trace_lenslet
 
 WAVELENGTH = 520e-6
 # Pupil radius, mm: about half the paper's pitch (1.23 mm), and the largest at which the lens can be traced to a field

@@ -7,7 +7,8 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.optics.psf import PSFS, psf_of_depth
-from gs_jax.optics.raytrace import pupil_quadrature, trace_lenslet
+from gs_jax.optics.pupil import pupil_quadrature
+from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.simulation.synthetic import simulate, simulate_points, simulate_volume
 
 

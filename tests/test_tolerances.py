@@ -43,7 +43,7 @@ from gs_jax.objectives import Conditions
 from gs_jax.objectives.conditions import field_heights
 from gs_jax.optics import theory
 from gs_jax.optics.diffraction import axial_strehl, strehl
-from gs_jax.optics.raytrace import pupil_quadrature
+from gs_jax.optics.pupil import pupil_quadrature
 
 from .test_cli import run
 

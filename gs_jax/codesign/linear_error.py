@@ -37,7 +37,8 @@ from ..layers import object_index
 from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
 from ..objectives.paraxial import occupancy
 from ..optics import theory
-from ..optics.raytrace import pupil_quadrature, trace_lenslet
+from ..optics.pupil import pupil_quadrature
+from ..optics.raytrace import trace_lenslet
 
 # Lit fraction of a plane of the scene, and the distance over which its correlation falls to 1/e, mm.
 FILL, LENGTH = 0.03, 0.05

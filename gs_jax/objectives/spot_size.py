@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
 from ..optics import theory
-from ..optics.raytrace import pupil_quadrature, trace_lenslet
+from ..optics.pupil import pupil_quadrature
+from ..optics.raytrace import trace_lenslet
 from .conditions import Depths, as_conditions, best_type, clear_diameter, field_heights, field_radius
 
 # Share of the light within the encircled radius.

@@ -33,7 +33,8 @@ from ..base.arrays import safe_quotient, safe_sqrt
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..typing import Real, Result, ScalarLike
-from .raytrace import Point, chief_ray_length, direction_cosines, pupil_quadrature, pupil_radius, trace_lenslet
+from .pupil import pupil_quadrature, pupil_radius
+from .raytrace import Point, chief_ray_length, direction_cosines, trace_lenslet
 
 # Gauss-Newton steps to the best focus. The first is right to 1e-3, and each squares its error.
 _FOCUS_STEPS = 3

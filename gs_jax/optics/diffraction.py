@@ -18,7 +18,8 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from ..geometry import Imager
 from ..typing import ScalarLike
-from .raytrace import Point, chief_ray_length, direction_cosines, pupil_quadrature, pupil_radius, trace_lenslet
+from .pupil import pupil_quadrature, pupil_radius
+from .raytrace import Point, chief_ray_length, direction_cosines, trace_lenslet
 
 # Straight edges of the aperture: vectors `(x, y)` from the vertex to the nearest point of each, mm.
 Edges = Float[Array | np.ndarray, "edge 2"] | None

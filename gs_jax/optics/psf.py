@@ -20,8 +20,8 @@ from ..geometry import Imager, chief_ray
 from ..typing import ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
-from .pupil import vogel_spiral
-from .raytrace import Point, pupil_quadrature, pupil_radius, trace_lenslet
+from .pupil import pupil_quadrature, pupil_radius, vogel_spiral
+from .raytrace import Point, trace_lenslet
 from .spectrum import emission_lines
 from .theory import airy_sigma, cutoff_frequency
 

@@ -1,14 +1,15 @@
-"""Rays over the clear aperture of the mean lens, and the light in each. Host code."""
+"""Points and rays over the pupil: the clear aperture of the mean lens, the light in each ray, and quadrature."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Array, Float, Float64
 
 from ..geometry import Imager
 from ..lenses import EACH, MicrolensArray, sag
-from ..typing import Coordinates, Scalars
+from ..typing import Coordinates, ScalarLike, Scalars
 from .apertures import clear_area
 from .radiometry import solid_angle, transmittance
 from .raytrace import refract, to_numpy
@@ -145,3 +146,24 @@ def add_diffraction(imager: Imager, rays: PupilSamples) -> PupilSamples:
 def vogel_spiral(radius: Float[np.ndarray, " k"], order: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:
     """Points of Vogel's spiral with these radii and numbers: evenly spread angles."""
     return radius[:, None] * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)], -1)
+
+
+def pupil_radius(imager: Imager, radius: ScalarLike | None = None) -> Float[Array, ""]:
+    """`radius` in the imager's precision; half the aperture's diameter if it is None."""
+    if radius is None:
+        return imager.array.aperture_diameter / 2
+    return jnp.asarray(radius, imager.sensor_distance.dtype)
+
+
+def pupil_quadrature(radius: ScalarLike, rings: int = 8) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
+    """Points and weights (sum 1) of the mean over a disc, exact for polynomials up to degree `4 rings - 2`.
+
+    Gauss-Legendre in the squared radius, equal angles around (Abramowitz and Stegun 25.4.61).
+    """
+    radius = jnp.asarray(radius)
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    around = 4 * rings
+    angle = 2 * np.pi * (np.arange(around) + 0.5) / around
+    unit = np.sqrt((nodes + 1) / 2)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    points = jnp.asarray(unit.reshape(-1, 2), radius.dtype) * radius
+    return points, jnp.asarray(np.repeat(weights / (2 * around), around), radius.dtype)

@@ -336,27 +336,6 @@ def chief_ray_length(imager: Imager, chief: LensletRay) -> Float[Array, ""]:
     return behind * jnp.sqrt(1 + squared)
 
 
-def pupil_radius(imager: Imager, radius: ScalarLike | None = None) -> Float[Array, ""]:
-    """`radius` in the imager's precision; half the aperture's diameter if it is None."""
-    if radius is None:
-        return imager.array.aperture_diameter / 2
-    return jnp.asarray(radius, imager.sensor_distance.dtype)
-
-
-def pupil_quadrature(radius: ScalarLike, rings: int = 8) -> tuple[Float[Array, "point 2"], Float[Array, " point"]]:
-    """Points and weights (sum 1) of the mean over a disc, exact for polynomials up to degree `4 rings - 2`.
-
-    Gauss-Legendre in the squared radius, equal angles around (Abramowitz and Stegun 25.4.61).
-    """
-    radius = jnp.asarray(radius)
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
-    around = 4 * rings
-    angle = 2 * np.pi * (np.arange(around) + 0.5) / around
-    unit = np.sqrt((nodes + 1) / 2)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    points = jnp.asarray(unit.reshape(-1, 2), radius.dtype) * radius
-    return points, jnp.asarray(np.repeat(weights / (2 * around), around), radius.dtype)
-
-
 def direction_cosines(tangent: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
     """Lateral direction cosines of a ray with the slopes `tangent`."""
     return tangent / jnp.sqrt(1 + jnp.sum(tangent**2, -1, keepdims=True))
