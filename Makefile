@@ -10,7 +10,8 @@ TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # Libraries older or newer than the others warn of each other.
 SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -m "not slow" \
 	$(addprefix tests/test_,imports.py linear_map.py cpu_kernels.py operators.py shipped_capture.py solve.py files.py \
-	mold_files.py solvers.py::test_it_finds_two_bright_voxels)
+	mold_files.py layers.py solvers.py::test_it_finds_two_bright_voxels \
+	apertures.py::test_a_compiled_lens_does_not_bound_itself)
 # Of the oldest Python, which has the lowest versions; of the newest at hand.
 LOWEST := .venv-lowest/bin/python
 NEWEST := .venv-newest/bin/python

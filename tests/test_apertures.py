@@ -56,6 +56,14 @@ def test_the_edge_is_where_points_change_hands():
         assert np.all((owner == np.arange(32)[:, None]) == inside)
 
 
+@pytest.mark.parametrize("scale", [1.1, 0.9, 1.37])
+def test_a_compiled_lens_does_not_bound_itself(scale):
+    """Compilers that optimise fuse the product into the difference of centres: not 0 of a lens and itself."""
+    lenses = array([[-1.313, 0.437], [0.221, 0.119], [1.127, -0.741], [0.333, 1.416], [-0.629, -1.243]], diameter=1.1)
+    areas = lambda scale: aperture_area(dataclasses.replace(lenses, centers=scale * lenses.centers))
+    np.testing.assert_allclose(jax.jit(areas)(jnp.array(scale)), areas(jnp.array(scale)), rtol=1e-9)
+
+
 def test_area_is_the_integral_of_the_edge():
     lenses, count = array(layout(32)), 4096
     angles = (np.arange(count) + 0.5) * (2 * np.pi / count)

@@ -201,9 +201,13 @@ def small_parent(depth_count):
 
 @pytest.mark.slow
 def test_terms_have_gradients():
-    """Finite differences of 1e-5 in float64 are good to 1e-6 of the curvature; kinks are elsewhere."""
+    """Finite differences of 1e-5 in float64 are good to 1e-6 of the curvature.
+
+    Kinks are elsewhere: of a sphere, whose two curvatures are one, the larger has one.
+    """
     parent = small_parent(2)
-    values = start_values(*parent) | {"sensor_distance_mm": jnp.array(5.7), "aperture_diameter_mm": jnp.array(1.1)}
+    start = {"sensor_distance_mm": 5.7, "aperture_diameter_mm": 1.1, "conic_constant": -0.2}
+    values = start_values(*parent) | {name: jnp.array(value) for name, value in start.items()}
     check_grads(
         jax.jit(lambda values: everything(*candidate(*parent, values=values))), (values,), order=1, eps=1e-5, rtol=1e-3
     )

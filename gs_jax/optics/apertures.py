@@ -24,6 +24,8 @@ from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses computed at once, and neighbours that may bound a lens. A cell of a random layout has six on average.
 _BATCH, _NEIGHBOURS = 16, 64
+# Lenses nearer than this part of their diameter are in one place.
+_COINCIDENT = 1e-5
 # For lenses that differ: neighbours, radii in each direction at which the edge is bracketed, and bisections.
 _NEAREST, _BRACKETS, _BISECTIONS = 32, 24, 20
 
@@ -253,7 +255,8 @@ def pitch(centers: Float[Array | np.ndarray, "lens 2"]) -> tuple[Float[Array, ""
 def _bisectors(offset, diameter):
     """Unit normals and distances of the bisectors with lenses at these offsets; for the lens itself, out of reach."""
     distance = safe_sqrt(jnp.sum(offset**2, axis=1))
-    apart = distance > 0
+    # Not 0: compiled, the difference of a lens's centre and itself may be rounded to another number.
+    apart = distance > _COINCIDENT * diameter
     along_x = jnp.array([[1, 0]], offset.dtype)
     normal = jnp.where(apart[:, None], offset, along_x) / jnp.where(apart, distance, 1)[:, None]
     return normal, jnp.where(apart, distance / 2, diameter)
