@@ -85,7 +85,6 @@ def schema() -> dict[str, Any]:
     array["properties"] |= more["properties"]
     array["required"].remove("centers_mm")
     array["oneOf"] = [{"required": [name]} for name in ("centers_mm", "centers_file")]
-    made["$defs"]["ImagingTable"]["properties"]["spectrum_file"] = {"type": "string", "minLength": 1}
     # The centres file may have these columns.
     lens = made["$defs"]["LensTable"]
     lens["required"] = [name for name in lens["required"] if name not in LENS_KEYS]
@@ -95,6 +94,8 @@ def schema() -> dict[str, Any]:
             key = design_keys()[f"{table}.{name}".removeprefix(".")]
             field.pop("title", None)
             field["description"] = _comment_text(key)
+    file = {"type": "string", "minLength": 1, "description": "in place of `spectrum_nm`: the name of a CSV file"}
+    made["$defs"]["ImagingTable"]["properties"]["spectrum_file"] = file
     return {"$schema": "http://json-schema.org/draft-07/schema#"} | _for_toml(made) | {"title": "A design of gs-jax"}
 
 
