@@ -60,6 +60,7 @@ def test_a_spectrum_of_a_file(tmp_path):
     assert gs.read_design(tmp_path / "again.toml") == gs.read_design(tmp_path / "mine.toml")
 
 
+@pytest.mark.integration
 def test_psfs_are_means_over_the_wavelengths():
     scope = design(bandwidth_nm=60.0).imager()
     lines = emission_lines(scope)

@@ -153,6 +153,7 @@ def test_layers_of_index_one_are_air():
     np.testing.assert_allclose(*light, rtol=1e-12)
 
 
+@pytest.mark.integration
 def test_derivatives_by_thickness_index_and_gap():
     grid = gs.Grid([20.5, 22.0], (9, 9), 0.2)
     scope, cover = layered(), gs.Layers([0.17], [1.523])
