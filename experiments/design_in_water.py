@@ -6,7 +6,7 @@ of the same study, which starts from `geomscope` with the layers. Depths are 18,
 
     python -m experiments.design_in_water [--out DIR]
 
-Writes `water.json`, `water.md` and the design, `geomscope-exposure-water.toml`; about two minutes of processor time.
+Writes `water.json` and `water.md`; about two minutes of processor time.
 """
 
 from pathlib import Path
