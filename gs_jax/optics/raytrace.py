@@ -30,7 +30,7 @@ Point = Float[Array | np.ndarray, "2"] | tuple[ScalarLike, ScalarLike]
 Module = TypeVar("Module", Imager, MicrolensArray)
 
 # Newton steps for the height of a ray. Each squares an error that starts at 1e-3, or at 1e-2 within a sample.
-_NEWTON_STEPS, _LAST_STEP = 4, 1e-10
+_NEWTON_STEPS, _LAST_STEP = 4, 1e-14
 
 
 class RefractedRay(NamedTuple):
@@ -211,7 +211,7 @@ def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> 
         change = slope2 * change / h
         step = (excess - paraxial + slope2 * off) / (1 - change)
         excess = excess - step
-        # As soon as the next step would be 1e-10 of the height: rays land within a tenth of a picometre.
+        # As soon as the next step would be 1e-14 of the height: solid angles, too, are those of compiled rays.
         if on_host and (step * step * change <= _LAST_STEP * h * h).all():
             break
     return reduced + excess, excess, change
