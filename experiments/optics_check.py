@@ -30,6 +30,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
 from gs_jax.geometry import envelope
 from gs_jax.io.captures import read_capture
+from gs_jax.layers import layers_in_front, object_index
 from gs_jax.optics.aberrations import best_focus, independent_rms, seidel_of_array, wavefront_rms
 from gs_jax.optics.apertures import aperture_area
 from gs_jax.optics.diffraction import strehl
@@ -110,14 +111,8 @@ def optiland_rays(imager: Imager, depth: float, points: Float[np.ndarray, "ray 2
 
 def _layers(imager: Imager, depth: float) -> tuple[tuple[float, float], list[tuple[float, float]]]:
     """Thickness and index of the object's medium in front of the point, and of what follows up to the array."""
-    sample, layers = imager.sample, [] if imager.filters is None else imager.filters.slabs[::-1]
-    cover = [] if sample is None or sample.layers is None else sample.layers.slabs
-    filled = sum(float(thickness) for thickness, _ in (*layers, *cover))
-    if sample is None or sample.surface is None:
-        index = 1.0 if sample is None else float(sample.refractive_index)
-        return (depth - filled, index), [*cover, *layers]
-    surface = float(sample.surface)
-    return (depth - surface, float(sample.refractive_index)), [*cover, (surface - filled, 1.0), *layers]
+    layers = [(float(t), float(n)) for t, n in layers_in_front(imager.filters, imager.sample)[::-1]]
+    return (depth - sum(t for t, _ in layers), float(object_index(imager.sample))), layers
 
 
 def compare(imager: Imager, depth: float, field: float, radius: float = RADIUS) -> dict:

@@ -27,7 +27,7 @@ from .base.arrays import (
 )
 from .base.errors import input_error
 from .emission import EmissionBand
-from .layers import Layers, Sample, check_room, depth_of_reduced, object_surface, reduced_distance
+from .layers import Layers, Sample, check_room, depth_of_reduced, object_index, object_surface, reduced_distance
 from .lenses import MicrolensArray
 from .sensor import Sensor
 from .typing import Scalar, Scalars
@@ -214,6 +214,13 @@ class Imager(eqx.Module):
         """
         depth = array_namespace(self.sensor_distance).asarray(depth)
         return reduced_distance(depth, self.filters, self.sample) + self.array.reduced_thickness_front
+
+    def depth_in_medium(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
+        """Distance `n z'` that the lens vertices would have if all were of the object's medium, mm.
+
+        A point that moves by `dz` moves by `dz / (n z')` of this; and a lens takes `1 / (n z')^2` of its light.
+        """
+        return object_index(self.sample) * self.reduced_depth(depth)
 
     def depth_of(self, reduced_depth: Scalars) -> Scalars:
         """Depth `z` of a reduced depth `z'`, mm."""

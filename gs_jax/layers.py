@@ -78,8 +78,8 @@ class Sample(eqx.Module):
         Depth at which the medium begins, from the array's front, mm. None, the default, is a medium in contact with
         what is in front of it: the layers on the array, or its plano face.
     layers
-        Between the air and the medium, from the medium outward: a cover slip, the bottom of a dish. They end where
-        the medium begins.
+        Between the medium and the air, from the medium toward the array: a cover slip, the bottom of a dish. They end
+        where the medium begins.
 
     Raises
     ------
@@ -157,6 +157,19 @@ def check_room(
             raise ValueError(f"`{name}` must be {needed:.6g} mm, as thick as {what}, or more, got {found:.6g} mm.")
 
 
+def layers_in_front(filters: Layers | None, sample: Sample | None) -> list[tuple[Scalar, Scalar]]:
+    """Thickness and index of all between the array's front and the object's medium, from the array outward, mm.
+
+    A sample with a surface has a gap of air before it, whose thickness may be 0.
+    """
+    front = [] if filters is None else filters.slabs
+    if sample is None:
+        return front
+    cover = [] if sample.layers is None else sample.layers.slabs[::-1]
+    gap = [] if sample.surface is None else [(sample.surface - sum(t for t, _ in (*front, *cover)), 1.0)]
+    return [*front, *gap, *cover]
+
+
 def object_slabs(depth: Scalars, filters: Layers | None, sample: Sample | None) -> list[tuple[Scalars, Scalar]]:
     """Thickness and index of what a ray crosses between the array and a depth that is not air, mm."""
     slabs = [] if filters is None else filters.slabs
@@ -168,8 +181,4 @@ def object_slabs(depth: Scalars, filters: Layers | None, sample: Sample | None) 
 
 def object_indices(filters: Layers | None, sample: Sample | None) -> list[Scalar]:
     """Indices that a ray meets from the object's medium, which comes first, to the array's front."""
-    indices = [1.0] if sample is None else [sample.refractive_index]
-    if sample is not None:
-        cover = [] if sample.layers is None else list(sample.layers.refractive_index)
-        indices += [*cover, *([] if sample.surface is None else [1.0])]
-    return indices + ([] if filters is None else list(filters.refractive_index[::-1]))
+    return [object_index(sample), *(index for _, index in reversed(layers_in_front(filters, sample)))]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gs_jax as gs
-from gs_jax.cli.light import Light
+from gs_jax.calibration.sample import with_sample
 from gs_jax.io.depth_frames import frame_of
 from gs_jax.io.napari import reader
 
@@ -76,9 +76,10 @@ def test_what_a_calibration_finds_of_a_sample_goes_where_it_is_from(lab):
     stack = [{"name": "filter", "thickness_mm": 2.0, "refractive_index": "BK7"}, {"thickness_mm": 15.0}, slip]
     design = gs.read_design("lab.toml").replace(layers={"object": stack}, sample={"refractive_index": "water"})
     # The slip moves with the surface; it becomes the sample's.
-    moved = gs.Sample(1.334, 17.5, gs.Layers([0.17], [1.523]))
+    water = gs.refractive_index("water", 520.0)
+    moved = gs.Sample(water, 17.5, gs.Layers([0.17], [1.523]))
     scope = dataclasses.replace(design.imager(), filters=gs.Layers([2.0], [1.52]), sample=moved)
-    new = Light(None, None, None, None).found(design, scope, ["tilt", "sample_at"])
+    new = with_sample(design, scope, None)
     assert new.layers.object == design.layers.object[:1] and new.samples == design.samples
     assert new.sample.model_dump(exclude_defaults=True) == {
         "refractive_index": "water",
@@ -86,10 +87,9 @@ def test_what_a_calibration_finds_of_a_sample_goes_where_it_is_from(lab):
         "layers": (slip,),
     }
     scope = dataclasses.replace(design.imager("gel"), sample=gs.Sample(1.44, 19.5, moved.layers))
-    new = Light("gel", None, None, None).found(design, scope, ["sample_at", "sample_index"])
+    new = with_sample(design, scope, "gel")
     gel = new.samples["gel"]
     assert (new.sample, gel.refractive_index, gel.surface_mm) == (design.sample, 1.44, 19.5)
-    assert Light("gel", None, None, None).found(design, scope, ["tilt"]) is design
 
 
 SIMULATE, METRICS = ("simulate", "points.csv", "lab.toml"), ("metrics", "lab.toml")
@@ -127,7 +127,7 @@ def test_a_file_that_says_array_is_not_taken_for_another(lab, monkeypatch, capsy
     gs.write_points("points.csv", TRUTH, provenance={"depths_from": "array"})
     how = ("--sample", "gel", "--depths-from", "sample", "-o", "a.tif")
     status, _, err = run(monkeypatch, capsys, *SIMULATE, *how)
-    assert status == 2 and "--depths-from must be array for depths that count from the array" in err
+    assert status == 2 and "--depths-from must be array, as SCENE says" in err
 
 
 def test_metrics_show_the_path_of_the_light(lab, monkeypatch, capsys):

@@ -16,19 +16,26 @@ from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance
 from ..io.toml import one_line
+from ..layers import layers_in_front
 from ..lenses import EACH, MicrolensArray
 from .fit import Calibration
+from .sample import with_sample
 
 # Length of the longest arrow in the figure, in sides of the sensor.
 _LONGEST = 0.08
 
 
-def apply_calibration(design: Design, result: Calibration, provenance: Provenance | None = None) -> Design:
+def apply_calibration(
+    design: Design, result: Calibration, provenance: Provenance | None = None, *, sample: str | None = None
+) -> Design:
     """The design with the calibrated values, which its provenance lists, too; `InputError` if it is not valid.
 
-    Lenses that turn out to be imaged beside the sensor are left out.
+    Lenses that turn out to be imaged beside the sensor are left out. What was fitted of a sample goes into the one of
+    `[samples]` that `sample` names, or into `[sample]`.
     """
     imager = result.imager
+    if not {"sample_at_mm", "sample_index"}.isdisjoint(result.values):
+        design = with_sample(design, imager, sample)
     one = lambda value: float(f"{float(value):.9g}")
 
     def pair(values) -> tuple[float, float]:
@@ -73,11 +80,10 @@ def apply_calibration(design: Design, result: Calibration, provenance: Provenanc
 
 def medium_in_words(imager: Imager) -> str:
     """What holds the object, and the layers between it and the array."""
-    sample, slabs = imager.sample, [] if imager.filters is None else imager.filters.slabs
-    medium = "air"
+    sample, medium = imager.sample, "air"
     if sample is not None:
         medium = f"n = {float(sample.refractive_index):.4g} from z = {float(imager.sample_surface):.5g} mm"
-        slabs = slabs + ([] if sample.layers is None else sample.layers.slabs[::-1])
+    slabs = layers_in_front(imager.filters, sample)
     layers = [f"{float(t):g} mm of n = {float(n):g}" for t, n in slabs if float(n) != 1]
     return f"{medium}, behind {' and '.join(layers)}" if layers else medium
 

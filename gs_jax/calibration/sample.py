@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError
+from ..design.design import Design
+from ..design.imagers import sample_tables
+from ..design.light_path import layers_of, sample_table
 from ..geometry import Imager
 from ..layers import Layers, object_surface
+from ..materials import index_of
 
 # Where the sample begins, mm, and its refractive index.
 OF_SAMPLE = ("sample_at", "sample_index")
@@ -59,3 +63,29 @@ def check_fitted_sample(imager: Imager) -> None:
         if value is not None and float(value) < lowest * (1 - 1e-6):
             needs = f"{name} must be {lowest:.6g}{unit} or more"
             raise InputError(f"captures: {needs}, got {float(value):.6g} as what fits the spots best; hold {name}.")
+
+
+def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
+    """The design with the sample of an imager as `[sample]`, or as the one of `[samples]` with this name.
+
+    What is named in the design, materials and layers, keeps its name where it has the same numbers. A fit of the
+    surface may have made the device's layers behind the gap of air the sample's, with which they move.
+    """
+    sample, before, wavelength = imager.sample, sample_table(design, name), 1e6 * float(imager.wavelength)
+    assert sample is not None
+    found = sample_tables(sample)
+    if np.isclose(index_of(before.refractive_index, wavelength), float(sample.refractive_index), rtol=1e-6):
+        found["refractive_index"] = before.refractive_index
+    if _alike(layers_of(before.layers[::-1], wavelength), sample.layers):
+        found["layers"] = before.model_dump()["layers"]
+    kept = design.layers.object[: 0 if imager.filters is None else len(imager.filters.thickness)]
+    layers = design.layers.model_copy(update={"object": kept})
+    if name in design.samples:
+        return design.replace(layers=layers, samples={**design.samples, name: found})
+    return design.replace(layers=layers, sample=found)
+
+
+def _alike(one: Layers | None, other: Layers | None) -> bool:
+    if one is None or other is None or len(one.thickness) != len(other.thickness):
+        return False
+    return np.allclose(np.array(one.slabs), np.array(other.slabs), rtol=1e-6)

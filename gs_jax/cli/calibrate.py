@@ -11,10 +11,8 @@ from .files import check_may_write, force_option, provenance_of
 from .light import Light, light_options
 from .options import DESIGN, CaptureOptions, capture_options
 
-_NAMES = (
-    *("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses"),
-    *("sample-at", "sample-index"),
-)
+_OF_DEVICE = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
+_NAMES = (*_OF_DEVICE, "sample-at", "sample-index")
 
 
 class _Names(click.ParamType):
@@ -122,8 +120,8 @@ def calibrate_command(
             images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
             options = {"captures": of, "fit": names, "find_lenses": find_lenses}
             outcome = calibrate(images, points, imager, **options, progress=progress)
-    found = light.found(microscope, outcome.imager, names)
-    write_design(output, apply_calibration(found, outcome, camera.recorded(provenance_of(*inputs))))
+    provenance = camera.recorded(provenance_of(*inputs))
+    write_design(output, apply_calibration(microscope, outcome, provenance, sample=light.sample))
     write_figure(drawing, plot_residuals(outcome))
     camera.print_corrections()
     Console().print(summary_table(microscope, outcome, with_surface(imager, names)))

@@ -46,28 +46,6 @@ class Light(NamedTuple):
         near, far = design.imaging.working_distance_mm
         return max(near, float(str(imager.sample_surface))), far
 
-    def found(self, design, imager, fitted: Iterable[str]) -> Any:
-        """The design with what was fitted of the sample, in the table that it is from; of options, in `[sample]`.
-
-        A fit of the surface may have made the device's layers behind the gap of air the sample's, with which they move.
-        """
-        from ..design.imagers import sample_tables
-        from ..design.light_path import sample_table
-
-        found = sample_tables(imager.sample) if any(name.startswith("sample_") for name in fitted) else None
-        if found is None:
-            return design
-        before = {} if self.refractive_index is not None else sample_table(design, self.sample).model_dump()
-        if "sample_index" not in fitted and before:
-            found["refractive_index"] = before["refractive_index"]
-        if len(before.get("layers", ())) == len(found["layers"]) and before:
-            found["layers"] = before["layers"]
-        kept = design.layers.object[: 0 if imager.filters is None else len(imager.filters.thickness)]
-        layers = design.layers.model_copy(update={"object": kept})
-        if self.sample in design.samples:
-            return design.replace(layers=layers, samples={**design.samples, self.sample: found})
-        return design.replace(layers=layers, sample=found)
-
     def origin(self, imager) -> float | None:
         """Depth from which depths count, mm; None if it is the array."""
         if self.depths_from == "array":

@@ -157,8 +157,7 @@ def reconstruct_command(
         given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
-            files = {"design_text": text, "capture": capture, "camera": camera, "points": points}
-            files |= {"frame": frame}
+            files = {"design_text": text, "capture": capture, "camera": camera, "points": points, "frame": frame}
             how = {"track": track, "interval": frame_interval, "resume": resume}
             with workers:
                 return reconstruct_recording(

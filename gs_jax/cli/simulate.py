@@ -98,9 +98,7 @@ def _placed(scene: Path, objects, grid, light: Light, imager):
 
     origin, said = light.origin(imager), frame_of(scene)
     if origin is not None and said == "array":
-        raise InputError(
-            "--depths-from must be array for depths that count from the array, as the file says, got sample."
-        )
+        raise InputError("--depths-from must be array, as SCENE says that its depths count from there, got sample.")
     moved = (origin or 0.0) if said is None else 0.0
     if grid is None:
         objects = objects + np.array([0, 0, moved, 0])

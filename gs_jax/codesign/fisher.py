@@ -31,7 +31,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager, envelope
-from ..layers import object_index
 from ..objectives.conditions import Conditions, field_radius
 from ..typing import Real
 from .linear_error import lens_electrons, noise_density, transfer_power
@@ -252,7 +251,7 @@ def _information(imager, at, spot, place) -> Float[Array, "depth 3 3"]:
     weight = envelope(jnp.sum(beside**2, 1)[None], imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
     light = lens_electrons(imager, at)[:, None] * weight
     per_shift = light**2 * slope[:, None] / (noise + light * energy[:, None])
-    along = object_index(imager.sample) * imager.reduced_depth(at.depths)
+    along = imager.depth_in_medium(at.depths)
     # Derivative of image positions by x, y, z, divided by the magnification.
     shift = jnp.concatenate(
         [

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..geometry import Imager, field_limit
 from ..grid import Grid
-from ..layers import object_index
 from ..objectives.conditions import Conditions, finite_plate, per_type
 from .array_psf import array_spectrum, condition_number, mean_inverse_views, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
@@ -42,7 +41,7 @@ def ghosts(imager: Imager, at: Conditions, key: PRNGKeyArray) -> Float[Array, ""
     sources, targets = _points(imager, at, near, _SOURCES), _points(imager, at, far, _TARGETS)
     pixel = imager.sensor.pixel_pitch
     size = 4 * pixel / imager.magnification(at.depths)[0]
-    axial = size * object_index(imager.sample) * imager.reduced_depth(at.depths)[0] / imager.field_radius
+    axial = size * imager.depth_in_medium(at.depths)[0] / imager.field_radius
     return sidelobes(imager, sources, targets, width=pixel, lateral=size, axial=axial).rms
 
 

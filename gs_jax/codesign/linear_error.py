@@ -33,7 +33,6 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
-from ..layers import object_index
 from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
 from ..objectives.paraxial import occupancy
 from ..optics import theory
@@ -202,8 +201,7 @@ def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
     # In a medium the lens takes a smaller solid angle.
-    away = object_index(imager.sample) * imager.reduced_depth(at.depths)
-    return at.exposure * area * (AWAY / away) ** 2
+    return at.exposure * area * (AWAY / imager.depth_in_medium(at.depths)) ** 2
 
 
 def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:

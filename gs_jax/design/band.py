@@ -72,8 +72,11 @@ def check_band(imaging: ImagingTable) -> None:
     if not spectrum:
         return
     wavelengths, light = np.array(spectrum).T
-    if len(set(wavelengths)) < len(wavelengths) or len(wavelengths) < 2 or not light.any():
-        raise ValueError("`imaging.spectrum_nm` must be two or more wavelengths, some with light, got others")
+    if (count := len(set(wavelengths))) < 2 or count < len(wavelengths):
+        got = f"{len(wavelengths)} of which {count} differ"
+        raise ValueError(f"`imaging.spectrum_nm` must be two or more wavelengths, each once, got {got}")
+    if not light.any():
+        raise ValueError("`imaging.spectrum_nm` must have light at some wavelength, got none")
     if not min(wavelengths) <= middle <= max(wavelengths):
         ends = f"{min(wavelengths):g} to {max(wavelengths):g} nm, of the spectrum"
         raise ValueError(f"`imaging.wavelength_nm` must be within {ends}, got {middle:g}")

@@ -17,7 +17,6 @@ from scipy.special import bdtrc
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..layers import object_index
 from ..lenses import lenses_by_type
 from ..optics.lens_types import core_width, split_by_type, type_weights
 from ..optics.psf_core import apparent_depths
@@ -207,7 +206,7 @@ def search_grid(imager: Imager, grid: Grid) -> Grid:
     middle = (near + far) / 2
     pitch = COARSE * imager.sensor.pixel_pitch / float(imager.magnification(middle))
     # A lens at the field radius sees a point move from plane to plane as from voxel to voxel.
-    step = pitch * float(object_index(imager.sample) * imager.reduced_depth(middle)) / imager.field_radius
+    step = pitch * float(imager.depth_in_medium(middle)) / imager.field_radius
     planes = near + step * np.arange(-1, math.ceil((far - near) / step) + 2)
     # `at`, as the outer planes may lie behind the array's front.
     return Grid.over(imager.sensor, depths=[middle], pitch=pitch).at(planes)

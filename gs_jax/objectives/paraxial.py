@@ -46,8 +46,8 @@ def lateral_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]
 def axial_resolution(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Axial resolution in focus, without aberrations (Eq. 6); a row a type."""
     at = as_conditions(imager, depths)
-    lateral, reduced = lateral_resolution(imager, at), imager.reduced_depth(at.depths)
-    return theory.axial_resolution(lateral, reduced, field_radius(imager, at)) * object_index(imager.sample)
+    along = imager.depth_in_medium(at.depths)
+    return theory.axial_resolution(lateral_resolution(imager, at), along, field_radius(imager, at))
 
 
 @by_type
@@ -141,7 +141,7 @@ def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     `n` is the index of the object's medium.
     """
     at = as_conditions(imager, depths)
-    away = object_index(imager.sample) * imager.reduced_depth(at.depths)
+    away = imager.depth_in_medium(at.depths)
     return lenses_per_point(imager, at) * (clear_diameter(imager, at) / 4 / away) ** 2
 
 

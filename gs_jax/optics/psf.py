@@ -203,8 +203,6 @@ def psf_of_depth(
     if kind == "diffraction":  # as fine as the aperture diffracts
         cutoff = float(cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, 2 * radius))
         make = partial(make, samples=math.ceil(cutoff * imager.sensor.pixel_pitch))
-    if len(lines) == 1:
-        return lambda depth: make(imager, depth, size=size, radius=radius)
 
     def mean_psf(depth):
         each = [weight * make(one, depth, size=size, radius=radius) for weight, one in lines]

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from ...base.errors import needs_extra
 from ...design.design import Design
 from ...geometry import Imager
-from ...layers import object_surface
+from ...layers import layers_in_front
 from ...layouts import cell_edges
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
@@ -159,14 +159,7 @@ def _faces(slabs: Sequence[tuple[Any, Any]]) -> list[_Face]:
 
 def _slabs(imager: Imager) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
     """Thickness and index of all layers: from the array's front to the object's medium, and from the sensor."""
-    filters, windows, sample = imager.filters, imager.windows, imager.sample
-    front, behind = ([] if part is None else part.slabs for part in (filters, windows))
-    if sample is not None:
-        cover = [] if sample.layers is None else sample.layers.slabs[::-1]
-        thickness = sum(float(each) for each, _ in [*front, *cover])
-        gap = float(object_surface(filters, sample)) - thickness
-        front = [*front, (max(gap, 0.0), 1.0), *cover]
-    return front, behind
+    return layers_in_front(imager.filters, imager.sample), [] if imager.windows is None else imager.windows.slabs
 
 
 def _layers(design: Design, imager: Imager, end: float, far: float) -> list[tuple[float, float, str]]:
