@@ -9,7 +9,7 @@ import pytest
 
 import gs_jax as gs
 from gs_jax.calibration.sample import with_sample
-from gs_jax.io.depth_frames import frame_of
+from gs_jax.io.depth_frames import DepthFrame, frame_of
 from gs_jax.io.napari import reader
 
 from .test_cli import run
@@ -121,6 +121,14 @@ def test_what_does_not_go_together(lab, monkeypatch, capsys, arguments, words):
     np.save("capture.npy", np.ones((640, 640), np.uint16))
     status, _, err = run(monkeypatch, capsys, *arguments)
     assert status == 2 and words in err and err.count("\n") == 1, err
+
+
+@pytest.mark.parametrize("name", ["v.ome.tif", "v.zarr"])
+def test_a_volume_from_the_surface_on_is_read_back(tmp_path, name):
+    """Its first plane is the surface itself."""
+    grid, frame = gs.Grid([SURFACE, SURFACE + 0.4, SURFACE + 0.8], (3, 4), 0.1), DepthFrame(SURFACE)
+    gs.write_volume(tmp_path / name, np.ones(grid.volume_shape, np.float32), frame.grid(grid), frame.note)
+    assert gs.read_volume(tmp_path / name)[1].depths.tolist() == pytest.approx([19.0, 19.4, 19.8])
 
 
 def test_a_file_that_says_array_is_not_taken_for_another(lab, monkeypatch, capsys):

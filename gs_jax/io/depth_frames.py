@@ -31,13 +31,13 @@ class DepthFrame(NamedTuple):
 
     def grid(self, grid: Grid) -> Grid:
         """The grid of an output, from one with depths from the array."""
-        return grid if self.surface is None else grid.at(_moved(grid.depths, -self.surface))
+        return grid if self.surface is None else grid.at(moved(grid.depths, -self.surface))
 
     def columns(self, columns: Mapping[str, Any]) -> dict[str, Any]:
         """Columns of points, from those with depths from the array."""
         if self.surface is None:
             return dict(columns)
-        depths = _moved(columns["z_mm"], -self.surface)
+        depths = moved(columns["z_mm"], -self.surface)
         return {**columns, "z_mm": depths, SURFACE: np.full(len(depths), self.surface)}
 
     def points(self, points: Any, more: Mapping[str, Any] | None) -> tuple[Any, Mapping[str, Any] | None]:
@@ -50,7 +50,7 @@ class DepthFrame(NamedTuple):
         return rows, columns
 
 
-def _moved(depths: Any, by: float) -> np.ndarray:
+def moved(depths: Any, by: float) -> np.ndarray:
     """Depths to a nanometre, which float32's digits do not show."""
     return np.round(np.asarray(depths, float) + by, 6)
 
@@ -73,9 +73,3 @@ def surface_of(path: PathLike) -> float:
         return float(provenance[SURFACE])
     except (KeyError, ValueError) as error:
         raise input_error(SURFACE, "a number of mm", provenance.get(SURFACE, "nothing"), path) from error
-
-
-def from_array(path: PathLike, grid: Grid) -> Grid:
-    """The grid of a volume with depths from the array."""
-    surface = surface_of(path)
-    return grid.at(_moved(grid.depths, surface)) if surface else grid

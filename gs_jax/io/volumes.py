@@ -27,7 +27,7 @@ from jaxtyping import Array, Shaped
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
-from .depth_frames import from_array
+from .depth_frames import moved, surface_of
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
 from .provenance import NAMESPACE, Provenance
@@ -108,7 +108,6 @@ def read_volume(path: PathLike) -> tuple[Volume, Grid]:
     ((3, 41, 41), 0.1)
     """
     voxels, grid = _FORMATS[check_suffix(path, VOLUME_SUFFIXES)].read(Path(path))
-    grid = from_array(path, grid)
     if not np.isfinite(voxels).all():
         raise input_error("voxels", "finite", "a NaN or an infinity", path)
     return voxels, grid
@@ -141,13 +140,18 @@ def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None
 
 
 def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
-    """Grid of depths, pitches `(y, x)` and centre of the first voxel `(y, x)`, mm; centred if `first` is None."""
+    """Grid of depths, pitches `(y, x)` and centre of the first voxel `(y, x)`, mm; centred if `first` is None.
+
+    Its depths are from the array, also where those of the file count from the sample's surface.
+    """
     pitch = pitches[1]
     if not (1e-6 <= pitch <= 1e4 and math.isclose(pitches[0], pitch, rel_tol=1e-6)):
         raise input_error("voxels", "squares from 1e-6 to 1e4 mm", f"{pitches} mm (y, x)", path)
+    if surface := surface_of(path):
+        depths = moved(depths, surface).tolist()
     for depth in depths:
         if not 1e-6 <= depth <= 1e4:
-            raise input_error("depth of a plane", "from 1e-6 to 1e4 mm", f"{depth} mm", path)
+            raise input_error("depth of a plane", "from 1e-6 to 1e4 mm from the array", f"{depth} mm", path)
     if first is None:
         return Grid(depths, shape, pitch)
     if not all(abs(place) <= 1e4 for place in first):
