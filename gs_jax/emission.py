@@ -1,6 +1,8 @@
 """An emission band as a few wavelengths, each with the refractive indices that it has."""
 
 import equinox as eqx
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .base.arrays import FINITE, NOT_NEGATIVE, POSITIVE, as_float, as_float_or_none, check_fields
@@ -24,7 +26,8 @@ class EmissionBand(eqx.Module):
     Raises
     ------
     ValueError
-        If the numbers are not one for each wavelength, or out of range.
+        If the numbers are not one for each wavelength, or out of range, or the weights do not add up to 1 (traced
+        values are not checked).
 
     Examples
     --------
@@ -50,6 +53,8 @@ class EmissionBand(eqx.Module):
             if (value := getattr(self, name)) is not None and value.shape[:1] != count:
                 raise ValueError(f"`{name}` must have a row for each of {count[0]} wavelengths, got {value.shape}.")
         check_fields(self, weights=NOT_NEGATIVE, wavelengths=POSITIVE, lens=FINITE, sample=FINITE)
+        if not isinstance(self.weights, Tracer) and abs((total := float(np.sum(self.weights))) - 1) > 1e-3:
+            raise ValueError(f"`weights` must add up to 1, got {total:.6g}.")
 
     def __len__(self) -> int:
         return len(self.weights)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import get_args
 
 import jax
 import numpy as np
@@ -11,6 +12,8 @@ import gs_jax as gs
 from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.design.design import Design, checked_design
 from gs_jax.design.keys import commented
+from gs_jax.design.tables import Material
+from gs_jax.materials import MATERIALS
 
 from .test_designs import edited
 
@@ -44,6 +47,10 @@ def design_of(changes) -> Design:
 def test_indices_of_materials_are_the_published_ones(material, wavelength, index):
     last_digit = {"BK7": 1e-5, "fused silica": 1e-5, "air": 0}.get(material, 6e-4)
     assert gs.refractive_index(material, wavelength) == pytest.approx(index, abs=last_digit)
+
+
+def test_files_take_all_materials():
+    assert get_args(Material) == tuple(MATERIALS)
 
 
 @pytest.mark.parametrize(

@@ -65,8 +65,8 @@ def combined() -> Design:
 
 
 def stack(surface: float, gap: float = 0.0) -> dict[str, Any]:
-    """A filter, a gap and a window on the sensor, and a gel behind a cover slip."""
-    glass, slip = {"thickness_mm": 2.0, "refractive_index": 1.52}, {"thickness_mm": 0.17, "refractive_index": 1.523}
+    """A filter, a gap and a window on the sensor, a gel behind a cover slip, and an emission band."""
+    glass, slip = {"thickness_mm": 2.0, "refractive_index": "BK7"}, {"thickness_mm": 0.17, "refractive_index": 1.523}
     window = {"thickness_mm": 0.55, "refractive_index": 1.51}
     return {
         "layers": {
@@ -74,6 +74,7 @@ def stack(surface: float, gap: float = 0.0) -> dict[str, Any]:
             "sensor": [{"thickness_mm": 0.6}, window],
         },
         "sample": {"refractive_index": 1.43, "surface_mm": surface, "layers": [slip]},
+        "bandwidth_nm": 40.0,
     }
 
 

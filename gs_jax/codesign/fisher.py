@@ -16,8 +16,8 @@ white over an image, so a lens whose image of the point moves by `s` contributes
     F = N^2 / n  integral |2 pi v . s|^2 |H(v)|^2 dv
 
 for `N` electrons, the transfer function `H` and noise of the density `n` (Kay, Fundamentals of Statistical Signal
-Processing I, 1993, section 3.5). A wide halo adds little at the frequencies that count; a Gaussian of its variance
-would not distinguish a sharp core in a halo from no core. The noise is that of a scene
+Processing I, 1993, section 3.5). Stray light adds little at the frequencies that count; a Gaussian of the spot's
+variance would not distinguish a sharp core in stray light from no core. The noise is that of a scene
 (`linear_error.noise_density`) plus the point's own.
 """
 

@@ -69,11 +69,8 @@ def datasheet(
     InputError
         If a depth or the circle_of_confusion is not positive and finite, or there is no depth.
     """
-    depths = _checked(design, depths)
-    centers, parts = (
-        np.array(design.array.centers_mm),
-        parts_of(design, depths, circle_of_confusion=circle_of_confusion),
-    )
+    depths, imager, centers = _checked(design, depths), design.imager(), np.array(design.array.centers_mm)
+    parts = parts_of(design, depths, circle_of_confusion=circle_of_confusion)
     distances = nearest_neighbour_distances(centers)
     columns = [_columns(*part) for part in parts]
     best = np.argmin([column["spot_width_um"] for column in columns], 0)
@@ -91,16 +88,15 @@ def datasheet(
         "pitch_mm": _round(float(distances.mean())),
         "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
-        **_light_path(design),
-        **_over_the_band(design, depths[len(depths) // 2]),
+        **_light_path(imager),
+        **_over_the_band(imager, depths[len(depths) // 2]),
         "coverage": _round(sum(float(objectives.coverage(*part)) for part in parts)),
         **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
     }
 
 
-def _light_path(design: Design) -> dict[str, Any]:
+def _light_path(imager: Imager) -> dict[str, Any]:
     """Layers and sample: thicknesses, what they are of air, and by how much they move the depth in focus."""
-    imager = design.imager()
     found: dict[str, Any] = {}
     for side, layers in (("object", imager.filters), ("sensor", imager.windows)):
         if layers is not None:
@@ -119,15 +115,15 @@ def _light_path(design: Design) -> dict[str, Any]:
     return found
 
 
-def _over_the_band(design: Design, depth: float) -> dict[str, Any]:
-    """By how much focus and width of the spot differ over the emission band, at a depth."""
-    imager = design.imager()
+def _over_the_band(imager: Imager, depth: float) -> dict[str, Any]:
+    """Focus and width of the spot at each wavelength of the emission band, at a depth, by the sharpest lens type."""
     if imager.band is None:
         return {}
-    each = [one for _, one in emission_lines(imager)]
-    at = Conditions([depth])
-    focus = [float(jnp.ravel(objectives.focus_distance(one, at))[0]) for one in each]
-    width = [1000 * float(jnp.min(objectives.spot_width(one, at))) for one in each]
+    at, each = Conditions([depth]), [one for _, one in emission_lines(imager)]
+    widths = [[float(objectives.spot_width(*part)[0]) for part in per_type(one, at)] for one in each]
+    best = int(np.argmin(np.mean(widths, 0)))
+    focus = [float(objectives.focus_distance(*per_type(one, at)[best])[0]) for one in each]
+    width = [1000 * row[best] for row in widths]
     return {
         "band_nm": [_round(1e6 * float(one.wavelength)) for one in each],
         "band_depth_mm": _round(depth),

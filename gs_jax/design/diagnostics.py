@@ -57,7 +57,7 @@ def _rays(sheet: dict[str, Any]) -> list[str]:
         return []
     return [
         f"Exact rays spread a point over {_span(wide)} um of the object (width at half height), where Eq. 5 promises "
-        f"{_span(promised)}: expect a bright core within a wide halo."
+        f"{_span(promised)}: expect a bright core within wide stray light."
     ]
 
 
@@ -69,6 +69,7 @@ def _sharp_cores(imager: Imager, at: Conditions) -> list[str]:
     if best in (0, _DEPTHS - 1):
         return []
     near, far = (float(depths[i]) for i in np.flatnonzero(within >= _NEARLY * within[best])[[0, -1]])
+    near = max(near, float(imager.sample_surface))
     return [f"By exact rays cores of spots hold half of the most light, or more, at {near:.3g} to {far:.3g} mm."]
 
 
@@ -121,14 +122,15 @@ def _sharp_range(design: Design, imager: Imager, at: Conditions) -> str:
     if imager.reduced_sensor_distance <= f:
         return f"The sensor at {v:g} mm is not behind the focal plane at {f:.4g} mm: no depth is in focus."
     in_focus = imager.depth_of(theory.depth_in_focus(f, imager.reduced_sensor_distance))
-    focused = dataclasses.replace(at, depths=in_focus[None])
+    focused, begins = dataclasses.replace(at, depths=in_focus[None]), float(imager.sample_surface)
     near, far = (
-        max(float(objectives.near_limit(imager, focused)[0]), 0),
+        max(float(objectives.near_limit(imager, focused)[0]), begins),
         float(objectives.far_limit(imager, focused)[0]),
     )
     working = "the working distance is {:g} to {:g} mm".format(*design.imaging.working_distance_mm)
-    if far <= 0:
-        return f"The sensor at {v:g} mm is so far that only points within the plate are in focus; {working}."
+    if far <= begins:
+        where = f"before {begins:g} mm, where the object's medium begins," if begins else "within the plate"
+        return f"The sensor at {v:g} mm is so far that only points {where} are in focus; {working}."
     return f"In focus by Eqs. 7 and 8, of a thin lens, are {near:.4g} to {far:.4g} mm; {working}."
 
 

@@ -87,11 +87,11 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
         if in_focus > 0:
             sharp = focal_length, focal_length / float(clear_diameter(array)), 1 / in_focus, circle_of_confusion
             ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
-    nearest = float(imager.reduced_depth(0.0))
-    if not ends or not np.isfinite(ends).all() or min(ends) <= nearest:
-        why = "no depth is in focus" if not ends else "the sharp depths have no end"
+    near, far = (float(imager.depth_of(np.asarray(end))) for end in (min(ends, default=0), max(ends, default=0)))
+    near = max(near, float(imager.sample_surface))
+    if not 0 < near < far < np.inf:
+        why = "the sharp depths have no end" if ends and not far < np.inf else "no depth is in focus"
         raise InputError(f"working_distance_mm must be given as [nearest, farthest] in mm: {why}.")
-    near, far = (float(imager.depth_of(np.asarray(end))) for end in (min(ends), max(ends)))
     return round(near, 4), round(far, 4)
 
 

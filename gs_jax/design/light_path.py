@@ -1,33 +1,15 @@
-"""The layers and the sample of a design, as the geometry takes them."""
+"""The layers and the sample of a `Design`, as the geometry takes them."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from ..base.errors import InputError, short_repr
 from ..layers import Layers, Sample, object_surface, reduced_distance
 from ..materials import index_of
-from .tables import ArrayTable, ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
+from .tables import LayerTable, SampleTable
 
 # The name of no sample, and the table of none.
 AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
-
-
-@runtime_checkable
-class Path(Protocol):
-    """What of a design the light crosses."""
-
-    @property
-    def lens(self) -> LensTable: ...
-    @property
-    def array(self) -> ArrayTable: ...
-    @property
-    def imaging(self) -> ImagingTable: ...
-    @property
-    def layers(self) -> LayersTable: ...
-    @property
-    def sample(self) -> SampleTable: ...
-    @property
-    def samples(self) -> dict[str, SampleTable]: ...
 
 
 def layers_of(tables: Sequence[LayerTable], wavelength_nm: float) -> Layers | None:
@@ -47,14 +29,14 @@ def sample_of(table: SampleTable, wavelength_nm: float) -> Sample | None:
     return Sample(index, table.surface_mm, layers_of(table.layers[::-1], wavelength_nm))
 
 
-def chosen_sample(design: Path, sample: str | Sample | None, wavelength_nm: float) -> Sample | None:
+def chosen_sample(design, sample: str | Sample | None, wavelength_nm: float) -> Sample | None:
     """The sample of a name, or the default one (None); "air" is none."""
     if isinstance(sample, Sample):
         return sample
     return sample_of(sample_table(design, sample), wavelength_nm)
 
 
-def sample_table(design: Path, name: str | None) -> SampleTable:
+def sample_table(design, name: str | None) -> SampleTable:
     """The sample of a name, or the default one (None), as the file has it."""
     if name is None:
         return design.sample
@@ -64,12 +46,12 @@ def sample_table(design: Path, name: str | None) -> SampleTable:
     return NO_SAMPLE if name == AIR else design.samples[name]
 
 
-def plate_index(design: Path) -> float:
+def plate_index(design) -> float:
     """Index of lenses and plate at the design's wavelength."""
     return index_of(design.lens.refractive_index, design.imaging.wavelength_nm)
 
 
-def reduced_depth(design: Path, depth: float, index: float | None = None) -> float:
+def reduced_depth(design, depth: float, index: float | None = None) -> float:
     """Reduced depth `z'` in the default sample, mm, of lenses of the design's index or another."""
     wavelength = design.imaging.wavelength_nm
     filters, sample = layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength)
@@ -77,21 +59,21 @@ def reduced_depth(design: Path, depth: float, index: float | None = None) -> flo
     return float(reduced_distance(depth, filters, sample)) + in_front
 
 
-def reduced_sensor_distance(design: Path, distance: float, index: float | None = None) -> float:
+def reduced_sensor_distance(design, distance: float, index: float | None = None) -> float:
     """Reduced sensor distance `v'`, mm, of lenses of the design's index or another."""
     windows = layers_of(design.layers.sensor, design.imaging.wavelength_nm)
     behind = _plate(design, index) if design.lens.orientation == "curved" else 0.0
     return distance - (0.0 if windows is None else float(windows.shortening)) + behind
 
 
-def object_begins(design: Path) -> float:
+def object_begins(design) -> float:
     """Depth at which the default sample begins, or air beyond the filters, mm."""
     wavelength = design.imaging.wavelength_nm
     begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength))
     return float(f"{float(begins):.9g}")
 
 
-def path_in_words(design: Path) -> list[str]:
+def path_in_words(design) -> list[str]:
     """Layers and sample, a line each."""
     index = lambda table: str(table.refractive_index)
     sides = (("in front", design.layers.object), ("on the sensor", design.layers.sensor))
@@ -105,7 +87,7 @@ def path_in_words(design: Path) -> list[str]:
     return lines
 
 
-def check_path(design: Path) -> None:
+def check_path(design) -> None:
     """Raise `ValueError` unless the layers and samples have room, and their materials are known at the wavelength."""
     wavelength = design.imaging.wavelength_nm
     for key, material in _materials(design):
@@ -129,7 +111,7 @@ def check_path(design: Path) -> None:
         raise ValueError(f"`imaging.working_distance_mm` must be {allowed}, got {working}")
 
 
-def _check_sample(design: Path, key: str, table: SampleTable) -> None:
+def _check_sample(design, key: str, table: SampleTable) -> None:
     if sample_of(table, design.imaging.wavelength_nm) is None:
         return
     inside = _total(design.layers.object) + _total(table.layers)
@@ -144,11 +126,11 @@ def _total(layers: Sequence[LayerTable]) -> float:
     return sum((layer.thickness_mm for layer in layers), 0.0)
 
 
-def _plate(design: Path, index: float | None) -> float:
+def _plate(design, index: float | None) -> float:
     return design.array.substrate_thickness_mm / (plate_index(design) if index is None else index)
 
 
-def _materials(design: Path) -> list[tuple[str, Any]]:
+def _materials(design) -> list[tuple[str, Any]]:
     """All indices by their keys."""
     layers = {"layers.object": design.layers.object, "layers.sensor": design.layers.sensor}
     found: list[tuple[str, Any]] = [("lens.refractive_index", design.lens.refractive_index)]

@@ -11,6 +11,10 @@ def emission_lines(imager: Imager) -> list[tuple[Scalar, Imager]]:
     band, parts = imager.band, _dispersive(imager)
     if band is None:
         return [(1.0, imager)]
+    for part, shift in parts:
+        if shift.shape[1:] != part.refractive_index.shape:
+            shape = *shift.shape[:1], *part.refractive_index.shape
+            raise ValueError(f"`band` must have {shape} refractive indices of a part of the imager, got {shift.shape}.")
 
     def line(k):
         indices = [part.refractive_index + shift[k] for part, shift in parts]

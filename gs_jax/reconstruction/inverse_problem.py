@@ -25,7 +25,7 @@ from ..typing import Image
 
 # Percentile of the pixels that is taken for the camera's offset: few captures are lit all over.
 _DARK_PERCENTILE = 1
-# Minimum half wavelength of a background mode, in pixels of the halo's grid: the width of a spot's halo.
+# Minimum half wavelength of a background mode, in pixels of the stray light's grid: the width of a spot's stray light.
 _HALF_WAVE = 6.5
 _ROUNDING = 0.02
 
@@ -154,7 +154,7 @@ def _cosine_modes(size, count, dtype):
 
 
 def num_detrend_modes(imager: Imager, optics: PsfModel) -> int:
-    """Number of cosine modes per axis that are smoother than a spot's halo; 0 for optics without a halo."""
+    """Number of cosine modes per axis that are smoother than a spot's stray light; 0 for optics without."""
     if isinstance(optics, PerTypePsf):
         optics = optics.optics[0]
     if not isinstance(optics, FieldVaryingPsf):

@@ -17,7 +17,7 @@ from ..base.errors import InputError
 from ..typing import Real
 from .base import Operator, as_image, check_options, differences, differences_adjoint, magnitude, norm
 
-# Default number of background knots along each side: their spacing is wider than the halo of a spot.
+# Default number of background knots along each side: their spacing is wider than the stray light of a spot.
 BACKGROUND_KNOTS = 8
 # Lower bound of Dey's denominator, which must stay positive.
 _MIN_DENOMINATOR = 0.1

@@ -105,7 +105,12 @@ def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str
 def _path_rows(design: Design) -> list[tuple[str, str]]:
     layers, sample = design.layers, design.sample
     sides = {"on the array": layers.object, "before the object": sample.layers, "on the sensor": layers.sensor}
-    words = lambda each: f"{each.name or 'layer'}, {each.thickness_mm:g} mm, n = {each.refractive_index}"
+
+    def words(layer):
+        if layer.refractive_index in (1, "air"):
+            return f"{layer.name or 'air'}, {layer.thickness_mm:g} mm"
+        return f"{layer.name or 'layer'}, {layer.thickness_mm:g} mm, n = {layer.refractive_index}"
+
     rows = [(side, "; ".join(map(words, parts))) for side, parts in sides.items() if parts]
     if sample == NO_SAMPLE:
         return rows
