@@ -19,6 +19,8 @@ from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
+from gs_jax.optics import psf
+from gs_jax.optics.psf import spot_image
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run
@@ -100,7 +102,7 @@ def test_the_saved_design_is_the_one_shown(either):
 @pytest.mark.integration
 def test_moves_compile_nothing(either):
     start, sliders = start_of(either, STUDY), make_sliders(either)
-    compiled: list[Any] = [evaluation._diffract, evaluation._landing, preview._sum_lenses]
+    compiled: list[Any] = [psf._pixel_energy, psf._even_rays, preview._sum_lenses]
     counts = []
     for moves in ({}, *({name: slider.start * 1.01} for name, slider in sliders.items())):
         values = complete_values(sliders, moves)
@@ -146,7 +148,7 @@ def test_wide_spots_are_counted_by_rays(design):
     """Both ways agree where both hold; beyond, diffraction would be folded back."""
     start, samples = start_of(design), evaluation.pupil_samples(start_of(design))
     unit = evaluation.lens_unit(start, complete_values(make_sliders(design), {}))
-    near, wide = (evaluation.spot(unit, depth, 0.0, 0.2, samples=samples) for depth in (20.0, 2.0))
+    near, wide = (spot_image(unit, depth, 0.0, size=49, radius=0.2, samples=samples) for depth in (20.0, 2.0))
     assert near.sum() == pytest.approx(1, abs=0.05)
     assert 0.1 < wide.sum() <= 1 and np.count_nonzero(wide) > 50
 

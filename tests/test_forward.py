@@ -58,12 +58,12 @@ def volume_and_image():
 
 @pytest.mark.integration
 def test_without_cpu_kernels_xla_computes_the_same(tmp_path):
-    """With one warning, where their folder cannot be imported."""
+    """Where their folder is not there; without a warning, as without numba."""
     code = "import sys; sys.modules['gs_jax.projection.cpu'] = None; from tests import test_forward as t; "
     code += "t.np.savez(sys.argv[1], *t.volume_and_image())"
     call = [sys.executable, "-c", code, str(tmp_path / "results.npz")]
     done = subprocess.run(call, cwd=Path(__file__).parents[1], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stderr.count("XLA is used instead") == 1, done.stderr
+    assert done.returncode == 0 and not done.stderr, done.stderr
     with np.load(tmp_path / "results.npz") as results:
         for ours, plain in zip(volume_and_image(), results.values(), strict=True):
             np.testing.assert_allclose(ours, plain, rtol=1e-5, atol=2e-6 * float(ours.max()))

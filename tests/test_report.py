@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
+from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.pictures.volume_pictures import downsample, make_slices
 
 from .browser import browser, watched
@@ -268,6 +270,18 @@ def test_the_contrast_of_a_perfect_lens():
     )
     # Light beside the window, and a pupil of squares.
     np.testing.assert_allclose(curve, drawings.ideal_mtf(frequency, imager, depth, 0.3), atol=0.02)
+
+
+def test_a_wide_spot_has_the_light_that_rays_bring():
+    """The spot of an f/1.5 sphere is far wider than its window, into which diffraction folded light from beside it."""
+    imager = read_design(Path(__file__).parents[1] / "design" / "geomscope-targets.toml").imager()
+    psfs = drawings.simulate_psfs(imager, np.array([20.0]), 1.76, 0.64)
+    aperture = 0.88 * np.sqrt(np.random.default_rng(0).random((4000, 1)))
+    angle = 2 * np.pi * np.random.default_rng(1).random((4000, 1))
+    rays = trace_lenslet(imager, 20.0, aperture * np.hstack([np.cos(angle), np.sin(angle)]))
+    window = psfs.images.shape[-1] * imager.sensor.pixel_pitch / 2
+    share = np.mean(np.abs(rays.landing[rays.valid]).max(1) <= window)
+    assert float(psfs.caught[0, 0]) == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.integration

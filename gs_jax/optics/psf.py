@@ -2,7 +2,8 @@
 
 `diffraction_psf` is scalar diffraction with the exact wavefront, `geometric_psf` counts rays, `gaussian_psf` is a
 Gaussian with the moments of the rays. Each returns `(size, size)` pixels `[row, column]` with the sum 1, centred on the
-chief ray of `gs_jax.geometry`: what that map leaves out (distortion, coma) is in the PSF.
+chief ray of `gs_jax.geometry`: what that map leaves out (distortion, coma) is in the PSF. `spot_image` takes
+diffraction or rays, whichever the width of the spot asks for.
 """
 
 import math
@@ -14,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import gaussian_filter
 
 from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
-from ..typing import ScalarLike
+from ..typing import Scalar, ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
 from .pupil import pupil_quadrature, pupil_radius, vogel_spiral
@@ -25,8 +27,9 @@ from .raytrace import Point, trace_lenslet
 from .spectrum import emission_lines
 from .theory import airy_sigma, cutoff_frequency
 
-# Rays of `geometric_psf`.
-_RAYS = 2**15
+# Rays of `geometric_psf` and `spot_image`; the quantile of their distances that is a spot's width; the smoothing of ray
+# counts, of which a pixel has few, in pixels.
+_RAYS, _QUANTILE, _SMOOTH = 2**15, 0.98, 1.0
 # Window of `psf_of_depth`: margin for diffraction, largest reach of the rays in pixels, and rays along the radius.
 _WINDOW_MARGIN, _FARTHEST, _FAN = 16, 128, 65
 
@@ -105,13 +108,10 @@ def geometric_psf(
     Parameters and errors are those of `diffraction_psf`.
     """
     _check_size(size)
-    order = np.arange(_RAYS) + 0.5
     radius = pupil_radius(imager, radius)
-    points = radius * jnp.asarray(vogel_spiral(np.sqrt(order / _RAYS), order), radius.dtype)
-    rays = trace_lenslet(imager, depth, points, field)
-    weights = jnp.where(rays.valid, soft_aperture(points, radius, edges, radius * (np.pi / _RAYS) ** 0.5), 0)
-    dtype = rays.landing.dtype
-    from_chief = rays.landing - _chief_landing(imager, depth, field, dtype)[None]
+    points, from_chief, valid = _even_rays(imager, depth, field, radius)
+    dtype = from_chief.dtype
+    weights = jnp.where(valid, soft_aperture(points, radius, edges, radius * (np.pi / _RAYS) ** 0.5), 0)
     position = from_chief[:, ::-1] / imager.sensor.pixel_pitch + jnp.asarray(offset, dtype)[None] + size // 2
     corner = jnp.floor(position)
     fraction, corner = position - corner, corner.astype(int)
@@ -161,6 +161,40 @@ def gaussian_psf(
     return image / jnp.sum(image)
 
 
+def spot_image(
+    imager: Imager, depth: ScalarLike, height: ScalarLike, *, size: int, radius: ScalarLike, samples: int
+) -> Float[np.ndarray, "row column"]:
+    """Light of a point on pixels about the chief ray, as fractions of that through the aperture.
+
+    By diffraction; by rays where the spot is wider than the windows that `samples` resolve.
+
+    Parameters
+    ----------
+    imager
+        As of `diffraction_psf`.
+    depth, height
+        Of the object point, and its distance from the lens's axis, mm.
+    size, radius, samples
+        As of `diffraction_psf`.
+    """
+    depth, height, radius = (jnp.asarray(x, imager.sensor_distance.dtype) for x in (depth, height, radius))
+    pixel = imager.sensor.pixel_pitch
+    field = height, jnp.zeros_like(height)
+    _, offset, valid = (np.asarray(x) for x in _even_rays(imager, depth, field, radius))
+    resolved = size * samples / least_samples(imager, 2 * float(radius)) / 2
+    if valid.any() and np.quantile(np.abs(offset[valid]).max(1), _QUANTILE) < pixel * resolved:
+        return np.asarray(_pixel_energy(imager, depth, size, field, (0.0, 0.0), radius, None, samples), float)
+    edges = pixel * (np.arange(size + 1) - size / 2)
+    counts = np.histogram2d(offset[valid, 1], offset[valid, 0], [edges, edges])[0] / max(valid.sum(), 1)
+    return gaussian_filter(counts, _SMOOTH)
+
+
+def least_samples(imager: Imager, diameter: Scalar) -> float:
+    """`s` of `diffraction_psf`: samples per pixel below which light of the window itself is folded back."""
+    cutoff = cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
+    return imager.sensor.pixel_pitch * float(cutoff)
+
+
 PSFS = {"diffraction": diffraction_psf, "geometric": geometric_psf, "gaussian": gaussian_psf}
 
 
@@ -201,8 +235,7 @@ def psf_of_depth(
     size = steps * (2 * math.ceil(pixels + _WINDOW_MARGIN) + 1)
     make = PSFS[kind]
     if kind == "diffraction":  # as fine as the aperture diffracts
-        cutoff = float(cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, 2 * radius))
-        make = partial(make, samples=math.ceil(cutoff * imager.sensor.pixel_pitch))
+        make = partial(make, samples=math.ceil(least_samples(imager, 2 * radius)))
 
     def mean_psf(depth):
         each = [weight * make(one, depth, size=size, radius=radius) for weight, one in lines]
@@ -211,6 +244,16 @@ def psf_of_depth(
     return mean_psf
 
 
+@jax.jit
+def _even_rays(imager: Imager, depth, field, radius):
+    """Points evenly over the pupil, where their rays land from the chief ray's spot, mm, and whether they do."""
+    order = np.arange(_RAYS) + 0.5
+    points = radius * jnp.asarray(vogel_spiral(np.sqrt(order / _RAYS), order), radius.dtype)
+    rays = trace_lenslet(imager, depth, points, field)
+    return points, rays.landing - _chief_landing(imager, depth, field, rays.landing.dtype)[None], rays.valid
+
+
+@partial(jax.jit, static_argnames=("size", "samples"))
 def _pixel_energy(imager, depth, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:
     """Energy on the pixels, as fractions of the energy through the pupil."""
     _check_size(size)

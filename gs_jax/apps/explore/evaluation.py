@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import gaussian_filter
 
 from ... import objectives
 from ...base.errors import InputError
@@ -26,17 +24,13 @@ from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
 from ...objectives.paraxial import third_order_wavefront
-from ...optics import aberrations, theory
-from ...optics.psf import diffraction_psf, window_fraction
-from ...optics.pupil import GOLDEN_ANGLE
-from ...optics.raytrace import trace_lenslet
+from ...optics import aberrations
+from ...optics.psf import least_samples, spot_image
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
 _DEPTHS, SPOT_DEPTHS, SPOT_FIELDS = 7, (0, 3, 6), (0.0, 1.0)
 # Pixels along a side of a spot's window.
 SIZE = 49
-# Rays of a spot, the quantile of their distances that is its width, and the smoothing of ray counts, pixels.
-_RAYS, _QUANTILE, _SMOOTH = 2**15, 0.98, 1.0
 _LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm")
 # As in `gs_jax.design.diagnostics`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
 _FAR, _MAX_UNCOVERED = 2.0, 0.005
@@ -160,7 +154,7 @@ def evaluate_design(start: Start, values: Values, terms: tuple[str, ...] = ()) -
     for row, column in np.ndindex(spots.shape[:2]):
         number, height = int(sharpest[SPOT_DEPTHS[row]]), SPOT_FIELDS[column] * values["field_radius_mm"]
         depth, radius = depths[SPOT_DEPTHS[row]], diameters[number] / 2
-        spots[row, column] = spot(units[number], depth, height, radius, samples=samples)
+        spots[row, column] = spot_image(units[number], depth, height, size=SIZE, radius=radius, samples=samples)
     return Evaluation(depths, numbers, scalars, entries, diameters, spots)
 
 
@@ -247,46 +241,7 @@ def lens_unit(start: Start, values: Values, number: int = 0) -> Imager:
 def pupil_samples(start: Start) -> int:
     """Samples per pixel that resolve the spots of the starting design: decides shapes, so no slider changes it."""
     widest = float(start.imager.array.aperture_diameter.max())
-    return int(np.clip(math.ceil(1.5 * _fold(start.imager, widest)), 2, 4))
-
-
-def _fold(imager: Imager, diameter: float) -> float:
-    """`s` of `diffraction_psf`, which folds back light outside `samples / s` windows."""
-    cutoff = theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter)
-    return imager.sensor.pixel_pitch * float(cutoff)
-
-
-def spot(unit: Imager, depth: float, height: float, radius: float, *, samples: int) -> Float[np.ndarray, "row column"]:
-    """The spot of a point at a depth and a height beside the axis, through a clear aperture of this radius, mm.
-
-    By diffraction; by rays where the spot is wider than the samples of the pupil resolve.
-    """
-    pixel = unit.sensor.pixel_pitch
-    numbers = [jnp.asarray(x, unit.sensor_distance.dtype) for x in (depth, height, radius)]
-    offset, valid = (np.asarray(x) for x in _landing(unit, *numbers))
-    resolved = pixel * SIZE * samples / _fold(unit, 2 * radius) / 2
-    if valid.any() and np.quantile(np.abs(offset[valid]).max(1), _QUANTILE) < resolved:
-        return np.asarray(_diffract(unit, *numbers, samples), float)
-    edges = pixel * (np.arange(SIZE + 1) - SIZE / 2)
-    counts = np.histogram2d(offset[valid, 1], offset[valid, 0], [edges, edges])[0] / max(valid.sum(), 1)
-    # A pixel has few rays.
-    return gaussian_filter(counts, _SMOOTH)
-
-
-@jax.jit
-def _landing(unit: Imager, depth: Array, height: Array, radius: Array):
-    """Where rays meet the sensor, from the chief ray's spot, and whether they reach it."""
-    order = np.arange(_RAYS) + 0.5
-    spiral = np.sqrt(order / _RAYS) * np.stack([np.cos(GOLDEN_ANGLE * order), np.sin(GOLDEN_ANGLE * order)])
-    beside = jnp.zeros_like(height)
-    rays = trace_lenslet(unit, depth, radius * jnp.asarray(spiral.T, radius.dtype), (height, beside))
-    return rays.landing - unit.views(jnp.stack([height, beside, depth])[None], np.array([0])).spot, rays.valid
-
-
-@partial(jax.jit, static_argnums=4)
-def _diffract(unit: Imager, depth: Array, height: Array, radius: Array, samples: int) -> Array:
-    options = {"size": SIZE, "field": (height, jnp.zeros_like(height)), "radius": radius, "samples": samples}
-    return diffraction_psf(unit, depth, **options) * window_fraction(unit, depth, **options)
+    return int(np.clip(math.ceil(1.5 * least_samples(start.imager, widest)), 2, 4))
 
 
 def find_violations(

@@ -11,10 +11,11 @@ from scipy.signal import fftconvolve
 
 from ...geometry import Imager, envelope
 from ...grid import Grid
+from ...optics.psf import spot_image
 from ...optics.raytrace import to_numpy
 from ...sensor import Sensor
 from ...simulation.phantoms import random_points
-from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples, spot
+from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples
 
 # Cells across the map of ghosts, and its depths.
 _CELLS, _GHOST_DEPTHS = 141, 9
@@ -89,7 +90,7 @@ def reconstruct_points(start: Start, values: Values, clear_diameters: Float[np.n
     for number, (lenses, diameter) in enumerate(zip(start.types, clear_diameters, strict=True)):
         unit = lens_unit(start, values, number)
         for k, depth in enumerate(depths):
-            binned = _bin(spot(unit, float(depth), 0.0, diameter / 2, samples=samples), coarse)
+            binned = _bin(spot_image(unit, float(depth), 0.0, size=SIZE, radius=diameter / 2, samples=samples), coarse)
             image += fftconvolve(_dots(small, points[plane == k], lenses), binned, mode="same")
     grid = Grid.over(sensor, depths=depths, pitch=max(sensor.shape) * sensor.pixel_pitch / _VOXELS)
     volume = _backproject(np.maximum(image, 0), small, grid)

@@ -9,7 +9,6 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.ticker import LogLocator, MaxNLocator
@@ -21,7 +20,7 @@ from ...layers import layers_in_front
 from ...layouts import cell_edges
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
-from ...optics.psf import diffraction_psf, window_fraction
+from ...optics.psf import least_samples, spot_image
 from ...pictures.style import round_length
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
@@ -268,7 +267,7 @@ def _outlines(imager: Imager) -> str:
 
 
 class Psfs(NamedTuple):
-    """PSFs on the sensor, each with the sum 1, at depths and field heights, mm.
+    """PSFs on the sensor, each with the sum 1, or 0 if no light arrives, at depths and field heights, mm.
 
     `caught` is the share of the light through the lens that falls into the window.
     """
@@ -280,26 +279,21 @@ class Psfs(NamedTuple):
 
 
 def simulate_psfs(imager: Imager, depths: Float[np.ndarray, " depth"], diameter: float, radius: float) -> Psfs:
-    """Diffraction PSFs at up to five of the depths, mm, and over the field; of lenses that differ, those of the first.
+    """PSFs at up to five of the depths, mm, and over the field; of lenses that differ, those of the first.
 
-    `diameter` is that of the clear aperture, and `radius` contains 80 % of the light on the sensor, mm.
+    By diffraction, or by rays where they are wide. `diameter` is that of the clear aperture, and `radius` contains
+    80 % of the light on the sensor, mm.
     """
     if not imager.array.alike:
         imager = eqx.tree_at(lambda i: i.array, imager, imager.array.lens(0))
     heights, pixel = np.array(FIELDS) * imager.field_radius, imager.sensor.pixel_pitch
     chosen = np.linspace(depths.min(), depths.max(), min(_PSF_DEPTHS, len(depths)))
-    # Light outside of `samples / s` windows is aliased into them, see `diffraction_psf`.
-    s = pixel * float(theory.cutoff_frequency(imager.wavelength, imager.reduced_sensor_distance, diameter))
-    samples = int(np.clip(np.ceil(1.3 * s), 2, _MAX_SAMPLES))
+    samples = int(np.clip(np.ceil(1.3 * least_samples(imager, diameter)), 2, _MAX_SAMPLES))
     size = 2 * int(np.clip(_WINDOW_RADII * radius / pixel, *_WINDOW) // 2) + 1
-    images, caught = np.empty((len(chosen), len(heights), size, size)), np.empty((len(chosen), len(heights)))
-    for i, depth in enumerate(chosen):
-        for j, height in enumerate(heights):
-            field = (jnp.asarray(height), jnp.asarray(0.0))
-            options = {"field": field, "size": size, "radius": jnp.asarray(diameter / 2), "samples": samples}
-            images[i, j] = diffraction_psf(imager, jnp.asarray(depth), **options)
-            caught[i, j] = window_fraction(imager, jnp.asarray(depth), **options)
-    return Psfs(images, caught, chosen, heights)
+    options = {"size": size, "radius": diameter / 2, "samples": samples}
+    light = np.array([[spot_image(imager, depth, height, **options) for height in heights] for depth in chosen])
+    caught = light.sum((2, 3))
+    return Psfs(light / np.where(caught > 0, caught, 1)[..., None, None], caught, chosen, heights)
 
 
 def mtf(

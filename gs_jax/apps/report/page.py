@@ -197,7 +197,8 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
 
 
 def _psf_pictures(psfs: Psfs, imager: Imager) -> dict[str, Any]:
-    root = to_uint8(np.sqrt(psfs.images / psfs.images.max((2, 3), keepdims=True)), 0.0, 1.0)
+    peaks = psfs.images.max((2, 3), keepdims=True)
+    root = to_uint8(np.sqrt(psfs.images / np.where(peaks > 0, peaks, 1)), 0.0, 1.0)
     rows = [
         [(png_uri(root[i, j], "magma"), 100 * float(psfs.caught[i, j])) for i in range(len(psfs.depths))]
         for j in range(len(psfs.heights))
