@@ -203,6 +203,53 @@ def stray_light() -> str:
     return svg(640, 250, parts)
 
 
+def arrow(x: float, y: float, along_x: float, along_y: float, words: str, color: str = INK) -> list[str]:
+    """Return an arrow from (x, y), with a label beyond its tip."""
+    length = math.hypot(along_x, along_y)
+    to_x, to_y, u, w = x + along_x, y + along_y, along_x / length, along_y / length
+    tips = [line(to_x, to_y, to_x - 6 * u + s * 4 * w, to_y - 6 * w - s * 4 * u, color, 1.5) for s in (-1, 1)]
+    label = text(to_x + 11 * u, to_y + 11 * w + 4.5, words, anchor="middle", italic=True, color=color)
+    return [line(x, y, to_x, to_y, color, 1.5), *tips, label]
+
+
+def array_frames() -> str:
+    """Frames of the maker's files: arrays from the side, light from the left, and as seen from their lenses."""
+    parts, glass = [], f'fill="{GLASS}" stroke="{FAINT}"'
+    for left, plano in ((0.0, True), (330.0, False)):
+        side, names = (1, ("plano", "the sensor", "down")) if plano else (-1, ("curved", "the object", "up"))
+        middle, base = left + 160, left + 160 + 12.0 * side
+        tip = base + 20 * side
+        parts += [
+            text(middle, 22, f"{names[0]} side toward the object", anchor="middle"),
+            f'<rect x="{min(base, base - 36 * side):g}" y="40" width="36" height="130" {glass}/>',
+            *(
+                f'<path d="M {base} {y - 21} Q {2 * tip - base} {y} {base} {y + 21} Z" {glass}/>'
+                for y in (62, 105, 148)
+            ),
+            *arrow(left + 20, 60, 50, 0, "light", RAY)[:-1],
+            text(left + 20, 50, "light", color=RAY),
+            line(tip, 40, tip, 205, FAINT, 1, "3 3"),
+            line(base, 30, base, 230, FAINT, 1, "3 3"),
+            *arrow(tip, 190, 44, 0, "z", RAY),
+            text(tip + 52, 208, ".dat, .csv", color=RAY, anchor="middle"),
+            *arrow(base, 222, 44 * side, 0, "z"),
+            text(base + 52 * side, 242, ".tif, .png, .xyz", anchor="middle"),
+            f'<rect x="{left + 90}" y="290" width="140" height="110" {glass}/>',
+            *(
+                f'<circle cx="{left + x}" cy="{y}" r="17" fill="{LIGHT}" stroke="{FAINT}"/>'
+                for x, y in ((125, 320), (190, 312), (142, 368), (204, 374))
+            ),
+            *arrow(middle, 345, 45, 0, "x"),
+            *arrow(middle, 345, 0, -38, "y"),
+            dot(middle, 345, 3, INK),
+            text(middle, 278, f"seen from the lenses, from {names[1]}", anchor="middle"),
+            text(left + 84, 300, "row 0", anchor="end", color=FAINT),
+            text(left + 84, 400, "last row", anchor="end", color=FAINT),
+            text(middle, 420, f"x of the design: to the right; y: {names[2]}", anchor="middle"),
+        ]
+    return svg(660, 435, parts)
+
+
 def imports() -> dict[str, set[str]]:
     """Return the imports between folders and modules of the package."""
     graph: dict[str, set[str]] = {}
@@ -263,6 +310,7 @@ DRAWINGS = {
     "light-path": light_path,
     "field": field,
     "stray-light": stray_light,
+    "array-frames": array_frames,
     "imports": imports_drawing,
 }
 

@@ -35,6 +35,7 @@ COMMANDS = {
     "benchmark": "presentation",
     "mold": "fabrication",
     "mask": "fabrication",
+    "heights": "fabrication",
     "train": "train",
     "report": "presentation",
     "explore": "presentation",

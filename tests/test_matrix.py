@@ -22,6 +22,7 @@ from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
+from gs_jax.mold.height_files import write_heights
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
@@ -264,6 +265,7 @@ def optimise(case: Case, _) -> None:
 def mold(case: Case, folder: Path) -> None:
     report = gs.make_mold(case.design, folder / "mold.stl")
     assert report["verification"]["lenses"] == len(case.design.array.centers_mm)
+    assert write_heights(case.design, folder / "heights.dat", step=0.1)["deviation_nm"] < 1
 
 
 def reported(case: Case, folder: Path) -> None:

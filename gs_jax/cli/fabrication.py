@@ -1,4 +1,4 @@
-"""`gs-jax mold`, `mask` and `tolerance`: fabrication of a design, and its errors."""
+"""`gs-jax mold`, `mask`, `heights` and `tolerance`: fabrication of a design, and its errors."""
 
 import math
 from pathlib import Path
@@ -10,7 +10,7 @@ from ..apps.tolerance.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
-from .files import check_may_write, provenance_of
+from .files import check_may_write, force_option, provenance_of
 from .light import Light, check_beyond, sample_options
 from .options import DESIGN, UM, Depths, Number
 
@@ -81,6 +81,41 @@ def mask_command(design: Path, output: Path):
     alone, rings = len(mask.circles), len(mask.openings)
     width, height = mask.outline.max(0) - mask.outline.min(0)
     click.echo(f"{output}: {alone} round openings and {rings} others on a sheet of {width:g} x {height:g} mm")
+
+
+@click.command("heights", epilog="Example: gs-jax heights design/geomscope.toml -o array.tif")
+@click.argument("design", type=DESIGN)
+@click.option(
+    "-o",
+    "--output",
+    type=Path,
+    required=True,
+    help="HEIGHTS.tif (float, mm), .png (16 bits), .xyz (text), .dat (grid sag of OpticStudio); LENSES.csv.",
+)
+@click.option("--step-um", type=SMALL_UM, default=10.0, help="Distance of points; not of LENSES.csv.")
+@force_option
+def heights_command(design: Path, output: Path, step_um: float, force: bool):
+    """Write the molded surface of the file DESIGN for its maker, or for an optical program.
+
+    TIFF, PNG and text hold heights above the plate between the lenses, seen from the lenses' side: x to the right, y
+    up. A grid sag, and the list of a plate and its lenses for non-sequential rays, have z along the light, and z = 0 at
+    the vertices. A .json of the output's name plus .json has the frame and scale. The file is read back and compared
+    with the design.
+    """
+    from ..design.design import design_text, read_design
+    from ..mold.height_files import HEIGHT_SUFFIXES, write_heights
+
+    check_output(output, HEIGHT_SUFFIXES)
+    check_may_write(output, inputs=(design,), force=force)
+    microscope = read_design(design)
+    provenance = provenance_of(design, design=design_text(microscope))
+    with Progress() as progress, errors_name_file(design):
+        report = write_heights(microscope, output, step=step_um / 1000, provenance=provenance, progress=progress)
+    columns, rows = report.get("points", (0, 0))
+    what = f"{columns} x {rows} points every {step_um:g} um" if columns else f"{report['objects']} objects"
+    count = f", {1e6 * scale:.4g} nm a count" if (scale := report.get("mm_per_count")) else ""
+    click.echo(f"{output}: {what}{count}; read back, it is within {report['deviation_nm']:.2g} nm of the design")
+    click.echo(f"{output}: {report['frame']}; (x, y) of the design is ({report['design_x_y']})")
 
 
 def _options(command):
