@@ -72,17 +72,24 @@ class Progress:
             advance()
 
     def counter(
-        self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
+        self,
+        description: str,
+        total: int | None,
+        *,
+        quarter: str = "",
+        rate: str = "",
+        words: Callable[[], str] | None = None,
     ) -> AbstractContextManager[Callable[[], None]]:
         """Report a task of `total` parts, if known; call the value of the `with` statement after each part.
 
         A task of more than a minute is announced, with its time and memory, and the option `quarter` that would take a
-        quarter of the time. `rate` is the plural of the parts, if their number per second is shown.
+        quarter of the time. `rate` is the plural of the parts, if their number per second is shown, and `words` tells
+        what else is shown beside it.
         """
         task = _Task(description, total, quarter)
         if self._bars:
-            return _bar(self._bars, task, rate)
-        return _lines(task, rate) if self._lines else nullcontext(lambda: None)
+            return _bar(self._bars, task, rate, words)
+        return _lines(task, rate, words) if self._lines else nullcontext(lambda: None)
 
 
 class _Task:
@@ -126,7 +133,7 @@ def _in_words(seconds: float) -> str:
 
 
 @contextmanager
-def _bar(bars: Bars, task: _Task, rate: str) -> Iterator[Callable[[], None]]:
+def _bar(bars: Bars, task: _Task, rate: str, words: Callable[[], str] | None) -> Iterator[Callable[[], None]]:
     bar, began = bars.add_task(task.description, total=task.total, rate=""), time.monotonic()
 
     def advance():
@@ -135,7 +142,8 @@ def _bar(bars: Bars, task: _Task, rate: str) -> Iterator[Callable[[], None]]:
         if text := task.announcement():
             bars.console.print(text, highlight=False, soft_wrap=True)
         if rate and now > began:
-            bars.update(bar, rate=f"{task.done / (now - began):.3g} {rate}/s")
+            more = f", {words()}" if words else ""
+            bars.update(bar, rate=f"{task.done / (now - began):.3g} {rate}/s{more}")
 
     yield advance
     if task.total is None:
@@ -143,7 +151,7 @@ def _bar(bars: Bars, task: _Task, rate: str) -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def _lines(task: _Task, rate: str) -> Iterator[Callable[[], None]]:
+def _lines(task: _Task, rate: str, words: Callable[[], str] | None) -> Iterator[Callable[[], None]]:
     say = partial(print, file=sys.stderr, flush=True)
     began = last = time.monotonic()
 
@@ -155,7 +163,8 @@ def _lines(task: _Task, rate: str) -> Iterator[Callable[[], None]]:
         of, digits = f" of {task.total}" if task.total else "", 0 if taken >= _EVERY else 2
         per_second = f", {done / taken:.3g} {rate}/s" if rate and taken > 0 else ""
         time_left = f", about {each * left:.0f} s left" if left and done else ""
-        say(f"gs-jax: {task.description}: {done}{of}, {taken:.{digits}f} s{per_second}{time_left}")
+        more = f", {words()}" if words else ""
+        say(f"gs-jax: {task.description}: {done}{of}, {taken:.{digits}f} s{per_second}{more}{time_left}")
 
     def advance():
         task.advance(now := time.monotonic())
@@ -182,7 +191,13 @@ class CancellableProgress(Progress):
 
     @contextmanager
     def counter(
-        self, description: str, total: int | None, *, quarter: str = "", rate: str = ""
+        self,
+        description: str,
+        total: int | None,
+        *,
+        quarter: str = "",
+        rate: str = "",
+        words: Callable[[], str] | None = None,
     ) -> Iterator[Callable[[], None]]:
         """As `Progress.counter`; of nested tasks, `state` tells the innermost."""
         self.check_cancelled()

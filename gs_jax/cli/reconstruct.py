@@ -27,6 +27,7 @@ from .options import (
     worker_options,
 )
 from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
+from .watch_command import check_watched, watch_folder
 
 
 @click.command(
@@ -100,6 +101,7 @@ def reconstruct_command(
     frame_interval: float | None,
     track: float | None,
     resume: bool,
+    watch: bool,
     light: Light,
     camera: CaptureOptions,
     workers: Workers,
@@ -152,13 +154,18 @@ def reconstruct_command(
     depths = light.from_array(depths, imager)
     method_options |= {"points": points is not None, "weights": weights}
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
+    how = {"track": track, "interval": frame_interval, "resume": resume}
+    if watch:
+        check_watched(output, workers=workers.remote, resume=resume, force=force)
+        with Progress() as progress:
+            files = {"design_text": text, "camera": camera, "points": points, "frame": frame}
+            return watch_folder(capture, plan, output, **files, **how, progress=progress)
     with open_recording(capture, page=camera.page) as recording, Progress() as progress:
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
         given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording:
             files = {"design_text": text, "capture": capture, "camera": camera, "points": points, "frame": frame}
-            how = {"track": track, "interval": frame_interval, "resume": resume}
             with workers:
                 return reconstruct_recording(
                     recording, plan, output, **files, **how, workers=workers, progress=progress

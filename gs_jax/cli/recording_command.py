@@ -3,7 +3,7 @@
 import atexit
 import hashlib
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from .options import UM, CaptureOptions, Number, depth_range
 # Failed frames that are named; others are only counted, and listed in the journal.
 _MAX_NAMED = 10
 # Options that do not change the volumes.
-_OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "resume", "force", "workers", "scheduler")
+_OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "resume", "watch", "force", "workers", "scheduler")
 
 
 def recording_options(command):
@@ -42,7 +42,13 @@ def recording_options(command):
         help="Recordings with --points: largest displacement of a particle between frames, um; POINTS.csv gets a "
         "column of particle numbers. Needs pip install 'gs-jax[track]'.",
     )
-    return interval(track(resume(command)))
+    watch = click.option(
+        "--watch",
+        is_flag=True,
+        help="CAPTURE is a folder into which a camera writes: reconstruct each capture as it comes, the newest first, "
+        "to VOLUME.zarr, until Ctrl-C. Needs pip install 'gs-jax[live]'.",
+    )
+    return watch(interval(track(resume(command))))
 
 
 def check_recording(capture: Path, recording, output: Path, *, resume: bool, given: dict[str, Any], force: bool):
@@ -74,11 +80,17 @@ def open_frames(capture: Path, camera: CaptureOptions, plan):
     return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
 
 
-def frames_of(recording, camera: CaptureOptions, plan):
-    """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`."""
+def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):
+    """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`.
+
+    `is_live` compiles all before the first frame comes.
+    """
     import numpy as np
 
     image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
+    if is_live:
+        with suppress(InputError):
+            reconstruct(np.zeros(plan.imager.sensor.shape, np.float32), Progress())
     # Only the first frame is checked; an iterator gives one item to one thread.
     checks = iter([plan.check] if plan.is_learned else [])
 
@@ -129,7 +141,7 @@ def reconstruct_recording(
         run = partial(reconstruct_frames, read=read, make=make)
     names = recording.names
     provenance = provenance_of(plan.weights, *camera.files, design=design_text)
-    request = _request(names, provenance)
+    request = request_of(provenance, names)
     provenance[f"input {capture.name}"] = f"{len(names)} frames, {names[0]} to {names[-1]}"
     provenance = camera.recorded(provenance)
     provenance |= frame.note if plan.imager.sample is not None else {}
@@ -156,9 +168,9 @@ def reconstruct_recording(
     run(series, on_failure=on_failure, progress=progress)
     print_messages()
     seconds, new = time.monotonic() - began, len(series.finished) - before
-    written = _write_points(points, series, track, provenance, frame) if points else ""
+    written = write_series_points(points, series, track, provenance, frame) if points else ""
     camera.print_corrections()
-    check = _print_notes(series)
+    check = print_notes(series)
     size = " x ".join(map(str, (series.count, *plan.grid.volume_shape)))
     rest = f"; {before} were there" if before else ""
     rate = f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
@@ -183,17 +195,18 @@ def residual_in_words(residual) -> str:
     return f"{error}, {residual.regions.max():.0%} where it is farthest"
 
 
-def _request(names, provenance) -> dict[str, str]:
+def request_of(provenance: dict[str, str], names: list[str] | None = None) -> dict[str, str]:
     """What the volumes depend on: options, the design, and the contents of the files beside the recording."""
     options = click.get_current_context().params
     request = {name: str(value) for name, value in options.items() if name not in _OTHER_OPTIONS and value is not None}
     request |= {name: text for name, text in provenance.items() if name.startswith(("input ", "design"))}
     request["points"] = str(bool(options.get("points")))
-    request["names of frames"] = hashlib.sha256("\n".join(names).encode()).hexdigest()
+    if names is not None:
+        request["names of frames"] = hashlib.sha256("\n".join(names).encode()).hexdigest()
     return request
 
 
-def _write_points(path, series, track, provenance, frame) -> str:
+def write_series_points(path, series, track, provenance, frame) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
     from ..detection.tracking import track as track_particles
     from ..io.point_tables import write_points_in_time
@@ -215,7 +228,7 @@ def _write_points(path, series, track, provenance, frame) -> str:
     return f"{words} of {particles} particle{'s' * (particles != 1)}" if track else words
 
 
-def _print_notes(series) -> str:
+def print_notes(series) -> str:
     """Print how many frames were corrected or have warnings, with the first warning; return the check."""
     from ..io.volume_series import JOURNAL
 

@@ -96,14 +96,14 @@ def _paged(path: Path, count: int, read: Callable[[int, Selection], Images]) -> 
 
 def _open_files(path: Path, matches: list[Path], page: int | str | None) -> Recording:
     files = [each for each in matches if each.suffix.lower() in CAPTURE_SUFFIXES and not each.name.startswith(".")]
-    files = sorted((each for each in files if not each.is_dir()), key=_natural_key)
+    files = sorted((each for each in files if not each.is_dir()), key=natural_key)
     if not files:
         raise InputError(f"{path}: no captures; their files end in {', '.join(CAPTURE_SUFFIXES)}.")
     read = lambda index, selection: read_images(files[index], selection._replace(page=page))
     return Recording([each.name for each in files], read, files)
 
 
-def _natural_key(path: Path) -> list[Any]:
+def natural_key(path: Path | str) -> list[Any]:
     """Key of the natural order: texts and numbers alternate."""
     parts = re.split(r"(\d+)", str(path))
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]

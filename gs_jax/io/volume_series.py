@@ -2,7 +2,8 @@
 
 The store has its full size from the first frame on, and opens at any moment; frames that are not written read as zeros.
 `frames.jsonl` in it has a line of JSON for the request, then one per frame, appended when the frame is wholly written.
-A last line without its end, which a crash cut off, does not count.
+A last line without its end, which a crash cut off, does not count. A store whose number of frames is not known grows by
+`add`, and its journal also has a line with the name of each frame.
 
 The format is OME-Zarr 0.5 (Zarr 3), whose shards make one file of a frame's planes, written whole or not at all. In 0.4
 each plane is a file: 1.3 million for 10^5 frames of 13 planes, which few file systems of clusters bear.
@@ -36,7 +37,7 @@ class VolumeSeries:
     path
         Store, ends in `.zarr`. It is made with the first frame, and replaces an image of that name.
     count, grid
-        Number of frames, and the grid of each.
+        Number of frames, None if they are to be added, and the grid of each.
     interval
         Seconds between frames, if they are known.
     request
@@ -55,7 +56,7 @@ class VolumeSeries:
     def __init__(
         self,
         path: Path,
-        count: int,
+        count: int | None,
         grid: Grid,
         *,
         interval: float | None = None,
@@ -63,7 +64,11 @@ class VolumeSeries:
         provenance: Provenance | None = None,
         resume: bool = False,
     ):
-        self.path, self.count, self.grid, self.interval = path, count, grid, interval
+        self.path, self.grid, self.interval = path, grid, interval
+        self._declared, self.count = count, count or 0
+        # Of frames that were added, and how many of them the journal has.
+        self.names: list[str] = []
+        self._journaled = 0
         self.request, self.provenance = request or {}, provenance or {}
         self.finished: set[int] = set()
         self.failed: dict[int, str] = {}
@@ -81,6 +86,12 @@ class VolumeSeries:
         """Whether the store exists, so that other processes can write volumes by `write_frame`."""
         return bool(self._levels)
 
+    def add(self, name: str) -> int:
+        """Append a frame of this name, which the journal has with the next volume or failure; return its number."""
+        self.names.append(name)
+        self.count = len(self.names)
+        return self.count - 1
+
     def write(self, frame: int, volume: Volume | None, note: Note | None = None) -> None:
         """Write the volume of a frame, counted from 0, then its note to the journal.
 
@@ -89,6 +100,7 @@ class VolumeSeries:
         if volume is not None:
             if not self._levels:
                 self._create(volume)
+            self._grow()
             write_frame(self.path, self._levels, frame, volume)
         self._append({"frame": frame, **(note or {})})
         self.finished.add(frame)
@@ -98,6 +110,7 @@ class VolumeSeries:
         """Record why a frame has no volume."""
         self.failed[frame] = reason
         if self._levels:
+            self._grow()
             self._append({"frame": frame, "error": reason})
 
     def notes(self) -> Iterator[tuple[int, Note]]:
@@ -105,15 +118,26 @@ class VolumeSeries:
         if not self._levels:
             return
         with open(self.path / JOURNAL, "rb") as file:
-            places = {frame: place for frame, place, error in _lines(file) if not error}
+            places = {note["frame"]: place for note, place in _lines(file) if not _is_other(note)}
             for frame in sorted(places):
                 file.seek(places[frame])
                 yield frame, json.loads(file.readline())
 
-    def _append(self, note: Note) -> None:
+    def _append(self, *notes: Note) -> None:
         journal = self.path / JOURNAL
         with disk_errors_name(self.path, journal), open(journal, "a", encoding="utf-8", newline="\n") as file:
-            file.write(json.dumps(note, ensure_ascii=False) + "\n")
+            file.write("".join(json.dumps(note, ensure_ascii=False) + "\n" for note in notes))
+
+    def _grow(self) -> None:
+        """Make room for the frames that were added, and write their names."""
+        count, first = self.count, self._journaled
+        if self._declared is not None or count == first:
+            return
+        with disk_errors_name(self.path, self.path):
+            for array in self._levels:
+                array.resize((count, *array.shape[1:]))
+        self._append(*({"frame": frame, "name": self.names[frame]} for frame in range(first, count)))
+        self._journaled = count
 
     def _create(self, volume: Volume) -> None:
         with needs_extra("zarr"):
@@ -126,9 +150,9 @@ class VolumeSeries:
         with atomic_write(self.path) as temporary:
             group = zarr.create_group(store=temporary, zarr_format=3, attributes=attributes)
             for level, shape in enumerate(shapes):
-                size = (self.count, len(depths), *shape)
+                size = (max(self.count, 1), len(depths), *shape)
                 group.create_array(str(level), shape=size, dtype=volume.dtype, **frame_shards(size))
-            lines = [{"request": self.request, "frames": self.count}]
+            lines = [{"request": self.request, "frames": self._declared}]
             lines += [{"frame": frame, "error": reason} for frame, reason in self.failed.items()]
             text = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
             (temporary / JOURNAL).write_text(text, encoding="utf-8", newline="\n")
@@ -138,20 +162,26 @@ class VolumeSeries:
         head = _read_head(self.path)
         if head is None:
             raise input_error("store for --resume", "what an interrupted recording left", "another store", self.path)
-        now, before = ({**request, "frames": str(count)} for request, count in ((self.request, self.count), head))
+        count = lambda n: "those of a watched folder" if n is None else str(n)
+        now, before = ({**request, "frames": count(n)} for request, n in ((self.request, self._declared), head))
         for key in dict.fromkeys([*now, *before]):
             if before.get(key) != now.get(key):
                 given, allowed = (short_repr(each[key]) if key in each else "none" for each in (now, before))
                 raise input_error(f"{key} with --resume", f"{allowed}, as before", given, self.path)
         journal = self.path / JOURNAL
         with open(journal, "rb") as file:
-            for frame, _, error in _lines(file):
-                if error:
+            for note, _ in _lines(file):
+                frame = note["frame"]
+                if "name" in note:
+                    self.names.append(note["name"])
+                elif error := note.get("error", ""):
                     self.failed[frame] = error
                 else:
                     self.finished.add(frame)
                     self.failed.pop(frame, None)
             whole = file.tell()
+        if self._declared is None:
+            self.count = self._journaled = len(self.names)
         os.truncate(journal, whole)
         self._levels = open_levels(self.path, self.grid)
 
@@ -176,12 +206,13 @@ def write_frame(path: Path, levels: list[Any], frame: int, volume: Volume) -> No
             array[frame] = volume
 
 
-def _read_head(path: PathLike) -> tuple[dict[str, str], int] | None:
-    """The request of a store and its number of frames; None without a journal."""
+def _read_head(path: PathLike) -> tuple[dict[str, str], int | None] | None:
+    """The request of a store and its number of frames, None of one that grows; None without a journal."""
     try:
         with open(Path(path) / JOURNAL, encoding="utf-8") as file:
             head = json.loads(file.readline())
-        return {str(key): str(value) for key, value in head["request"].items()}, int(head["frames"])
+        count = head["frames"]
+        return {str(key): str(value) for key, value in head["request"].items()}, count and int(count)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -226,21 +257,24 @@ def check_replaceable(path: Path) -> None:
     if (head := _read_head(path)) is None:
         return
     with open(path / JOURNAL, "rb") as file:
-        done = len({frame for frame, _, error in _lines(file) if not error})
-    if done < head[1]:
-        raise InputError(
-            f"{path}: has {done} of {head[1]} frames of an interrupted recording; give --resume to continue it, or "
-            "--force to replace it."
-        )
+        done = len({note["frame"] for note, _ in _lines(file) if not _is_other(note)})
+    if head[1] is None or done < head[1]:
+        frames = f"{done} frames of a watched folder" if head[1] is None else f"{done} of {head[1]} frames"
+        of = "" if head[1] is None else " of an interrupted recording"
+        raise InputError(f"{path}: has {frames}{of}; give --resume to continue it, or --force to replace it.")
 
 
-def _lines(file) -> Iterator[tuple[int, int, str]]:
-    """Frames, offsets of their lines and errors of an open journal, which is left at the end of its last whole line."""
+def _lines(file) -> Iterator[tuple[Note, int]]:
+    """Notes of an open journal and the offsets of their lines; it is left at the end of its last whole line."""
     file.readline()
     while (line := file.readline()).endswith(b"\n"):
-        note = json.loads(line)
-        yield note["frame"], file.tell() - len(line), note.get("error", "")
+        yield json.loads(line), file.tell() - len(line)
     file.seek(-len(line), os.SEEK_CUR)
+
+
+def _is_other(note: Note) -> bool:
+    """Whether a note is of a failure, or of a name, and not of a volume."""
+    return "error" in note or "name" in note
 
 
 def _pyramid(shape: tuple[int, ...]) -> list[tuple[int, int]]:

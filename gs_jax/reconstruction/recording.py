@@ -63,7 +63,7 @@ def reconstruct_frames(
         try:
             for frame, image in _read_ahead(reader, frames, read):
                 try:
-                    volume, note = _check_volume(*make(image.result()))
+                    volume, note = check_volume(*make(image.result()))
                     job = partial(series.write, frame, volume, note)
                 except InputError as error:
                     job = partial(series.fail, frame, str(error))
@@ -131,7 +131,7 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
         frame, exists = item
         with lock:
             image = read(frame)
-        volume, note = _check_volume(*make(image))
+        volume, note = check_volume(*make(image))
         if not exists:
             return volume, note
         write_frame(path, levels(), frame, volume)
@@ -140,7 +140,8 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
     return make_frame
 
 
-def _check_volume(volume, note):
+def check_volume(volume: Volume, note: Note) -> tuple[Volume, Note]:
+    """Return both; `InputError` if a voxel is not finite."""
     check_finite("volume", volume, "voxels")
     return volume, note
 
