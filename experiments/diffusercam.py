@@ -27,8 +27,9 @@ from experiments.common import Report, main, table
 from gs_jax.apps.method_benchmark import timed
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
+from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.solvers.base import differences, solve, total_variation
-from gs_jax.solvers.convolution import Convolution, ConvolutionADMM
+from gs_jax.solvers.convolution import ConvolutionADMM
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
@@ -49,8 +50,8 @@ def read(folder: Path, factor: int) -> tuple[np.ndarray, np.ndarray]:
 def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
     """Reconstruct the scene by one method."""
     rows, columns = image.shape
-    system = Convolution.of(psf[None], (rows, columns))
-    A = system.operator
+    system = ConvolutionOperator(psf[None], (rows, columns))
+    A = system
     if method == "ADMM":
         tv = TV / jnp.max(A.T.mv(image))  # in the unit of the solver
         return solve(system, image, ConvolutionADMM(steps, sparsity=0.0, tv=tv)).x
@@ -62,7 +63,7 @@ def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
 def objective(psf: Image, image: Image, scene: Image) -> Float[Array, ""]:
     """Objective of ADMM: half the squared residual plus total variation."""
     rows, columns = image.shape
-    residual = Convolution.of(psf[None], (rows, columns))(scene[None]) - image
+    residual = ConvolutionOperator(psf[None], (rows, columns)).mv(scene[None]) - image
     return jnp.vdot(residual, residual) / 2 + TV * total_variation(differences(scene[None], wrap=True), isotropic=False)
 
 
@@ -106,7 +107,7 @@ def run(
                 spent, results = _rounds(call, peer if method == "ADMM" else None, psf, image, some, rounds)
             scene = np.asarray(results["gs_jax"][0])
             common = {"factor": factor, "pixels": image.size, "steps": some, "method": method}
-            window = Convolution.of(psf[None], image.shape).window
+            window = ConvolutionOperator(psf[None], image.shape).window
             for name, seconds in spent.items():
                 x = scene if name == "gs_jax" else results[name]
                 cost = float(objective(*map(jnp.asarray, (psf, image, x)))) if method != "Richardson-Lucy" else None

@@ -31,7 +31,8 @@ From a capture to a volume:
     FISTA                FISTA: non-negative least squares with an L1 penalty, for any operator
     Unrolled             Unrolled inversion by trained networks; `Unrolled.pretrained()` loads those of the package
     ADMM                 ADMM: non-negative least squares with total variation and an L1 penalty, for any operator
-    deconvolve           Reconstruct a plane from its image through a shift-invariant system
+    ConvolutionADMM      ADMM for a `ConvolutionOperator`, with 3-D total variation and an L1 penalty
+    deconvolve           Reconstruct a plane, or a volume, from its image through measured PSFs
     show                 Maximum projections of a volume along z, y and x, to scale in mm, with points as circles
     write_volume         Writes a volume as float32, never rescaled or clipped, whole or not at all
     read_volume          A volume and its grid, from an OME-TIFF or an OME-Zarr (0.4 or 0.5) that has depths
@@ -58,6 +59,7 @@ The operators themselves, differentiable:
     forward              The image of a volume, summed lens by lens: Eq. (2), or with all of the light
     ImagingOperator      The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
     BackprojectionOperator  The paper's back-projection as a `lineax` operator, image to volume
+    ConvolutionOperator  Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint
     make_psf_model       The PSF model of a microscope at some depths, for `forward` and the solvers
     solve                Run a solver on an image, for all its steps or until its tolerance is met
 

@@ -25,6 +25,7 @@ from .mold.make import make_mold as make_mold
 from .pictures.volume_pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward, make_psf_model as make_psf_model
+from .projection.measured_psf import ConvolutionOperator as ConvolutionOperator
 from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,
     ImagingOperator as ImagingOperator,
@@ -38,6 +39,7 @@ from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
 from .solvers.admm import ADMM as ADMM
 from .solvers.base import solve as solve
+from .solvers.convolution import ConvolutionADMM as ConvolutionADMM
 from .solvers.fista import FISTA as FISTA
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
 from .solvers.unrolled import Unrolled as Unrolled

@@ -32,6 +32,7 @@ SOURCES = {
     "geomscope": "the lens centres that the paper's authors publish",
     "oracle": "whole captures by the ray tracer of tests/data",
     "diffusercam": "real captures of Waller Lab's DiffuserCam tutorial",
+    "diffusercam3d": "a real capture and a measured stack of Waller Lab's DiffuserCam",
 }
 
 

@@ -13,9 +13,9 @@ from skimage.restoration import denoise_tv_chambolle, richardson_lucy as of_skim
 
 from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
+from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.solvers.admm import ADMM
 from gs_jax.solvers.base import differences, differences_adjoint, lambda_max, shrink, solve, total_variation
-from gs_jax.solvers.convolution import Convolution
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
 
@@ -43,7 +43,7 @@ def blurred(imager, grid, dtype=jnp.float64):
 
 def convolution():
     psf = jax.random.uniform(jax.random.key(3), (2, 5, 4))
-    return Convolution.of(psf, (12, 10)).operator
+    return ConvolutionOperator(psf, (12, 10))
 
 
 OPERATORS = {
@@ -236,12 +236,12 @@ def test_richardson_lucy_is_scikit_images():
     psf /= psf.sum()
     truth = np.zeros((40, 42))
     truth[12:28, 14:28] = rng.random((16, 14))
-    system = Convolution.of(psf[None], truth.shape)
+    system = ConvolutionOperator(psf[None], truth.shape)
     embedded = jnp.zeros(system.scene_shape).at[(0, *system.window)].set(truth)
-    image = np.maximum(np.asarray(system(embedded)), 0)
+    image = np.maximum(np.asarray(system.mv(embedded)), 0)
     image[image < 1e-12] = 0  # an FFT's rounding
     expected = of_skimage(image, psf, num_iter=25, clip=False)
-    found = jax.jit(lambda b: solve(system.operator, b, RichardsonLucy(steps=25)))(jnp.asarray(image))
+    found = jax.jit(lambda b: solve(system, b, RichardsonLucy(steps=25)))(jnp.asarray(image))
     # The same iteration in exact arithmetic; 25 divisions amplify the rounding of the FFTs.
     np.testing.assert_allclose(found.x[0][system.window], expected, atol=1e-8)
 

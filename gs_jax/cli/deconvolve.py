@@ -1,52 +1,128 @@
-"""`gs-jax deconvolve`: a plane, from a capture and a measured PSF."""
+"""`gs-jax deconvolve`: a plane or a volume, from a capture and measured PSFs."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from ..io.files import check_output
 from .files import check_may_write, provenance_of
-from .options import CaptureOptions, Number, picture_options
+from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, picture_options
+
+_METHODS = ("admm", "fista", "richardson-lucy")
 
 
-@click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf.tif --tv 1e-3 -o scene.tif")
+@click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf_stack.tif -o volume.ome.tif")
 @click.argument("capture", type=Path)
-@click.argument("psf", type=Path)
-@click.option("--method", type=click.Choice(["admm", "fista", "richardson-lucy"]), default="admm")
-@click.option("--steps", type=click.IntRange(1, 100_000), default=100)
-@click.option("--tv", type=Number(0.0, 10.0), help="Weight of total variation.  [default: 0.001 of admm]")
-@click.option("-o", "--output", type=Path, required=True, help="SCENE.tif or .npy, float32, of CAPTURE's size.")
+@click.argument("psf", type=Path, nargs=-1, required=True)
+@click.option(
+    "--depths",
+    type=Depths(),
+    help="START:STOP:STEP in mm, STOP included: depths of the planes, in the order of the PSFs.  "
+    "[default: planes are numbered]",
+)
+@click.option("--voxel-um", type=UM, help="What a pixel of CAPTURE is wide in the scene, for scale bars.")
+@click.option(
+    "--method",
+    type=click.Choice(_METHODS),
+    default="admm",
+    show_default=True,
+    help="admm: smooth areas with edges, best for most scenes; fista: separate points; richardson-lucy: dim light, "
+    "where photons are few.",
+)
+@click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True, help="At most so many steps.")
+@click.option(
+    "--tv",
+    type=Number(0.0, 10.0),
+    help="Weight of total variation (admm, richardson-lucy): the more, the smoother.  [default: 0.001 of admm]",
+)
+@click.option(
+    "--tv-z",
+    type=Number(0.0, 1000.0),
+    help="How much neighbouring planes are to be alike, relative to neighbouring pixels (admm).  [default: 1]",
+)
+@click.option(
+    "--sparsity", type=Number(0.0, 1.0), help="Weight of the sum of voxels (admm, fista): the more, the darker."
+)
+@click.option("--stop-at-noise", is_flag=True, help="Stop early when all but noise is explained.")
+@click.option(
+    "--psf-page",
+    type=Page(),
+    help="Make one plane of each PSF file: of this page, from 1; or of the mean of repeated frames.  "
+    "[default: a plane for each page]",
+)
+@click.option(
+    "--binning",
+    type=click.IntRange(1, 64),
+    default=1,
+    help="Sum squares of so many pixels a side, of CAPTURE and PSFs alike: 2 takes a quarter of time and memory.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=Path,
+    required=True,
+    help="VOLUME.ome.tif, .npy, or .zarr (with --depths and --voxel-um), float32, planes of CAPTURE's size.",
+)
 @picture_options
 def deconvolve_command(
-    capture: Path, psf: Path, method: str, steps: int, tv: float | None, output: Path, camera: CaptureOptions
+    capture: Path,
+    psf: tuple[Path, ...],
+    output: Path,
+    depths: list[float] | None,
+    voxel_um: float | None,
+    psf_page: int | str | None,
+    binning: int,
+    method: str,
+    steps: int,
+    stop_at_noise: bool,
+    camera: CaptureOptions,
+    **weights: Any,
 ):
-    """Reconstruct the plane in CAPTURE, taken through a diffuser or another mask whose PSF is the file PSF.
+    """Reconstruct the scene in CAPTURE, taken through a diffuser, a lens array or another mask, from measured PSFs.
 
-    PSF is the image of a point on the axis, of any size; several pages are averaged. Both files may be TIFF, PNG or
-    .npy, and are read and corrected in the same way.
+    A PSF is what the camera sees of one small source in the middle of the field, such as a lit pinhole. From one PSF
+    follows the plane where the source was. From a stack, a PSF at each depth, follows a volume with a plane for each:
+    give the pages of a TIFF, a folder of images, a Zarr array (z, y, x), or several files in order.
+
+    All files may be TIFF, PNG or .npy, in the same pixels; a PSF may be smaller than CAPTURE, its source then being in
+    the PSF's middle. --dark, --flat, --bad-pixels and --offset correct all of them.
+
+    \b
+    One plane:
+    gs-jax deconvolve capture.tif psf.tif -o scene.tif
+
+    \b
+    A volume, every second pixel, from PSFs at 10, 10.5, ... 20 mm:
+    gs-jax deconvolve capture.tif psfs/ --depths 10:20:0.5 --binning 2 -o volume.ome.tif
     """
-    from ..io.captures import write_capture
-    from ..reconstruction.deconvolution import TV, deconvolve
-    from ..solvers.convolution import ConvolutionADMM
-    from ..solvers.fista import FISTA
-    from ..solvers.richardson_lucy import RichardsonLucy
+    import numpy as np
 
-    check_output(output, [".tif", ".tiff", ".npy"])
-    check_may_write(output, inputs=(capture, psf, *camera.files))
-    if method == "admm":
-        solver = ConvolutionADMM(steps, sparsity=0.0, tv=TV if tv is None else tv)
-    elif method == "richardson-lucy":
-        solver = RichardsonLucy(steps, accelerate=True, tv=tv or 0.0)
-    elif tv is None:
-        solver = FISTA(steps)
-    else:
-        raise InputError("--tv must be used with --method admm or richardson-lucy, got fista.")
-    image, spot = camera.read(capture), camera.read(psf, is_spot=True)
+    from ..io.captures import write_capture
+    from ..io.files import check_output
+    from ..io.plane_stacks import STACK_SUFFIXES, write_planes
+    from ..reconstruction.deconvolution import bin_pixels, deconvolve, make_solver
+
+    check_output(output, STACK_SUFFIXES)
+    check_may_write(output, inputs=(capture, *psf, *camera.files))
+    if output.suffix.lower() == ".zarr" and not (depths and voxel_um):
+        raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
+    solver = make_solver(method, steps, weights)
     with Progress() as progress:
-        scene = deconvolve(image, spot, solver, progress=progress)
+        with progress.step("Reading"):
+            image = bin_pixels(camera.read(capture), binning)
+            spots = np.stack([bin_pixels(spot, binning) for spot in camera.read_spots(psf, psf_page)])
+        if depths and len(depths) != len(spots):
+            raise InputError(f"--depths must be one for each PSF, {len(spots)} in all, got {len(depths)} depths.")
+        planes = deconvolve(image, spots, solver, stop_at_discrepancy=stop_at_noise, progress=progress)
         with progress.step("Writing"):
-            write_capture(output, scene, camera.recorded(provenance_of(capture, psf, *camera.files)))
+            provenance = camera.recorded(provenance_of(capture, *psf, *camera.files))
+            if len(planes) == 1 and not depths:
+                write_capture(output, planes[0], provenance)
+            else:
+                write_planes(output, planes, depths, voxel_um and voxel_um * binning / 1000, provenance)
     camera.print_corrections()
-    click.echo(f"{output}: {scene.shape[0]} x {scene.shape[1]} pixels, {method}, {steps} steps")
+    z, rows, columns = planes.shape
+    of = "" if z == 1 and not depths else f"{depth_range(depths)}, " if depths else f"{z} planes, "
+    click.echo(f"{output}: {of}{rows} x {columns} pixels, {method}, at most {steps} steps")

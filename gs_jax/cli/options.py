@@ -202,15 +202,27 @@ class CaptureOptions:
         self.sensor = imager.sensor
         return eqx.tree_at(lambda i: i.sensor, imager, self.readout.sensor(imager.sensor))
 
-    def read(self, path: Path, *, is_spot: bool = False):
-        """Read and correct a capture; of a single spot, average all pages and keep sharp pixels."""
+    def read(self, path: Path):
+        """Read and correct a capture."""
         from ..io.camera import read_corrected
 
-        page, correction = self.page, self.correction
-        if is_spot:
-            page = "mean"
-            correction = correction._replace(bad_pixels="none") if correction.bad_pixels == "auto" else correction
-        capture = read_corrected(path, self.sensor, page=page, readout=self.readout, correction=correction)
+        return self._note(
+            path, read_corrected(path, self.sensor, page=self.page, readout=self.readout, correction=self.correction)
+        )
+
+    def read_spots(self, paths: tuple[Path, ...], page: int | str | None):
+        """Read and correct images of a point as a stack, a plane for each page; or for each file with `page`.
+
+        Single sharp pixels are kept.
+        """
+        import numpy as np
+
+        from ..io.plane_stacks import read_spots
+
+        spots = read_spots(paths, page=page, readout=self.readout, correction=self.correction)
+        return np.stack([self._note(path, capture) for path, capture in spots])
+
+    def _note(self, path, capture):
         for line in capture.done:
             self.done.setdefault(line, []).append(path)
         self.warnings |= dict.fromkeys(capture.warnings)
@@ -261,7 +273,7 @@ class CaptureOptions:
 
 def capture_options(command):
     """Add the options of captures; the command receives them as `camera`, a `CaptureOptions`."""
-    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS))
+    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS), ("roi", "binning"))
 
 
 def picture_options(command):
@@ -269,11 +281,11 @@ def picture_options(command):
     return _with_camera(command, (*_FORMAT_OPTIONS, *_CORRECTION_OPTIONS))
 
 
-def _with_camera(command, options):
+def _with_camera(command, options, region=()):
     @functools.wraps(command)
     def wrapper(*args, **kwargs):
-        names = ("page", "channel", "bayer", "roi", "binning", "dark", "flat", "bad_pixels", "offset")
-        camera = CaptureOptions(**{name: kwargs.pop(name) for name in names if name in kwargs})
+        names = ("page", "channel", "bayer", *region, "dark", "flat", "bad_pixels", "offset")
+        camera = CaptureOptions(**{name: kwargs.pop(name) for name in names})
         return command(*args, camera=camera, **kwargs)
 
     for option in reversed(options):

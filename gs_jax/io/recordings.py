@@ -51,8 +51,8 @@ class Recording(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_recording(path: PathLike, *, page: int | str | None = None) -> Iterator[Recording | None]:
-    """Open the frames of a recording; None if the path is a single capture.
+def open_recording(path: PathLike, *, page: int | str | None = None, axes: str = "t") -> Iterator[Recording | None]:
+    """Open the frames of a recording, or the planes of a stack; None if the path is a single capture.
 
     Parameters
     ----------
@@ -62,6 +62,8 @@ def open_recording(path: PathLike, *, page: int | str | None = None) -> Iterator
         of one.
     page
         As for `read_capture`: each file is then one frame, and a single file no recording.
+    axes
+        What the first axis of OME-Zarr may be: "t", or "tz" for stacks.
 
     Raises
     ------
@@ -71,7 +73,7 @@ def open_recording(path: PathLike, *, page: int | str | None = None) -> Iterator
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_dir() and (suffix == ".zarr" or any((path / name).exists() for name in _ZARR_ROOTS)):
-        yield _open_zarr(path, page)
+        yield _open_zarr(path, page, axes)
     elif path.is_dir():
         yield _open_files(path, [path / name for name in os.listdir(path)], page)
     elif re.search(r"[*?[]", str(path)) and not path.exists():
@@ -109,7 +111,7 @@ def natural_key(path: Path | str) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(parts)]
 
 
-def _open_zarr(path: Path, page: int | str | None) -> Recording:
+def _open_zarr(path: Path, page: int | str | None, first: str) -> Recording:
     with needs_extra("zarr"):
         import zarr
         from zarr import open as open_zarr
@@ -122,9 +124,10 @@ def _open_zarr(path: Path, page: int | str | None) -> Recording:
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
     shape, axes = array.shape, _axes(store)
-    if len(shape) < 3 or any(n != 1 for n in shape[1:-2]) or not shape[0] or (axes and axes[0] != "t"):
+    if len(shape) < 3 or any(n != 1 for n in shape[1:-2]) or not shape[0] or (axes and axes[0] not in first):
         given = f"{size_text(shape)}{f' ({names})' if (names := ', '.join(axes)) else ''}"
-        raise input_error("array", "(t, y, x), with axes of 1 alone between t and y", given, path)
+        allowed = f"({first[-1]}, y, x), with axes of 1 alone between {first[-1]} and y"
+        raise input_error("array", allowed, given, path)
 
     def read(index, selection):
         check_colour(path, None, selection)

@@ -22,12 +22,12 @@ def _image_structure(self) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(self.imager.sensor.shape, self.imager.sensor_distance.dtype)
 
 
-def _transpose(self) -> "Transposed":
+def transpose(self) -> "Transposed":
     """The exact adjoint, as `.T`."""
     return Transposed(self)
 
 
-def _as_matrix(self) -> Float[Array, "out in"]:
+def as_matrix(self) -> Float[Array, "out in"]:
     """The dense matrix, for small systems."""
     return _as_function(self).as_matrix()
 
@@ -67,7 +67,7 @@ class ImagingOperator(lx.AbstractLinearOperator):
     grid: Grid
     optics: PsfModel = None
     in_structure, out_structure = _volume_structure, _image_structure
-    transpose, as_matrix = _transpose, _as_matrix
+    transpose, as_matrix = transpose, as_matrix
 
     def mv(self, vector: Float[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume."""
@@ -99,7 +99,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     method: str = eqx.field(static=True, default="linear")
     normalize: bool = eqx.field(static=True, default=False)
     in_structure, out_structure = _image_structure, _volume_structure
-    transpose, as_matrix = _transpose, _as_matrix
+    transpose, as_matrix = transpose, as_matrix
 
     def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
@@ -109,7 +109,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
 class Transposed(lx.AbstractLinearOperator):
     """The transpose of one of these operators."""
 
-    operator: ImagingOperator | BackprojectionOperator
+    operator: lx.AbstractLinearOperator
 
     def mv(self, vector: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
         return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)[0]
@@ -120,16 +120,16 @@ class Transposed(lx.AbstractLinearOperator):
     def out_structure(self) -> jax.ShapeDtypeStruct:
         return self.operator.in_structure()
 
-    def transpose(self) -> ImagingOperator | BackprojectionOperator:
+    def transpose(self) -> lx.AbstractLinearOperator:
         return self.operator
 
     def as_matrix(self) -> Float[Array, "out in"]:
         return self.operator.as_matrix().T
 
 
-# Lineax dispatches these on the operator's class.
-for _class in (ImagingOperator, BackprojectionOperator, Transposed):
-    for _property in (
+def no_structure(operator: type[lx.AbstractLinearOperator]) -> None:
+    """Register a class with lineax, which dispatches on it, as real and without special structure."""
+    for of in (
         lx.is_symmetric,
         lx.is_diagonal,
         lx.is_tridiagonal,
@@ -139,7 +139,11 @@ for _class in (ImagingOperator, BackprojectionOperator, Transposed):
         lx.is_negative_semidefinite,
         lx.has_unit_diagonal,
     ):
-        _property.register(_class)(lambda _: False)
-    for _same in (lx.linearise, lx.conj):
-        _same.register(_class)(lambda operator: operator)
-    lx.materialise.register(_class)(lambda operator: lx.materialise(_as_function(operator)))
+        of.register(operator)(lambda _: False)
+    for same in (lx.linearise, lx.conj):
+        same.register(operator)(lambda operator: operator)
+    lx.materialise.register(operator)(lambda operator: lx.materialise(_as_function(operator)))
+
+
+for _class in (ImagingOperator, BackprojectionOperator, Transposed):
+    no_structure(_class)

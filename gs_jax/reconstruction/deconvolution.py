@@ -1,58 +1,78 @@
-"""Deconvolution of a capture with a measured PSF, of a diffuser or any other mask in front of a camera."""
+"""Deconvolution of a capture with measured PSFs, of a diffuser or any other mask in front of a camera."""
+
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Array, Float32, Num
 
 from ..base.arrays import check_finite
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, input_error, short_repr
+from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..solvers.convolution import Convolution, ConvolutionADMM
+from ..projection.measured_psf import ConvolutionOperator, scene_size
+from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import Image
 from .inverse_problem import subtract_offset
-from .pipeline import run_solver
+from .pipeline import DISCREPANCY_FACTOR, run_solver
+from .residual import discrepancy_target
 
 # Default weight of ADMM's total variation.
 TV = 1e-3
+# Arrays of the scene's size at the peak, the PSFs' spectra among them, as measured.
+_ARRAYS = {ConvolutionADMM: 16, FISTA: 9, RichardsonLucy: 9}
 
 Deconvolver = ConvolutionADMM | FISTA | RichardsonLucy
+# Solvers by the names of the command line, as functions of the number of steps.
+SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
+    "admm": lambda steps: ConvolutionADMM(steps, sparsity=0.0, tv=TV),
+    "fista": FISTA,
+    "richardson-lucy": lambda steps: RichardsonLucy(steps, accelerate=True),
+}
 
 
 def deconvolve(
     image: Image,
-    psf: Num[Array | np.ndarray, "high wide"],
-    solver: Deconvolver = ConvolutionADMM(steps=100, tv=TV),
+    psf: Num[Array | np.ndarray, "*depth high wide"],
+    solver: Deconvolver = ConvolutionADMM(steps=100, sparsity=0.0, tv=TV),
     *,
+    stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
-) -> Float32[np.ndarray, "row column"]:
-    """Reconstruct a plane from its image through a shift-invariant system.
+) -> Float32[np.ndarray, "*depth row column"]:
+    """Reconstruct a plane, or a volume, from its image through measured PSFs.
 
     *Host.*
 
-    Points beside the sensor whose light reaches it are reconstructed, too, and then cropped (Antipa et al., Optica 5,
-    1, 2018). The camera's offset, the first percentile, is subtracted from image and PSF.
+    Each plane has one PSF, wherever in it a point is. Points beside the sensor whose light reaches it are
+    reconstructed, too, and then cropped (Antipa et al., Optica 5, 1, 2018). The camera's offset, the first percentile,
+    is subtracted from the image and from each PSF.
 
     Parameters
     ----------
     image
         Linear, in any unit.
     psf
-        Image of a point on the axis, which is at the middle; any unit.
+        Image of a point on the axis, which is at the middle; any unit. Or a stack of them, one for each depth.
     solver
-        Solver that inverts the convolution.
+        Solver that inverts the convolutions.
+    stop_at_discrepancy
+        Stop early where the cost is no larger than the image's noise leaves (Morozov's discrepancy principle).
     progress
         Shows progress.
 
     Returns
     -------
     ndarray
-        The scene, `image.shape`, in the image's unit: its sum is about that of the light that reaches the sensor.
+        The scene, a plane of `image.shape` for each PSF, in the image's unit: its sum is about that of the light that
+        reaches the sensor.
 
     Raises
     ------
     InputError
-        If `solver` is no such solver, a pixel is not finite, or the PSF is dark.
+        If `solver` is no such solver, a pixel is not finite, the PSF is no image or stack, is larger than the image, or
+        has a dark plane, or the solver would not fit into memory.
 
     Examples
     --------
@@ -64,16 +84,76 @@ def deconvolve(
     >>> scene = gs.deconvolve(image, psf, gs.FISTA(steps=50))
     >>> print(*divmod(int(scene.argmax()), 64))
     30 30
+    >>> nearer = np.zeros((33, 33))
+    >>> nearer[16, [4, 16, 31]] = 1.0  # the spots are farther apart
+    >>> volume = gs.deconvolve(image, np.stack([nearer, psf]))
+    >>> print(volume.shape, volume.sum((1, 2)).argmax())
+    (2, 64, 64) 1
     """
     if not isinstance(solver, Deconvolver):
         raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")
     check_finite("image", image)
     check_finite("psf", psf)
-    light, spot = (subtract_offset(np.asarray(part, np.float32)) for part in (image, psf))
-    if not spot.sum() > 0:
-        raise InputError("psf must be the image of a point, got no light above the darkest percent.")
-    system = Convolution.of(spot[None] / spot.sum(), light.shape)
+    spots = _spots(psf)
+    if any(k > n for k, n in zip(spots.shape[1:], image.shape, strict=True)):
+        size = lambda shape: " x ".join(map(str, shape))
+        raise input_error("psf", f"at most the image's {size(image.shape)} pixels", size(spots.shape[1:]))
+    _check_memory(solver, (len(spots), *scene_size(image.shape, spots.shape[1:])))
+    light = subtract_offset(np.asarray(image, np.float32))
+    system = ConvolutionOperator(spots, light.shape)
     # Weights of priors suit images of the order of 1.
-    unit = float(np.abs(light).max()) or 1.0
-    scene = run_solver(solver, light / np.float32(unit), system, progress or Progress())
-    return np.float32(unit) * scene[0][system.window]
+    unit = np.float32(np.abs(light).max() or 1.0)
+    target = 0.0
+    if stop_at_discrepancy:
+        counts = isinstance(solver, RichardsonLucy)
+        target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light / unit, counts=counts)
+    scene = run_solver(solver, light / unit, system, progress or Progress(), target)
+    scene = unit * scene[:, *system.window]
+    return scene if psf.ndim == 3 else scene[0]
+
+
+def make_solver(method: str, steps: int, weights: dict[str, float | None]) -> Deconvolver:
+    """The solver of a name with the weights that are given; `InputError` if it lacks one."""
+    solver = SOLVERS[method](steps)
+    given = {name: weight for name, weight in weights.items() if weight is not None}
+    for name in given:
+        if not hasattr(solver, name):
+            option = f"--{name.replace('_', '-')}"
+            allowed = " or ".join(other for other, make in SOLVERS.items() if hasattr(make(1), name))
+            raise InputError(f"{option} must be used with --method {allowed}, got {method}.")
+    return dataclasses.replace(solver, **given)
+
+
+def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarray, "y x"]:
+    """Sums of squares of pixels; what fills no square is left out."""
+    if side == 1:
+        return image
+    rows, columns = (n // side for n in image.shape)
+    if min(rows, columns) < 2:
+        raise input_error("--binning", "such that 2 x 2 pixels or more are left", f"{rows} x {columns}")
+    light = np.asarray(image[: rows * side, : columns * side], np.float32)
+    return light.reshape(rows, side, columns, side).sum((1, 3))
+
+
+def _spots(psf) -> Float32[np.ndarray, "depth high wide"]:
+    """PSFs above their offsets, each with the sum 1."""
+    if psf.ndim not in (2, 3) or min(psf.shape) < 1:
+        raise input_error("psf", "an image or a stack of images", f"the shape {psf.shape}")
+    spots = np.array(psf, np.float32).reshape(-1, *psf.shape[-2:])
+    for plane in range(len(spots)):
+        spot = subtract_offset(spots[plane])
+        if not (total := spot.sum()) > 0:
+            where = f" in plane {plane + 1}" if len(spots) > 1 else ""
+            raise InputError(f"psf must be the image of a point, got no light above the darkest percent{where}.")
+        spots[plane] = spot / total
+    return spots
+
+
+def _check_memory(solver, shape):
+    size = 4 * _ARRAYS[type(solver)] * int(np.prod(shape, dtype=np.int64))
+    if size > (memory := available_memory()):
+        voxels = " x ".join(map(str, shape))
+        raise InputError(
+            f"psf, image: the solver must take at most {memory / 2**30:.3g} GiB, the free memory, got {voxels} voxels, "
+            f"for which it takes about {size / 2**30:.3g} GiB; --binning 2 takes a quarter."
+        )

@@ -21,7 +21,6 @@ from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject
 from ..projection.forward_model import FIDELITIES, PsfModel
 from ..solvers.base import Solver
-from ..solvers.convolution import ConvolutionADMM
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
@@ -41,7 +40,7 @@ _PLANES = 16
 # Default voxel of an iterative method, in pixels seen at the middle depth.
 PIXELS_PER_VOXEL = 4
 # The noise's share of the cost is known to a few percent.
-_DISCREPANCY_FACTOR = 1.1
+DISCREPANCY_FACTOR = 1.1
 
 
 def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, *, pixels: int = 1) -> Grid:
@@ -190,7 +189,7 @@ def reconstructor(
         target = 0.0
         # The steps of `Unrolled` were trained together.
         if stop_at_discrepancy and not isinstance(method, Unrolled):
-            target = _DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
+            target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
         if isinstance(method, PinholeRichardsonLucy):
             return run_solver(method.solver(background), light, problem, progress, target)
         if isinstance(method, RichardsonLucy):
@@ -265,11 +264,11 @@ def _wider_voxels(grid):
 
 
 def run_solver(solver, light, problem, progress, target_cost=0.0):
-    """Run a solver on an `InverseProblem` or a `Convolution`, step by step, until it converges or meets the target."""
+    """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target."""
     # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, problem)
-    quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else ""
+    quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else "twice the --binning"
     with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):
             state, cost, residual = _step(state, compiled, light, problem)
@@ -282,13 +281,13 @@ def run_solver(solver, light, problem, progress, target_cost=0.0):
 
 @jax.jit
 def _start(solver, light, problem):
-    return solver.init(_operator(solver, problem), light)
+    return solver.init(_operator(problem), light)
 
 
 @partial(jax.jit, donate_argnums=0)
 def _step(state, solver, light, problem):
-    return solver.step(_operator(solver, problem), light, state)
+    return solver.step(_operator(problem), light, state)
 
 
-def _operator(solver, problem):
-    return problem if isinstance(solver, ConvolutionADMM) else problem.operator
+def _operator(problem):
+    return problem.operator if isinstance(problem, InverseProblem) else problem

@@ -26,7 +26,7 @@ from .base import as_image, check_options, differences, differences_adjoint, lam
 
 # The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
 # many times: convergence is proven for a penalty that is constant from some step on.
-_BALANCE, _FACTOR, _MAX_CHANGES = 10.0, 2.0, 50
+_BALANCE, _FACTOR, MAX_CHANGES = 10.0, 2.0, 50
 # Over-relaxation (Boyd, section 3.4.3) with conjugate gradients. On images of particles and of letters, 1.8 gives a
 # lower cost than 1 after as many steps, and about the same as 1.6.
 _RELAXATION = 1.8
@@ -80,7 +80,7 @@ class Splitting(NamedTuple):
     @classmethod
     def start(cls, x: PyTree, split: PyTree, rho: Array) -> "Splitting":
         """From `x = 0` and its split."""
-        return cls(x, split, split, rho, jnp.array(_MAX_CHANGES))
+        return cls(x, split, split, rho, jnp.array(MAX_CHANGES))
 
 
 class Iterate(NamedTuple):
@@ -210,11 +210,16 @@ def advance(
     # multipliers is 0 at the solution, and a relative residual would have no scale.
     primal = divide(norm(subtract(split, new)), jnp.maximum(norm(split), norm(new)))
     dual = divide(norm(subtract(new, z)), jnp.maximum(norm(u), norm(new)))
-    factor = jnp.where(primal > _BALANCE * dual, _FACTOR, jnp.where(dual > _BALANCE * primal, 1 / _FACTOR, 1))
-    factor = jnp.where(changes > 0, factor, 1).astype(rho.dtype)
-    changes = changes - (factor != 1).astype(changes.dtype)
+    factor, changes = balance(primal, dual, changes)
     splitting = Splitting(x, new, jax.tree.map(lambda leaf: leaf / factor, u), rho * factor, changes)
     return splitting, cost(x, split), jnp.maximum(primal, dual)
+
+
+def balance(primal, dual, changes):
+    """Factor of the penalty that balances the residuals, and the changes that are left."""
+    factor = jnp.where(primal > _BALANCE * dual, _FACTOR, jnp.where(dual > _BALANCE * primal, 1 / _FACTOR, 1))
+    factor = jnp.where(changes > 0, factor, 1).astype(primal.dtype)
+    return factor, changes - (factor != 1).astype(changes.dtype)
 
 
 def _conjugate_gradients(A, smooth, right_side, iterate, steps):

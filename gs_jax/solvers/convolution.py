@@ -1,109 +1,123 @@
-"""Shift-invariant imaging by a measured PSF, as convolution and crop, and its ADMM solver with an exact x-step.
-
-A sensor sees only a part of the light that a diffuser or lens array casts, also from points beyond its edges. So the
-scene is larger than the image: it holds every point whose PSF reaches the sensor, and the image is the middle of its
-convolution (Antipa et al., DiffuserCam, Optica 5, 1, 2018).
-"""
+"""ADMM for measured stacks of PSFs, with an exact x-step by FFTs, plane by plane."""
 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from ..base.arrays import divide, safe_sqrt
+from ..projection.measured_psf import ConvolutionOperator
 from ..typing import Image, Real
-from .admm import Regularizer, Splitting, advance, positive_or_one
-from .base import as_image, check_options
+from .admm import MAX_CHANGES, balance, positive_or_one
+from .base import as_image, check_options, lambda_max, shrink, total_variation
 
 # Initial penalty of the convolved scene, relative to the image's weight. With 1 or 0.01 the cost falls more slowly, on
-# DiffuserCam's image and on random ones.
+# both captures of DiffuserCam and on random ones.
 _INITIAL_PENALTY = 0.1
+# Over-relaxation (Boyd, section 3.4.3).
+_RELAXATION = 1.8
 
 
-class Convolution(eqx.Module):
-    """Convolution with a PSF for each depth, stored as spectra on the scene's grid. Make it with `of`."""
+class System(NamedTuple):
+    """What does not change from step to step.
 
-    spectra: Complex[Array, "depth tall half"]
-    image_shape: tuple[int, int] = eqx.field(static=True)
-    scene_shape: tuple[int, int, int] = eqx.field(static=True)
+    `tv` and `l1` are absolute weights, `splits` is 1 with total variation and 0 without. `smooth` is the spectrum of
+    `D'D + 1` within planes. `filters` are `(D'D + 1)^-1 psf*`, a plane each; None without differences along z, where
+    they are `psf.conj() / smooth`. `response` is the spectrum of `sum(psf filters)`.
+    """
 
-    @classmethod
-    def of(cls, psf: Float[Array | np.ndarray, "depth high wide"], image_shape: tuple[int, int]) -> "Convolution":
-        """Convolution with a measured PSF.
+    tv: Array
+    l1: Array
+    splits: Array
+    gain: Array
+    smooth: Array
+    filters: Array | None
+    response: Array
 
-        Parameters
-        ----------
-        psf
-            Image of a point on the axis at each depth, the point being at `(high // 2, wide // 2)`.
-        image_shape
-            `(rows, columns)` of the images.
 
-        Raises
-        ------
-        ValueError
-            If `psf` is empty or not `(depth, row, column)`.
-        """
-        if psf.ndim != 3 or min(psf.shape) < 1:
-            raise ValueError(f"`psf` must be (depth, row, column) and not empty, got {psf.shape}.")
-        from scipy.fft import next_fast_len  # imported here: solvers without FFTs do not need SciPy
+class Sums(NamedTuple):
+    """Each split variable plus its scaled multiplier; the proximal map tells them apart.
 
-        size = [int(next_fast_len(n + k - 1, real=True) or 0) for n, k in zip(image_shape, psf.shape[1:], strict=True)]
-        padded = jnp.pad(jnp.asarray(psf), [(0, 0), *((0, n - k) for n, k in zip(size, psf.shape[1:], strict=True))])
-        centred = jnp.roll(padded, [-(k // 2) for k in psf.shape[1:]], (1, 2))
-        rows, columns = image_shape
-        return cls(jnp.fft.rfft2(centred), (rows, columns), (len(psf), size[0], size[1]))
+    `image` is the convolved scene over the gain; `differences` and `scene` are those of the scene, plane by plane.
+    """
 
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the image within a plane of the scene."""
-        corner = [(n - m) // 2 for n, m in zip(self.scene_shape[1:], self.image_shape, strict=True)]
-        rows, columns = (slice(a, a + m) for a, m in zip(corner, self.image_shape, strict=True))
-        return rows, columns
+    image: Float[Array, "tall wide"]
+    differences: Float[Array, "depth axis tall wide"]
+    scene: Float[Array, "depth tall wide"]
 
-    def __call__(self, scene: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
-        """Image of a scene of `scene_shape`."""
-        spectrum = jnp.sum(jnp.fft.rfft2(scene) * self.spectra, axis=0)
-        return jnp.fft.irfft2(spectrum, s=self.scene_shape[1:])[self.window]
 
-    @property
-    def operator(self) -> lx.AbstractLinearOperator:
-        """`lineax` operator for any solver; its transpose is exact."""
-        scene = jax.ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
-        return lx.FunctionLinearOperator(eqx.Partial(type(self).__call__, self), scene)
+class Penalty(NamedTuple):
+    """`rho`, by which sums are scaled, the factor by which it changes before the next step, and the changes left."""
+
+    rho: Array
+    factor: Array
+    changes: Array
 
 
 class State(NamedTuple):
     """State of `ConvolutionADMM`.
 
-    `gain` is the scale by which the system is divided, `spectrum` the spectrum of the divided system, and
-    `inverse_spectrum` that of the inverse of the x-step's matrix.
+    `spectra` are `(D'D + 1)^-1` of the differences and the scene that the next x-step aims at; `best` is the best
+    estimate so far, and `cost` its cost.
     """
 
-    splitting: Splitting
-    regularizer: Regularizer
-    gain: Array
-    spectrum: Array
-    inverse_spectrum: Array
+    system: System
+    sums: Sums
+    spectra: Array
+    penalty: Penalty
+    best: Array
+    cost: Array
 
 
 class ConvolutionADMM(eqx.Module):
-    """ADMM for a `Convolution`, with an exact x-step by four FFTs; cost, parameters and errors as for `ADMM`.
+    """ADMM for a `ConvolutionOperator`, with 3-D total variation and an L1 penalty.
 
-    As in DiffuserCam (Antipa et al., Optica 5, 1, 2018) the convolved scene is split too, which separates the crop to
-    the sensor from the convolution. The steps are not over-relaxed: with 1.6 or 1.8 the cost of DiffuserCam's image
-    falls more slowly. Differences are periodic, in depth too. The estimate has `system.scene_shape`;
-    `system.window` is the image's place in it.
+    *Differentiable.*
+
+    It minimises `|A x - image|^2 / 2 + tv TV(x) + l1 sum|x|`. The convolved scene is split, too, which separates the
+    crop to the sensor from the convolution (Almeida and Figueiredo, IEEE Trans. Image Process. 22, 3074, 2013; Antipa
+    et al., Optica 5, 1, 2018), so that FFTs solve the x-step exactly: for each frequency its matrix is one that is
+    diagonal, plus one of rank one (Wohlberg, ICASSP 2014, 7173). Each plane takes three FFTs a step. Planes follow
+    one another, so that little beside the state is of the size of the scene. Differences are periodic along rows and
+    columns.
+
+    The estimate is the best so far of the sparse split, each scaled to fit best, so costs never rise. It has
+    `A.scene_shape`; `A.window` is the image's place in it.
 
     The convolved scene has its own penalty `rho / gain^2`, where `gain^2` is the geometric mean of the largest and the
-    mean eigenvalue of `A'A`. For one split the best penalty is the geometric mean of the extreme eigenvalues (Ghadimi
-    et al., IEEE Trans. Autom. Control 60, 644, 2015); the smallest of a diffuser is 0, hence the mean. With the mean
-    alone, low spatial frequencies, up to `max / mean` times as strong (4e5 for 2 million pixels), outweigh the
-    regularizer, which then acts slowly.
+    mean eigenvalue of `A'A` for the mean plane. For one split the best penalty is the geometric mean of the extreme
+    eigenvalues (Ghadimi et al., IEEE Trans. Autom. Control 60, 644, 2015); the smallest of a diffuser is 0, hence the
+    mean. With the mean alone, low spatial frequencies, up to `max / mean` times as strong (4e5 for 2 million pixels),
+    outweigh the regularizer, which then acts slowly.
+
+    Parameters
+    ----------
+    steps, tolerance, sparsity, tv, isotropic
+        As for `ADMM`.
+    tv_z
+        Weight of differences between planes, relative to those within planes. 0: each plane for itself.
+    nonnegative
+        Whether the scene has no negative values.
+
+    Raises
+    ------
+    InputError
+        If an option is negative or `steps` is 0.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, numpy as np
+    >>> stack = np.zeros((2, 20, 30))
+    >>> stack[0, 10, 15] = stack[1, 10, 5] = stack[1, 10, 25] = 1.0
+    >>> A = gs.ConvolutionOperator(stack)
+    >>> scene = np.zeros(A.in_structure().shape)
+    >>> scene[1, 18:22, 28] = 1.0
+    >>> solution = gs.solve(A, A.mv(scene), gs.ConvolutionADMM(steps=30, tv=0.001))
+    >>> print(np.unravel_index(solution.x.argmax(), scene.shape)[0])
+    1
     """
 
     steps: int = eqx.field(static=True, default=20)
@@ -111,60 +125,157 @@ class ConvolutionADMM(eqx.Module):
     sparsity: Real | Float[Array, ""] = 0.01
     tv: Real | Float[Array, ""] = 0.0
     isotropic: bool = eqx.field(static=True, default=False)
+    tv_z: float = eqx.field(static=True, default=1.0)
+    nonnegative: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         check_options(self)
 
-    def init(self, system: Convolution, image: Image) -> State:
-        A = system.operator
-        regularizer = Regularizer.of(self, A.T.mv(as_image(A, image)), wrap=True)
-        shape, axes = system.scene_shape, _axes(system)
-        # The sum of 2-D convolutions is plane 0 of a 3-D convolution with the PSF's depths reversed.
-        backwards = jnp.roll(system.spectra[::-1], 1, axis=0)
-        spectrum = jnp.fft.fft(backwards, axis=0) if shape[0] > 1 else backwards
-        power = jnp.abs(spectrum) ** 2
-        gain = safe_sqrt(safe_sqrt(jnp.mean(power) * jnp.max(power)))
-        spectrum = _scale(divide(jnp.ones_like(gain), gain), spectrum)
-        laplacian = _laplacian_spectrum(shape, axes, gain.dtype)[..., : spectrum.shape[-1]]
-        inverse_spectrum = 1 / (jnp.abs(spectrum) ** 2 + regularizer.splits_differences * laplacian + 1)
-        x = jnp.zeros(shape, gain.dtype)
-        splitting = Splitting.start(x, (x, *regularizer.split(x)), positive_or_one(_INITIAL_PENALTY * gain**2))
-        return State(splitting, regularizer, gain, spectrum, inverse_spectrum)
+    def init(self, A: ConvolutionOperator, image: Image) -> State:
+        image = as_image(A, image)
+        unit = lambda_max(A.T.mv(image))
+        tv, l1 = (jnp.asarray(weight, image.dtype) * unit for weight in (self.tv, self.sparsity))
+        splits = (tv > 0).astype(tv.dtype)
+        power = jnp.sum(A.spectra.real**2 + A.spectra.imag**2, axis=0)
+        depths, *size = A.scene_shape
+        gain = safe_sqrt(safe_sqrt(jnp.mean(power) * jnp.max(power)) / depths)
+        smooth = 1 + splits * _laplacian(size, power.dtype)
+        filters = _solve_along_z(smooth, A.spectra.conj(), splits * self.tv_z**2) if self._axes(A) == 3 else None
+        response = power / smooth if filters is None else jnp.sum(_real_of_product(A.spectra, filters), axis=0)
+        x = jnp.zeros(A.scene_shape, image.dtype)
+        sums = Sums(x[0], jnp.zeros((depths, self._axes(A), *size), image.dtype), x)
+        penalty = Penalty(positive_or_one(_INITIAL_PENALTY * gain**2), jnp.ones_like(gain), jnp.array(MAX_CHANGES))
+        system = System(tv, l1, splits, gain, smooth, filters, response)
+        return State(system, sums, jnp.zeros_like(A.spectra), penalty, x, jnp.vdot(image, image) / 2)
 
-    def step(self, system: Convolution, image: Image, state: State) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
-        image = as_image(system.operator, image)
-        splitting, regularizer, gain, spectrum, inverse_spectrum = state
-        shape, axes = system.scene_shape, _axes(system)
-        transform = lambda x: jnp.fft.rfftn(x, axes=axes)
-        inverse = lambda f: jnp.fft.irfftn(f, s=[shape[axis] for axis in axes], axes=axes)
-        window = (0, *system.window)
-
-        def update(x, target, rho):
-            v, *rest = target
-            right_side = spectrum.conj() * transform(v) + transform(regularizer.adjoint(rest))
-            solution = _scale(inverse_spectrum, right_side)
-            x = inverse(solution)
-            return x, (inverse(spectrum * solution), *regularizer.split(x))
-
-        def prox(split, rho):
-            v, *rest = split
-            measured = (rho * v[window] + gain * image) / (rho + gain**2)
-            return v.at[window].set(measured), *regularizer.prox(rest, rho)
-
-        def cost(x, split):
-            v, *rest = split
-            residual = gain * v[window] - image
-            return jnp.vdot(residual, residual) / 2 + regularizer.cost(rest)
-
-        splitting, now, residual = advance(splitting, update, prox, cost)
-        return state._replace(splitting=splitting), now, residual
+    def step(
+        self, A: ConvolutionOperator, image: Image, state: State
+    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        image = as_image(A, image)
+        sums, penalty, residual = self._update_sums(A, image, state)
+        spectra, best, cost = self._update_best(A, image, state._replace(sums=sums, penalty=penalty))
+        return State(state.system, sums, spectra, penalty, best, cost), state.cost, residual
 
     def estimate(self, state: State) -> Float[Array, "depth tall wide"]:
-        return state.splitting.z[-1]
+        return state.best
 
+    def _axes(self, A):
+        """Number of axes along which there are differences."""
+        return 3 if self.tv_z and A.scene_shape[0] > 1 else 2
 
-def _axes(system):
-    return (0, 1, 2) if system.scene_shape[0] > 1 else (1, 2)
+    def _differences(self, x, following):
+        """Differences of a plane, along the plane's axes and to the following plane."""
+        return jnp.stack(
+            [jnp.roll(x, -1, 0) - x, jnp.roll(x, -1, 1) - x]
+            + ([] if following is None else [self.tv_z * (following - x)])
+        )
+
+    def _prox(self, A, image, system, rho):
+        """Proximal maps of the three splits, each of a plane."""
+        window, gain = A.window, system.gain
+
+        def measured(v):
+            return v.at[window].set((rho * v[window] + gain * image) / (rho + gain**2))
+
+        def sparse(w):
+            if self.nonnegative:
+                return jnp.maximum(w - system.l1 / rho, 0)
+            return w - jnp.clip(w, -system.l1 / rho, system.l1 / rho)
+
+        return measured, lambda u: shrink(u, system.tv / rho, isotropic=self.isotropic), sparse
+
+    def _update_sums(self, A, image, state):
+        """Solve the x-step and add its scene to the multipliers."""
+        system, sums, spectra, penalty = state.system, state.sums, state.spectra, state.penalty
+        gain, response, factor, size = system.gain, system.response, penalty.factor, A.scene_shape[1:]
+        rho = penalty.rho * factor
+        before, after = self._prox(A, image, system, penalty.rho), self._prox(A, image, system, rho)
+
+        def update(x, total, old, new):
+            """Next sum of a split `x`, and the squares of its residuals and sizes."""
+            z = old(total)
+            multiplier = (total - z) / factor
+            total = _RELAXATION * x + (1 - _RELAXATION) * z + multiplier
+            changed = new(total)
+            parts = x - changed, x, changed, changed - z, total - changed
+            return total, jnp.stack([jnp.vdot(part, part) for part in parts])
+
+        # The x-step by Woodbury's identity: `spectra` plus what the convolved scene adds through the filters.
+        v = before[0](sums.image)
+        target = jnp.fft.rfft2(v - (sums.image - v) / factor)
+        seen = jnp.sum(A.spectra * spectra, axis=0)
+        inverse = divide(jnp.ones_like(response), gain**2 + response)
+        light = _scale(inverse, _scale(gain, target) - seen)
+        convolved = jnp.fft.irfft2(seen + _scale(response, light), size)
+        image_sum, squares = update(divide(convolved, jnp.broadcast_to(gain, size)), sums.image, before[0], after[0])
+        if system.filters is None:
+            light = _scale(1 / system.smooth, light)
+
+        def plane(carry, planes):
+            following, squares = carry
+            spectrum, filter, differences, scene, is_last = planes
+            x = jnp.fft.irfft2(spectrum + (filter.conj() if system.filters is None else filter) * light, size)
+            toward = None if following is None else jnp.where(is_last, x, following)
+            split = system.splits * self._differences(x, toward)
+            differences, of_differences = update(split, differences, before[1], after[1])
+            scene, of_scene = update(x, scene, before[2], after[2])
+            carry = None if following is None else x, squares + of_differences + of_scene
+            return carry, (differences, scene)
+
+        filters = A.spectra if system.filters is None else system.filters
+        is_last = jnp.arange(len(filters)) == len(filters) - 1
+        start = (None if self._axes(A) == 2 else jnp.zeros(size, image.dtype)), squares
+        planes = spectra, filters, sums.differences, sums.scene, is_last
+        (_, squares), (differences, scene) = lax.scan(plane, start, planes, reverse=True)
+        primal, split, changed, dual, multiplier = safe_sqrt(squares)
+        # Residuals of the split itself, as for `ADMM`.
+        primal, dual = divide(primal, jnp.maximum(split, changed)), divide(dual, jnp.maximum(multiplier, changed))
+        factor, changes = balance(primal, dual, penalty.changes)
+        return Sums(image_sum, differences, scene), Penalty(rho, factor, changes), jnp.maximum(primal, dual)
+
+    def _update_best(self, A, image, state):
+        """Solve for what the next x-step aims at, and keep the best of the sparse scenes."""
+        system, sums, penalty = state.system, state.sums, state.penalty
+        _, prox_differences, prox_scene = self._prox(A, image, system, penalty.rho)
+        along_z = self._axes(A) == 3
+
+        def target(total, prox):
+            z = prox(total)
+            return z, z - (total - z) / penalty.factor
+
+        def variation(x, following):
+            split = self._differences(x, following if along_z else None)
+            return total_variation(split, isotropic=self.isotropic)
+
+        def plane(carry, planes):
+            last, last_z, seen, cost = carry
+            psf, differences, scene, is_first = planes
+            _, u = target(differences, prox_differences)
+            x, w = target(scene, prox_scene)
+            back = jnp.roll(u[0], 1, 0) - u[0] + jnp.roll(u[1], 1, 1) - u[1]
+            if along_z:
+                back = back + self.tv_z * (last_z - u[2])
+            cost = cost + jnp.where(is_first, 0, system.tv * variation(last, x)) + system.l1 * jnp.sum(jnp.abs(x))
+            spectrum = jnp.fft.rfft2(system.splits * back + w)
+            spectrum = spectrum if along_z else _scale(1 / system.smooth, spectrum)
+            return (x, u[-1] if along_z else last_z, seen + psf * jnp.fft.rfft2(x), cost), spectrum
+
+        dark = jnp.zeros_like(sums.image)
+        is_first = jnp.arange(len(A.spectra)) == 0
+        start = dark, dark, jnp.zeros_like(A.spectra[0]), jnp.zeros((), image.dtype)
+        planes = A.spectra, sums.differences, sums.scene, is_first
+        (last, _, seen, cost), spectra = lax.scan(plane, start, planes)
+        cost = cost + system.tv * variation(last, last)
+        if along_z:
+            spectra = _solve_along_z(system.smooth, spectra, system.splits * self.tv_z**2)
+        seen = jnp.fft.irfft2(seen, A.scene_shape[1:])[A.window]
+        # The exact minimum along the ray of the sparse scene, as the penalties are homogeneous.
+        scale = divide(jnp.maximum(jnp.vdot(seen, image) - cost, 0), jnp.vdot(seen, seen))
+        residual = scale * seen - image
+        cost = jnp.vdot(residual, residual) / 2 + scale * cost
+        better = cost < state.cost
+        best = jnp.where(better, scale * prox_scene(sums.scene), state.best)
+        return spectra, best, jnp.where(better, cost, state.cost)
 
 
 def _scale(factor, spectrum):
@@ -172,10 +283,23 @@ def _scale(factor, spectrum):
     return lax.complex(factor * spectrum.real, factor * spectrum.imag)
 
 
-def _laplacian_spectrum(shape, axes, dtype):
-    """Eigenvalues of `D'D` with periodic differences: `2 - 2 cos(2 pi k / n)`, summed over the axes."""
-    total = jnp.zeros((1, 1, 1), dtype)
-    for axis in axes:
-        angle = 2 * jnp.pi * jnp.arange(shape[axis], dtype=dtype) / shape[axis]
-        total = total + (2 - 2 * jnp.cos(angle)).reshape([-1 if a == axis else 1 for a in range(3)])
-    return total
+def _real_of_product(a, b):
+    return a.real * b.real - a.imag * b.imag
+
+
+def _laplacian(size, dtype):
+    """Eigenvalues of `D'D` with periodic differences along rows and columns: `2 - 2 cos(2 pi k / n)` each."""
+    rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(n) / n) for n in size)
+    return jnp.asarray(rows[:, None] + columns[: size[1] // 2 + 1], dtype)
+
+
+def _solve_along_z(smooth, spectra, weight):
+    """`(smooth + weight Dz'Dz)^-1 spectra`: cosines diagonalise differences that end at the first and last plane."""
+    count = len(spectra)
+    modes = np.cos(np.pi * (np.arange(count) + 0.5) * np.arange(count)[:, None] / count)
+    modes = jnp.asarray(modes / np.linalg.norm(modes, axis=1, keepdims=True), smooth.dtype)
+    values = jnp.asarray(2 - 2 * np.cos(np.pi * np.arange(count) / count), smooth.dtype)
+    mix = lambda matrix, part: jnp.einsum("ab,byx->ayx", matrix, part)
+    stiffness = smooth[None] + weight * values[:, None, None]
+    parts = (mix(modes, part) / stiffness for part in (spectra.real, spectra.imag))
+    return lax.complex(*(mix(modes.T, part) for part in parts))

@@ -1,0 +1,136 @@
+"""Imaging through a measured stack of PSFs: one shift-invariant PSF for each plane, and a sensor that crops the sum.
+
+A sensor sees only a part of the light that a diffuser or lens array casts, also from points beyond its edges. So the
+scene is larger than the image: it holds every point whose PSF reaches the sensor, and the image is the middle of the
+sum of its planes' convolutions (Antipa et al., DiffuserCam, Optica 5, 1, 2018).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import ShapeDtypeStruct, lax
+from jaxtyping import Array, Complex, Float, Num
+
+from ..base.arrays import as_shape
+from ..base.errors import InputError
+from .linear_map import LinearMap
+from .operators import as_matrix, no_structure, transpose
+
+
+class ConvolutionOperator(lx.AbstractLinearOperator):
+    """Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint.
+
+    *Differentiable*, a `lineax` operator like `ImagingOperator`, also with respect to the PSFs from which it is made.
+    Its leaves are their spectra, of the size of the scene. Planes are convolved one after the other, so that no other
+    array is of that size. `gs_jax.solve` takes it with every solver, `jax.vmap` maps it over scenes and images.
+
+    Parameters
+    ----------
+    psf_stack
+        Image of a point on the axis at each depth, `(depth, high, wide)`, the point being at `(high // 2, wide // 2)`.
+    image_shape
+        `(rows, columns)` of the sensor; by default those of the PSFs.
+
+    Attributes
+    ----------
+    scene_shape
+        `(depth, tall, wide)` of scenes.
+    window
+        Rows and columns of the sensor within a plane of the scene.
+
+    Raises
+    ------
+    InputError
+        If `psf_stack` is empty or not `(depth, high, wide)`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, jax.numpy as jnp
+    >>> stack = jnp.zeros((2, 20, 30)).at[0, 10, 15].set(1.0).at[1, 10, [5, 25]].set(0.5)
+    >>> A = gs.ConvolutionOperator(stack)
+    >>> A.in_structure().shape, A.out_structure().shape
+    ((2, 40, 60), (20, 30))
+    >>> solution = gs.solve(A, jnp.ones((20, 30)), gs.FISTA(steps=10))
+    """
+
+    spectra: Complex[Array, "depth tall half"]
+    image_shape: tuple[int, int] = eqx.field(static=True)
+    scene_shape: tuple[int, int, int] = eqx.field(static=True)
+
+    def __init__(
+        self, psf_stack: Num[Array | np.ndarray, "depth high wide"], image_shape: tuple[int, int] | None = None
+    ):
+        psf = jnp.asarray(psf_stack)
+        if psf.ndim != 3 or min(psf.shape) < 1:
+            raise InputError(f"psf_stack must be (depth, row, column) and not empty, got the shape {psf.shape}.")
+        psf = psf if jnp.issubdtype(psf.dtype, jnp.floating) else psf.astype(float)
+        self.image_shape = as_shape(image_shape or psf.shape[1:])
+        tall, wide = scene_size(self.image_shape, psf.shape[1:])
+        self.scene_shape = (len(psf), tall, wide)
+        self.spectra = lax.map(lambda plane: centred_spectrum(plane, (tall, wide)), psf)
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        return middle(self.image_shape, self.scene_shape[1:])
+
+    def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
+        """The image of a scene."""
+        sizes = _Sizes(self.image_shape, self.scene_shape[1:])
+        return _convolution(sizes, self.spectra, jnp.asarray(vector, self.spectra.real.dtype))
+
+    def in_structure(self) -> ShapeDtypeStruct:
+        return ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
+
+    def out_structure(self) -> ShapeDtypeStruct:
+        return ShapeDtypeStruct(self.image_shape, self.spectra.real.dtype)
+
+    transpose, as_matrix = transpose, as_matrix
+
+
+no_structure(ConvolutionOperator)
+
+
+class _Sizes(NamedTuple):
+    image: tuple[int, int]
+    scene: tuple[int, int]
+
+
+def _convolve(sizes: _Sizes, spectra, scene):
+    def add(total, plane):
+        light, spectrum = plane
+        return total + jnp.fft.rfft2(light) * spectrum, None
+
+    total = lax.scan(add, jnp.zeros_like(spectra[0]), (scene, spectra))[0]
+    return jnp.fft.irfft2(total, sizes.scene)[middle(*sizes)]
+
+
+def _correlate(sizes: _Sizes, spectra, image):
+    spectrum = jnp.fft.rfft2(jnp.zeros(sizes.scene, image.dtype).at[middle(*sizes)].set(image))
+    return lax.map(lambda psf: jnp.fft.irfft2(spectrum * psf.conj(), sizes.scene), spectra)
+
+
+_convolution = LinearMap(_convolve, _correlate)
+
+
+def scene_size(image_shape: tuple[int, ...], psf_shape: tuple[int, ...]) -> tuple[int, int]:
+    """Smallest size of fast FFTs that holds every point whose PSF reaches the sensor."""
+    from scipy.fft import next_fast_len  # imported here: solvers without FFTs do not need SciPy
+
+    rows, columns = (int(next_fast_len(n + k - 1, real=True) or 0) for n, k in zip(image_shape, psf_shape, strict=True))
+    return rows, columns
+
+
+def centred_spectrum(psf: Float[Array, "high wide"], size: tuple[int, int]) -> Complex[Array, "tall half"]:
+    """Spectrum of a PSF on a scene's grid, its middle at the origin."""
+    padded = jnp.pad(psf, [(0, n - k) for n, k in zip(size, psf.shape, strict=True)])
+    return jnp.fft.rfft2(jnp.roll(padded, [-(k // 2) for k in psf.shape], (0, 1)))
+
+
+def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a sensor within a plane of a scene."""
+    corner = [(n - m) // 2 for n, m in zip(size, image_shape, strict=True)]
+    rows, columns = (slice(a, a + m) for a, m in zip(corner, image_shape, strict=True))
+    return rows, columns
