@@ -3,7 +3,8 @@
 `napari.yaml` names both. The work runs in another thread; a timer in this one shows its progress.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
@@ -44,9 +45,7 @@ class Result(NamedTuple):
     warnings: list[str]
 
 
-def reconstruct_layers(
-    name: str,
-    capture: Path | np.ndarray,
+def prepare_layers(
     design: Path,
     depths: str,
     voxel_um: float,
@@ -54,8 +53,8 @@ def reconstruct_layers(
     suppress: str,
     points: bool,
     progress: CancellableProgress,
-) -> Result:
-    """Reconstructs a file, or the pixels of a layer, as `gs-jax reconstruct` with these options.
+) -> Callable[[str, Path | np.ndarray], Result]:
+    """Returns the function that reconstructs a file, or the pixels of a layer, as `gs-jax reconstruct` does.
 
     Raises
     ------
@@ -71,25 +70,62 @@ def reconstruct_layers(
         planes = Depths().convert(depths, None, None)
     except click.BadParameter as error:
         raise InputError(f"Depths {error.message}") from error
-    camera = CaptureOptions(dark=None, flat=None, bad_pixels="auto", offset=0.0)
-    with progress.step("Reading"):
-        imager = camera.imager(read_design(design).imager())
-        if isinstance(capture, Path):
-            image, warnings = camera.read(capture), list(camera.warnings)
-        else:
-            image, warnings = _correct_pixels(name, capture, imager.sensor)
+    imager = read_design(design).imager()
     options = {"method": method, "suppress": suppress, "points": points}
     plan = Plan.of(imager, planes, voxel_um / _UM_PER_MM or None, **options)
     grid, volume_of = plan.grid, plan.prepare(progress)
-    with progress.step("Reconstructing"):
-        volume, found, _, warning = volume_of(image, progress)
-    progress.check_cancelled()
-    layers = [volume_layer(volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
-    if found is not None:
-        layers.append(points_layer(found, f"{name}, {len(found)} points", mean_step(grid)))
-    z, y, x = volume.shape
-    status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM_PER_MM:.4g} um laterally, {depth_range(planes)}"
-    return Result(layers, _capture_transform(imager.sensor), status, warnings + ([warning] if warning else []))
+
+    def reconstruct(name: str, capture: Path | np.ndarray) -> Result:
+        with progress.step("Reading"):
+            if isinstance(capture, Path):
+                camera = CaptureOptions(dark=None, flat=None, bad_pixels="auto", offset=0.0)
+                camera.imager(imager)
+                image, warnings = camera.read(capture), list(camera.warnings)
+            else:
+                image, warnings = _correct_pixels(name, capture, imager.sensor)
+        with progress.step("Reconstructing"):
+            volume, found, _, warning = volume_of(image, progress)
+        progress.check_cancelled()
+        layers = [volume_layer(volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
+        if found is not None:
+            layers.append(points_layer(found, f"{name}, {len(found)} points", mean_step(grid)))
+        z, y, x = volume.shape
+        status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM_PER_MM:.4g} um laterally, {depth_range(planes)}"
+        return Result(layers, _capture_transform(imager.sensor), status, warnings + ([warning] if warning else []))
+
+    return reconstruct
+
+
+def newest_captures(folder: Path, make: Callable[[str, Path], Result], progress: CancellableProgress) -> Iterator:
+    """Yields the `Result` of the newest capture of a folder again and again, or what is wrong with it in words.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be watched.
+    """
+    from .io.watched_folder import WatchedFolder
+    from .reconstruction.live import SETTLED
+
+    name, since = "", 0.0
+    with WatchedFolder(folder) as watched:
+        while True:
+            names = watched.changes(_POLL_INTERVAL / 1000)
+            progress.check_cancelled()
+            if names:
+                name, since = names[-1], time.monotonic()
+            if not name:
+                continue
+            try:
+                result = make(name, folder / name)
+                late = time.time() - (folder / name).stat().st_mtime
+                yield result._replace(status=f"{name}, {1000 * late:.0f} ms after it was written")
+            except (InputError, FileNotFoundError) as error:
+                # It may be half-written.
+                if time.monotonic() - since < SETTLED:
+                    continue
+                yield str(error)
+            name = ""
 
 
 def _correct_pixels(name, pixels, sensor):
@@ -138,6 +174,8 @@ class Reconstruct(Container):
         names = sorted((path.stem for path in shipped_designs()), key=lambda name: name != "geomscope")
         self.layer = ComboBox(label="Capture", choices=captures, tooltip="An open grey layer, or:")
         self.file = FileEdit(label="or a file", nullable=True, filter="*.tif *.tiff *.png *.npy")
+        tip = "Live: its newest capture, again and again, while a camera writes."
+        self.folder = FileEdit(label="or a folder", nullable=True, mode="d", tooltip=tip)
         self.design = ComboBox(label="Design", choices=names, tooltip="One that comes with gs-jax, or:")
         self.design_file = FileEdit(label="or a file", nullable=True, filter="*.toml")
         self.depths = LineEdit(
@@ -149,19 +187,22 @@ class Reconstruct(Container):
         self.method = ComboBox(label="Method", choices=METHODS)
         self.suppress = ComboBox(label="Suppress", choices=SUPPRESSIONS, tooltip="Background, after backproject.")
         self.points = CheckBox(label="Find points")
-        self.run, self.cancel = PushButton(text="Run"), PushButton(text="Cancel", enabled=False)
+        self.run, self.live, self.cancel = (PushButton(text=each) for each in ("Run", "Live", "Cancel"))
+        self.cancel.enabled = False
         self.bar, self.status = ProgressBar(label=" "), Label(label=" ", value="")
-        buttons = Container(widgets=[self.run, self.cancel], layout="horizontal", labels=False, label=" ")
-        files = self.layer, self.file, self.design, self.design_file
+        buttons = Container(widgets=[self.run, self.live, self.cancel], layout="horizontal", labels=False, label=" ")
+        files = self.layer, self.file, self.folder, self.design, self.design_file
         options = self.depths, self.voxel, self.method, self.suppress, self.points
         super().__init__(widgets=[*files, *options, buttons, self.bar, self.status])
         self.voxel.native.setSpecialValueText("default")
         self.status.native.setWordWrap(True)
         self.run.clicked.connect(self.start)
+        self.live.clicked.connect(self.start_live)
         self.cancel.clicked.connect(self.abort)
         self.worker: Any = None
         self._capture: Any = None
         self._result: Result | str | None = None
+        self._live: list[Layer] | None = None  # of the newest capture of a folder; the next one replaces their data
         # The timer polls what the other thread sets, and is deleted with the widget.
         self._done, closed = Event(), Event()
         self.native.destroyed.connect(lambda: closed.set())
@@ -177,9 +218,21 @@ class Reconstruct(Container):
         if file is None and self._capture is None:
             show_error("Capture must be a layer or a file, got none.")
             return
+        name = self._capture.name if file is None else file.name
+        self._live = None
+        self._start(name, self._capture.data if file is None else file)
+
+    def start_live(self) -> None:
+        """Starts the reconstruction of the newest capture of a folder, again and again, in another thread."""
+        folder: Any = self.folder.value
+        if folder is None:
+            show_error("The folder must be one into which a camera writes, got none.")
+            return
+        self._capture, self._live = None, []
+        self._start(folder.name, folder)
+
+    def _start(self, name: str, capture: Path | np.ndarray) -> None:
         request = {
-            "name": self._capture.name if file is None else file.name,
-            "capture": self._capture.data if file is None else file,
             "design": self.design_file.value or DESIGN.convert(self.design.value, None, None),
             "depths": self.depths.value,
             "voxel_um": self.voxel.value,
@@ -190,7 +243,7 @@ class Reconstruct(Container):
         self._result = None
         self._done.clear()
         work: Any = self._work
-        self.worker = create_worker(work, request, _start_thread=False)
+        self.worker = create_worker(work, name, capture, request, _start_thread=False)
         self._set_running(True)
         self.worker.start()
 
@@ -200,16 +253,21 @@ class Reconstruct(Container):
         self.cancel.enabled = False
         self.status.value = "Stops after this step."
 
-    def _work(self, request: dict[str, Any]) -> None:
+    def _work(self, name: str, capture: Path | np.ndarray, request: dict[str, Any]) -> None:
         # Other exceptions are errors of the program, which napari shows.
         try:
-            self._result = reconstruct_layers(**request, progress=self.progress)
+            make = prepare_layers(**request, progress=self.progress)
+            if self._live is None or not isinstance(capture, Path):
+                self._result = make(name, capture)
+            else:
+                for result in newest_captures(capture, make, self.progress):
+                    self._result = result
         except Cancelled:
             pass
         except InputError as error:
             self._result = str(error)
         except OSError as error:
-            self._result = f"{request['name']}: {error.strerror or error}"
+            self._result = f"{name}: {error.strerror or error}"
         finally:
             self._done.set()
 
@@ -217,10 +275,13 @@ class Reconstruct(Container):
         status, done, total = self.progress.state
         self.bar.native.setRange(0, total or 0)
         self.bar.native.setValue(done)
-        if status and self.cancel.enabled:
+        if status and self.cancel.enabled and not self._live:
             self.status.value = status
         if self._done.is_set():
             self._finish()
+        elif self._live is not None:
+            result, self._result = self._result, None
+            self._show_newest(result)
 
     def _finish(self) -> None:
         self._set_running(False)
@@ -231,6 +292,20 @@ class Reconstruct(Container):
             show_error(result)
         elif result is not None:
             self._show(result, self._capture)
+
+    def _show_newest(self, result: Result | str | None) -> None:
+        if isinstance(result, str):
+            show_warning(result)
+        elif result is not None and any(each in self.viewer.layers for each in self._live or ()):
+            # The user's limits of contrast stay.
+            for layer, (data, fields, _) in zip(self._live or (), result.layers, strict=True):
+                layer.data, layer.name = data, fields["name"]
+                layer.features = fields.get("features", {})
+            self.status.value = result.status
+        elif result is not None:
+            before = list(self.viewer.layers)
+            self._show(result, None)
+            self._live = [each for each in self.viewer.layers if each not in before]
 
     def _show(self, result: Result, capture: Layer | None) -> None:
         for warning in result.warnings:
@@ -250,7 +325,8 @@ class Reconstruct(Container):
         self.status.value = result.status
 
     def _set_running(self, running: bool) -> None:
-        self.run.enabled, self.cancel.enabled = not running, running
+        self.run.enabled = self.live.enabled = not running
+        self.cancel.enabled = running
         if running:
             self._timer.start()
         else:

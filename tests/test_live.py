@@ -41,14 +41,14 @@ class Camera:
         self.folder, self.steps, self.read = path / "run", list(steps), []
         self.folder.mkdir(exist_ok=True)
 
-    def changes(self, timeout: float) -> list[str] | None:
+    def changes(self, timeout: float) -> Any:
         assert timeout < live.SETTLED + 1
-        step = self.steps.pop(0) if self.steps else None
-        if callable(step):
-            return step()
-        for number in step or ():
+        step: Any = self.steps.pop(0) if self.steps else None
+        if step is None or callable(step):
+            return step and step()
+        for number in step:
             np.save(self.folder / f"f{number}.npy", image_of(number))
-        return None if step is None else [f"f{number}.npy" for number in step]
+        return [f"f{number}.npy" for number in step]
 
     def run(self, series: VolumeSeries, **calls) -> None:
         def read(frame):

@@ -202,12 +202,12 @@ def test_a_widget_that_is_closed_ends_its_work(widget, viewer, fourth_step):
 @pytest.mark.parametrize(
     "field, value, message",
     [
-        ("design_file", "wrong.toml", "`lens.refractive_index` must be a number above 1, up to 5, got -1"),
+        ("design_file", "wrong.toml", "`lens.refractive_index` must be a number above 1, up to 5, .*got -1"),
         ("design_file", "none.toml", "none.toml: "),
         ("depths", "18:17:1", "Depths must have .* got '18:17:1'"),
         ("voxel", 0.01, "at most .* GiB of the free memory"),
         ("suppress", "unet", "--suppress unet must be used with --method backproject, got fista"),
-        ("file", "small.npy", "small.npy: "),
+        ("file", "small.npy", "image must be 96 x 80, .*small.npy"),
     ],
 )
 def test_what_is_wrong_is_one_line(widget, viewer, folder, field, value, message):
@@ -231,3 +231,36 @@ def test_a_layer_that_is_no_capture_is_refused(widget, viewer):
     until(widget)
     (found,) = errors()
     assert found.startswith("double: the layer must have 96 x 80 pixels (rows x columns")
+
+
+def test_live_replaces_the_layers_of_the_newest_capture(widget, viewer, folder):
+    frames = folder / "run"
+    frames.mkdir()
+    widget.folder.value, widget.suppress.value, widget.points.value = frames, "clusters", True
+    widget.live.clicked.emit(True)
+    assert widget.cancel.enabled and not widget.run.enabled and not widget.live.enabled
+    rng = np.random.default_rng(0)
+    pixels, made = rng.integers(90, 110, (96, 80)).astype(np.uint16), []
+    for name in ("f1.npy", "f2.npy"):
+        pixels[40 + 8 * len(made), 30:34] = 4000
+        np.save(frames / f".{name}", pixels)
+        (frames / f".{name}").rename(frames / name)
+        until(widget, lambda name=name: any(each.name == f"{name}, clusters" for each in viewer.layers))
+        volume, points = viewer.layers
+        made.append((volume, points, np.array(volume.data)))
+        assert points.name.startswith(f"{name}, ") and len(points.features) == len(points.data)
+    assert made[0][:2] == made[1][:2] and not np.array_equal(made[0][2], made[1][2])
+    assert re.match(r"f2.npy, \d+ ms after it was written", widget.status.value)
+    # A bad capture is told of, and the next one is made.
+    np.save(frames / "f3.npy", np.zeros((5, 4), np.uint16))
+    until(widget, lambda: any("f3.npy" in each for each in errors()))
+    np.save(frames / "f4.npy", pixels)
+    until(widget, lambda: volume.name == "f4.npy, clusters")
+    widget.cancel.clicked.emit(True)
+    until(widget)
+    assert widget.status.value == "Cancelled." and len(viewer.layers) == 2 and widget.live.enabled
+
+
+def test_live_needs_a_folder(widget):
+    widget.live.clicked.emit(True)
+    assert errors() == ["The folder must be one into which a camera writes, got none."]
