@@ -29,6 +29,7 @@ CAPTURES = Path(__file__).parent / "data"
 # Whole ones, and what others publish, lie beside the repository: too large, or not ours, to ship.
 DATA = Path(__file__).parents[2] / "shared" / "data"
 SOURCES = {
+    "randoscope": "a measured point spread function of a printed array, and its recipe",
     "geomscope": "the lens centres that the paper's authors publish",
     "oracle": "whole captures by the ray tracer of tests/data",
     "diffusercam": "real captures of Waller Lab's DiffuserCam tutorial",

@@ -448,7 +448,8 @@ def test_the_command(tmp_path):
             [],
             "positions: every capture needs one or more sources, got 1 sources for 3 captures",
         ),
-        (["--from-scene"], "calibrate needs --positions"),
+        (["--from-scene"], "--from-scene needs one capture, without --positions"),
+        (["--pattern", names[0], "--find-lenses"], "--pattern needs DESIGN's lenses"),
         (["--fit", "focus"], "must be some of sensor-distance, rotation"),
     ):
         wrong = CliRunner().invoke(commands, [*arguments, str(tmp_path / "other.toml"), *more])

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Float, Float64, Int
-from scipy.spatial import KDTree
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError
@@ -22,7 +21,7 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses
+from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses, search_rotation
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
 from .spot_model import (
     FITTABLE,
@@ -43,7 +42,7 @@ from .spot_model import (
     trace_core_offsets,
     weighted_residuals,
 )
-from .spots import Sources, SpotLists, Spots, assign_spots, find_spots_mm
+from .spots import Sources, SpotLists, Spots, assign_spots, find_blurred_spots_mm, find_spots_mm
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)
@@ -56,15 +55,15 @@ _MAX_STEPS = 300
 _MULTIPLE = 256
 # What is guessed from the pattern of the lenses, if it is fitted.
 _POSE = ("sensor_distance", "rotation", "shift")
+# What the pattern of the lenses alone determines.
+PATTERN_FITTED = ("rotation", "shift", "scale")
 # What self-calibration fits: an unknown scene determines neither sensor distance nor shift.
 SELF_FITTED = ("rotation", "tilt")
 _SELF_FITTABLE = (*SELF_FITTED, "lenses", *OF_SAMPLE)
 # Most and fewest points that self-calibration uses.
 _MOST_POINTS, _MIN_POINTS = 60, 5
-# Range on either side and step of the search for the rotation, radians, and number of bright sources that it uses.
-_ROTATION, _ROTATION_STEP, _ROTATION_SOURCES = np.radians(5.0), np.radians(0.4), 5
-# Distance on the sensor within which rays meet in a point, over `match_radius`.
-_MEETING = 0.5
+# Number of bright sources that the search for the rotation uses.
+_ROTATION_SOURCES = 5
 
 
 class Calibration(NamedTuple):
@@ -106,6 +105,7 @@ def calibrate(
     captures: Int[np.ndarray, " source"] | None = None,
     fit: Sequence[str] = FITTED,
     find_lenses: bool = False,
+    blurred: Collection[int] = (),
     progress: Progress | None = None,
 ) -> Calibration:
     """Estimate a microscope's geometry from captures of point sources, starting from its design.
@@ -136,6 +136,11 @@ def calibrate(
         Find the lenses themselves, whatever positions the design lists, and fit only sensor distance and depth offset
         of `fit`: the lenses' positions contain rotation, shift, scale and tilt. Needs known points. If the design has
         lenses of several types, the type of each is estimated from the light of its spots.
+    blurred
+        Captures, from 0, in which every lens has one wide spot of any shape: of a source out of focus or aberrated, or
+        of an even white surface, whose middle is the source's place. Middles of such spots are on chief rays, and
+        weigh in inverse proportion to the spots' width. With `scale`, their pattern may be half as large as the
+        design's to one and a half times, which is the array's scale if the source is far.
     progress
         Shows how far the work is.
 
@@ -163,15 +168,18 @@ def calibrate(
     sources = Sources(np.array(points, np.float64), np.asarray(captures))
     if unknown_names := [name for name in fit if name not in FITTABLE]:
         raise InputError(f"fit must be some of {', '.join(FITTABLE)}, got {', '.join(unknown_names)}.")
-    sources.check(len(images), imager, fit)
+    sources.check(len(images), imager, fit, blurred)
     imager = with_surface(imager, fit)
     for number, image in enumerate(images, 1):
         _check_image(f"capture {number}", image, imager)
-    counts = [int((sources.captures == number).sum()) for number in range(len(images))]
     # SciPy's filters release the GIL.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as threads:
-        results = threads.map(find_spots_mm, images, [imager] * len(images), counts)
-        spots = [found for found, _ in zip(results, progress.track(images, "Finding spots"), strict=True)]
+        work = [
+            threads.submit(_spots_of, number, image, imager, sources, blurred) for number, image in enumerate(images)
+        ]
+        found = [one.result() for one, _ in zip(work, progress.track(images, "Finding spots"), strict=True)]
+    spots, blur = [each for each, _ in found], np.array([width for _, width in found])
+    sources = sources._replace(blur=blur)
     unknown = np.isnan(sources.points)
     with progress.step("Matching lenses"):
         if find_lenses:
@@ -179,16 +187,36 @@ def calibrate(
         elif set(fit).isdisjoint(_POSE):
             guess = guess_from_pose(spots, sources, imager)
         else:
-            guess = guess_from_pattern(spots, sources, imager)
+            guess = guess_from_pattern(spots, sources, imager, free_scale="scale" in fit)
         held = [name for name in _POSE[: 1 if find_lenses else None] if name not in fit]
         where = lambda i: [getattr(i, name) for name in held]
         guess = guess._replace(imager=eqx.tree_at(where, guess.imager, where(imager)) if held else guess.imager)
     if not find_lenses:
+        if guess.scale != 1:
+            # Windows and neighbours are as large as the pattern turned out to be.
+            again = [
+                find_blurred_spots_mm(image, guess.imager) if k in blurred else found[k]
+                for k, image in enumerate(images)
+            ]
+            spots, blur = [each for each, _ in again], np.array([width for _, width in again])
+            guess = guess._replace(sources=guess.sources._replace(blur=blur))
         result = refine(spots, guess.imager, guess.sources, unknown, fit, progress=progress)
-        return result._replace(mirrored=guess.mirrored)
+        scaled = lambda values: {
+            name: value * (guess.scale if name == "scale" else 1) for name, value in values.items()
+        }
+        return result._replace(
+            mirrored=guess.mirrored, values=scaled(result.values), deviations=scaled(result.deviations)
+        )
     fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
     lens_sd = _UNLISTED * match_radius(guess.imager.array.centers)
     return _drop_unseen_lenses(refine(spots, guess.imager, guess.sources, unknown, fit, lens_sd, progress))
+
+
+def _spots_of(number: int, image: Image, imager: Imager, sources: Sources, blurred: Collection[int]):
+    """The spots of a capture, and their width in that of a sharp one."""
+    if number in blurred:
+        return find_blurred_spots_mm(image, imager)
+    return find_spots_mm(image, imager, int((sources.captures == number).sum())), 1.0
 
 
 def _drop_unseen_lenses(result: Calibration) -> Calibration:
@@ -225,9 +253,9 @@ def refine(
     current, points, state = imager, sources.points, None
     assigned = data = None
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
-        offsets = trace_core_offsets(current, points[:, 2], fit)
+        offsets = trace_core_offsets(current, points[sources.blurs == 1, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
-        data = _observations(imager, sources.points, unknown, assigned, offsets)
+        data = _observations(imager, sources, unknown, assigned, offsets)
         state = state or initial_unknowns(fit, data)
         if not jax.tree.leaves(state):
             raise InputError(f"calibration: fit one or more of {', '.join(FITTABLE)}, got nothing to fit.")
@@ -240,7 +268,8 @@ def refine(
     assert state is not None and assigned is not None and data is not None
     check_fitted_sample(current)
     off = np.asarray(residuals(state, data), np.float64)[: len(assigned.lenses)]
-    errors = standard_errors(state, data, lens_sd, estimate_noise(off, state, assigned.lenses))
+    over_width = off / sources.blurs[assigned.sources, None]
+    errors = standard_errors(state, data, lens_sd, estimate_noise(over_width, state, assigned.lenses))
     check_determined(errors, radius)
     sources = sources._replace(points=points)
     return Calibration(current, False, named_values(state), errors, sources, assigned, off)
@@ -253,19 +282,19 @@ def spot_residuals(
     imager, sources = result.imager, Sources(points, np.arange(len(points)))
     offsets, spots = trace_core_offsets(imager, points[:, 2]), [find_spots_mm(image, imager) for image in images]
     assigned = assign_spots(spots, sources, imager, offsets, match_radius(imager.array.centers))
-    data = _observations(imager, points, np.zeros_like(points, bool), assigned, offsets)
+    data = _observations(imager, sources, np.zeros_like(points, bool), assigned, offsets)
     return np.asarray(residuals(Unknowns(), data), np.float64)[: len(assigned.lenses)]
 
 
-def _observations(imager: Imager, points, unknown, spots: Spots, offsets: CoreOffsets) -> Observations:
+def _observations(imager: Imager, sources: Sources, unknown, spots: Spots, offsets: CoreOffsets) -> Observations:
     size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
     dtype = imager.sensor_distance.dtype
-    sources, lenses, positions = (
+    of, lenses, positions = (
         jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)])) for part in spots
     )
     valid, unknown = jnp.arange(size) < len(spots.lenses), jnp.asarray(np.argwhere(unknown))
-    points = jnp.asarray(points, dtype)
-    return Observations(imager, points, unknown, sources, lenses, positions.astype(dtype), valid, offsets)
+    points, blur = jnp.asarray(sources.points, dtype), jnp.asarray(sources.blurs, dtype)[of]
+    return Observations(imager, points, unknown, of, lenses, positions.astype(dtype), valid, blur, offsets)
 
 
 def self_calibrate(
@@ -312,7 +341,7 @@ def self_calibrate(
     depths = np.asarray(grid.depths, np.float64)
     with progress.step("Searching for the rotation"):
         spots = find_spots_mm(image, imager, _ROTATION_SOURCES)
-        rotated = _search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
+        rotated = search_rotation(spots, imager, (depths.min(), depths.max())) if "rotation" in fit else imager
     points = find_points(image, rotated, grid, progress=progress)[:_MOST_POINTS, :3]
     if len(points) < _MIN_POINTS:
         needs = f"a sparse scene in focus with {_MIN_POINTS} or more points is needed"
@@ -320,29 +349,3 @@ def self_calibrate(
     spots = find_spots_mm(image, imager, len(points))
     sources = Sources(points, np.zeros(len(points), int))
     return refine([spots], rotated, sources, np.ones(points.shape, bool), fit, progress=progress)
-
-
-def _search_rotation(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths: tuple[float, float]) -> Imager:
-    """The imager at the rotation at which most rays through spots and lenses meet."""
-    near, far = (float(imager.magnification(depth)) for depth in depths)
-    within = _MEETING * match_radius(imager.array.centers)
-    step = within / imager.field_radius
-    magnifications = np.linspace(far, near, max(int(np.ceil((near - far) / step)) + 1, 2))
-    steps = np.floor(_ROTATION / _ROTATION_STEP)
-    rotated = [_rotate(imager, turn) for turn in np.arange(-steps, steps + 1) * _ROTATION_STEP]
-    return max(rotated, key=lambda one: max(_concentration(spots, one, m, within) for m in magnifications))
-
-
-def _rotate(imager: Imager, angle: float) -> Imager:
-    return eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + jnp.asarray(angle, imager.rotation.dtype))
-
-
-def _concentration(spots, imager: Imager, magnification: float, within: float) -> float:
-    """How clearly rays meet in a plane: the sum of cubes of the number of rays near each."""
-    centers = np.asarray(imager.centers, np.float64)
-    points = ((1 + magnification) * centers - spots[:, None]) / magnification
-    points = points[np.linalg.norm(points - centers, axis=-1) < imager.field_radius]
-    if not len(points):
-        return 0.0
-    count = KDTree(points).query_ball_point(points, within / magnification, return_length=True)
-    return float((np.asarray(count, float) ** 3).sum())

@@ -29,6 +29,9 @@ from .spots import Sources, SpotLists, assign_spots, classify_lenses
 _FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12
 # Fewest spots on lenses of a clear pattern, and their share of those tried.
 _MIN_SPOTS, _MIN_SHARE = 6, 0.5
+# Of blurred spots: their distance from lenses of the pattern, over `match_radius`, which chance meets more often; the
+# share that has to be on lenses; and the relative error of a scale that is fitted.
+_BLURRED, _BLURRED_SHARE, _FREE_SCALE = 3.0, 0.7, 0.5
 # Similarities that are tried at once.
 _BATCH = 20_000
 # Relative error of the sensor distance, and number of steps in which it is searched for without known lenses.
@@ -39,6 +42,10 @@ _SCALE, _SCALE_ERROR = 1.3, 0.2
 _GUESSES = 6
 # Least share of the spots on lenses that other captures show, too, where lenses are searched for.
 _MIN_SHARED = 0.5
+# Range on either side and step of the search for the rotation, radians.
+_ROTATION, _ROTATION_STEP = np.radians(5.0), np.radians(0.4)
+# Distance on the sensor within which rays meet in a point, over `match_radius`.
+_MEETING_ON_SENSOR = 0.5
 # Distance within which rays meet in an unlisted lens, in field radii: 0.06 mm of the paper's.
 _MEETING = 0.02
 
@@ -52,6 +59,7 @@ class Similarity(NamedTuple):
     on_lenses: int
     tried: int
     sources: int
+    share: float = _MIN_SHARE
 
     @property
     def rotation(self) -> float:
@@ -60,8 +68,8 @@ class Similarity(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether enough spots are on lenses: half of those of one source."""
-        return self.on_lenses >= max(_MIN_SPOTS, _MIN_SHARE * self.tried / self.sources)
+        """Whether enough spots are on lenses: a share of those of one source."""
+        return self.on_lenses >= max(_MIN_SPOTS, self.share * self.tried / self.sources)
 
 
 def match_pattern(
@@ -70,17 +78,19 @@ def match_pattern(
     scale: float,
     tolerance: float,
     sources: int = 1,
+    *,
+    blurred: bool = False,
 ) -> Similarity:
     """Find the similarity from lens centers to spots `(x, y)`, mm, brightest first, of one of some sources.
 
-    `scale` is expected within a relative `tolerance`.
+    `scale` is expected within a relative `tolerance`. Middles of `blurred` spots may be three times as far from lenses.
     """
     most = min(sources, _MOST_SOURCES)
     p, c = spots[: _TRIED * most] @ (1, 1j), centers @ (1, 1j)
-    best = Similarity(1 + 0j, 0j, False, 0, len(p), sources)
+    best = Similarity(1 + 0j, 0j, False, 0, len(p), sources, _BLURRED_SHARE if blurred else _MIN_SHARE)
     if len(p) < 3 or len(c) < 3:
         return best
-    tree, radius = KDTree(centers), match_radius(centers)
+    tree, radius = KDTree(centers), match_radius(centers) * (_BLURRED if blurred else 1)
     beside = np.asarray(tree.query(centers, k=min(_NEIGHBOURS + 1, len(c)))[1])
     first, second = np.repeat(np.arange(len(c)), beside.shape[1] - 1), beside[:, 1:].ravel()
     begin, end = np.meshgrid(np.arange(min(_FIRST * most, len(p))), np.arange(len(p)))
@@ -96,7 +106,8 @@ def match_pattern(
             count = (_nearest_lens(p, factor, shift, tree, mirrored)[0] < radius).sum(1)
             top = int(count.argmax())
             if count[top] > best.on_lenses:
-                best = Similarity(complex(factor[top]), complex(shift[top]), mirrored, int(count[top]), len(p), sources)
+                found = {"factor": complex(factor[top]), "shift": complex(shift[top]), "on_lenses": int(count[top])}
+                best = best._replace(mirrored=mirrored, **found)
     if best.on_lenses < 2:
         return best
     # Least squares over the spots on lenses.
@@ -148,28 +159,35 @@ def triangulate_lenses(
 
 
 class InitialGuess(NamedTuple):
-    """An imager and sources that explain most spots."""
+    """An imager and sources that explain most spots; `scale` is that of its array, in that of the design."""
 
     imager: Imager
     mirrored: bool
     sources: Sources
+    scale: float = 1.0
 
 
-def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager) -> InitialGuess:
+def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, free_scale: bool = False) -> InitialGuess:
     """Guess from the clearest pattern; of several sources in a capture, from the one that explains most spots.
 
+    With `free_scale` the scale of blurred spots is the array's, of half to one and a half times the design's.
     `InputError` if no capture has a clear pattern.
     """
-    centers = np.asarray(imager.array.centers, np.float64)
+    centers, blurs = np.asarray(imager.array.centers, np.float64), sources.blurs
     matches = []
     for source, point in enumerate(sources.points):
         capture = int(sources.captures[source])
         in_capture = int((sources.captures == capture).sum())
-        matches.append((match_pattern(spots[capture], centers, *_scale(imager, point[2]), in_capture), source))
+        scale, error = _scale(imager, point[2])
+        error = _FREE_SCALE if free_scale and blurs[source] > 1 else error
+        found = match_pattern(spots[capture], centers, scale, error, in_capture, blurred=bool(blurs[source] > 1))
+        matches.append((found, source))
     matches.sort(key=lambda match: -match[0].on_lenses)
     best = matches[0][0]
     if not best.is_clear:
         needs = "most captures must show spots of point sources through this array"
+        if blurs[matches[0][1]] > 1:
+            needs = "a pattern must show an image of each lens of this array, apart from its neighbours"
         raise InputError(f"captures: {needs}, got {best.on_lenses} of {best.tried} bright spots on lenses at best.")
     clear = [(match, source) for match, source in matches if match.is_clear]
     # Points that lack a coordinate determine less of the geometry.
@@ -178,8 +196,10 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager) -> In
     single = len(np.unique(sources.captures)) == len(sources.captures)
     guesses = []
     for match, source in clear[: 1 if single else _GUESSES]:
-        posed = _pose(match, sources.points[source], imager)
-        guesses.append(InitialGuess(posed, match.mirrored, _locate_sources(spots, sources, posed)))
+        free = free_scale and bool(blurs[source] > 1) and not np.isnan(sources.points[source, 2])
+        scale = abs(match.factor) / float(imager.scale(sources.points[source, 2])) if free else 1.0
+        posed = _pose(match, sources.points[source], imager, scale)
+        guesses.append(InitialGuess(posed, match.mirrored, _locate_sources(spots, sources, posed), scale))
     return guesses[0] if len(guesses) == 1 else max(guesses, key=lambda guess: _explained(spots, guess))
 
 
@@ -203,10 +223,11 @@ def _explained(spots: SpotLists, guess: InitialGuess) -> int:
     )
 
 
-def _pose(match: Similarity, point, imager: Imager) -> Imager:
-    """The imager whose pattern `p = s c - M q`, `s = 1 + M`, is the matched one."""
-    scale, (x, y, z), array = abs(match.factor), point, imager.array
+def _pose(match: Similarity, point, imager: Imager, of_array: float = 1.0) -> Imager:
+    """The imager whose pattern `p = s c - M q`, `s = 1 + M`, is the matched one, of an array scaled by `of_array`."""
+    scale, (x, y, z), array = abs(match.factor) / of_array, point, imager.array
     magnification = scale - 1
+    array = with_centers(array, array.centers * jnp.asarray(of_array, array.centers.dtype))
     if match.mirrored:
         # The complex conjugate: y becomes -y.
         array = with_centers(array, array.centers * jnp.asarray([[1.0, -1.0]], array.centers.dtype))
@@ -227,12 +248,14 @@ def _locate_sources(spots: SpotLists, sources: Sources, imager: Imager) -> Sourc
         capture = int(sources.captures[source])
         missing = np.isnan(points[source])
         if missing.any():
-            points[source] = np.where(missing, _locate(left[capture], points[source, 2], imager), points[source])
+            radius = match_radius(imager.array.centers) * (_BLURRED if sources.blurs[source] > 1 else 1)
+            found = _locate(left[capture], points[source, 2], imager, radius)
+            points[source] = np.where(missing, found, points[source])
         left[capture] = _remove_spots(left[capture], points[source], imager)
     return sources._replace(points=points)
 
 
-def _locate(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
+def _locate(spots, depth: float, imager: Imager, radius: float) -> tuple[float, float, float]:
     """The source that most of the spots belong to, at a depth, or at any if that is NaN."""
     if np.isnan(depth):
         match = match_pattern(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
@@ -240,7 +263,7 @@ def _locate(spots, depth: float, imager: Imager) -> tuple[float, float, float]:
         depth = max(float(imager.depth_of(imager.reduced_sensor_distance / magnification)), 1e-3)
     magnification = float(imager.magnification(depth))
     pattern = (1 + magnification) * np.asarray(imager.centers, np.float64)
-    shift, _ = match_shift(spots, pattern, match_radius(imager.array.centers))
+    shift, _ = match_shift(spots, pattern, radius)
     x, y = -shift / magnification
     return float(x), float(y), depth
 
@@ -293,3 +316,29 @@ def guess_without_lenses(
         numbers = {name: np.array([float(getattr(one, name)) for one in types])[which] for name in EACH}
         guess = eqx.tree_at(lambda i: i.array, guess, dataclasses.replace(guess.array, **numbers))
     return InitialGuess(guess, False, sources)
+
+
+def search_rotation(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths: tuple[float, float]) -> Imager:
+    """The imager at the rotation at which most rays through spots and lenses meet."""
+    near, far = (float(imager.magnification(depth)) for depth in depths)
+    within = _MEETING_ON_SENSOR * match_radius(imager.array.centers)
+    step = within / imager.field_radius
+    magnifications = np.linspace(far, near, max(int(np.ceil((near - far) / step)) + 1, 2))
+    steps = np.floor(_ROTATION / _ROTATION_STEP)
+    rotated = [_rotate(imager, turn) for turn in np.arange(-steps, steps + 1) * _ROTATION_STEP]
+    return max(rotated, key=lambda one: max(_concentration(spots, one, m, within) for m in magnifications))
+
+
+def _rotate(imager: Imager, angle: float) -> Imager:
+    return eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + jnp.asarray(angle, imager.rotation.dtype))
+
+
+def _concentration(spots, imager: Imager, magnification: float, within: float) -> float:
+    """How clearly rays meet in a plane: the sum of cubes of the number of rays near each."""
+    centers = np.asarray(imager.centers, np.float64)
+    points = ((1 + magnification) * centers - spots[:, None]) / magnification
+    points = points[np.linalg.norm(points - centers, axis=-1) < imager.field_radius]
+    if not len(points):
+        return 0.0
+    count = KDTree(points).query_ball_point(points, within / magnification, return_length=True)
+    return float((np.asarray(count, float) ** 3).sum())

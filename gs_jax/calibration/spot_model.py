@@ -50,6 +50,8 @@ _NAMES = {
 }
 # A spot is at a lens within this distance, in pitches of the array: 0.06 mm on the paper's plate.
 _MATCH_RADIUS = 0.0488
+# A blurred spot is at a lens within this distance, over `match_radius`.
+_BLURRED_RADIUS = 5.0
 
 FITTED = ("sensor_distance", "rotation", "shift", "tilt")
 OF_DEVICE = (*FITTED, "scale", "depth_offset", "lenses")
@@ -96,7 +98,8 @@ class Observations(NamedTuple):
     """What a fit is given: the initial imager, sources, and spots of known lenses.
 
     `points` `(source, 3)` hold initial guesses of the coordinates that `unknown` `(unknown, 2)` lists by source and
-    axis. Spots are padded to one size, so that one shape is compiled; `valid` marks the actual ones.
+    axis. Spots are padded to one size, so that one shape is compiled; `valid` marks the actual ones. `blur` is the
+    width of each in that of a sharp one, by which its residual is divided.
     """
 
     imager: Imager
@@ -106,12 +109,18 @@ class Observations(NamedTuple):
     lenses: Int[Array, " spot"]
     positions: Float[Array, "spot 2"]
     valid: Bool[Array, " spot"]
+    blur: Float[Array, " spot"]
     offsets: CoreOffsets
 
 
 def match_radius(centers: Float[Array | np.ndarray, "lens 2"]) -> float:
     """Distance within which a spot is at a lens of an array, mm: a twentieth of the pitch."""
     return _MATCH_RADIUS * float(nearest_neighbour_distances(np.asarray(centers, np.float64)).mean())
+
+
+def blurred_radius(centers: Float[Array | np.ndarray, "lens 2"]) -> float:
+    """Distance within which a blurred spot is at a lens of an array, mm: a quarter of the pitch."""
+    return _BLURRED_RADIUS * match_radius(centers)
 
 
 def initial_unknowns(names: Sequence[str], data: Observations) -> Unknowns:
@@ -156,14 +165,16 @@ def source_points(unknowns: Unknowns, data: Observations) -> Float[Array, "sourc
 def residuals(unknowns: Unknowns, data: Observations) -> Float[Array, "spot 2"]:
     """Predicted less observed spots, pixels; 0 for padding."""
     imager, points = apply_to_imager(unknowns, data.imager), source_points(unknowns, data)[data.sources]
-    off = (_predict(imager, points, data.lenses, data.offsets) - data.positions) / imager.sensor.pixel_pitch
+    off = (
+        _predict(imager, points, data.lenses, data.offsets, data.blur == 1) - data.positions
+    ) / imager.sensor.pixel_pitch
     return jnp.where(data.valid[:, None], off, 0)
 
 
 def weighted_residuals(unknowns: Unknowns, args: tuple[Observations, Float[Array, ""]]):
     """Residuals of Huber's loss, and deviations of lenses over their prior standard deviation, the second argument."""
     data, lens_sd = args
-    off = residuals(unknowns, data)
+    off = residuals(unknowns, data) / data.blur[:, None]
     squared = jnp.sum(off**2, -1, keepdims=True)
     large = squared > OUTLIER**2
     distance = jnp.sqrt(jnp.where(large, squared, 1.0))
@@ -171,9 +182,11 @@ def weighted_residuals(unknowns: Unknowns, args: tuple[Observations, Float[Array
     return off, None if unknowns.lenses is None else unknowns.lenses * (NOISE / lens_sd)
 
 
-def _predict(imager: Imager, points, lenses, offsets: CoreOffsets) -> Float[Array, "spot 2"]:
+def _predict(imager: Imager, points, lenses, offsets: CoreOffsets, sharp) -> Float[Array, "spot 2"]:
     views = imager.views(points, lenses)
-    field2 = jnp.sum(views.offset**2, -1) / imager.field_radius**2
+    # The middles of blurred spots are on chief rays, at any field.
+    offset = jnp.where(jnp.asarray(sharp)[..., None], views.offset, 0)
+    field2 = jnp.sum(offset**2, -1) / imager.field_radius**2
     of_type = jax.vmap(lambda column: jnp.interp(points[:, 2], offsets.depths, column))
     at = lambda columns: of_type(columns)[offsets.type_of[lenses], jnp.arange(len(lenses))]
     radial = jnp.zeros_like(field2)
@@ -181,22 +194,31 @@ def _predict(imager: Imager, points, lenses, offsets: CoreOffsets) -> Float[Arra
         radial = radial * field2 + at(offsets.offset[..., power])
         for name, slope in offsets.slopes.items():
             radial = radial + (number(imager, name) - offsets.values[name]) * at(slope[..., power])
-    return views.spot + views.offset / imager.field_radius * radial[:, None]
+    return views.spot + offset / imager.field_radius * radial[:, None]
 
 
 @jax.jit
 def predict_spots(
-    imager: Imager, points: Float[Array | np.ndarray, "source 3"], offsets: CoreOffsets
+    imager: Imager,
+    points: Float[Array | np.ndarray, "source 3"],
+    offsets: CoreOffsets,
+    sharp: Bool[Array | np.ndarray, " source"],
 ) -> Float[Array, "source lens 2"]:
-    """Predict the spots of sources under every lens, mm."""
+    """Predict the spots of sources, which are sharp or blurred, under every lens, mm."""
     lenses, dtype = jnp.arange(len(imager.array.centers)), imager.sensor_distance.dtype
-    of_source = lambda point: _predict(imager, jnp.tile(point, (len(lenses), 1)), lenses, offsets)
-    return jax.lax.map(of_source, jnp.asarray(points, dtype))
+    of_source = lambda source: _predict(imager, jnp.tile(source[0], (len(lenses), 1)), lenses, offsets, source[1])
+    return jax.lax.map(of_source, (jnp.asarray(points, dtype), jnp.asarray(sharp)))
 
 
 def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"], fit: Sequence[str] = ()) -> CoreOffsets:
-    """Trace core offsets at these depths, or a few that span them, with derivatives by what is fitted of `_TRACED`."""
-    nodes = np.unique(depths)
+    """Trace core offsets at these depths, or a few that span them, with derivatives by what is fitted of `_TRACED`.
+
+    Without depths, where all spots are blurred, there are none.
+    """
+    nodes, types = np.unique(depths), jnp.asarray(type_of_lens(imager.array))
+    if not len(nodes):
+        one = lambda *shape: jnp.zeros(shape, imager.sensor_distance.dtype)
+        return CoreOffsets(one(1), one(int(types.max()) + 1, 1, 1), {}, {}, types)
     if len(nodes) > _DEPTHS:
         nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
     offset, slopes = core_polynomials(imager, nodes), {}
@@ -205,7 +227,6 @@ def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"], fit
         beyond = eqx.tree_at(lambda i, name=name: number(i, name), imager, value * (1 + _STEP))
         slopes[name] = (core_polynomials(beyond, nodes) - offset) / (float(value) * _STEP)
     typed = lambda tables: jax.tree.map(lambda table: jnp.asarray(table, imager.sensor_distance.dtype), tables)
-    types = jnp.asarray(type_of_lens(imager.array))
     return CoreOffsets(typed(nodes), typed(offset), typed(slopes), typed(values), types)
 
 

@@ -4,7 +4,7 @@ The middle of a spot is where a Gaussian window that moves to the centroid of wh
 so that rays far from the core do not count.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +15,21 @@ from skimage.feature import peak_local_max
 from ..base.errors import InputError
 from ..detection.background import subtract_background
 from ..geometry import Imager
+from ..layouts import nearest_neighbour_distances
 from ..optics.lens_types import FIELDS
 from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
 from ..typing import Image
-from .spot_model import MAX_MOVES, MOVE_TOLERANCE, WINDOW, CoreOffsets, match_radius, predict_spots
+from .blurred import BLURRED_WINDOW, find_blurred_spots
+from .spot_model import (
+    MAX_MOVES,
+    MOVE_TOLERANCE,
+    WINDOW,
+    CoreOffsets,
+    blurred_radius,
+    match_radius,
+    predict_spots,
+)
 
 # Half width of the square that the window sees, pixels.
 _HALF = 4
@@ -27,6 +37,8 @@ _HALF = 4
 _THRESHOLD_SNR, _MIN_DISTANCE = 8.0, 6
 # Spots looked for in a capture, for each of its sources.
 _SPOTS = 60
+# Wide spots looked for, over the number of lenses.
+_MOST_BLURRED = 2
 # Predicted spots closer than this, over `match_radius`, are blurred into one.
 _BLURRED = 0.5
 # Half widths of the squares by whose light types of lenses are told apart, pixels; rounds of alternation; least share.
@@ -36,12 +48,22 @@ SpotLists = Sequence[Float64[np.ndarray, "_ 2"]]
 
 
 class Sources(NamedTuple):
-    """Points `(x, y, z)`, mm, NaN where unknown, and the capture of each, from 0."""
+    """Points `(x, y, z)`, mm, NaN where unknown, and the capture of each, from 0.
+
+    `blur` is the width of each capture's spots, in that of a sharp one; None where all are sharp. Blurred spots are
+    those of one source, which all lenses see.
+    """
 
     points: Float64[np.ndarray, "source 3"]
     captures: Int[np.ndarray, " source"]
+    blur: Float64[np.ndarray, " capture"] | None = None
 
-    def check(self, count: int, imager: Imager, fit: Sequence[str]) -> None:
+    @property
+    def blurs(self) -> Float64[np.ndarray, " source"]:
+        """`blur` of each source, 1 of a sharp one."""
+        return np.ones(len(self.captures)) if self.blur is None else self.blur[self.captures]
+
+    def check(self, count: int, imager: Imager, fit: Sequence[str], blurred: Collection[int] = ()) -> None:
         """`InputError` unless each of `count` captures has a source where the imager's object may be.
 
         Nor if the known coordinates cannot determine what is to be fitted, whatever the spots are.
@@ -64,6 +86,10 @@ class Sources(NamedTuple):
             needs = f"depths must be {begins:g} mm, where the {what}, or more"
             raise InputError(f"positions: {needs}, got {np.nanmin(depths):g} mm.")
         self._check_fit(fit)
+        for number in blurred:
+            if (count := int((self.captures == number).sum())) != 1:
+                needs = f"capture {number + 1} must have one source, as each lens has one image in it"
+                raise InputError(f"positions: {needs}, got {count}.")
 
     def _check_fit(self, fit):
         of_depth = [name for name in ("sensor_distance", "depth_offset") if name in fit]
@@ -91,6 +117,15 @@ def find_spots(image: Image, most: int) -> Float64[np.ndarray, "spot 2"]:
     return np.array([_middle_of_pixels(light, peak) for peak in peaks]).reshape(-1, 2)
 
 
+def find_blurred_spots_mm(image: Image, imager: Imager) -> tuple[Float64[np.ndarray, "spot 2"], float]:
+    """Wide spots, as far apart as lenses, `(x, y)` on the sensor, mm, and their median width in that of a sharp one."""
+    centers = np.asarray(imager.array.centers, np.float64)
+    pitch = float(nearest_neighbour_distances(centers).mean()) / imager.sensor.pixel_pitch
+    middles, radii = find_blurred_spots(image, pitch, _MOST_BLURRED * len(centers))
+    width = BLURRED_WINDOW * float(np.median(radii)) / WINDOW if len(radii) else 1.0
+    return np.asarray(imager.sensor.to_mm(middles), np.float64), max(width, 1 + 1e-6)
+
+
 def find_spots_mm(image: Image, imager: Imager, sources: int = 1) -> Float64[np.ndarray, "spot 2"]:
     """The brightest spots of so many sources, `(x, y)` on the sensor, mm."""
     return np.asarray(imager.sensor.to_mm(find_spots(image, _SPOTS * sources)), np.float64)
@@ -114,12 +149,13 @@ def _middle_of_pixels(light, peak):
 def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: CoreOffsets, within: float) -> Spots:
     """Assign to each source and lens within the field radius the spot nearest to its prediction, at most `within` away.
 
-    A source with an unknown coordinate has no spots. Lengths are in mm.
+    Blurred spots may be `blurred_radius` away. A source with an unknown coordinate has no spots. Lengths are in mm.
     """
     centers = np.asarray(imager.centers, np.float64)
-    predicted = np.asarray(predict_spots(imager, np.nan_to_num(sources.points, nan=1.0), offsets), np.float64)
+    sharp = sources.blurs == 1
+    predicted = np.asarray(predict_spots(imager, np.nan_to_num(sources.points, nan=1.0), offsets, sharp), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)
-    seen = (beside < imager.field_radius) & ~np.isnan(sources.points.sum(1))[:, None]
+    seen = ((beside < imager.field_radius) | ~sharp[:, None]) & ~np.isnan(sources.points.sum(1))[:, None]
     rows, blurred = [], _BLURRED * match_radius(imager.array.centers)
     for capture, found in enumerate(spots):
         source, lens = np.argwhere(seen & (sources.captures == capture)[:, None]).T
@@ -128,9 +164,10 @@ def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: Co
         wanted = predicted[source, lens]
         alone = np.asarray(KDTree(wanted).query_ball_point(wanted, blurred, return_length=True)) == 1
         distance, nearest = (np.asarray(part) for part in KDTree(found).query(wanted))
+        near = distance < (within if sharp[source[0]] else blurred_radius(imager.array.centers))
         rows += [
             (source[k], lens[k], *found[nearest[k]])
-            for k in np.flatnonzero(alone * (distance < within))
+            for k in np.flatnonzero(alone * near)
             # A spot belongs to the nearest prediction only.
             if distance[k] == distance[nearest == nearest[k]].min()
         ]

@@ -13,6 +13,8 @@ from .options import DESIGN, CaptureOptions, capture_options
 
 _OF_DEVICE = ("sensor-distance", "rotation", "shift", "tilt", "scale", "depth-offset", "lenses")
 _NAMES = (*_OF_DEVICE, "sample-at", "sample-index")
+# Depth of the source of a pattern unless --positions says another, mm: 10 m.
+_FAR = 1e4
 
 
 class _Names(click.ParamType):
@@ -31,7 +33,7 @@ class _Names(click.ParamType):
 
 @click.command("calibrate", epilog="Example: gs-jax calibrate geomscope a.tif b.tif --positions p.csv -o my.toml")
 @click.argument("design", type=DESIGN)
-@click.argument("captures", type=Path, nargs=-1, required=True)
+@click.argument("captures", type=Path, nargs=-1)
 @click.option(
     "--positions",
     type=Path,
@@ -50,6 +52,12 @@ class _Names(click.ParamType):
     "--from-scene", is_flag=True, help="Fit rotation and tilt to one capture of any sparse scene, without positions."
 )
 @click.option(
+    "--pattern",
+    type=Path,
+    help="Capture with one image of every lens, sharp or not: of a far source, or of an even white surface. Alone, it "
+    "fits rotation, shift and scale of the lenses' pattern; with CAPTURES, scale beside the rest.",
+)
+@click.option(
     "-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of the residuals is written beside it."
 )
 @light_options
@@ -63,6 +71,7 @@ def calibrate_command(
     hold: tuple[str, ...],
     find_lenses: bool,
     from_scene: bool,
+    pattern: Path | None,
     output: Path,
     force: bool,
     light: Light,
@@ -74,15 +83,20 @@ def calibrate_command(
     a quarter, its rotation and shift by any amount, and the array may be mirrored. Positions are in the sensor's frame,
     with z from the array, or from the sample. One capture suffices; several depths and positions are better.
 
+    Without a point source, a --pattern shows how the array is turned and mirrored, where it is, and its scale on the
+    sensor. It is taken to come from 10 m away, unless --positions has a line for it (`capture` is the file's name).
+    Lenses may differ and be out of focus, but their images must be apart; --hold scale where the design is exact.
+
     DESIGN's layers are in place. Sources at --positions are in air, unless --sample says what held them (`--sample
     sample` for DESIGN's [sample]) or a number of the sample is fitted; a scene is in DESIGN's [sample]. Points of known
     depths in a sample show where it begins and its index: --fit sample-at,sample-index, with --hold
     sensor-distance,rotation,shift,tilt. Those of a scene that nobody knows hardly show.
     """
+    import numpy as np
     from rich.console import Console
 
     from ..calibration.calibrated_design import apply_calibration, medium_in_words, plot_residuals, summary_table
-    from ..calibration.fit import SELF_FITTED, calibrate, self_calibrate
+    from ..calibration.fit import PATTERN_FITTED, SELF_FITTED, calibrate, self_calibrate
     from ..calibration.sample import OF_SAMPLE, with_surface
     from ..calibration.spot_model import FITTED
     from ..calibration.spots import Sources
@@ -91,34 +105,44 @@ def calibrate_command(
     from ..io.point_tables import read_positions
     from ..reconstruction.pipeline import voxel_grid
 
-    if from_scene == (positions is not None) or (from_scene and (find_lenses or len(captures) > 1)):
+    if from_scene and (positions or pattern or find_lenses or len(captures) != 1):
+        raise InputError("--from-scene needs one capture, without --positions, --pattern and --find-lenses.")
+    if pattern and find_lenses:
+        raise InputError("--pattern needs DESIGN's lenses, got --find-lenses.")
+    if not from_scene and (bool(captures) and not positions or not (captures or pattern)):
         raise InputError(
-            "calibrate needs --positions POINTS.csv, or --from-scene with one capture and without --find-lenses."
+            "calibrate needs captures with --positions POINTS.csv, or a --pattern, or one capture with --from-scene."
         )
     check_output(output, [".toml"])
     drawing = check_output(output.with_suffix(".png"), [".png"])
-    inputs = (design, *captures, *([positions] if positions else []), *camera.files)
+    pictures = (*captures, *([pattern] if pattern else []))
+    inputs = (design, *pictures, *([positions] if positions else []), *camera.files)
     check_may_write(output, drawing, inputs=inputs, force=force)
     microscope = read_design(design)
-    names = [name for name in (*(SELF_FITTED if from_scene else FITTED), *fit) if name not in hold]
+    fitted = SELF_FITTED if from_scene else FITTED if captures else PATTERN_FITTED
+    names = [name for name in (*fitted, *(["scale"] if pattern else []), *fit) if name not in hold]
     of_sample = from_scene or light.depths_from == "sample" or not set(names).isdisjoint(OF_SAMPLE)
     light = _with_sample(light, microscope, default="sample" if of_sample else "air")
     imager = camera.imager(light.imager(microscope))
     with Progress() as progress:
-        if positions is None:
+        if from_scene:
             capture = next(iter(captures))
             image = camera.read(capture)
             grid = voxel_grid(imager, list(light.working_distance(microscope, imager)))
             with errors_name_file(capture):
                 outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
         else:
-            points, of = read_positions(positions, captures)
+            points, of = read_positions(positions, pictures) if positions else (np.zeros((0, 3)), np.zeros(0, int))
             points[:, 2] += light.origin(imager) or 0.0
-            sources = Sources(points, of)
-            with errors_name_file(positions):
-                sources.check(len(captures), imager, names)
-            images = [camera.read(path) for path in progress.track(captures, "Reading captures")]
-            options = {"captures": of, "fit": names, "find_lenses": find_lenses}
+            blurred = [len(captures)] if pattern else []
+            if pattern and len(captures) not in of:
+                # A far source shows the array's shift unless others do: then its own direction is fitted.
+                aside = np.nan if captures else 0.0
+                points, of = np.append(points, [[aside, aside, _FAR]], 0), np.append(of, len(captures))
+            with errors_name_file(positions or pattern or design):
+                Sources(points, of).check(len(pictures), imager, names, blurred)
+            images = [camera.read(path) for path in progress.track(pictures, "Reading captures")]
+            options = {"captures": of, "fit": names, "find_lenses": find_lenses, "blurred": blurred}
             outcome = calibrate(images, points, imager, **options, progress=progress)
     provenance = camera.recorded(provenance_of(*inputs))
     write_design(output, apply_calibration(microscope, outcome, provenance, sample=light.sample))

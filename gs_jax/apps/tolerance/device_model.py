@@ -306,8 +306,9 @@ def _photograph(
     """The device's spots of points, as a calibration that assumes another imager takes them."""
     count, most = points.lenses.shape
     sources, lenses, seen = jnp.repeat(jnp.arange(count), most), points.lenses.ravel(), points.seen.ravel()
-    nowhere = jnp.zeros((count * most, 2), points.points.dtype)
-    spots = Observations(device, points.points, jnp.zeros((0, 2), int), sources, lenses, nowhere, seen, offsets)
+    nowhere, sharp = jnp.zeros((count * most, 2), points.points.dtype), jnp.ones(count * most, points.points.dtype)
+    none = jnp.zeros((0, 2), int)
+    spots = Observations(device, points.points, none, sources, lenses, nowhere, seen, sharp, offsets)
     places = residuals(Unknowns(), spots) * device.sensor.pixel_pitch
     return spots._replace(positions=places, imager=assumed, offsets=known)
 

@@ -1,0 +1,99 @@
+"""Calibration by wide spots: a white surface's images, which are discs that we draw, and a real printed array."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.printed_array import FAR as FAR_MM, SHAPE, recipe
+from gs_jax import Imager, InputError, MicrolensArray, Sensor, calibrate, random_layout
+from gs_jax.calibration.blurred import find_blurred_spots, half_light_radius
+from gs_jax.calibration.fit import PATTERN_FITTED
+from gs_jax.calibration.initial_guess import match_pattern
+from gs_jax.io.captures import read_capture
+
+from .helpers import needs
+from .test_calibration import captures
+
+FAR = np.array([[0.0, 0.0, FAR_MM]])
+
+
+def discs(shape, middles, radius: float, seed=0) -> np.ndarray:
+    """Evenly lit discs at `(row, column)`, darker toward their edges, on an offset, with shot noise."""
+    rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])[None]
+    light = np.zeros(shape)
+    for row, column in middles:
+        distance = np.hypot(rows - row, columns - column)
+        light += np.clip(radius - distance + 0.5, 0, 1) * (1 - 0.3 * np.minimum(distance / radius, 1) ** 2)
+    return 100 + np.random.default_rng(seed).poisson(3000 * light + 20).astype(float)
+
+
+def device() -> tuple[Imager, Imager]:
+    """A device with its array mirrored, turned, moved and shrunk, and its design."""
+    centers = np.asarray(random_layout(24, (5.5, 5.5), pitch=0.9, seed=3))
+    design = Imager(MicrolensArray(centers), Sensor((480, 500), 0.015), 5.8, 2.5)
+    built = dataclasses.replace(design.array, centers=0.98 * centers * (1, -1))
+    return dataclasses.replace(design, array=built, rotation=2.0, shift=(0.3, -0.2)), design
+
+
+def white(actual: Imager, place=FAR, radius=20.0) -> np.ndarray:
+    middles = np.asarray(actual.project(place))[:, 0]
+    return discs(actual.sensor.shape, np.asarray(actual.sensor.to_pixels(middles)), radius)
+
+
+def test_middles_and_widths_of_discs():
+    rng = np.random.default_rng(0)
+    places = np.stack(np.meshgrid([60, 110, 160], [60, 110, 160, 210]), -1).reshape(-1, 2) + rng.uniform(-2, 2, (12, 2))
+    image = discs((220, 270), places, 15.0)
+    middles, radii = find_blurred_spots(image, 50.0, 20)
+    away = np.linalg.norm(middles[:, None] - places, axis=-1)
+    assert len(middles) == 12 and away.min(0).max() < 0.05
+    # Half of an even disc's light is within 0.71 of its radius; these are darker toward the edge.
+    assert np.all((radii > 9.9) & (radii < 10.6))
+    assert half_light_radius(np.zeros((50, 50)), np.array([25.0, 25.0]), 30.0) == 0
+    assert len(find_blurred_spots(np.zeros((80, 80)), 30.0, 5)[0]) == 0
+
+
+def test_chance_is_no_pattern_of_wide_spots():
+    centers = np.asarray(random_layout(40, (8.0, 8.0), pitch=1.0, seed=1))
+    chance = np.random.default_rng(0).uniform(-4, 4, (20, 2))
+    assert not match_pattern(chance, centers, 1.0, 0.5, blurred=True).is_clear
+
+
+@pytest.mark.integration
+def test_a_white_surface_shows_rotation_shift_and_scale():
+    actual, design = device()
+    found = calibrate([white(actual)], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    assert found.mirrored and len(found.residuals) == 24 and found.rms < 0.1
+    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
+    assert found.values["scale"] == pytest.approx(0.98, abs=1e-4)
+    # Images that overlap show no lenses, nor does the dark.
+    for image in (white(actual, radius=45.0), np.random.default_rng(0).normal(100, 2, actual.sensor.shape)):
+        with pytest.raises(InputError, match="captures: a pattern must show an image of each lens .*, got"):
+            calibrate([image], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    with pytest.raises(InputError, match="capture 1 must have one source, .*, got 2"):
+        calibrate(
+            [white(actual)], np.repeat(FAR, 2, 0), design, fit=PATTERN_FITTED, captures=np.zeros(2, int), blurred=[0]
+        )
+
+
+@pytest.mark.integration
+def test_a_white_surface_tells_scale_from_sensor_distance():
+    """Which a bead alone does not. The surface's light comes from far to one side, as nobody said."""
+    actual, design = device()
+    surface, bead = white(actual, np.array([[300.0, -200.0, FAR_MM]])), np.array([[0.3, -0.2, 18.0]])
+    start, places = dataclasses.replace(design, sensor_distance=5.6), np.append(bead, [[np.nan, np.nan, FAR_MM]], 0)
+    fit = ("sensor_distance", *PATTERN_FITTED)
+    found = calibrate([*captures(actual, bead), surface], places, start, fit=fit, blurred=[1])
+    assert found.values["sensor_distance_mm"] == pytest.approx(5.8, abs=0.005)
+    assert found.values["scale"] == pytest.approx(0.98, abs=3e-4)
+
+
+@pytest.mark.integration
+def test_a_printed_array_of_37_radii():
+    """Mirrored, turned, out of focus and of unknown scale: what `experiments/printed_array.py` measures in full."""
+    data = needs("randoscope/psf.tif").parent
+    found = calibrate([read_capture(data / "psf.tif", SHAPE)], FAR, recipe(data), fit=PATTERN_FITTED, blurred=[0])
+    assert found.mirrored and len(found.residuals) == 37 and found.rms < 2
+    assert found.values["rotation_deg"] == pytest.approx(150.4, abs=0.5)
+    assert found.values["scale"] == pytest.approx(1.36, abs=0.01)
