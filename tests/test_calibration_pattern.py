@@ -67,6 +67,9 @@ def test_a_white_surface_shows_rotation_shift_and_scale():
     assert found.mirrored and len(found.residuals) == 24 and found.rms < 0.1
     np.testing.assert_allclose(found.imager.centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
     assert found.values["scale"] == pytest.approx(0.98, abs=1e-4)
+    # Discs that touch draw each other's middles a little.
+    touching = calibrate([white(actual, radius=27.0)], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    np.testing.assert_allclose(touching.imager.centers, actual.centers, atol=0.1 * actual.sensor.pixel_pitch)
     # Images that overlap show no lenses, nor does the dark.
     for image in (white(actual, radius=45.0), np.random.default_rng(0).normal(100, 2, actual.sensor.shape)):
         with pytest.raises(InputError, match="captures: a pattern must show an image of each lens .*, got"):

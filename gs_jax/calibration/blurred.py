@@ -1,10 +1,13 @@
 """Middles and widths of spots that are wide, of any shape: out of focus, aberrated, or a lens's image of a surface.
 
-The window of the mean shift is as wide as the spot itself, so that structure within the spot does not hold it.
+The window of the mean shift is as wide as the spot itself, so that structure within the spot does not hold it, and
+ends half-way to the nearest neighbour, so that discs that touch do not draw each other's middles: what it then sees of
+a disc is all of it, and its edges.
 """
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import KDTree
 from skimage.feature import peak_local_max
 
 from ..detection.background import gaussian_smooth
@@ -16,6 +19,8 @@ from .spot_model import MAX_MOVES, MOVE_TOLERANCE
 _SMOOTHING, _APART, _THRESHOLD = 1 / 7, 1 / 3, 0.02
 # The light of a spot is that within this distance of its middle, in pitches, less the light of the darkest share.
 _REACH, _DARKEST = 0.5, 0.1
+# Least distance of the nearest neighbour that counts, in pitches; the most is one.
+_NEAREST = 0.6
 # Rounds in which middles and widths are found by turns; distance from the maximum that a middle may have, in pitches.
 _ROUNDS, _FARTHEST = 3, 0.25
 # Standard deviation of the window over the half-light radius, which is 1.18 of a Gaussian spot.
@@ -39,7 +44,9 @@ def find_blurred_spots(
     least = _THRESHOLD * max(float(smooth.max()), 0)
     peaks = peak_local_max(smooth, min_distance=max(int(_APART * pitch), 1), threshold_abs=least, exclude_border=False)
     border = np.minimum(peaks, np.array(image.shape) - 1 - peaks).min(1)
-    found = [_settle(light, peak.astype(float), pitch) for peak in peaks[border >= _REACH * pitch][:most]]
+    peaks = peaks[border >= _REACH * pitch][:most].astype(float)
+    nearest = np.asarray(KDTree(peaks).query(peaks, 2)[0])[:, 1] if len(peaks) else np.zeros(0)
+    found = [_settle(light, *each) for each in zip(peaks, np.clip(nearest, _NEAREST * pitch, pitch), strict=True)]
     middles = np.array([middle for middle, _ in found]).reshape(-1, 2)
     radii = np.array([radius for _, radius in found])
     if len(middles):
@@ -62,19 +69,21 @@ def half_light_radius(image: Image, middle: Float64[np.ndarray, "2"], pitch: flo
 
 
 def _settle(light, peak, pitch: float):
-    """Middle and half-light radius of the spot at a maximum."""
+    """Middle and half-light radius of the spot at a maximum, which is a `pitch` from the next."""
     middle, radius = peak, _REACH * pitch / 2
     for _ in range(_ROUNDS):
-        middle = _shift(light, middle, BLURRED_WINDOW * radius, peak, _FARTHEST * pitch)
+        middle = _shift(light, middle, BLURRED_WINDOW * radius, peak, pitch)
         radius = max(half_light_radius(light, middle, pitch), 1.0)
     return middle, radius
 
 
-def _shift(light, middle, deviation: float, peak, farthest: float):
+def _shift(light, middle, deviation: float, peak, pitch: float):
     """Where a Gaussian window comes to rest that moves to the centroid of what it sees."""
+    end, farthest = _REACH * pitch, _FARTHEST * pitch
     for _ in range(MAX_MOVES):
-        near, distance, places = _around(light, middle, 4 * deviation)
-        seen = np.maximum(near, 0) * np.exp(-((distance / deviation) ** 2) / 2)
+        near, distance, places = _around(light, middle, end)
+        inside = np.clip(end - distance + 0.5, 0, 1)
+        seen = np.maximum(near, 0) * inside * np.exp(-((distance / deviation) ** 2) / 2)
         if not seen.sum() > 0:
             break
         last, middle = middle, np.array([(seen * place).sum() for place in places]) / seen.sum()

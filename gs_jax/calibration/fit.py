@@ -57,7 +57,7 @@ _MULTIPLE = 256
 _POSE = ("sensor_distance", "rotation", "shift")
 # What the pattern of the lenses alone determines.
 PATTERN_FITTED = ("rotation", "shift", "scale")
-# What self-calibration fits: an unknown scene determines neither sensor distance nor shift.
+# Of an unknown scene, which determines neither sensor distance nor shift.
 SELF_FITTED = ("rotation", "tilt")
 _SELF_FITTABLE = (*SELF_FITTED, "lenses", *OF_SAMPLE)
 # Most and fewest points that self-calibration uses.
@@ -193,20 +193,13 @@ def calibrate(
         guess = guess._replace(imager=eqx.tree_at(where, guess.imager, where(imager)) if held else guess.imager)
     if not find_lenses:
         if guess.scale != 1:
-            # Windows and neighbours are as large as the pattern turned out to be.
-            again = [
-                find_blurred_spots_mm(image, guess.imager) if k in blurred else found[k]
-                for k, image in enumerate(images)
-            ]
-            spots, blur = [each for each, _ in again], np.array([width for _, width in again])
-            guess = guess._replace(sources=guess.sources._replace(blur=blur))
+            # Windows are as large as the pattern turned out to be.
+            for k in blurred:
+                spots[k], blur[k] = find_blurred_spots_mm(images[k], guess.imager)
         result = refine(spots, guess.imager, guess.sources, unknown, fit, progress=progress)
-        scaled = lambda values: {
-            name: value * (guess.scale if name == "scale" else 1) for name, value in values.items()
-        }
-        return result._replace(
-            mirrored=guess.mirrored, values=scaled(result.values), deviations=scaled(result.deviations)
-        )
+        for numbers in (result.values, result.deviations):
+            numbers |= {name: guess.scale * value for name, value in numbers.items() if name == "scale"}
+        return result._replace(mirrored=guess.mirrored)
     fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
     lens_sd = _UNLISTED * match_radius(guess.imager.array.centers)
     return _drop_unseen_lenses(refine(spots, guess.imager, guess.sources, unknown, fit, lens_sd, progress))
