@@ -1,0 +1,135 @@
+"""Matching of spots with the pattern of the lenses, whatever is between them.
+
+The spots of a point source are the lens centers, rotated, scaled, shifted and perhaps mirrored. Two spots and two
+lenses determine such a similarity; of all with a plausible scale, the one that puts most spots on lenses is taken.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from .spot_model import match_radius
+from .spots import SpotLists
+
+# Brightest spots of each source that pairs begin with, and that are matched; sources and neighbours at most.
+_FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12
+# Fewest spots on lenses of a clear pattern, and their share of those tried.
+_MIN_SPOTS, _MIN_SHARE = 6, 0.5
+# Of blurred spots: their distance from lenses of the pattern, over `match_radius`, which chance meets more often, and
+# the share that has to be on lenses.
+BLURRED, _BLURRED_SHARE = 3.0, 0.7
+# Similarities that are tried at once.
+_BATCH = 20_000
+
+
+class Similarity(NamedTuple):
+    """`p = factor c + shift` in complex numbers `x + iy`, of lens centers `c`, conjugated first if mirrored."""
+
+    factor: complex
+    shift: complex
+    mirrored: bool
+    on_lenses: int
+    tried: int
+    sources: int
+    share: float = _MIN_SHARE
+
+    @property
+    def rotation(self) -> float:
+        """Rotation of the array, radians."""
+        return math.atan2(self.factor.imag, self.factor.real)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether enough spots are on lenses: a share of those of one source."""
+        return self.on_lenses >= max(_MIN_SPOTS, self.share * self.tried / self.sources)
+
+
+def match_pattern(
+    spots: Float[np.ndarray, "spot 2"],
+    centers: Float[np.ndarray, "lens 2"],
+    scale: float,
+    tolerance: float,
+    sources: int = 1,
+    *,
+    blurred: bool = False,
+) -> Similarity:
+    """Find the similarity from lens centers to spots `(x, y)`, mm, brightest first, of one of some sources.
+
+    `scale` is expected within a relative `tolerance`. Middles of `blurred` spots may be three times as far from lenses.
+    """
+    most = min(sources, _MOST_SOURCES)
+    p, c = spots[: _TRIED * most] @ (1, 1j), centers @ (1, 1j)
+    best = Similarity(1 + 0j, 0j, False, 0, len(p), sources, _BLURRED_SHARE if blurred else _MIN_SHARE)
+    if len(p) < 3 or len(c) < 3:
+        return best
+    tree, radius = KDTree(centers), match_radius(centers) * (BLURRED if blurred else 1)
+    beside = np.asarray(tree.query(centers, k=min(_NEIGHBOURS + 1, len(c)))[1])
+    first, second = np.repeat(np.arange(len(c)), beside.shape[1] - 1), beside[:, 1:].ravel()
+    begin, end = np.meshgrid(np.arange(min(_FIRST * most, len(p))), np.arange(len(p)))
+    one, other = begin[begin != end], end[begin != end]
+    for mirrored in (False, True):
+        lenses = c.conj() if mirrored else c
+        factors = (p[other] - p[one])[:, None] / (lenses[second] - lenses[first])
+        pairs = np.argwhere(np.abs(np.abs(factors) / scale - 1) < tolerance)
+        for start in range(0, len(pairs), _BATCH):
+            pair, lens = pairs[start : start + _BATCH].T
+            factor = factors[pair, lens]
+            shift = p[one[pair]] - factor * lenses[first[lens]]
+            count = (_nearest_lens(p, factor, shift, tree, mirrored)[0] < radius).sum(1)
+            top = int(count.argmax())
+            if count[top] > best.on_lenses:
+                found = {"factor": complex(factor[top]), "shift": complex(shift[top]), "on_lenses": int(count[top])}
+                best = best._replace(mirrored=mirrored, **found)
+    if best.on_lenses < 2:
+        return best
+    # Least squares over the spots on lenses.
+    nearest = _nearest_lens(p, best.factor, best.shift, tree, best.mirrored)
+    distance, lens = (np.asarray(part)[0] for part in nearest)
+    use = distance < radius
+    lenses = (c.conj() if best.mirrored else c)[lens[use]]
+    factor, shift = np.linalg.lstsq(np.stack([lenses, np.ones_like(lenses)], -1), p[use])[0]
+    return best._replace(factor=complex(factor), shift=complex(shift))
+
+
+def _nearest_lens(p, factor, shift, tree, mirrored):
+    """Distance of each spot, mapped back to the plate, from the nearest lens, and that lens: `(similarity, spot)`."""
+    back = (p[None] - np.atleast_1d(shift)[:, None]) / np.atleast_1d(factor)[:, None]
+    back = back.conj() if mirrored else back
+    return tree.query(np.stack([back.real, back.imag], -1))
+
+
+def match_shift(
+    spots: Float[np.ndarray, "spot 2"], pattern: Float[np.ndarray, "lens 2"], radius: float
+) -> tuple[Float64[np.ndarray, "2"], int]:
+    """Find the displacement of a pattern of spots, mm, and the number of spots that agree on it within a radius."""
+    if not len(spots) or not len(pattern):
+        return np.zeros(2), 0
+    apart = (spots[:, None] - pattern[None]).reshape(-1, 2)
+    tree = KDTree(apart)
+    count = tree.query_ball_point(apart, radius, return_length=True)
+    together = tree.query_ball_point(apart[int(count.argmax())], radius)
+    return np.median(apart[together], axis=0), len(together)
+
+
+def triangulate_lenses(
+    spots: SpotLists, points: Float[np.ndarray, "image 2"], magnifications: Float[np.ndarray, " image"], radius: float
+) -> tuple[Float64[np.ndarray, "lens 2"], int, int]:
+    """Find lens centers, mm, where rays of several captures meet, and the number of their spots and of pairs of spots.
+
+    The ray from a point `q` of magnification M to its spot `p` passes the plate at `c = (p + M q) / (1 + M)`. Rays meet
+    within `radius`.
+    """
+    passing = [(p + m * q) / (1 + m) for p, q, m in zip(spots, points, magnifications, strict=True)]
+    positions, capture = np.concatenate(passing), np.repeat(np.arange(len(spots)), [len(p) for p in spots])
+    pairs, count = KDTree(positions).query_pairs(radius, output_type="ndarray"), len(positions)
+    pairs = pairs[capture[pairs[:, 0]] != capture[pairs[:, 1]]]
+    _, group = connected_components(coo_array((np.ones(len(pairs)), tuple(pairs.T)), (count, count)), directed=False)
+    size = np.bincount(group)
+    several = np.flatnonzero(size > 1)
+    sums = np.stack([np.bincount(group, column) for column in positions.T], -1)
+    return sums[several] / size[several, None], int(size[several].sum()), len(pairs)
