@@ -10,7 +10,7 @@ from .captures import CAPTURE_SUFFIXES
 from .recordings import natural_key
 
 # Milliseconds: between two looks of the watching library, and the longest time for which it gathers changes.
-_STEP, _GATHER = 2, 8
+_STEP, _GATHER = 4, 8
 # Milliseconds without a change after which the folder is listed, in case that a change was lost.
 _LISTED = 2000
 
