@@ -52,7 +52,9 @@ def live(folder: Path, images: np.ndarray, rate: float) -> dict:
     while "watched until" not in (line := process.stderr.readline()):
         if not line:
             raise RuntimeError("the command ended before it watched")
+    before = process.cpu_times()
     began, ended = camera(run, images, rate)
+    after = process.cpu_times()
     time.sleep(_REST)
     process.send_signal(signal.SIGINT)
     process.communicate()
@@ -64,9 +66,11 @@ def live(folder: Path, images: np.ndarray, rate: float) -> dict:
     newest = np.array(order) >= np.maximum.accumulate(order)
     # The first frame makes the store.
     delays = 1000 * (written - taken)[newest][1:]
+    count = float(np.sum(written <= ended))
     return {
         "camera_frames_per_s": len(images) / (ended - began),
-        "volumes_per_s": float(np.sum(written <= ended)) / (ended - began),
+        "volumes_per_s": count / (ended - began),
+        "cpu_ms": 1000 * (after.user + after.system - before.user - before.system) / count,
         "newest": len(delays),
         "delay_ms": np.percentile(delays, (50, 95)).tolist(),
     }
@@ -102,7 +106,9 @@ def report(frames: int, pixels: int, progress: Progress) -> Report:
         one = float(np.mean(results["one_ms"][number : number + 2]))
         middle, most = each["delay_ms"]
         rates = f"{each['camera_frames_per_s']:.1f}", f"{each['volumes_per_s']:.1f}"
-        rows.append((*rates, f"{one:.0f}", f"{middle:.0f}", f"{middle / one:.2f}", f"{most:.0f}"))
+        rows.append(
+            (*rates, f"{each['cpu_ms']:.0f}", f"{one:.0f}", f"{middle:.0f}", f"{middle / one:.2f}", f"{most:.0f}")
+        )
     z, y, x = results["voxels"]
     recorded = " and ".join(f"{each:.1f}" for each in results["recorded_per_s"])
     before, after = results["load"]
@@ -110,7 +116,15 @@ def report(frames: int, pixels: int, progress: Progress) -> Report:
         f"{results['pixels']}^2 to {z} x {y} x {x} voxels; as a recording {recorded} frames/s before and after; "
         f"load of the machine {before:.1f} and {after:.1f}"
     )
-    columns = "camera, frames/s", "volumes/s", "one, ms", "delay, ms", "delay over one", "95 %, ms"
+    columns = (
+        "camera, frames/s",
+        "volumes/s",
+        "processor, ms a volume",
+        "one, ms",
+        "delay, ms",
+        "delay over one",
+        "95 %, ms",
+    )
     lines = [columns, ("---:",) * len(columns), *rows]
     text = f"**{title}**\n\n" + "".join(f"| {' | '.join(row)} |\n" for row in lines)
     return Report({"live.json": results, "live.md": text}, [table(columns, rows, title)])

@@ -1,5 +1,6 @@
 """`gs-jax reconstruct --watch`: captures to one OME-Zarr while a camera takes them."""
 
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,8 @@ from .recording_command import frames_of, print_notes, request_of, write_series_
 _SHARE, _PAUSE = 20, 1.0
 # Failed frames that are named.
 _MAX_NAMED = 10
+# Seconds for which a thread keeps the interpreter: reading, computing and writing wait for each other ten times shorter.
+_SWITCH = 5e-4
 
 
 def check_watched(output: Path, *, workers: bool, resume: bool, force: bool) -> None:
@@ -79,6 +82,7 @@ def watch_folder(
             click.echo(f"gs-jax: frame {number} ({series.names[number]}): {reason}", err=True)
 
     click.echo(f"{folder}: watched until Ctrl-C", err=True)
+    before, _ = sys.getswitchinterval(), sys.setswitchinterval(_SWITCH)
     try:
         with watched, progress.counter("Reconstructing", None, rate="frames", words=state.words) as advance:
 
@@ -89,6 +93,7 @@ def watch_folder(
 
             reconstruct_live(series, folder, changes, read, make, on_failure=on_failure, on_done=on_done)
     finally:
+        sys.setswitchinterval(before)
         if table:
             table.write()
         camera.print_corrections()
