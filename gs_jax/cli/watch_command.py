@@ -19,7 +19,7 @@ from .recording_command import frames_of, print_notes, request_of, write_series_
 _SHARE, _PAUSE = 20, 1.0
 # Failed frames that are named.
 _MAX_NAMED = 10
-# Seconds for which a thread keeps the interpreter: reading, computing and writing wait for each other ten times shorter.
+# Seconds for which a thread keeps the interpreter: a tenth of the default, so that threads wait shorter for each other.
 _SWITCH = 5e-4
 
 
