@@ -1,15 +1,17 @@
 """Ray-traced captures through a filter, a window and a cover slip into a gel, with the layers and without.
 
-Another group's tracer made the captures with the authors' lenses: the gel (PDMS) begins at 19.67 mm and holds 100
-points, or three planes of words. The geometry is the device's own; "layers ignored" is the same in air, focused where
-the layers focus it. Columns are as in `experiments/true_image.py` and `experiments/fig9_benchmark.py`: the model's
-image, binned by 4, against the capture; points that `find_points` detects; PSNR of the words above an empty volume, on
-planes 0.8 mm apart: 0.56 mm of reduced depth, as planes 0.5 mm apart are in `experiments/fig9_benchmark.py`.
+Another group's tracer made the captures with the authors' lenses: three of single points in air, and two of a gel
+(PDMS) that begins at 19.67 mm and holds 100 points, or three planes of words. The three calibrate the device, with the
+filter and the window or with air in their place ("layers ignored"). Then nothing is fitted anew: with the layers, the
+gel and its cover slip are added as they are; without them, the object is in air. Columns are as in
+`experiments/true_image.py` and `experiments/fig9_benchmark.py`: the model's image, binned by 4, against the capture;
+points that `find_points` detects; PSNR of the words above an empty volume, on planes 0.8 mm apart: 0.56 mm of reduced
+depth, as planes 0.5 mm apart are in `experiments/fig9_benchmark.py`.
 
     python -m experiments.through_layers DATA [--out DIR] [--methods richardson-lucy,unrolled]
 
-DATA holds `L_points.tif`, `L_words.tif`, their truth, `*.json`, and, in `../../geomscope`, the lens centres. Writes
-`layers.json` and `layers.md`; about fifteen minutes on two cores.
+DATA holds `L_cal_*.tif`, `L_points.tif`, `L_words.tif`, their truth, `*.json`, and, in `../../geomscope`, the lens
+centres. Writes `layers.json` and `layers.md`; about fifteen minutes on two cores.
 """
 
 import dataclasses
@@ -27,6 +29,7 @@ from gs_jax import (
     MicrolensArray,
     Sample,
     Sensor,
+    calibrate,
     find_points,
     forward,
     localization,
@@ -44,6 +47,7 @@ from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
 
 # Fine voxels of the strokes, mm; planes of a reconstruction from word to word; steps of iterative methods.
 _FINE, _PLANES, STEPS = 0.012, 2, 20
+CASES = ("with layers", "layers ignored")
 
 
 def scope_of(data: Path, truth: dict) -> Imager:
@@ -69,19 +73,28 @@ def scope_of(data: Path, truth: dict) -> Imager:
     )
 
 
-def without_layers(scope: Imager) -> Imager:
-    """The device in air, its sensor where the windows make it appear."""
-    distance = scope.reduced_sensor_distance - scope.array.reduced_thickness_back
-    return dataclasses.replace(scope, sensor_distance=distance, filters=None, windows=None, sample=None)
+def calibrated(data: Path, progress: Progress) -> tuple[dict[str, Imager], dict]:
+    """The device as three captures in air give it, with the layers and without; and what the two fits say."""
+    in_air = sorted(data.glob("L_cal_*.json"))
+    points = np.array([json.loads(path.read_text())["points_mm"][0][:3] for path in in_air])
+    scope = scope_of(data, json.loads((data / "L_points.json").read_text()))
+    images = [read_capture(path.with_suffix(".tif"), scope.sensor.shape) for path in in_air]
+    devices, results = {}, {}
+    without = dataclasses.replace(scope, filters=None, windows=None, sample=None)
+    for name, start, sample in ((CASES[0], scope, scope.sample), (CASES[1], without, None)):
+        result = calibrate(images, points, dataclasses.replace(start, sample=None), progress=progress)
+        devices[name] = dataclasses.replace(result.imager, sample=sample)
+        results[name] = {"rms_px": result.rms, "values": result.values, "deviations": result.deviations}
+    return devices, results
 
 
-def on_points(data: Path, progress: Progress) -> dict:
-    """Detections with the layers and without, and the model's image."""
-    truth = json.loads((data / "L_points.json").read_text())
-    points, scope = np.array(truth["points_mm"]), scope_of(data, truth)
+def on_points(data: Path, devices: dict[str, Imager], progress: Progress) -> dict:
+    """Detections by each device, and the image by the model of the first."""
+    points = np.array(json.loads((data / "L_points.json").read_text())["points_mm"])
+    scope = devices[CASES[0]]
     image = read_capture(data / "L_points.tif", scope.sensor.shape)
     results = {}
-    for name, each, near in (("with layers", scope, 19.8), ("layers ignored", without_layers(scope), 16.0)):
+    for (name, each), near in zip(devices.items(), (19.8, 16.0), strict=True):
         grid = Grid.over(each.sensor, depths=np.linspace(near, 24.1, 9), pitch=0.04)
         found = find_points(image, each, grid, progress=progress)
         beside = np.hypot(*(found[:, None, :2] - points[None, :, :2]).transpose(2, 0, 1))
@@ -93,22 +106,22 @@ def on_points(data: Path, progress: Progress) -> dict:
             "lateral_rmse_um": 1000 * float(np.sqrt((beside.min(1) ** 2).mean())),
             "axial_rmse_um": 1000 * float(np.sqrt((off**2).mean())),
             "axial_bias_um": 1000 * float(off.mean()),
+            "axial_spread_um": 1000 * float(off.std()),
         }
     light = full_image_of_points(points, scope, progress)
     return results | {"model": scores(light, electrons(image))}
 
 
-def on_words(data: Path, methods: list[str], progress: Progress) -> dict:
-    """The model's image of the words, and the volumes of some methods."""
+def on_words(data: Path, devices: dict[str, Imager], methods: list[str], progress: Progress) -> dict:
+    """Each device's image of the words, and the volumes of some methods."""
     truth = json.loads((data / "L_words.json").read_text())
-    scope = scope_of(data, truth)
-    image = read_capture(data / "L_words.tif", scope.sensor.shape)
+    image = read_capture(data / "L_words.tif", devices[CASES[0]].sensor.shape)
     emitters = np.concatenate([strokes(plane) for plane in truth["planes"]])
     z = np.unique(emitters[:, 2])
     count = 2 * int(np.ceil(np.abs(emitters[:, :2]).max() / _FINE + 1)) + 1
     fine = Grid(z, (count, count), _FINE)
     results = {}
-    for name, each in (("with layers", scope), ("layers ignored", without_layers(scope))):
+    for name, each in devices.items():
         model = forward(rasterize(emitters, fine), each, fine, make_psf_model(each, z, progress=progress))
         results[name] = {"model": scores(np.asarray(model), electrons(image))}
         depths = np.interp(np.arange(_PLANES * (len(z) - 1) + 1) / _PLANES, np.arange(len(z)), z)
@@ -126,22 +139,33 @@ def electrons(image: np.ndarray) -> np.ndarray:
 
 
 def report(data: Path, methods: str, progress: Progress) -> Report:
-    points, words = on_points(data, progress), on_words(data, methods.split(","), progress)
-    cases = ("with layers", "layers ignored")
-    columns = ("", *cases)
+    devices, fits = calibrated(data, progress)
+    points = on_points(data, devices, progress)
+    words = on_words(data, devices, methods.split(","), progress)
+    cases, columns = CASES, ("", *CASES)
     row = lambda label, values: [label, *values]
     rows = [
+        row("calibration in air: residual, pixels RMS", [f"{fits[case]['rms_px']:.3f}" for case in cases]),
+        *(row(name, [_with_error(fits[case], name) for case in cases]) for name in fits[CASES[0]]["values"]),
         row("points found, of 100", [str(points[case]["points"]) for case in cases]),
         row("F1", [f"{points[case]['f1']:.2f}" for case in cases]),
         row("lateral RMS, um", [f"{points[case]['lateral_rmse_um']:.1f}" for case in cases]),
         row("axial RMS, um", [f"{points[case]['axial_rmse_um']:.0f}" for case in cases]),
         row("axial bias, um", [f"{points[case]['axial_bias_um']:.0f}" for case in cases]),
+        row("axial spread about the bias, um", [f"{points[case]['axial_spread_um']:.0f}" for case in cases]),
         row("words, model: correlation, binned 4", [f"{_model(words, case, 'bin_4'):.3f}" for case in cases]),
         row("words, model: light", [f"{words[case]['model']['light']:.3f}" for case in cases]),
         *(row(f"words, {m}: dB above empty", [f"{words[c][m]:.1f}" for c in cases]) for m in methods.split(",")),
     ]
     text = "# Captures through layers\n\n" + markdown_table(columns, rows) + "\n"
-    return Report({"layers.json": {"points": points, "words": words}, "layers.md": text}, [table(columns, rows)])
+    return Report(
+        {"layers.json": {"calibration": fits, "points": points, "words": words}, "layers.md": text},
+        [table(columns, rows)],
+    )
+
+
+def _with_error(fit: dict, name: str) -> str:
+    return f"{fit['values'][name]:.4f} +- {fit['deviations'][name]:.4f}"
 
 
 def _model(words: dict, case: str, binned: str) -> float:

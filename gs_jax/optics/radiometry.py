@@ -1,18 +1,10 @@
 """How much of a point's light a ray carries: solid angle, and Fresnel losses at every face. Shapes are `refract`'s."""
 
-import numpy as np
-
 from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..layers import object_indices
 from ..typing import Coordinates, Scalar, Scalars
 from .raytrace import RefractedRay, dot, secant, square_and_root
-
-# Rays for which a polynomial is fitted, and the squared sine up to which it serves; its nodes, and the coefficients by
-# values there.
-_MANY, _STEEP = 256, 0.5
-_NODES = np.cos(np.pi * (np.arange(11) + 0.5) / 11)
-_FIT = np.linalg.inv(np.vander(_NODES, increasing=True))
 
 
 def solid_angle(imager: Imager, ray: RefractedRay) -> Scalars:
@@ -54,26 +46,8 @@ def transmittance(imager: Imager, ray: RefractedRay) -> Scalars:
 
 
 def _through(indices, slope: Coordinates) -> Scalars:
-    """Light that plane faces between media of these indices transmit; `slope` is the ray's in air.
-
-    Many rays on the host, through several faces, take it from a polynomial in the squared sine, to 1e-8.
-    """
+    """Light that plane faces between media of these indices transmit; `slope` is the ray's in air."""
     square = dot(slope, slope)
-    if len(indices) < 3 or not isinstance(square, np.ndarray) or square.size < _MANY:
-        return _through_faces(indices, square)
-    sine2 = square / (1 + square)
-    half = sine2.max() / 2
-    if not 0 < half < _STEEP / 2:
-        return _through_faces(indices, square)
-    nodes = half * (1 + _NODES)
-    *lower, light = _FIT @ _through_faces(indices, nodes / (1 - nodes))
-    away = sine2 / half - 1
-    for coefficient in lower[::-1]:
-        light = light * away + coefficient
-    return light
-
-
-def _through_faces(indices, square: Scalars) -> Scalars:
     light, cosines = 1.0, [_cosine(n, square) for n in indices]
     for k in range(len(indices) - 1):
         light = light * _fresnel(indices[k], cosines[k], indices[k + 1], cosines[k + 1])

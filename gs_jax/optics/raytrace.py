@@ -192,12 +192,6 @@ def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> 
     difference, the third the derivative by `h` of what the layers make of it, before the last step.
     """
     square, excess, change = dot(across, across), paraxial + 0 * across[0], 0.0
-    on_host = isinstance(square, np.ndarray)
-    if on_host:
-        # To third order, and bounded.
-        slope2 = square / (reduced * reduced)
-        third = sum(thickness * (n**2 - 1) / (2 * n**3) for thickness, n in slabs)
-        excess = excess - slope2 / (1 + slope2 / 2) * third
     for _ in range(_NEWTON_STEPS):
         h = reduced + excess
         slope2 = square / (h * h)
@@ -212,7 +206,7 @@ def _height(reduced: Scalars, paraxial: Scalars, slabs, across: Coordinates) -> 
         step = (excess - paraxial + slope2 * off) / (1 - change)
         excess = excess - step
         # As soon as the next step would be 1e-14 of the height: solid angles, too, are those of compiled rays.
-        if on_host and (step * step * change <= _LAST_STEP * h * h).all():
+        if isinstance(square, np.ndarray) and (step * step * change <= _LAST_STEP * h * h).all():
             break
     return reduced + excess, excess, change
 
