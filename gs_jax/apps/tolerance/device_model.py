@@ -61,8 +61,8 @@ ERROR_FIELDS = {
 CONSTANT = ("roughness", "printed layers")
 # Rings of equal area in a lens: terraces are wide in its middle only.
 _RINGS = 256
-# A single lens gives no depth.
-_MIN_LENSES = 2
+# A single lens gives no depth. Lists of lenses are filled up to a multiple of so many.
+_MIN_LENSES, _ROUNDED = 2, 8
 # Steps of the finite differences of core positions: relative, of the conic constant, and of the index.
 _STEPS = {"radius": 0.01, "conic": 0.05, "index": 0.005}
 # Depths at which cores are traced; interpolation has kinks there, which few asked depths meet.
@@ -269,7 +269,9 @@ def _visible(imager: Imager, points: Float64[np.ndarray, "point 3"]) -> VisibleP
         x, y, z = points[count.argmin()]
         point = f"the point at x {x:.4g}, y {y:.4g}, z {z:.4g} mm"
         raise InputError(f"{_MIN_LENSES} or more lenses must see {point} to know its depth, got {count.min()}.")
-    lenses = np.argsort(~seen, axis=1, kind="stable")[:, : count.max()]
+    # Devices that differ little take the same program.
+    most = -(-count.max() // _ROUNDED) * _ROUNDED
+    lenses = np.argsort(~seen, axis=1, kind="stable")[:, :most]
     return VisiblePoints(jnp.asarray(points), jnp.asarray(lenses), jnp.asarray(np.take_along_axis(seen, lenses, 1)))
 
 

@@ -35,7 +35,7 @@ from .device_model import (
 from .tolerance_spec import ToleranceSpec
 
 # Default number of depths; devices per compiled call, and those whose rays are in memory at once.
-_DEPTHS, _BATCH, _AT_ONCE = 5, 64, 8
+_DEPTHS, _BATCH = 5, 8
 # Default limits, relative to the design: spot width, and Strehl ratio where that is at least so large.
 MAX_WIDTH, MIN_STREHL, LEAST_STREHL = 1.2, 0.8, 0.1
 
@@ -193,11 +193,10 @@ def tolerance(
 
 
 def measure_devices(problem: Problem, errors: Errors, advance=lambda: None) -> Measures:
-    """Measure devices, in batches of one size, so that one program is compiled."""
+    """Measure devices, in batches of one size for any number of them, so that one program is compiled."""
     batches, count = [], len(errors.radius)
-    size = min(_BATCH, count)
-    for start in range(0, count, size):
-        index = np.minimum(np.arange(start, start + size), count - 1)
+    for start in range(0, count, _BATCH):
+        index = np.minimum(np.arange(start, start + _BATCH), count - 1)
         batch = _measure(problem, jax.tree.map(lambda part, index=index: part[index], errors))
         batches.append(Measures(*(np.asarray(part, np.float64)[: count - start] for part in batch)))
         advance()
@@ -207,7 +206,7 @@ def measure_devices(problem: Problem, errors: Errors, advance=lambda: None) -> M
 @eqx.filter_jit
 def _measure(problem: Problem, errors: Errors) -> Measures:
     one = lambda each: Measures(*_sharpness(problem, each), *depth_errors(*problem.depth_arguments, each))
-    return jax.lax.map(one, errors, batch_size=_AT_ONCE)
+    return jax.vmap(one)(errors)
 
 
 def _sharpness(problem: Problem, errors: Errors) -> tuple[Float[Array, " depth"], Float[Array, " depth"]]:
