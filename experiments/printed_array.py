@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray, Sensor, calibrate
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.blurred import half_light_radius
+from gs_jax.calibration.blurred import half_light_radius, mean_shift
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
 from gs_jax.io.captures import read_capture
@@ -38,6 +38,8 @@ from gs_jax.optics.pupil import add_diffraction, aperture_profile, sample_pupil
 # wavelength, mm. Neighbours end the lenses before the nominal aperture does.
 SHAPE, PIXEL, DISTANCE, INDEX, PLATE, WAVELENGTH = (486, 648), 4 * 0.0022, 8.74, 1.515, 1.7, 510e-6
 APERTURE, FAR = 0.4, 1e4
+# Standard deviations of two windows, pixels.
+WINDOWS = (4.0, 8.0)
 # Distances of a source that are tried, mm, and rays through a lens.
 SOURCES, RAYS = np.geomspace(100.0, 1000.0, 15), 2000
 
@@ -106,6 +108,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     """Return the content of `printed_array.json`, and what the figure shows."""
     start = recipe(data)
     image = read_capture(data / "psf.tif", SHAPE).astype(np.float64)
+    image -= np.median(image)
     found = calibrate([image], np.array([[0.0, 0.0, FAR]]), start, fit=PATTERN_FITTED, blurred=[0], progress=progress)
     pixels_per_mm = found.values["scale"] / PIXEL
     with progress.step("Leaving out lenses"):
@@ -122,6 +125,9 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     others = [law(defocus_law(radius[every != k], seen[every != k]), radius[k]) for k in every]
     numbers = defocus_law(radius, seen)
     rms = lambda off: float(np.sqrt((off**2).sum(-1).mean()))
+    # Where a wide spot is depends on the window that looks.
+    centers = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
+    two = [np.array([mean_shift(image, place, one, pitch) for place in centers]) for one in WINDOWS]
     wide = seen > np.median(seen)
     results = {
         "mirrored": found.mirrored,
@@ -137,6 +143,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
             "of_the_wider_half": rms(similarity[wide]),
             "with_distortion": rms(distorted),
         },
+        "middles_by_two_windows_differ_rms_pixels": rms(two[0] - two[1]),
         "half_light_radius_pixels": {"least": seen.min(), "most": seen.max()},
         "width_correlation": {
             "rays_far_source_nothing_fitted": agree(rays[FAR]),
@@ -191,6 +198,7 @@ def report(data: Path, progress: Progress) -> Report:
         for group in ("values", "left_out_rms_pixels", "width_correlation", "law")
         for name, value in results[group].items()
     ]
+    rows.append(["middles by two windows differ", f"{results['middles_by_two_windows_differ_rms_pixels']:.3g}"])
     rows.insert(0, ["lenses matched", f"{results['lenses_matched']} of {results['lenses']}"])
     files = {"printed_array.json": results, "printed_array.png": picture(results, shown)}
     return Report(files, [table(("", "found"), rows)])

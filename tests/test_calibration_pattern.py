@@ -11,6 +11,7 @@ from gs_jax.calibration.blurred import find_blurred_spots, half_light_radius
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.calibration.pattern_matching import match_pattern
 from gs_jax.io.captures import read_capture
+from gs_jax.layouts import hexagonal_layout, square_layout
 
 from .helpers import needs
 from .test_calibration import captures, render_spots, traced_spots
@@ -58,6 +59,15 @@ def test_chance_is_no_pattern_of_wide_spots():
     centers = np.asarray(random_layout(40, (8.0, 8.0), pitch=1.0, seed=1))
     chance = np.random.default_rng(0).uniform(-4, 4, (20, 2))
     assert not match_pattern(chance, centers, 1.0, 0.5, blurred=True).is_clear
+
+
+@pytest.mark.parametrize("layout", [hexagonal_layout, square_layout])
+def test_of_a_regular_array_the_pose_next_to_the_design_is_found(layout):
+    centers = np.asarray(layout((9.0, 9.0), pitch=1.0))
+    spots = (centers @ (1, 1j) * 1.05 * np.exp(0.1j) + 0.2 - 0.3j)[np.argsort(np.hypot(*centers.T))][:20]
+    found = match_pattern(np.stack([spots.real, spots.imag], -1), centers, 1.0, 0.5, blurred=True)
+    assert not found.mirrored and found.on_lenses == 20
+    assert abs(found.factor - 1.05 * np.exp(0.1j)) < 1e-6 and abs(found.shift - (0.2 - 0.3j)) < 1e-6
 
 
 @pytest.mark.integration

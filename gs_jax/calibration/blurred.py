@@ -72,14 +72,19 @@ def _settle(light, peak, pitch: float):
     """Middle and half-light radius of the spot at a maximum, which is a `pitch` from the next."""
     middle, radius = peak, _REACH * pitch / 2
     for _ in range(_ROUNDS):
-        middle = _shift(light, middle, BLURRED_WINDOW * radius, peak, pitch)
+        middle = mean_shift(light, peak, BLURRED_WINDOW * radius, pitch)
         radius = max(half_light_radius(light, middle, pitch), 1.0)
     return middle, radius
 
 
-def _shift(light, middle, deviation: float, peak, pitch: float):
-    """Where a Gaussian window comes to rest that moves to the centroid of what it sees."""
-    end, farthest = _REACH * pitch, _FARTHEST * pitch
+def mean_shift(
+    light: Float64[np.ndarray, "row column"], peak: Float64[np.ndarray, "2"], deviation: float, pitch: float
+) -> Float64[np.ndarray, "2"]:
+    """Where a Gaussian window comes to rest that moves from a maximum to the centroid of what it sees.
+
+    The window ends at half a `pitch`, and rests within a quarter of the maximum; all in pixels, `(row, column)`.
+    """
+    middle, end, farthest = peak, _REACH * pitch, _FARTHEST * pitch
     for _ in range(MAX_MOVES):
         near, distance, places = _around(light, middle, end)
         inside = np.clip(end - distance + 0.5, 0, 1)

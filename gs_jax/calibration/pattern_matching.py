@@ -23,6 +23,8 @@ _MIN_SPOTS, _MIN_SHARE = 6, 0.5
 # Of blurred spots: their distance from lenses of the pattern, over `match_radius`, which chance meets more often, and
 # the share that has to be on lenses.
 BLURRED, _BLURRED_SHARE = 3.0, 0.7
+# Of a similarity, how far it is from the list as it is must count less than a spot on a lens.
+_FARTHEST = 1e3
 # Similarities that are tried at once.
 _BATCH = 20_000
 
@@ -61,6 +63,8 @@ def match_pattern(
     """Find the similarity from lens centers to spots `(x, y)`, mm, brightest first, of one of some sources.
 
     `scale` is expected within a relative `tolerance`. Middles of `blurred` spots may be three times as far from lenses.
+    Of several similarities that fit equally, as with a regular array, it is the one nearest to the list as it is: not
+    mirrored, of this scale, turned and shifted the least.
     """
     most = min(sources, _MOST_SOURCES)
     p, c = spots[: _TRIED * most] @ (1, 1j), centers @ (1, 1j)
@@ -71,7 +75,7 @@ def match_pattern(
     beside = np.asarray(tree.query(centers, k=min(_NEIGHBOURS + 1, len(c)))[1])
     first, second = np.repeat(np.arange(len(c)), beside.shape[1] - 1), beside[:, 1:].ravel()
     begin, end = np.meshgrid(np.arange(min(_FIRST * most, len(p))), np.arange(len(p)))
-    one, other = begin[begin != end], end[begin != end]
+    one, other, highest = begin[begin != end], end[begin != end], 0.0
     for mirrored in (False, True):
         lenses = c.conj() if mirrored else c
         factors = (p[other] - p[one])[:, None] / (lenses[second] - lenses[first])
@@ -81,10 +85,12 @@ def match_pattern(
             factor = factors[pair, lens]
             shift = p[one[pair]] - factor * lenses[first[lens]]
             count = (_nearest_lens(p, factor, shift, tree, mirrored)[0] < radius).sum(1)
-            top = int(count.argmax())
-            if count[top] > best.on_lenses:
+            away = np.abs(np.log(factor / scale)) + np.abs(shift) / np.abs(p).max() + mirrored
+            rank = count - away / _FARTHEST
+            top = int(rank.argmax())
+            if rank[top] > highest:
                 found = {"factor": complex(factor[top]), "shift": complex(shift[top]), "on_lenses": int(count[top])}
-                best = best._replace(mirrored=mirrored, **found)
+                best, highest = best._replace(mirrored=mirrored, **found), float(rank[top])
     if best.on_lenses < 2:
         return best
     # Least squares over the spots on lenses.

@@ -84,8 +84,9 @@ def calibrate_command(
     with z from the array, or from the sample. One capture suffices; several depths and positions are better.
 
     Without a point source, a --pattern shows how the array is turned and mirrored, where it is, and its scale on the
-    sensor. It is taken to come from 10 m away, unless --positions has a line for it (`capture` is the file's name).
-    Lenses may differ and be out of focus, but their images must be apart; --hold scale where the design is exact.
+    sensor. Its light is taken to come from 10 m straight ahead (beside CAPTURES: from any direction), unless
+    --positions has a line for it, whose `capture` is the file's name. Lenses may differ and be out of focus, but their
+    images must be apart.
 
     DESIGN's layers are in place. Sources at --positions are in air, unless --sample says what held them (`--sample
     sample` for DESIGN's [sample]) or a number of the sample is fitted; a scene is in DESIGN's [sample]. Points of known
