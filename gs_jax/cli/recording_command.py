@@ -90,7 +90,7 @@ def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False)
     image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
     if is_live:
         with suppress(InputError):
-            reconstruct(np.zeros(plan.imager.sensor.shape, np.float32), Progress())
+            reconstruct(_image_to_compile_for(plan), Progress())
     # Only the first frame is checked; an iterator gives one item to one thread.
     checks = iter([plan.check] if plan.is_learned else [])
 
@@ -110,6 +110,20 @@ def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False)
         return result.volume, note
 
     return lambda frame: (frame, *image_of(frame)), make
+
+
+def _image_to_compile_for(plan):
+    """An image for which all is compiled that captures need: dark, or of points where points are found."""
+    import numpy as np
+
+    if not plan.points and plan.suppress == "none":
+        return np.zeros(plan.imager.sensor.shape, np.float32)
+    from ..simulation.phantoms import random_points
+    from ..simulation.synthetic import simulate
+
+    depths, side = np.asarray(plan.grid.depths, float), float(plan.imager.field_radius)
+    points = random_points(10, (side, side), (depths.min(), depths.max()), seed=0)
+    return np.asarray(simulate(points, plan.imager, optics="near", psf="geometric"), np.float32)
 
 
 def reconstruct_recording(
