@@ -152,6 +152,7 @@ def plot_residuals(result: Calibration) -> Figure:
     lines.plot(inverse[order], fitted[order], color="0.6", label="1 + v/z'")
     lines.plot(inverse, seen, ".", label="spots of a source")
     lines.set(xlabel="1/z', 1/mm", ylabel="scale of the pattern, s_z")
+    lines.locator_params(axis="x", nbins=4)
     worst = float(np.abs(seen - fitted).max()) if len(seen) else 0.0
     lines.set_title(f"s_z by depth (Eq. 1), off by up to {worst:.1e}", fontsize=9)
     lines.legend(fontsize=8)
