@@ -53,6 +53,12 @@ _METHODS = ("admm", "fista", "richardson-lucy")
     "[default: a plane for each page]",
 )
 @click.option(
+    "--psf-places",
+    type=Path,
+    help="PLACES.csv, x_mm,y_mm,z_mm, a line for each PSF: of sources all over the field, four or more at each z, if "
+    "the PSF varies over the field.",
+)
+@click.option(
     "--binning",
     type=click.IntRange(1, 64),
     default=1,
@@ -73,6 +79,7 @@ def deconvolve_command(
     depths: list[float] | None,
     voxel_um: float | None,
     psf_page: int | str | None,
+    psf_places: Path | None,
     binning: int,
     method: str,
     steps: int,
@@ -85,6 +92,9 @@ def deconvolve_command(
     A PSF is what the camera sees of one small source in the middle of the field, such as a lit pinhole. From one PSF
     follows the plane where the source was. From a stack, a PSF at each depth, follows a volume with a plane for each:
     give the pages of a TIFF, a folder of images, a Zarr array (z, y, x), or several files in order.
+
+    If the PSF changes over the field, measure it at several places and list them with --psf-places. The order of
+    sources is free; scale and orientation need not be known.
 
     All files may be TIFF, PNG or .npy, in the same pixels; a PSF may be smaller than CAPTURE, its source then being in
     the PSF's middle. --dark, --flat, --bad-pixels and --offset correct all of them.
@@ -102,27 +112,44 @@ def deconvolve_command(
     from ..io.captures import write_capture
     from ..io.files import check_output
     from ..io.plane_stacks import STACK_SUFFIXES, write_planes
+    from ..io.point_tables import read_positions
     from ..reconstruction.deconvolution import bin_pixels, deconvolve, make_solver
+    from ..reconstruction.field_fit import fit_field
 
     check_output(output, STACK_SUFFIXES)
-    check_may_write(output, inputs=(capture, *psf, *camera.files))
-    if output.suffix.lower() == ".zarr" and not (depths and voxel_um):
+    files = [path for path in (*psf, psf_places, *camera.files) if path]
+    check_may_write(output, inputs=(capture, *files))
+    if psf_places and depths:
+        raise InputError("--depths must not be given with --psf-places, whose z_mm are the depths, got both.")
+    if output.suffix.lower() == ".zarr" and not ((depths or psf_places) and voxel_um):
         raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
     solver = make_solver(method, steps, weights)
     with Progress() as progress:
         with progress.step("Reading"):
             image = bin_pixels(camera.read(capture), binning)
             spots = np.stack([bin_pixels(spot, binning) for spot in camera.read_spots(psf, psf_page)])
-        if depths and len(depths) != len(spots):
+        fit = None
+        if psf_places:
+            with progress.step("Fitting the PSFs"):
+                fit = fit_field(spots, read_positions(psf_places, psf)[0], image.shape)
+            depths = None if np.isnan(fit.depths).any() else fit.depths.tolist()
+        elif depths and len(depths) != len(spots):
             raise InputError(f"--depths must be one for each PSF, {len(spots)} in all, got {len(depths)} depths.")
-        planes = deconvolve(image, spots, solver, stop_at_discrepancy=stop_at_noise, progress=progress)
+        planes = deconvolve(
+            image, fit.operator if fit else spots, solver, stop_at_discrepancy=stop_at_noise, progress=progress
+        )
         with progress.step("Writing"):
-            provenance = camera.recorded(provenance_of(capture, *psf, *camera.files))
+            provenance = camera.recorded(provenance_of(capture, *files))
             if len(planes) == 1 and not depths:
                 write_capture(output, planes[0], provenance)
             else:
                 write_planes(output, planes, depths, voxel_um and voxel_um * binning / 1000, provenance)
     camera.print_corrections()
+    if fit:
+        click.echo(
+            f"{psf_places}: {fit.rank} components explain {len(spots)} PSFs to {fit.error:.2g} of their RMS, those at "
+            f"other places predict one to {fit.left_out_error:.2g}; places fit to {fit.place_error:.2g} pixels"
+        )
     z, rows, columns = planes.shape
     of = "" if z == 1 and not depths else f"{depth_range(depths)}, " if depths else f"{z} planes, "
     click.echo(f"{output}: {of}{rows} x {columns} pixels, {method}, at most {steps} steps")

@@ -1,6 +1,7 @@
 """Deconvolution of a capture with measured PSFs, of a diffuser or any other mask in front of a camera."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +11,9 @@ from ..base.arrays import check_finite
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..projection.measured_psf import ConvolutionOperator, scene_size
+from ..projection.measured_field import FieldConvolutionOperator
+from ..projection.measured_psf import ConvolutionOperator
+from ..solvers.admm import ADMM
 from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
@@ -21,10 +24,10 @@ from .residual import discrepancy_target
 
 # Default weight of ADMM's total variation.
 TV = 1e-3
-# Arrays of the scene's size at the peak, the PSFs' spectra among them, as measured.
-_ARRAYS = {ConvolutionADMM: 16, FISTA: 9, RichardsonLucy: 9}
+# Arrays of the scene's size at the peak, the PSFs' spectra among them, as measured; and for each further component.
+_ARRAYS, _EACH_COMPONENT = {ConvolutionADMM: 16, ADMM: 16, FISTA: 9, RichardsonLucy: 9}, 4
 
-Deconvolver = ConvolutionADMM | FISTA | RichardsonLucy
+Deconvolver = ConvolutionADMM | ADMM | FISTA | RichardsonLucy
 # Solvers by the names of the command line, as functions of the number of steps.
 SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
     "admm": lambda steps: ConvolutionADMM(steps, sparsity=0.0, tv=TV),
@@ -35,7 +38,7 @@ SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
 
 def deconvolve(
     image: Image,
-    psf: Num[Array | np.ndarray, "*depth high wide"],
+    psf: Num[Array | np.ndarray, "*depth high wide"] | FieldConvolutionOperator,
     solver: Deconvolver = ConvolutionADMM(steps=100, sparsity=0.0, tv=TV),
     *,
     stop_at_discrepancy: bool = False,
@@ -45,18 +48,20 @@ def deconvolve(
 
     *Host.*
 
-    Each plane has one PSF, wherever in it a point is. Points beside the sensor whose light reaches it are
-    reconstructed, too, and then cropped (Antipa et al., Optica 5, 1, 2018). The camera's offset, the first percentile,
-    is subtracted from the image and from each PSF.
+    Each plane has one PSF, wherever in it a point is, unless PSFs were measured over the field. Points beside the
+    sensor whose light reaches it are reconstructed, too, and then cropped (Antipa et al., Optica 5, 1, 2018). The
+    camera's offset, the first percentile, is subtracted from the image and from each PSF.
 
     Parameters
     ----------
     image
         Linear, in any unit.
     psf
-        Image of a point on the axis, which is at the middle; any unit. Or a stack of them, one for each depth.
+        Image of a point on the axis, which is at the middle; any unit. Or a stack of them, one for each depth. Or the
+        operator of PSFs that were measured over the field, by `gs_jax.reconstruction.field_fit.fit_field`.
     solver
-        Solver that inverts the convolutions.
+        Solver that inverts the convolutions. For PSFs over the field `ADMM`, which takes the weights of
+        `ConvolutionADMM` if that is given.
     stop_at_discrepancy
         Stop early where the cost is no larger than the image's noise leaves (Morozov's discrepancy principle).
     progress
@@ -93,14 +98,13 @@ def deconvolve(
     if not isinstance(solver, Deconvolver):
         raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")
     check_finite("image", image)
-    check_finite("psf", psf)
-    spots = _spots(psf)
-    if any(k > n for k, n in zip(spots.shape[1:], image.shape, strict=True)):
-        size = lambda shape: " x ".join(map(str, shape))
-        raise input_error("psf", f"at most the image's {size(image.shape)} pixels", size(spots.shape[1:]))
-    _check_memory(solver, (len(spots), *scene_size(image.shape, spots.shape[1:])))
     light = subtract_offset(np.asarray(image, np.float32))
-    system = ConvolutionOperator(spots, light.shape)
+    system = psf if isinstance(psf, FieldConvolutionOperator) else _stack_operator(psf, light.shape)
+    if isinstance(system, FieldConvolutionOperator):
+        solver = _of_any_operator(solver)
+    elif isinstance(solver, ADMM):
+        raise InputError("solver must be ConvolutionADMM() for PSFs that do not vary over the field, got ADMM.")
+    _check_memory(solver, system)
     # Weights of priors suit images of the order of 1.
     unit = np.float32(np.abs(light).max() or 1.0)
     target = 0.0
@@ -109,7 +113,7 @@ def deconvolve(
         target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light / unit, counts=counts)
     scene = run_solver(solver, light / unit, system, progress or Progress(), target)
     scene = unit * scene[:, *system.window]
-    return scene if psf.ndim == 3 else scene[0]
+    return scene[0] if isinstance(psf, Array | np.ndarray) and psf.ndim == 2 else scene
 
 
 def make_solver(method: str, steps: int, weights: dict[str, float | None]) -> Deconvolver:
@@ -135,25 +139,41 @@ def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarra
     return light.reshape(rows, side, columns, side).sum((1, 3))
 
 
-def _spots(psf) -> Float32[np.ndarray, "depth high wide"]:
-    """PSFs above their offsets, each with the sum 1."""
+def _stack_operator(psf, image_shape) -> ConvolutionOperator:
+    """Operator of PSFs above their offsets, each with the sum 1."""
     if psf.ndim not in (2, 3) or min(psf.shape) < 1:
         raise input_error("psf", "an image or a stack of images", f"the shape {psf.shape}")
+    check_finite("psf", psf)
     spots = np.array(psf, np.float32).reshape(-1, *psf.shape[-2:])
+    if any(k > n for k, n in zip(spots.shape[1:], image_shape, strict=True)):
+        raise input_error("psf", f"at most the image's {_size(image_shape)} pixels", _size(spots.shape[1:]))
     for plane in range(len(spots)):
         spot = subtract_offset(spots[plane])
         if not (total := spot.sum()) > 0:
             where = f" in plane {plane + 1}" if len(spots) > 1 else ""
             raise InputError(f"psf must be the image of a point, got no light above the darkest percent{where}.")
         spots[plane] = spot / total
-    return spots
+    return ConvolutionOperator(spots, image_shape)
 
 
-def _check_memory(solver, shape):
-    size = 4 * _ARRAYS[type(solver)] * int(np.prod(shape, dtype=np.int64))
+def _of_any_operator(solver: Deconvolver) -> Deconvolver:
+    if not isinstance(solver, ConvolutionADMM):
+        return solver
+    return ADMM(solver.steps, solver.tolerance, solver.sparsity, solver.tv, solver.isotropic)
+
+
+def _check_memory(solver, system):
+    arrays = _ARRAYS[type(solver)]
+    if isinstance(system, FieldConvolutionOperator):
+        arrays += _EACH_COMPONENT * system.weights.shape[1]
+    size = 4 * arrays * math.prod(system.scene_shape)
     if size > (memory := available_memory()):
-        voxels = " x ".join(map(str, shape))
         raise InputError(
-            f"psf, image: the solver must take at most {memory / 2**30:.3g} GiB, the free memory, got {voxels} voxels, "
-            f"for which it takes about {size / 2**30:.3g} GiB; --binning 2 takes a quarter."
+            f"psf, image: the solver must take at most {memory / 2**30:.3g} GiB, the free memory, got "
+            f"{_size(system.scene_shape)} voxels, for which it takes about {size / 2**30:.3g} GiB; --binning 2 takes a "
+            "quarter."
         )
+
+
+def _size(shape):
+    return " x ".join(map(str, shape))

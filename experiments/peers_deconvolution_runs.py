@@ -1,0 +1,187 @@
+"""Run one solver of `peers_deconvolution.py` in the environment that has it, step by step.
+
+    PYTHON experiments/peers_deconvolution_runs.py CODE INPUT.npz OUTPUT.npz STEPS
+
+CODE is gs_jax, scico or LenslessPiCam (`pip install scico`, `pip install lensless`, each in an environment of its own).
+After each step the objective of its scene is computed here, in NumPy and SciPy, the same for all; this is not timed.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+
+WARM_UP = 2
+# Penalties and relaxation of scico's example of this problem.
+PENALTIES, RELAXATION = (1.0, 5.0, 10.0), 1.8
+
+
+class Problem:
+    """`|crop(sum h_k * x_k) - y|^2 / 2 + tv |D x| + l1 |x|`, with differences along rows and columns."""
+
+    def __init__(self, path: str):
+        given = np.load(path)
+        self.image, self.stack = given["image"], given["stack"]
+        self.tv, self.l1 = float(given["tv"]), float(given["l1"])
+        # Of gradient vectors and of either sign, or of each axis and not negative.
+        self.isotropic = self.signed = bool(given["signed"])
+        size = tuple(n + k for n, k in zip(self.image.shape, self.stack.shape[1:], strict=True))
+        self.size: tuple[int, int] = (size[0], size[1])
+
+    def window(self, size: tuple[int, ...]) -> tuple[slice, slice]:
+        corner = [(n - m) // 2 for n, m in zip(size, self.image.shape, strict=True)]
+        rows, columns = (slice(a, a + m) for a, m in zip(corner, self.image.shape, strict=True))
+        return rows, columns
+
+    def objective(self, scene: np.ndarray) -> float:
+        spectrum, penalty, fft = np.zeros(()), 0.0, scipy.fft
+        high, wide = self.stack.shape[1:]
+        for plane, psf in zip(scene.astype(np.float32), self.stack, strict=True):
+            padded = np.zeros(plane.shape, np.float32)
+            padded[:high, :wide] = psf
+            padded = np.roll(padded, (-(high // 2), -(wide // 2)), (0, 1))
+            spectrum = spectrum + np.asarray(fft.rfft2(padded, workers=2)) * np.asarray(fft.rfft2(plane, workers=2))
+            steps = [np.roll(plane, -1, axis) - plane for axis in (0, 1)]
+            lengths = np.hypot(*steps) if self.isotropic else np.abs(steps[0]) + np.abs(steps[1])
+            penalty += self.tv * lengths.sum(dtype=np.float64) + self.l1 * np.abs(plane).sum(dtype=np.float64)
+        residual = np.asarray(fft.irfft2(spectrum, scene.shape[1:]))[self.window(scene.shape[1:])] - self.image
+        return float((residual.astype(np.float64) ** 2).sum() / 2 + penalty)
+
+
+# A code starts runs. After each step a run yields its scene, as a function, and the objective that the code itself has.
+Run = Iterator[tuple[Callable[[], np.ndarray], float]]
+
+
+def gs_jax(problem: Problem) -> Callable[[], Run]:
+    import jax
+
+    from gs_jax import ConvolutionADMM, ConvolutionOperator
+
+    A = ConvolutionOperator(problem.stack, problem.image.shape)
+    unit = float(jax.jit(lambda A, y: A.T.mv(y).max())(A, problem.image))
+    weights = {"tv": problem.tv / unit, "sparsity": problem.l1 / unit, "tv_z": 0.0}
+    solver = ConvolutionADMM(1, isotropic=problem.isotropic, nonnegative=not problem.signed, **weights)
+    init, step = jax.jit(solver.init), jax.jit(solver.step, donate_argnums=2)
+
+    def start() -> Run:
+        state = jax.block_until_ready(init(A, problem.image))
+        while True:
+            state = jax.block_until_ready(step(A, problem.image, state)[0])
+            yield partial(np.asarray, state.best), float(state.cost)
+
+    return start
+
+
+def scico(problem: Problem) -> Callable[[], Run]:
+    import jax
+    from scico.functional import (  # pyright: ignore[reportMissingImports]
+        L1Norm,
+        L21Norm,
+        NonNegativeIndicator,
+        ZeroFunctional,
+    )
+    from scico.linop import (  # pyright: ignore[reportMissingImports]
+        CircularConvolve,
+        Crop,
+        FiniteDifference,
+        Identity,
+        Sum,
+    )
+    from scico.loss import SquaredL2Loss  # pyright: ignore[reportMissingImports]
+    from scico.optimize.admm import ADMM, G0BlockCircularConvolveSolver  # pyright: ignore[reportMissingImports]
+
+    shape = (len(problem.stack), *problem.size)
+    options = {"input_shape": shape, "input_dtype": np.float32}
+    middle = np.array(problem.stack.shape[1:]) // 2
+    pads = [(rows.start, n - rows.stop) for rows, n in zip(problem.window(problem.size), problem.size, strict=True)]
+    crop = Crop(tuple(pads), input_shape=problem.size, input_dtype=np.float32)
+    convolve = CircularConvolve(jax.device_put(problem.stack), h_center=middle, ndims=2, **options)
+    differences = FiniteDifference(axes=(-2, -1), circular=True, **options)
+    last = problem.l1 * L1Norm() if problem.signed else NonNegativeIndicator()
+
+    def start() -> Run:
+        solver = ADMM(
+            f=ZeroFunctional(),
+            g_list=[
+                SquaredL2Loss(y=jax.device_put(problem.image), A=crop),
+                problem.tv * (L21Norm() if problem.isotropic else L1Norm()),
+                last,
+            ],
+            C_list=[Sum(axis=0, **options) @ convolve, differences, Identity(**options)],
+            rho_list=list(PENALTIES),
+            alpha=RELAXATION,
+            subproblem_solver=G0BlockCircularConvolveSolver(ndims=2),
+            itstat_options={"display": False},
+        )
+        while True:
+            solver.step()
+            jax.block_until_ready([solver.x, *solver.z_list, *solver.u_list])
+            yield partial(_of_sign, solver.x, problem.signed), float(solver.objective())
+
+    return start
+
+
+def _of_sign(scene, signed: bool) -> np.ndarray:
+    return np.asarray(scene) if signed else np.maximum(np.asarray(scene), 0)
+
+
+def LenslessPiCam(problem: Problem) -> Callable[[], Run]:
+    from lensless import ADMM  # pyright: ignore[reportMissingImports]
+
+    def start() -> Run:
+        solver = ADMM(problem.stack[..., None].astype(np.float32))
+        solver.set_data(problem.image[None, None, :, :, None].astype(np.float32))
+        for number in count():
+            solver._update(number)
+            yield partial(_of_sign, solver._image_est[0, ..., 0], problem.signed), math.nan
+
+    return start
+
+
+CODES = {code.__name__: code for code in (gs_jax, scico, LenslessPiCam)}
+
+
+def peak_mib() -> float:
+    """Peak memory of this process."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+
+
+def main() -> None:
+    code, given, results, steps = sys.argv[1:]
+    problem = Problem(given)
+    start = CODES[code](problem)
+    run = start()
+    for _ in range(WARM_UP):
+        next(run)
+    memory = peak_mib()
+    run = start()
+    seconds, processor, objectives, printed, scene = [], [], [], [], np.zeros(0)
+    for _ in range(int(steps)):
+        began, began_cpu = time.perf_counter(), time.process_time()
+        look, own = next(run)
+        seconds.append(time.perf_counter() - began)
+        processor.append(time.process_time() - began_cpu)
+        scene = look()
+        objectives.append(problem.objective(scene))
+        printed.append(own)
+    seen = scene[:, *problem.window(scene.shape[1:])]
+    np.savez(
+        results,
+        objectives=objectives,
+        printed=printed,
+        peak_mib=memory,
+        planes=seen,
+        seconds=np.cumsum(seconds),
+        processor_seconds=np.cumsum(processor),
+    )
+
+
+if __name__ == "__main__":
+    main()
