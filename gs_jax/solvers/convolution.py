@@ -191,14 +191,16 @@ class ConvolutionADMM(eqx.Module):
         rho = penalty.rho * factor
         before, after = self._prox(A, image, system, penalty.rho), self._prox(A, image, system, rho)
 
-        def update(x, total, old, new):
-            """Next sum of a split `x`, and the squares of its residuals and sizes."""
+        def update(x, total, old):
+            """Next sum of a split `x`, and the split variable before."""
             z = old(total)
             multiplier = (total - z) / factor
-            total = _RELAXATION * x + (1 - _RELAXATION) * z + multiplier
-            changed = new(total)
+            return _RELAXATION * x + (1 - _RELAXATION) * z + multiplier, z
+
+        def squares_of(x, z, total, changed):
+            """Squares of the residuals of a split, and of its sizes."""
             parts = x - changed, x, changed, changed - z, total - changed
-            return total, jnp.stack([jnp.vdot(part, part) for part in parts])
+            return jnp.stack([jnp.vdot(part, part) for part in parts])
 
         # The x-step by Woodbury's identity: `spectra` plus what the convolved scene adds through the filters.
         v = before[0](sums.image)
@@ -207,7 +209,9 @@ class ConvolutionADMM(eqx.Module):
         inverse = divide(jnp.ones_like(response), gain**2 + response)
         light = _scale(inverse, _scale(gain, target) - seen)
         convolved = jnp.fft.irfft2(seen + _scale(response, light), size)
-        image_sum, squares = update(divide(convolved, jnp.broadcast_to(gain, size)), sums.image, before[0], after[0])
+        seen = divide(convolved, jnp.broadcast_to(gain, size))
+        image_sum, v = update(seen, sums.image, before[0])
+        squares = squares_of(seen, v, image_sum, after[0](image_sum))
         if system.filters is None:
             light = _scale(1 / system.smooth, light)
 
@@ -217,9 +221,9 @@ class ConvolutionADMM(eqx.Module):
             x = jnp.fft.irfft2(spectrum + (filter.conj() if system.filters is None else filter) * light, size)
             toward = None if following is None else jnp.where(is_last, x, following)
             split = system.splits * self._differences(x, toward)
-            differences, of_differences = update(split, differences, before[1], after[1])
-            scene, of_scene = update(x, scene, before[2], after[2])
-            carry = None if following is None else x, squares + of_differences + of_scene
+            differences, _ = update(split, differences, before[1])
+            scene, w = update(x, scene, before[2])
+            carry = None if following is None else x, squares + squares_of(x, w, scene, after[2](scene))
             return carry, (differences, scene)
 
         filters = A.spectra if system.filters is None else system.filters
@@ -228,7 +232,7 @@ class ConvolutionADMM(eqx.Module):
         planes = spectra, filters, sums.differences, sums.scene, is_last
         (_, squares), (differences, scene) = lax.scan(plane, start, planes, reverse=True)
         primal, split, changed, dual, multiplier = safe_sqrt(squares)
-        # Residuals of the split itself, as for `ADMM`.
+        # Residuals of the splits themselves, as for `ADMM`, but of the differences, which follow the scene.
         primal, dual = divide(primal, jnp.maximum(split, changed)), divide(dual, jnp.maximum(multiplier, changed))
         factor, changes = balance(primal, dual, penalty.changes)
         return Sums(image_sum, differences, scene), Penalty(rho, factor, changes), jnp.maximum(primal, dual)
