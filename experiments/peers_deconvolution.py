@@ -30,7 +30,7 @@ from gs_jax.base.progress import Progress
 PLANES, EXAMPLE_TV, EXAMPLE_L1 = slice(1, 37), 3e-3, 1e-2
 # Objective to which time is measured, of the volume.
 LEVEL = 4.45
-STEPS = {"volume": {"gs_jax": 60, "scico": 40}, "plane": {"gs_jax": 100, "scico": 100, "LenslessPiCam": 100}}
+STEPS = {"volume": {"gs_jax": 60, "scico": 25}, "plane": {"gs_jax": 100, "scico": 100, "LenslessPiCam": 100}}
 SHOWN = (4, 11, 18, 25, 32)
 
 
