@@ -30,6 +30,8 @@ From a capture to a volume:
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start
     FISTA                FISTA: non-negative least squares with an L1 penalty, for any operator
     Unrolled             Unrolled inversion by trained networks; `Unrolled.pretrained()` loads those of the package
+    Surface              Sheets through the volume: a brightness and a depth for each column, fitted to the image
+    fit_surface          Fit sheets to an image: a brightness and a depth for each column of the grid
     ADMM                 ADMM: non-negative least squares with total variation and an L1 penalty, for any operator
     ConvolutionADMM      ADMM for a `ConvolutionOperator`, with 3-D total variation and an L1 penalty
     deconvolve           Reconstruct a plane, or a volume, from its image through measured PSFs

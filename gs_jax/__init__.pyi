@@ -34,6 +34,7 @@ from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.residual import forward_residual as forward_residual
+from .reconstruction.surface_fit import fit_surface as fit_surface
 from .sensor import Sensor as Sensor
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
@@ -42,6 +43,7 @@ from .solvers.base import solve as solve
 from .solvers.convolution import ConvolutionADMM as ConvolutionADMM
 from .solvers.fista import FISTA as FISTA
 from .solvers.richardson_lucy import RichardsonLucy as RichardsonLucy
+from .solvers.surface import Surface as Surface
 from .solvers.unrolled import Unrolled as Unrolled
 
 __all__: list[str]

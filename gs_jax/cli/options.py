@@ -18,7 +18,7 @@ _MAX_DEPTHS = 10_000
 # Nearest depth that a file of volumes may have, mm.
 NEAREST = 1e-6
 
-METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled")
+METHODS = ("backproject", "list-rl", "richardson-lucy", "fista", "admm", "unrolled", "surface")
 SUPPRESSIONS = ("none", "points", "clusters", "unet")
 FIDELITIES = ("full", "near", "pinhole")
 SIMULATED = ("full", "near")

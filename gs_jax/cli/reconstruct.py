@@ -54,7 +54,7 @@ from .watch_command import check_watched, watch_folder
     "--steps",
     type=click.IntRange(1, 100_000),
     default=20,
-    help="Steps of list-rl, richardson-lucy, fista and admm; unrolled has its own.",
+    help="Steps of list-rl, richardson-lucy, fista and admm; unrolled and surface have their own.",
 )
 @click.option(
     "--optics",
@@ -84,6 +84,12 @@ from .watch_command import check_watched, watch_folder
 @click.option(
     "--points", type=Path, help="POINTS.csv: also write the points in the capture; of a recording with their frame."
 )
+@click.option("--sheets", type=click.IntRange(1, 8), help="Sheets one behind the other (surface).  [default: 1]")
+@click.option(
+    "--surface",
+    type=Path,
+    help="SURFACE.ome.tif or .ply: also write brightness and depth of --method surface, as maps in um or a mesh in mm.",
+)
 @light_options
 @recording_options
 @worker_options
@@ -96,6 +102,7 @@ def reconstruct_command(
     voxel_um: float | None,
     output: Path,
     points: Path | None,
+    surface: Path | None,
     weights: Path | None,
     force: bool,
     frame_interval: float | None,
@@ -129,11 +136,16 @@ def reconstruct_command(
     from ..io.depth_frames import DepthFrame
     from ..io.point_tables import write_points
     from ..io.recordings import open_recording
+    from ..io.surfaces import SURFACE_SUFFIXES, write_surface
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
     from ..projection.linear_map import xla_only
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
+    if surface:
+        check_output(surface, SURFACE_SUFFIXES)
+        if method_options["method"] != "surface":
+            raise InputError(f"--surface must be used with --method surface, got {method_options['method']}.")
     if output.suffix.lower() == ".zarr":
         with needs_extra("zarr"):
             import_module("zarr")
@@ -145,7 +157,9 @@ def reconstruct_command(
         if not points:
             raise InputError("--track must be used with --points POINTS.csv, which has the particles.")
         import_linker()
-    check_may_write(None if resume else output, points, inputs=(capture, design, weights, *camera.files), force=force)
+    check_may_write(
+        None if resume else output, points, surface, inputs=(capture, design, weights, *camera.files), force=force
+    )
     if capture.suffix.lower() == ".toml":
         raise InputError(f"{capture}: CAPTURE must be an image, got a design: CAPTURE comes first, then DESIGN.")
     microscope = read_design(design)
@@ -164,6 +178,8 @@ def reconstruct_command(
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
         given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
+        if recording and surface:
+            raise InputError(f"--surface must be used with a single capture, got {len(recording.names)} frames.")
         if recording:
             files = {"design_text": text, "capture": capture, "camera": camera, "points": points, "frame": frame}
             with workers:
@@ -183,12 +199,18 @@ def reconstruct_command(
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if points and result.points is not None:
                 write_points(points, *frame.points(result.points, result.statistics), provenance=provenance)
+            if surface and (fit := result.surface):
+                maps = fit.brightness, fit.depth, fit.depth_sd
+                write_surface(surface, *maps, plan.grid, below=frame.surface or 0.0, provenance=provenance)
     camera.print_corrections()
     z, y, x = result.volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
     click.echo(f"{output}: {size}, {depth_range(shown)}")
     if residual:
         click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
+    if fit := result.surface:
+        voxels = f"{fit.error:.1%} of the capture unexplained (RMS), free voxels {fit.free_error:.1%}"
+        click.echo(f"{surface or output}: sheets leave {voxels}")
     if result.points is not None:
         count = len(result.points)
         click.echo(f"{points or output}: {count} point{'s' * (count != 1)}")

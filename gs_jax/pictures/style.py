@@ -24,6 +24,7 @@ _METHODS = {
     "richardson-lucy": ("Richardson-Lucy", PALETTE[6], "s"),
     "fista": ("FISTA", PALETTE[3], "p"),
     "admm": ("ADMM", "#009e73", "X"),
+    "surface": ("surface", "#56b4e9", "<"),
     "truth": ("truth", "black", ""),
 }
 # Methods that some tables call otherwise.

@@ -11,6 +11,7 @@ from ..solvers.admm import ADMM
 from ..solvers.base import Solver
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy
+from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 
 
@@ -96,7 +97,7 @@ _LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitiv
 Method = BackProjection | PinholeRichardsonLucy | Solver
 
 # Methods by the names of the command line and the benchmark, as functions of the number of steps; the unrolled solver
-# has as many as were trained.
+# has as many as were trained, and sheets as many as they need.
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
     "list-rl": lambda steps: PinholeRichardsonLucy(steps, **_LUCY),
@@ -104,4 +105,5 @@ METHODS: dict[str, Callable[[int], Method]] = {
     "fista": FISTA,
     "admm": ADMM,
     "unrolled": lambda steps: Unrolled.pretrained(),
+    "surface": lambda steps: Surface(),
 }

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from ..projection.backprojection import backproject
 from ..projection.forward_model import FIDELITIES, PsfModel
 from ..solvers.base import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
 from .inverse_problem import (
@@ -105,13 +107,13 @@ def reconstruct(
         As for `backproject`.
     method
         `BackProjection()`, `PinholeRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
-        `Unrolled.pretrained()`.
+        `Unrolled.pretrained()`, `Surface()`.
     optics
         As for `forward`, or a `fidelity` of `make_psf_model`. With "full" and "near", back-projection reads the bright
         cores of the spots; otherwise it follows the chief rays, as the paper does.
     stop_at_discrepancy
         Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle).
-        `BackProjection` and `Unrolled` ignore it.
+        `BackProjection`, `Unrolled` and `Surface` ignore it.
     progress
         Shows progress; by default nothing is shown.
 
@@ -139,9 +141,7 @@ def reconstruct(
     >>> print(grid.to_mm(peak).round(6))  # the point's position, mm
     [ 0.2 -0.1 20. ]
     """
-    if image.shape != imager.sensor.shape:
-        raise InputError(f"image must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
-    _check(method, optics, imager, grid, image)
+    check_call(image, imager, grid, method, optics)
     progress = progress or Progress()
     options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
     return reconstructor(imager, grid, method, **options)(image, progress)
@@ -155,8 +155,11 @@ def reconstructor(
     optics: PsfModel | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
-) -> Callable[[Image, Progress], Volume]:
+    read: Callable[[Any, Any], Any] | None = None,
+) -> Callable[[Image, Progress], Any]:
     """Prepare `reconstruct` for many images of one type; parameters and errors as there.
+
+    `read` takes a solver and its last state, and returns what is returned instead of the volume.
 
     Returns
     -------
@@ -175,20 +178,25 @@ def reconstructor(
     views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager, grid),)
     if isinstance(method, BackProjection):
         return partial(_backproject_views, views(), method)
+    if isinstance(method, Surface) and not (np.diff(np.asarray(grid.depths)) > 0).all():
+        raise InputError(
+            f"grid: depths must ascend with Surface(), got {short_repr(np.asarray(grid.depths).tolist())}."
+        )
     model = prepare_model(imager, grid, optics, progress or Progress())
     replaces_adjoint = isinstance(method, PinholeRichardsonLucy | Unrolled)
     if replaces_adjoint and by_name:
         what = "the pixels that back-projection reads"
         warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
     is_poisson = isinstance(method, PinholeRichardsonLucy | RichardsonLucy)
-    modes = num_detrend_modes(model.imager, model.optics) if by_name and not is_poisson else 0
+    fits_background = is_poisson or isinstance(method, Surface)
+    modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
     problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
     def volume_of(image, progress):
         light, background = prepare_data(image, model)
         target = 0.0
-        # The steps of `Unrolled` were trained together.
-        if stop_at_discrepancy and not isinstance(method, Unrolled):
+        # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
+        if stop_at_discrepancy and not isinstance(method, Unrolled | Surface):
             target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
         if isinstance(method, PinholeRichardsonLucy):
             return run_solver(method.solver(background), light, problem, progress, target)
@@ -196,11 +204,18 @@ def reconstructor(
             solver = dataclasses.replace(method, background=method.background + jnp.asarray(background))
             return run_solver(solver, light, problem, progress, target)
         light = light - background
-        if not isinstance(method, Unrolled):
+        if not isinstance(method, Unrolled | Surface):
             light = np.asarray(problem.detrend(light), light.dtype)
-        return run_solver(method, light, problem, progress, target)
+        return run_solver(method, light, problem, progress, target, read)
 
     return volume_of
+
+
+def check_call(image, imager, grid, method, optics):
+    """Raise the errors of `reconstruct` that need no computation."""
+    if image.shape != imager.sensor.shape:
+        raise InputError(f"image must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    _check(method, optics, imager, grid, image)
 
 
 def _check(method, optics, *arguments):
@@ -263,8 +278,11 @@ def _wider_voxels(grid):
     return f"--voxel-um {2000 * grid.pitch:.4g}"
 
 
-def run_solver(solver, light, problem, progress, target_cost=0.0):
-    """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target."""
+def run_solver(solver, light, problem, progress, target_cost=0.0, read=None):
+    """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target.
+
+    Returns the estimate, or `read(solver, state)`.
+    """
     # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, problem)
@@ -276,6 +294,8 @@ def run_solver(solver, light, problem, progress, target_cost=0.0):
             if float(residual) < solver.tolerance or float(cost) < target_cost:
                 break
             advance()
+    if read:
+        return read(solver, state)
     return np.asarray(solver.estimate(state), np.float32)
 
 

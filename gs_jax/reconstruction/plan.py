@@ -13,20 +13,23 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import blur_warning, sharpness
+from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
 from .methods import METHODS, Method
 from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
+from .surface_fit import SurfaceFit, surface_fitter
 
 
 class Result(NamedTuple):
-    """Reconstruction of an image: volume, points if asked for, their statistics as columns of a table, a warning."""
+    """Reconstruction of an image: volume, points if asked for, their statistics as columns, a warning, and sheets."""
 
     volume: Any
     points: Any = None
     statistics: Any = None
     warning: str | None = None
+    surface: SurfaceFit | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Plan:
                 "--weights must be used with --method unrolled or --suppress unet, "
                 f"got --method {method} and --suppress {suppress}."
             )
-        if stop_at_noise and method in ("backproject", "unrolled"):
+        if stop_at_noise and method in ("backproject", "unrolled", "surface"):
             raise InputError(
                 f"--stop-at-noise must be used with list-rl, richardson-lucy, fista or admm, got --method {method}."
             )
@@ -84,12 +87,14 @@ class Plan:
 
     def prepare(self, progress: Progress) -> Callable[[Image, Progress], Result]:
         """Compute what all images share; return the function that reconstructs one."""
-        clean = volume_of = None
+        clean = volume_of = fit = None
         if self.suppress == "unet":
             from ..detection.unet import read_weights, suppress
 
             clean = partial(suppress, network=read_weights(self.weights) if self.weights else None)
-        if self.suppress != "points":
+        if isinstance(self.method, Surface):
+            fit = surface_fitter(self.imager, self.grid, self.method, optics=self.optics, progress=progress)
+        elif self.suppress != "points":
             options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
             volume_of = reconstructor(self.imager, self.grid, self.method, **options, progress=progress)
         # Computed once, and only if points are asked for.
@@ -99,6 +104,9 @@ class Plan:
             points = statistics = warning = None
             if self.suppress == "points" or (self.points and self.suppress != "clusters"):
                 points, statistics, warning = self._find_points(image, sharp(), progress)
+            if fit:
+                surface = fit(image, progress)
+                return Result(surface.volume, points, statistics, warning or surface.warning, surface)
             volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
             if self.suppress == "clusters":
                 from ..detection.clusters import find_clusters

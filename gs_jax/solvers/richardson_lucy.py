@@ -123,14 +123,14 @@ class RichardsonLucy(eqx.Module):
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = jnp.maximum(as_image(A, image), 0)
         x, sensitivity, momentum, knots = state
-        point = _extrapolate(x, momentum) if momentum else x
+        point = extrapolate(state)
         background = jnp.asarray(self.background, image.dtype)
         expected = jnp.maximum(A.mv(point) + background + bilinear_background(knots, image), 0)
         # An FFT's rounding must not turn a dark pixel into a huge ratio.
         ratio = divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
         scale = sensitivity * _tv_denominator(point, self.tv) if self.tv else sensitivity
         new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
-        momentum = momentum and (x, new - point, _gain(new - point, momentum[1]))
+        momentum = momentum_after(new, point, x, momentum)
         residual = divide(norm(new - x), norm(new))
         state = State(new, sensitivity, momentum, background_step(knots, ratio))
         return state, kl_divergence(image, expected), residual
@@ -143,7 +143,7 @@ def bilinear_background(knots: Float[Array, "knot knot"] | None, image: Float[Ar
     """Background of the image's shape, bilinear between the knots; 0 without knots."""
     if knots is None:
         return jnp.zeros((), image.dtype)
-    rows, columns = (_hat_functions(n, len(knots), knots.dtype) for n in image.shape)
+    rows, columns = (hat_functions(n, len(knots), knots.dtype) for n in image.shape)
     return rows @ knots @ columns.T
 
 
@@ -153,12 +153,12 @@ def background_step(
     """Richardson-Lucy step of the background: multiplies each knot by the mean ratio under its hat function."""
     if knots is None:
         return None
-    rows, columns = (_hat_functions(n, len(knots), knots.dtype) for n in ratio.shape)
+    rows, columns = (hat_functions(n, len(knots), knots.dtype) for n in ratio.shape)
     # A sensor may have fewer pixels than knots.
     return divide(knots * (rows.T @ ratio @ columns), jnp.outer(rows.sum(0), columns.sum(0)))
 
 
-def _hat_functions(size, count, dtype):
+def hat_functions(size, count, dtype):
     """Piecewise linear functions, `(size, count)`: each is 1 at its knot and 0 at the others, and they sum to 1."""
     position = np.linspace(0, count - 1, size)
     return jnp.asarray(np.maximum(1 - np.abs(position[:, None] - np.arange(count)), 0), dtype)
@@ -178,13 +178,20 @@ def kl_divergence(image: Float[Array, "*shape"], expected: Float[Array, "*shape"
     return jnp.sum(jnp.where(expected > 0, expected - image, 0) - jnp.where(both, image * log, 0))
 
 
-def _extrapolate(x, momentum):
-    last, _, gain = momentum
-    return jnp.maximum(x + gain * (x - last), 0)
+def extrapolate(state: State) -> Float[Array, "..."]:
+    """Point from which the next step goes: along the last change, if it is accelerated."""
+    if not state.momentum:
+        return state.x
+    last, _, gain = state.momentum
+    return jnp.maximum(state.x + gain * (state.x - last), 0)
 
 
-def _gain(update, last):
-    return jnp.clip(divide(jnp.vdot(update, last), jnp.vdot(last, last)), 0, 1)
+def momentum_after(new, point, x, momentum):
+    """Momentum after a step from `point` to `new`; `x` is the estimate before."""
+    if not momentum:
+        return None
+    update, last = new - point, momentum[1]
+    return x, update, jnp.clip(divide(jnp.vdot(update, last), jnp.vdot(last, last)), 0, 1)
 
 
 def _without_rounding(sensitivity):

@@ -1,0 +1,413 @@
+"""Sheets fitted through a linear operator: a brightness and a depth for each column of a volume.
+
+What looks alike from all sides has no depth inside, so free voxels spread its light over the planes. A sheet has one
+depth at each place, which the views of the lenses fix together. The fit is Gauss-Newton's, from a few steps of
+Richardson-Lucy; each step takes one image and one adjoint, whatever it is for.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, Num
+
+from ..base.arrays import divide, safe_sqrt
+from ..base.errors import InputError
+from .base import Operator, as_image, check_options, differences, differences_adjoint, magnitude
+from .richardson_lucy import (
+    BACKGROUND_KNOTS,
+    RichardsonLucy,
+    State as LucyState,
+    background_step,
+    bilinear_background,
+    extrapolate,
+    hat_functions,
+    momentum_after,
+)
+
+# Voxels from one knot of the depth to the next.
+_SPACING = 5
+# Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end.
+_FIRST, _ROUNDS, _GRADIENTS, _PROBES = 10, 5, 3, 4
+# What a step is for.
+_LUCY, _LINEARISE, _PROBE, _GRADIENT = range(4)
+_SCHEDULE = (
+    *(_LUCY,) * _FIRST,
+    *(_LINEARISE, _PROBE, *(_GRADIENT,) * _GRADIENTS),
+    *(_LINEARISE, *(_GRADIENT,) * _GRADIENTS) * (_ROUNDS - 1),
+    _LINEARISE,
+    *(_PROBE,) * _PROBES,
+)
+# Differences between neighbours that count as edges: of depths, planes, and of roots of brightness, of their RMS.
+_EDGE_DEPTH, _EDGE_ROOT = 0.1, 0.3
+# Largest change of a depth in a Gauss-Newton step, planes: the gradient sees two planes.
+_MAX_MOVE = 1.0
+# The Hessian's diagonal leaves out what neighbours, brightness and the model's errors share: measured on sheets whose
+# depths are known, ray-traced or not, of 10,000 electrons.
+_UNDERSTATED = 3.6
+# Classes of brightness among which the noise is fitted, and steps of that.
+_CLASSES, _NOISE_STEPS = 32, 60
+# Light of the start's dark columns, of the mean's, from which they may become brighter.
+_FAINT = 1e-3
+# Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
+_DAMPING = 1e-3
+# The start has the brightness nearly right and the depths not. So the preconditioner lets the depths go first.
+_BRIGHTNESS_LATER = 0.1
+_START = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS, min_sensitivity=0.3)
+
+
+class Sheets(NamedTuple):
+    """Unknowns: roots of brightness, depths at knots, in planes from the first, and the background at its knots."""
+
+    root: Array
+    depth: Array
+    background: Array
+
+
+class State(NamedTuple):
+    """State of `Surface`.
+
+    Parameters
+    ----------
+    lucy
+        The free voxels from which the fit starts.
+    sheets, change, residual, direction
+        The sheets, and the change that conjugate gradients look for, with their residual and direction.
+    diagonal
+        Mean diagonal of the Hessian for each unknown, relative to that of `_energy`.
+    information
+        Sum of the last probes of the Hessian's diagonal, for each depth.
+    inverse
+        Inverse variance of each pixel.
+    errors
+        RMS misfit of the free voxels and of the sheets, relative to the image's RMS.
+    number
+        Steps taken.
+    """
+
+    lucy: LucyState
+    sheets: Sheets
+    change: Sheets
+    residual: Sheets
+    direction: Sheets
+    diagonal: Float[Array, "3"]
+    information: Array
+    inverse: Array
+    errors: Float[Array, "2"]
+    number: Int[Array, ""]
+
+
+class Surface(eqx.Module):
+    """Sheets through the volume: a brightness and a depth for each column, fitted to the image.
+
+    *Compiled.*
+
+    The volume is `brightness max(0, 1 - |k - depth|)` on the planes `k`: linear shares of two planes. A few steps of
+    Richardson-Lucy give the start; then brightness, depth and a smooth background are fitted by Gauss-Newton with
+    conjugate gradients. Pixels count by the inverse of their variance, `read + gain e + (relative e)^2` at the expected
+    light `e`, which is fitted to the residual: read noise, photons, and what the model lacks. Both maps are smoothed
+    but at edges (Charbonnier's penalty). There is no network. `fit_surface` returns the maps.
+
+    Parameters
+    ----------
+    sheets
+        Sheets one behind the other in a column.
+    smooth_depth, smooth_brightness
+        Weights of the penalties: of depth's differences between knots, 5 voxels apart, in planes, and of root
+        brightness between voxels, in its RMS.
+    steps, tolerance
+        As for `Solver`; at most the number of the schedule.
+
+    Raises
+    ------
+    InputError
+        If an option is out of range.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> volume = gs.reconstruct(image, scope, grid, gs.Surface(), optics="near")
+    >>> volume.shape
+    (3, 41, 41)
+    """
+
+    sheets: int = eqx.field(static=True, default=1)
+    smooth_depth: float = eqx.field(static=True, default=1.0)
+    smooth_brightness: float = eqx.field(static=True, default=0.0)
+    steps: int = eqx.field(static=True, default=len(_SCHEDULE))
+    tolerance: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self):
+        check_options(self)
+        if self.steps > len(_SCHEDULE):
+            raise InputError(f"steps must be 1 to {len(_SCHEDULE)}, got {self.steps}.")
+        if self.sheets < 1:
+            raise InputError(f"sheets must be 1 or more, got {self.sheets}.")
+        for name in ("smooth_depth", "smooth_brightness"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} must be 0 or more, got {getattr(self, name)}.")
+
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
+        image = jnp.maximum(as_image(A, image), 0)
+        lucy = _START.init(A, image)
+        _, rows, columns = lucy.x.shape
+        knots = [max(-(-n // _SPACING), 2) for n in (rows, columns)]
+        zeros = lambda *shape: jnp.zeros(shape, image.dtype)
+        background = zeros(BACKGROUND_KNOTS, BACKGROUND_KNOTS)
+        none = Sheets(zeros(self.sheets, rows, columns), zeros(self.sheets, *knots), background)
+        number = jnp.zeros((), jnp.int32)
+        return State(lucy, none, none, none, none, zeros(3), none.depth, jnp.zeros_like(image), zeros(2), number)
+
+    def step(
+        self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
+    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
+        light, schedule = as_image(A, image), jnp.array(_SCHEDULE, jnp.int32)
+        kind = schedule[state.number]
+        following = schedule[jnp.minimum(state.number + 1, len(_SCHEDULE) - 1)]
+        planes = state.lucy.x.shape[0]
+        probe = _probe(state, following)
+        # A volume, its image, and what is projected back, for all kinds: the operator is compiled once.
+        tangent = lambda to: (jax.jvp(lambda s: _volume(s, planes), (state.sheets,), (to,))[1], to.background)
+        inputs = (
+            lambda: (extrapolate(state.lucy), state.lucy.knots),
+            lambda: (_volume(state.sheets, planes), state.sheets.background),
+            lambda: tangent(probe),
+            lambda: tangent(state.direction),
+        )
+        volume, background = lax.switch(kind, inputs)
+        shown = A.mv(volume) + bilinear_background(background, light)
+        expected, residual = jnp.maximum(shown, 0), light - shown
+        fit_noise = lambda: divide(jnp.ones_like(light), _variance(residual, expected))
+        state = state._replace(inverse=lax.cond(kind == _LINEARISE, fit_noise, lambda: state.inverse))
+        rounding = jnp.finfo(light.dtype).eps * expected.max()
+        pulled = lax.switch(
+            jnp.minimum(kind, _PROBE),
+            (
+                lambda: divide(jnp.maximum(light, 0), expected, rounding),
+                lambda: state.inverse * residual,
+                lambda: state.inverse * shown,
+            ),
+        )
+        back = A.T.mv(pulled)
+        misfit = divide(jnp.mean(residual**2), jnp.mean(light**2)) ** 0.5
+
+        def pullback():
+            part = jax.vjp(lambda s: _volume(s, planes), state.sheets)[1](back)[0]
+            rows, columns = _hats(light.shape, background.shape, light.dtype)
+            return part._replace(background=rows.T @ pulled @ columns)
+
+        def after_lucy():
+            x, sensitivity, momentum, _ = state.lucy
+            new = divide(volume * jnp.maximum(back, 0), sensitivity)
+            momentum = momentum_after(new, volume, x, momentum)
+            lucy = LucyState(new, sensitivity, momentum, background_step(background, pulled))
+            sheets = lax.cond(following == _LUCY, lambda: state.sheets, lambda: self._first_sheets(lucy))
+            return state._replace(lucy=lucy, sheets=sheets, errors=state.errors.at[0].set(misfit))
+
+        def after_linearisation():
+            downhill = _add(pullback(), self._prior(state.sheets, state.sheets), -1)
+            none = jax.tree.map(jnp.zeros_like, downhill)
+            new = state._replace(change=none, residual=downhill, errors=state.errors.at[1].set(misfit))
+            return new._replace(direction=self._precondition(new, downhill))
+
+        def after_probe():
+            product = jax.tree.map(jnp.multiply, probe, pullback())
+            energy, square = _energy(state.sheets), jnp.max(probe.root**2)
+            rows, columns = _hats(light.shape, background.shape, light.dtype)
+            means = (
+                divide(product.root.sum(), square * energy.root.sum()),
+                divide(product.depth.sum(), energy.depth.sum()),
+                ((rows**2).T @ state.inverse @ columns**2).mean(),
+            )
+            # The last probes are of the depths alone.
+            is_first = following == _GRADIENT
+            new = state._replace(
+                diagonal=jnp.where(is_first, jnp.maximum(jnp.stack(means), 0), state.diagonal),
+                information=state.information + jnp.where(is_first, 0, product.depth),
+            )
+            return new._replace(direction=self._precondition(new, state.residual))
+
+        def after_gradient():
+            direction, ahead = state.direction, self._precondition(state, state.residual)
+            product = _dot(state.residual, ahead)
+            curved = _add(pullback(), self._prior(state.sheets, direction), 1)
+            curved = _add(curved, jax.tree.map(jnp.multiply, _damping(state), direction), 1)
+            length = divide(product, _dot(direction, curved))
+            change, residual = _add(state.change, direction, length), _add(state.residual, curved, -length)
+            ahead = self._precondition(state, residual)
+            direction = _add(ahead, direction, divide(_dot(residual, ahead), product))
+            sheets = lax.cond(following == _GRADIENT, lambda: state.sheets, lambda: _moved(state, change))
+            return state._replace(sheets=sheets, change=change, residual=residual, direction=direction)
+
+        state = lax.switch(kind, (after_lucy, after_linearisation, after_probe, after_gradient))
+        # The steps have no common residual: they are taken as planned.
+        return state._replace(number=state.number + 1), misfit, jnp.ones((), light.dtype)
+
+    def estimate(self, state: State) -> Float[Array, "depth y x"]:
+        is_start = state.number < _FIRST
+        return lax.cond(is_start, lambda: state.lucy.x, lambda: _volume(state.sheets, state.lucy.x.shape[0]))
+
+    def _first_sheets(self, lucy):
+        """Depths about which the light is, squared, because the background is in all planes; the light of a column."""
+        x = lucy.x
+        planes, *shape = x.shape
+        knots = [max(-(-n // _SPACING), 2) for n in shape]
+        rows, columns = _hats(shape, knots, x.dtype)
+        unit = divide(x, jnp.broadcast_to(x.max(), x.shape))
+        local = jnp.einsum("yk,zyx,xl->zkl", rows, unit**2, columns)
+        local = _widened(_widened(local, 1), 2)
+        local = local - (local.min(0) if planes > 2 else jnp.zeros_like(local[0]))[None]
+        k = jnp.arange(planes, dtype=x.dtype)[:, None, None]
+        # Where it is dark, the mean of all.
+        faint = 0.05 * local.sum(0).mean() + jnp.finfo(x.dtype).tiny
+        overall = divide((k * local).sum(), local.sum())
+        mean = ((k * local).sum(0) + faint * overall) / (local.sum(0) + faint)
+        spread = safe_sqrt(divide((local * (k - mean[None]) ** 2).sum(0), local.sum(0)))
+        apart = jnp.asarray(np.linspace(-1, 1, self.sheets) if self.sheets > 1 else np.zeros(1), x.dtype)
+        depth = mean[None] + apart[:, None, None] * spread[None]
+        # Several layers part the planes between them (Lloyd's algorithm).
+        for _ in range(8 if self.sheets > 1 else 0):
+            mine = _nearest(k, depth) * local[None]
+            depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
+        bright = (_nearest(k, _interpolated(depth, tuple(shape))) * x[None]).sum(1)
+        return Sheets(safe_sqrt(bright + _FAINT * bright.mean()), depth, lucy.knots)
+
+    def _prior(self, at, vector):
+        """Product of the penalties' Hessian, with the weights that edges have now, and a vector."""
+        unit = jnp.mean(at.root**2)
+        scaled = divide(at.root, jnp.broadcast_to(safe_sqrt(unit), at.root.shape))
+        root = jnp.stack([_diffused(a, v, _EDGE_ROOT) for a, v in zip(scaled, vector.root, strict=True)])
+        depth = jnp.stack([_diffused(a, v, _EDGE_DEPTH) for a, v in zip(at.depth, vector.depth, strict=True)])
+        root = self.smooth_brightness * divide(root, jnp.broadcast_to(unit, root.shape))
+        return Sheets(root, self.smooth_depth * depth, jnp.zeros_like(vector.background))
+
+    def _precondition(self, state, vector):
+        energy, mean, damping = _energy(state.sheets), state.diagonal, _damping(state)
+        root = mean[0] * (energy.root + energy.root.mean())
+        # A knot has four neighbours.
+        depth = mean[1] * energy.depth + damping.depth + self.smooth_depth / _EDGE_DEPTH
+        later = _BRIGHTNESS_LATER
+        return Sheets(
+            later * divide(vector.root, root),
+            divide(vector.depth, depth),
+            later * divide(vector.background, mean[2] + damping.background),
+        )
+
+
+def depth_of_sheets(state: State) -> tuple[Array, Array]:
+    """Depths `(layer, y, x)` and their standard deviations, in planes from the first."""
+    depth = jnp.clip(_interpolated(state.sheets.depth, state.sheets.root.shape[1:]), 0, state.lucy.x.shape[0] - 1)
+    # Means over neighbours: four probes alone are noisy.
+    rows, columns = (_hats((n,), (max(n // 3, 2),), depth.dtype)[0] for n in state.information.shape[1:])
+    means = lambda m: m / m.sum(0)[None]
+    local = jnp.einsum("yk,zyx,xl->zkl", means(rows), jnp.maximum(state.information, 0) / _PROBES, means(columns))
+    local = _interpolated(local, state.sheets.root.shape[1:])
+    return depth, divide(jnp.full_like(local, _UNDERSTATED), safe_sqrt(local))
+
+
+def _volume(sheets, planes):
+    depth = jnp.clip(_interpolated(sheets.depth, sheets.root.shape[1:]), 0, planes - 1)
+    k = jnp.arange(planes, dtype=depth.dtype)[None, :, None, None]
+    return (sheets.root[:, None] ** 2 * jnp.maximum(1 - jnp.abs(k - depth[:, None]), 0)).sum(0)
+
+
+def _hats(shape, knots, dtype):
+    return tuple(hat_functions(n, count, dtype) for n, count in zip(shape, knots, strict=True))
+
+
+def _interpolated(depth, shape):
+    rows, columns = _hats(shape, depth.shape[1:], depth.dtype)
+    return jnp.einsum("yk,zkl,xl->zyx", rows, depth, columns)
+
+
+def _widened(x, axis):
+    """Binomial mean of three neighbours along an axis."""
+    padded = jnp.pad(x, [(int(a == axis), int(a == axis)) for a in range(x.ndim)], mode="edge")
+    first, middle, last = (lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(3))
+    return (first + 2 * middle + last) / 4
+
+
+def _nearest(k, depth):
+    """1 where a layer is the nearest of a plane, else 0; ties are shared: `(layer, plane, y, x)`."""
+    away = jnp.abs(k[None] - depth[:, None])
+    mine = (away <= away.min(0)[None]).astype(depth.dtype)
+    return mine / mine.sum(0)[None]
+
+
+def _energy(sheets):
+    """Squares of the derivatives of the volume's voxels in each unknown."""
+    rows, columns = _hats(sheets.root.shape[1:], sheets.depth.shape[1:], sheets.root.dtype)
+    depth = jnp.einsum("yk,zyx,xl->zkl", rows**2, sheets.root**4, columns**2)
+    return Sheets(4 * sheets.root**2, depth, jnp.ones_like(sheets.background))
+
+
+def _damping(state):
+    means = [_DAMPING * d * e.mean() for d, e in zip(state.diagonal, _energy(state.sheets), strict=True)]
+    return Sheets(*(jnp.full(part.shape, d) for d, part in zip(means, state.sheets, strict=True)))
+
+
+def _probe(state, following):
+    """Random signs: the mean of their products with the Hessian's product is its diagonal."""
+    root, depth, background = state.sheets
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(0), state.number))
+    # As bright in the image as those of the depths.
+    size = jnp.where(following == _GRADIENT, safe_sqrt(jnp.mean(root**2)) / 2, 0)
+    sign = lambda key, part: jax.random.rademacher(key, part.shape, part.dtype)
+    return Sheets(size * sign(keys[0], root), sign(keys[1], depth), jnp.zeros_like(background))
+
+
+def _moved(state, change):
+    root, depth, background = state.sheets
+    return Sheets(
+        jnp.abs(root + jnp.clip(change.root, -root, root)),
+        jnp.clip(depth + jnp.clip(change.depth, -_MAX_MOVE, _MAX_MOVE), 0, state.lucy.x.shape[0] - 1),
+        background + change.background,
+    )
+
+
+def _diffused(at, vector, edge):
+    length = magnitude(differences(at, wrap=False))
+    weight = 1 / jnp.sqrt(length**2 + edge**2)
+    return differences_adjoint(weight[None] * differences(vector, wrap=False), wrap=False)
+
+
+def _variance(residual, expected):
+    """Variance of each pixel: `read + gain e + (relative e)^2`, the most likely for a residual.
+
+    Variances of classes of brightness are fitted by a multiplicative method, which leaves all three parts positive.
+    """
+    top = expected.max() + jnp.finfo(expected.dtype).tiny
+    unit = jnp.mean(residual**2)
+    place = jnp.minimum((safe_sqrt(expected / top) * _CLASSES).astype(jnp.int32), _CLASSES - 1).ravel()
+    total = lambda part: jax.ops.segment_sum(part.ravel(), place, _CLASSES)
+    count = total(jnp.ones_like(expected))
+    square = divide(total(residual**2), count * unit)
+    e = divide(total(expected), count * top)
+    parts = jnp.stack([jnp.ones_like(e), e, e**2])
+    least = 1e-6
+
+    def improve(shares, _):
+        variance = shares @ parts + least
+        ratio = divide(parts @ (count * square / variance**2), parts @ (count / variance))
+        return shares * jnp.sqrt(ratio), None
+
+    shares = lax.scan(improve, jnp.full(3, 1 / 3, e.dtype), length=_NOISE_STEPS)[0]
+    e = expected / top
+    return unit * (shares[0] + shares[1] * e + shares[2] * e**2 + least)
+
+
+def _add(a, b, length):
+    return jax.tree.map(lambda x, y: x + length * y, a, b)
+
+
+def _dot(a, b):
+    return jnp.stack([jnp.vdot(x, y) for x, y in zip(a, b, strict=True)]).sum()

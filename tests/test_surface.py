@@ -1,0 +1,94 @@
+"""Sheets fitted through the forward model: depth, focus, what is no sheet, and what is refused."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import trimesh
+
+import gs_jax as gs
+from gs_jax.io.surfaces import write_surface
+
+GRID = {"shape": (45, 45), "pitch": 0.08}
+DEPTHS = np.arange(18.0, 22.1, 0.5)
+
+
+bad: Any = gs.FISTA  # of the wrong type
+
+
+def scope() -> gs.Imager:
+    centers = gs.random_layout(36, (6.0, 6.0), seed=0)
+    array = gs.MicrolensArray(centers, 2.0, 1.43, 1.0, 1.0)
+    return gs.Imager(array, gs.Sensor((300, 300), 0.02), 5.8, 2.4)
+
+
+def emitters(depth) -> np.ndarray:
+    """A textured square; not on the grid's nodes."""
+    side = np.arange(-1.3, 1.3, 0.03)
+    x, y = (part.ravel() for part in np.meshgrid(side, side))
+    light = 1 + np.sin(9 * x + 3 * y) * np.cos(8 * y)
+    return np.column_stack([x, y, depth(x, y), light])
+
+
+@pytest.fixture(scope="module")
+def fit():
+    scene = emitters(lambda x, y: 20 + 1.2 * x)
+    image = np.asarray(gs.simulate(scene, scope(), optics="near", psf="geometric"))
+    image = np.random.default_rng(0).poisson(image * 1000 / image.max()).astype(np.float32)
+    return gs.fit_surface(image, scope(), gs.Grid(DEPTHS, **GRID), optics="near")
+
+
+def test_the_depth_of_a_tilted_sheet_is_found(fit):
+    grid = gs.Grid(DEPTHS, **GRID)
+    inner = np.abs(np.asarray(grid.x)) < 1.1
+    error = (fit.depth[0] - (20 + 1.2 * np.asarray(grid.x))[None])[np.ix_(inner, inner)]
+    # A third of the planes' distance is 0.17 mm.
+    assert np.nanstd(error) < 0.08 and abs(np.nanmean(error)) < 0.05 and np.isfinite(error).mean() > 0.7
+    assert fit.error < fit.free_error and fit.warning is None
+    assert np.isnan(fit.depth[0, 0, 0]) and (fit.depth_sd[np.isfinite(fit.depth)] > 0).all()
+
+
+def test_the_volume_is_the_sheet_on_the_planes(fit):
+    lit = np.isfinite(fit.depth[0])
+    mean = (fit.volume * DEPTHS[:, None, None]).sum(0)[lit] / fit.volume.sum(0)[lit]
+    np.testing.assert_allclose(mean, fit.depth[0][lit], atol=1e-3)
+    np.testing.assert_allclose(fit.volume.sum(0), fit.brightness[0], rtol=1e-3, atol=1e-6 * fit.brightness.max())
+
+
+def test_files_hold_maps_in_um_and_a_mesh_in_mm(fit, tmp_path):
+    grid, maps = gs.Grid(DEPTHS, **GRID), (fit.brightness, fit.depth, fit.depth_sd)
+    write_surface(tmp_path / "maps.ome.tif", *maps, grid, below=17.5, provenance={"design": "made up"})
+    with tifffile.TiffFile(tmp_path / "maps.ome.tif") as tiff:
+        pixels = tiff.asarray()
+        assert 'PhysicalSizeX="80.0"' in (tiff.ome_metadata or "") and 'Name="depth_um"' in (tiff.ome_metadata or "")
+    np.testing.assert_allclose(pixels[1], 1000 * (fit.depth[0] - 17.5), rtol=1e-5)
+    write_surface(tmp_path / "sheet.ply", *maps, grid)
+    mesh: Any = trimesh.load(tmp_path / "sheet.ply", process=False)
+    slope = np.polyfit(mesh.vertices[:, 0], mesh.vertices[:, 2], 1)
+    assert len(mesh.faces) > 500 and abs(slope[0] - 1.2) < 0.1
+
+
+def test_dark_captures_and_single_planes_are_finite():
+    grid = gs.Grid(DEPTHS, **GRID)
+    dark = gs.reconstruct(np.zeros((300, 300), np.float32), scope(), grid, gs.Surface(), optics="near")
+    assert not dark.any()
+    image = np.asarray(gs.simulate(emitters(lambda x, y: 20 + 0 * x), scope(), optics="near", psf="geometric"))
+    plane = gs.reconstruct(image, scope(), grid.at([20.0]), gs.Surface(), optics="near")
+    assert plane.shape == (1, 45, 45) and np.isfinite(plane).all() and plane[0, 22, 22] > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: gs.Surface(sheets=0), "sheets must be 1 or more, got 0"),
+        (lambda: gs.Surface(smooth_depth=-1.0), "smooth_depth must be 0 or more, got -1"),
+        (lambda: gs.Surface(steps=10_000), "steps must be 1 to 36, got 10000"),
+        (lambda: gs.reconstruct(np.zeros((300, 300)), scope(), gs.Grid([20, 18], **GRID), gs.Surface()), "must ascend"),
+        (lambda: gs.fit_surface(np.zeros((3, 3)), scope(), gs.Grid(DEPTHS, **GRID)), "must have the sensor's shape"),
+        (lambda: gs.fit_surface(np.zeros((3, 3)), scope(), gs.Grid(DEPTHS, **GRID), bad()), "must be a Surface"),
+    ],
+)
+def test_what_is_refused(make, words):
+    with pytest.raises(gs.InputError, match=words):
+        make()
