@@ -44,7 +44,8 @@ def reconstruct_live(
 ) -> None:
     """Make and write the volume of each capture of a folder, until `changes` returns None.
 
-    A volume is written while the next is made. The frames that were read when this ends, however it ends, are written.
+    Frames are read, computed and written one after the other: overlapped, on two busy cores no more volumes are made,
+    and each comes later. A volume that is being written when this ends is written wholly.
 
     Parameters
     ----------
@@ -69,14 +70,12 @@ def reconstruct_live(
         If a volume cannot be written.
     """
     queue = _Queue(series, folder)
-    writer, pending = ThreadPoolExecutor(1), None
+    # In another thread, so that Ctrl-C does not end it half-way.
+    writer = ThreadPoolExecutor(1)
     try:
         while (names := changes(queue.patience)) is not None:
             for name in names:
                 queue.add(name)
-            # An error of the writer ends this also while no capture comes.
-            if pending and pending.done():
-                pending = pending.result()
             if (frame := queue.pop()) is None:
                 continue
             try:
@@ -88,12 +87,7 @@ def reconstruct_live(
             except InputError as error:
                 job = partial(series.fail, frame, str(error))
                 on_failure(frame, str(error))
-            if pending:
-                pending.result()
-            pending = writer.submit(job)
-            volume = job = image = None
-        if pending:
-            pending.result()
+            writer.submit(job).result()
     finally:
         writer.shutdown()
 
