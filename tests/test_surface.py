@@ -49,6 +49,22 @@ def test_the_depth_of_a_tilted_sheet_is_found(fit):
     assert np.isnan(fit.depth[0, 0, 0]) and (fit.depth_sd[np.isfinite(fit.depth)] > 0).all()
 
 
+@pytest.mark.integration
+def test_two_sheets_are_two_and_one_is_warned_of():
+    scene = np.concatenate([emitters(lambda x, y: 18.8 + 0.2 * x), emitters(lambda x, y: 21.2 + 0.2 * y)])
+    image = np.asarray(gs.simulate(scene, scope(), optics="near", psf="geometric"))
+    image = np.random.default_rng(0).poisson(image * 3000 / image.max()).astype(np.float32)
+    grid = gs.Grid(DEPTHS, **GRID)
+    assert "try 2 sheets" in (gs.fit_surface(image, scope(), grid, optics="near").warning or "")
+    two = gs.fit_surface(image, scope(), grid, gs.Surface(sheets=2), optics="near")
+    x, y = (np.asarray(part) for part in (grid.x, grid.y))
+    inner = np.ix_(np.abs(y) < 1.1, np.abs(x) < 1.1)
+    for depth, true in zip(two.depth, (18.8 + 0.2 * x[None], 21.2 + 0.2 * y[:, None]), strict=True):
+        error = (depth - true)[inner]
+        assert np.nanstd(error) < 0.1 and abs(np.nanmean(error)) < 0.1 and np.isfinite(error).mean() > 0.8
+    assert two.warning is None
+
+
 def test_the_volume_is_the_sheet_on_the_planes(fit):
     lit = np.isfinite(fit.depth[0])
     mean = (fit.volume * DEPTHS[:, None, None]).sum(0)[lit] / fit.volume.sum(0)[lit]

@@ -209,8 +209,8 @@ def reconstruct_command(
     if residual:
         click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
     if fit := result.surface:
-        voxels = f"{fit.error:.1%} of the capture unexplained (RMS), free voxels {fit.free_error:.1%}"
-        click.echo(f"{surface or output}: sheets leave {voxels}")
+        others = f"one more {fit.further_error:.1%}, free voxels {fit.free_error:.1%}"
+        click.echo(f"{surface or output}: sheets leave {fit.error:.1%} of the capture unexplained (RMS), {others}")
     if result.points is not None:
         count = len(result.points)
         click.echo(f"{points or output}: {count} point{'s' * (count != 1)}")

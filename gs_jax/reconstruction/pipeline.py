@@ -156,7 +156,7 @@ def reconstructor(
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
     read: Callable[[Any, Any], Any] | None = None,
-) -> Callable[[Image, Progress], Any]:
+) -> Callable[..., Any]:
     """Prepare `reconstruct` for many images of one type; parameters and errors as there.
 
     `read` takes a solver and its last state, and returns what is returned instead of the volume.
@@ -164,7 +164,7 @@ def reconstructor(
     Returns
     -------
     Callable
-        Maps an image of `sensor.shape` and a progress display to the volume.
+        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface` to the volume.
 
     Warns
     -----
@@ -192,7 +192,7 @@ def reconstructor(
     modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
     problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
-    def volume_of(image, progress):
+    def volume_of(image, progress, method=method):
         light, background = prepare_data(image, model)
         target = 0.0
         # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
