@@ -24,9 +24,9 @@ from .richardson_lucy import (
     background_step,
     bilinear_background,
     extrapolate,
-    hat_functions,
     momentum_after,
 )
+from .sheets import Sheets, hats, interpolated, nearest, noise_variance, squared_derivatives, volume_of, widened
 
 # Voxels from one knot of the depth to the next.
 _SPACING = 5
@@ -48,8 +48,6 @@ _MAX_MOVE = 1.0
 # The Hessian's diagonal leaves out what neighbours, brightness and the model's errors share: measured on sheets whose
 # depths are known, ray-traced or not, of 10,000 electrons.
 _UNDERSTATED = 3.6
-# Classes of brightness among which the noise is fitted, and steps of that.
-_CLASSES, _NOISE_STEPS = 32, 60
 # Light of the start's dark columns, of the mean's, from which they may become brighter.
 _FAINT = 1e-3
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
@@ -57,14 +55,6 @@ _DAMPING = 1e-3
 # The start has the brightness nearly right and the depths not. So the preconditioner lets the depths go first.
 _BRIGHTNESS_LATER = 0.1
 _START = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS, min_sensitivity=0.3)
-
-
-class Sheets(NamedTuple):
-    """Unknowns: roots of brightness, depths at knots, in planes from the first, and the background at its knots."""
-
-    root: Array
-    depth: Array
-    background: Array
 
 
 class State(NamedTuple):
@@ -77,7 +67,7 @@ class State(NamedTuple):
     sheets, change, residual, direction
         The sheets, and the change that conjugate gradients look for, with their residual and direction.
     diagonal
-        Mean diagonal of the Hessian for each unknown, relative to that of `_energy`.
+        Mean diagonal of the Hessian for each unknown, relative to that of `squared_derivatives`.
     information
         Sum of the last probes of the Hessian's diagonal, for each depth.
     inverse
@@ -176,17 +166,17 @@ class Surface(eqx.Module):
         planes = state.lucy.x.shape[0]
         probe = _probe(state, following)
         # A volume, its image, and what is projected back, for all kinds: the operator is compiled once.
-        tangent = lambda to: (jax.jvp(lambda s: _volume(s, planes), (state.sheets,), (to,))[1], to.background)
+        tangent = lambda to: (jax.jvp(lambda s: volume_of(s, planes), (state.sheets,), (to,))[1], to.background)
         inputs = (
             lambda: (extrapolate(state.lucy), state.lucy.knots),
-            lambda: (_volume(state.sheets, planes), state.sheets.background),
+            lambda: (volume_of(state.sheets, planes), state.sheets.background),
             lambda: tangent(probe),
             lambda: tangent(state.direction),
         )
         volume, background = lax.switch(kind, inputs)
         shown = A.mv(volume) + bilinear_background(background, light)
         expected, residual = jnp.maximum(shown, 0), light - shown
-        fit_noise = lambda: divide(jnp.ones_like(light), _variance(residual, expected))
+        fit_noise = lambda: divide(jnp.ones_like(light), noise_variance(residual, expected))
         state = state._replace(inverse=lax.cond(kind == _LINEARISE, fit_noise, lambda: state.inverse))
         rounding = jnp.finfo(light.dtype).eps * expected.max()
         pulled = lax.switch(
@@ -201,8 +191,8 @@ class Surface(eqx.Module):
         misfit = divide(jnp.mean(residual**2), jnp.mean(light**2)) ** 0.5
 
         def pullback():
-            part = jax.vjp(lambda s: _volume(s, planes), state.sheets)[1](back)[0]
-            rows, columns = _hats(light.shape, background.shape, light.dtype)
+            part = jax.vjp(lambda s: volume_of(s, planes), state.sheets)[1](back)[0]
+            rows, columns = hats(light.shape, background.shape, light.dtype)
             return part._replace(background=rows.T @ pulled @ columns)
 
         def after_lucy():
@@ -221,8 +211,8 @@ class Surface(eqx.Module):
 
         def after_probe():
             product = jax.tree.map(jnp.multiply, probe, pullback())
-            energy, square = _energy(state.sheets), jnp.max(probe.root**2)
-            rows, columns = _hats(light.shape, background.shape, light.dtype)
+            energy, square = squared_derivatives(state.sheets), jnp.max(probe.root**2)
+            rows, columns = hats(light.shape, background.shape, light.dtype)
             means = (
                 divide(product.root.sum(), square * energy.root.sum()),
                 divide(product.depth.sum(), energy.depth.sum()),
@@ -254,17 +244,17 @@ class Surface(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "depth y x"]:
         is_start = state.number < _FIRST
-        return lax.cond(is_start, lambda: state.lucy.x, lambda: _volume(state.sheets, state.lucy.x.shape[0]))
+        return lax.cond(is_start, lambda: state.lucy.x, lambda: volume_of(state.sheets, state.lucy.x.shape[0]))
 
     def _first_sheets(self, lucy):
         """Depths about which the light is, squared, because the background is in all planes; the light of a column."""
         x = lucy.x
         planes, *shape = x.shape
         knots = [max(-(-n // _SPACING), 2) for n in shape]
-        rows, columns = _hats(shape, knots, x.dtype)
+        rows, columns = hats(shape, knots, x.dtype)
         unit = divide(x, jnp.broadcast_to(x.max(), x.shape))
         local = jnp.einsum("yk,zyx,xl->zkl", rows, unit**2, columns)
-        local = _widened(_widened(local, 1), 2)
+        local = widened(widened(local, 1), 2)
         local = local - (local.min(0) if planes > 2 else jnp.zeros_like(local[0]))[None]
         k = jnp.arange(planes, dtype=x.dtype)[:, None, None]
         # Where it is dark, the mean of all.
@@ -276,9 +266,9 @@ class Surface(eqx.Module):
         depth = mean[None] + apart[:, None, None] * spread[None]
         # Several layers part the planes between them (Lloyd's algorithm).
         for _ in range(8 if self.sheets > 1 else 0):
-            mine = _nearest(k, depth) * local[None]
+            mine = nearest(k, depth) * local[None]
             depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
-        bright = (_nearest(k, _interpolated(depth, tuple(shape))) * x[None]).sum(1)
+        bright = (nearest(k, interpolated(depth, tuple(shape))) * x[None]).sum(1)
         return Sheets(safe_sqrt(bright + _FAINT * bright.mean()), depth, lucy.knots)
 
     def _prior(self, at, vector):
@@ -291,7 +281,7 @@ class Surface(eqx.Module):
         return Sheets(root, self.smooth_depth * depth, jnp.zeros_like(vector.background))
 
     def _precondition(self, state, vector):
-        energy, mean, damping = _energy(state.sheets), state.diagonal, _damping(state)
+        energy, mean, damping = squared_derivatives(state.sheets), state.diagonal, _damping(state)
         root = mean[0] * (energy.root + energy.root.mean())
         # A knot has four neighbours.
         depth = mean[1] * energy.depth + damping.depth + self.smooth_depth / _EDGE_DEPTH
@@ -305,53 +295,17 @@ class Surface(eqx.Module):
 
 def depth_of_sheets(state: State) -> tuple[Array, Array]:
     """Depths `(layer, y, x)` and their standard deviations, in planes from the first."""
-    depth = jnp.clip(_interpolated(state.sheets.depth, state.sheets.root.shape[1:]), 0, state.lucy.x.shape[0] - 1)
+    depth = jnp.clip(interpolated(state.sheets.depth, state.sheets.root.shape[1:]), 0, state.lucy.x.shape[0] - 1)
     # Means over neighbours: four probes alone are noisy.
-    rows, columns = (_hats((n,), (max(n // 3, 2),), depth.dtype)[0] for n in state.information.shape[1:])
+    rows, columns = (hats((n,), (max(n // 3, 2),), depth.dtype)[0] for n in state.information.shape[1:])
     means = lambda m: m / m.sum(0)[None]
     local = jnp.einsum("yk,zyx,xl->zkl", means(rows), jnp.maximum(state.information, 0) / _PROBES, means(columns))
-    local = _interpolated(local, state.sheets.root.shape[1:])
+    local = interpolated(local, state.sheets.root.shape[1:])
     return depth, divide(jnp.full_like(local, _UNDERSTATED), safe_sqrt(local))
 
 
-def _volume(sheets, planes):
-    depth = jnp.clip(_interpolated(sheets.depth, sheets.root.shape[1:]), 0, planes - 1)
-    k = jnp.arange(planes, dtype=depth.dtype)[None, :, None, None]
-    return (sheets.root[:, None] ** 2 * jnp.maximum(1 - jnp.abs(k - depth[:, None]), 0)).sum(0)
-
-
-def _hats(shape, knots, dtype):
-    return tuple(hat_functions(n, count, dtype) for n, count in zip(shape, knots, strict=True))
-
-
-def _interpolated(depth, shape):
-    rows, columns = _hats(shape, depth.shape[1:], depth.dtype)
-    return jnp.einsum("yk,zkl,xl->zyx", rows, depth, columns)
-
-
-def _widened(x, axis):
-    """Binomial mean of three neighbours along an axis."""
-    padded = jnp.pad(x, [(int(a == axis), int(a == axis)) for a in range(x.ndim)], mode="edge")
-    first, middle, last = (lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(3))
-    return (first + 2 * middle + last) / 4
-
-
-def _nearest(k, depth):
-    """1 where a layer is the nearest of a plane, else 0; ties are shared: `(layer, plane, y, x)`."""
-    away = jnp.abs(k[None] - depth[:, None])
-    mine = (away <= away.min(0)[None]).astype(depth.dtype)
-    return mine / mine.sum(0)[None]
-
-
-def _energy(sheets):
-    """Squares of the derivatives of the volume's voxels in each unknown."""
-    rows, columns = _hats(sheets.root.shape[1:], sheets.depth.shape[1:], sheets.root.dtype)
-    depth = jnp.einsum("yk,zyx,xl->zkl", rows**2, sheets.root**4, columns**2)
-    return Sheets(4 * sheets.root**2, depth, jnp.ones_like(sheets.background))
-
-
 def _damping(state):
-    means = [_DAMPING * d * e.mean() for d, e in zip(state.diagonal, _energy(state.sheets), strict=True)]
+    means = [_DAMPING * d * e.mean() for d, e in zip(state.diagonal, squared_derivatives(state.sheets), strict=True)]
     return Sheets(*(jnp.full(part.shape, d) for d, part in zip(means, state.sheets, strict=True)))
 
 
@@ -378,31 +332,6 @@ def _diffused(at, vector, edge):
     length = magnitude(differences(at, wrap=False))
     weight = 1 / jnp.sqrt(length**2 + edge**2)
     return differences_adjoint(weight[None] * differences(vector, wrap=False), wrap=False)
-
-
-def _variance(residual, expected):
-    """Variance of each pixel: `read + gain e + (relative e)^2`, the most likely for a residual.
-
-    Variances of classes of brightness are fitted by a multiplicative method, which leaves all three parts positive.
-    """
-    top = expected.max() + jnp.finfo(expected.dtype).tiny
-    unit = jnp.mean(residual**2)
-    place = jnp.minimum((safe_sqrt(expected / top) * _CLASSES).astype(jnp.int32), _CLASSES - 1).ravel()
-    total = lambda part: jax.ops.segment_sum(part.ravel(), place, _CLASSES)
-    count = total(jnp.ones_like(expected))
-    square = divide(total(residual**2), count * unit)
-    e = divide(total(expected), count * top)
-    parts = jnp.stack([jnp.ones_like(e), e, e**2])
-    least = 1e-6
-
-    def improve(shares, _):
-        variance = shares @ parts + least
-        ratio = divide(parts @ (count * square / variance**2), parts @ (count / variance))
-        return shares * jnp.sqrt(ratio), None
-
-    shares = lax.scan(improve, jnp.full(3, 1 / 3, e.dtype), length=_NOISE_STEPS)[0]
-    e = expected / top
-    return unit * (shares[0] + shares[1] * e + shares[2] * e**2 + least)
 
 
 def _add(a, b, length):

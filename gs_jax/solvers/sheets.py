@@ -1,0 +1,86 @@
+"""Sheets through a volume: their voxels, the squares of their derivatives, and the noise of a capture."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..base.arrays import divide, safe_sqrt
+from .richardson_lucy import hat_functions
+
+# Classes of brightness among which the noise is fitted, and steps of that.
+_CLASSES, _NOISE_STEPS = 32, 60
+
+
+class Sheets(NamedTuple):
+    """Unknowns: roots of brightness, depths at knots, in planes from the first, and the background at its knots."""
+
+    root: Array
+    depth: Array
+    background: Array
+
+
+def volume_of(sheets, planes):
+    """Linear shares of each sheet on the two planes about its depth: `(plane, y, x)`."""
+    depth = jnp.clip(interpolated(sheets.depth, sheets.root.shape[1:]), 0, planes - 1)
+    k = jnp.arange(planes, dtype=depth.dtype)[None, :, None, None]
+    return (sheets.root[:, None] ** 2 * jnp.maximum(1 - jnp.abs(k - depth[:, None]), 0)).sum(0)
+
+
+def hats(shape, knots, dtype):
+    """Linear interpolation from knots, a matrix for each axis."""
+    return tuple(hat_functions(n, count, dtype) for n, count in zip(shape, knots, strict=True))
+
+
+def interpolated(depth, shape):
+    """Depths at all columns from those at knots."""
+    rows, columns = hats(shape, depth.shape[1:], depth.dtype)
+    return jnp.einsum("yk,zkl,xl->zyx", rows, depth, columns)
+
+
+def widened(x, axis):
+    """Binomial mean of three neighbours along an axis."""
+    padded = jnp.pad(x, [(int(a == axis), int(a == axis)) for a in range(x.ndim)], mode="edge")
+    first, middle, last = (lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(3))
+    return (first + 2 * middle + last) / 4
+
+
+def nearest(k, depth):
+    """1 where a layer is the nearest of a plane, else 0; ties are shared: `(layer, plane, y, x)`."""
+    away = jnp.abs(k[None] - depth[:, None])
+    mine = (away <= away.min(0)[None]).astype(depth.dtype)
+    return mine / mine.sum(0)[None]
+
+
+def squared_derivatives(sheets):
+    """Squares of the derivatives of the volume's voxels in each unknown."""
+    rows, columns = hats(sheets.root.shape[1:], sheets.depth.shape[1:], sheets.root.dtype)
+    depth = jnp.einsum("yk,zyx,xl->zkl", rows**2, sheets.root**4, columns**2)
+    return Sheets(4 * sheets.root**2, depth, jnp.ones_like(sheets.background))
+
+
+def noise_variance(residual, expected):
+    """Variance of each pixel: `read + gain e + (relative e)^2`, the most likely for a residual.
+
+    Variances of classes of brightness are fitted by a multiplicative method, which leaves all three parts positive.
+    """
+    top = expected.max() + jnp.finfo(expected.dtype).tiny
+    unit = jnp.mean(residual**2)
+    place = jnp.minimum((safe_sqrt(expected / top) * _CLASSES).astype(jnp.int32), _CLASSES - 1).ravel()
+    total = lambda part: jax.ops.segment_sum(part.ravel(), place, _CLASSES)
+    count = total(jnp.ones_like(expected))
+    square = divide(total(residual**2), count * unit)
+    e = divide(total(expected), count * top)
+    parts = jnp.stack([jnp.ones_like(e), e, e**2])
+    least = 1e-6
+
+    def improve(shares, _):
+        variance = shares @ parts + least
+        ratio = divide(parts @ (count * square / variance**2), parts @ (count / variance))
+        return shares * jnp.sqrt(ratio), None
+
+    shares = lax.scan(improve, jnp.full(3, 1 / 3, e.dtype), length=_NOISE_STEPS)[0]
+    e = expected / top
+    return unit * (shares[0] + shares[1] * e + shares[2] * e**2 + least)
