@@ -74,6 +74,7 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
 
     @property
     def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the sensor within a plane of the scene."""
         return middle(self.image_shape, self.scene_shape[1:])
 
     def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
