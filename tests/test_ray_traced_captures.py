@@ -1,7 +1,10 @@
+import dataclasses
+import json
+
 import pytest
 
 from experiments.ray_traced_captures import run
-from experiments.through_layers import on_points
+from experiments.through_layers import on_points, scope_of
 from gs_jax.base.progress import Progress
 
 from .helpers import needs
@@ -26,7 +29,11 @@ def test_every_one_of_120_ray_traced_points_is_a_peak():
 def test_points_in_a_gel_are_where_they_are():
     """By another group's tracer, through a filter, a window and a cover slip; without them nothing is right."""
     needs("geomscope/centers.csv")
-    result = on_points(needs("oracle/layers/L_points.tif").parent, Progress())
+    data = needs("oracle/layers/L_points.tif").parent
+    scope = scope_of(data, json.loads((data / "L_points.json").read_text()))
+    distance = scope.reduced_sensor_distance - scope.array.reduced_thickness_back
+    in_air = dataclasses.replace(scope, sensor_distance=distance, filters=None, windows=None, sample=None)
+    result = on_points(data, {"with layers": scope, "layers ignored": in_air}, Progress())
     found = result["with layers"]
     assert found["f1"] >= 0.99 and found["lateral_rmse_um"] <= 4 and found["axial_rmse_um"] <= 30
     assert result["model"]["bin_4"]["correlation"] >= 0.97 and abs(result["model"]["light"] - 1) <= 0.05

@@ -50,7 +50,7 @@ class Log(Progress):
         self.parts, self.most = [], most
 
     @contextmanager
-    def counter(self, description, total, *, quarter="", rate=""):
+    def counter(self, description, total, *, quarter="", rate="", words=None):
         def advance():
             self.parts.append((description, total))
             if len(self.parts) == self.most:

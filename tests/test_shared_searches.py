@@ -64,7 +64,7 @@ class Interrupted(Progress):
     left = 2
 
     @contextmanager
-    def counter(self, description, total, *, quarter="", rate=""):
+    def counter(self, description, total, *, quarter="", rate="", words=None):
         def advance():
             self.left -= 1
             if not self.left:
