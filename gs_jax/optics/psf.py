@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.ndimage import gaussian_filter
 
 from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
@@ -177,6 +176,8 @@ def spot_image(
     size, radius, samples
         As of `diffraction_psf`.
     """
+    from scipy.ndimage import gaussian_filter  # imported here: reconstruction does not need SciPy
+
     depth, height, radius = (jnp.asarray(x, imager.sensor_distance.dtype) for x in (depth, height, radius))
     pixel = imager.sensor.pixel_pitch
     field = height, jnp.zeros_like(height)
