@@ -176,7 +176,9 @@ def test_a_recording_by_workers_one_of_which_is_killed(folder, monkeypatch, caps
 
 
 def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, capsys):
-    frames = np.random.default_rng(2).integers(100, 3000, (300, 96, 80)).astype(np.uint16)
+    # Enough to be interrupted: a frame takes some milliseconds.
+    count = 900
+    frames = np.random.default_rng(2).integers(100, 3000, (count, 96, 80)).astype(np.uint16)
     save("rec.tif", frames)
     process, workers = started("--workers", "2")
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
@@ -191,5 +193,5 @@ def test_ctrl_c_stops_all_and_the_rest_is_made_by_others(folder, monkeypatch, ca
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
         arguments = command("rec.tif", "--resume", "--scheduler", cluster.scheduler_address)
         status, out, _ = run(monkeypatch, capsys, *arguments)
-    assert status == 0 and f"{300 - len(before)} frames in" in out and sorted(numbers()) == list(range(300))
+    assert status == 0 and f"{count - len(before)} frames in" in out and sorted(numbers()) == list(range(count))
     assert volumes().any((1, 2, 3)).all()

@@ -242,6 +242,7 @@ class Surface(eqx.Module):
         # The steps have no common residual: they are taken as planned.
         return state._replace(number=state.number + 1), misfit, jnp.ones((), light.dtype)
 
+    @eqx.filter_jit
     def estimate(self, state: State) -> Float[Array, "depth y x"]:
         is_start = state.number < _FIRST
         return lax.cond(is_start, lambda: state.lucy.x, lambda: volume_of(state.sheets, state.lucy.x.shape[0]))
