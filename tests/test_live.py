@@ -180,6 +180,11 @@ def test_a_folder_tells_what_comes(tmp_path):
         with open(tmp_path / "f11.npy", "ab") as file:
             file.write(b"more")
         assert {*told("f11.npy")} == {"f11.npy"}
+        # Captures that are deleted are not told.
+        (tmp_path / "f9.npy").unlink()
+        np.save(tmp_path / ".f13.npy", image_of(13))
+        (tmp_path / ".f13.npy").rename(tmp_path / "f13.npy")
+        assert {*told("f13.npy")} == {"f13.npy"}
 
 
 WATCH = ("reconstruct", "run", "design.toml", *OPTIONS, "--watch", "-o", "v.zarr")

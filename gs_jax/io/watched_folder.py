@@ -84,6 +84,8 @@ class WatchedFolder:
     def _tell(self, names: list[str], listed: bool) -> None:
         captures = [name for name in names if name.lower().endswith(CAPTURE_SUFFIXES) and not name.startswith(".")]
         captures = [name for name in captures if name not in self._told] if listed else captures
+        # The library also tells of files that are deleted.
+        captures = [name for name in captures if (self.folder / name).is_file()]
         self._told.update(captures)
         if captures:
             self._changes.put(captures)
