@@ -13,6 +13,7 @@ import pytest
 import tifffile
 
 from gs_jax import Grid, InputError
+from gs_jax.cli.watch_command import _State
 from gs_jax.io.captures import read_capture
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, check_replaceable, read_series
 from gs_jax.io.watched_folder import WatchedFolder
@@ -134,9 +135,23 @@ def test_a_capture_that_is_written_again_replaces_its_volume(tmp_path):
     np.testing.assert_array_equal(level(tmp_path / "v.zarr")[:, 0, 0, 0], [7])
 
 
+def test_a_bad_capture_over_a_good_one_keeps_its_volume(tmp_path):
+    series = series_in(tmp_path)
+
+    def bad():
+        (tmp_path / "run" / "f1.npy").write_bytes(b"no capture")
+        os.utime(tmp_path / "run" / "f1.npy", (1e9, 1e9))
+        return ["f1.npy"]
+
+    Camera(tmp_path, [1], bad).run(series)
+    assert series.finished == {0} and list(series.failed) == [0]
+    series.add("f2.npy")
+    assert _State(0).summary(series)[-1] == "1 capture has no volume; --resume makes it"
+
+
 def test_resume_goes_on(tmp_path):
     Camera(tmp_path, [1, 2, 3]).run(series_in(tmp_path))
-    with pytest.raises(InputError, match="v.zarr: has 1 frames of a watched folder; give --resume"):
+    with pytest.raises(InputError, match="v.zarr: has 1 frame of a watched folder; give --resume"):
         check_replaceable(tmp_path / "v.zarr")
     series = series_in(tmp_path, resume=True)
     assert series.names == ["f1.npy", "f2.npy", "f3.npy"] and series.finished == {2} and series.count == 3
@@ -243,6 +258,7 @@ def test_wrong_input_is_one_line(folder, monkeypatch, capsys):
     for arguments, words in {
         (*last, "v.tif"): "-o must be VOLUME.zarr, which grows in time, with --watch, got v.tif",
         (*WATCH, "--workers", "2"): "--workers and --scheduler must not be given with --watch",
+        (*WATCH, "--method", "surface", "--surface", "s.ply"): "--surface must be used with a single capture",
         (WATCH[0], "capture.tif", *WATCH[2:]): "capture.tif must be a folder to be watched, got a file",
         (WATCH[0], "none", *WATCH[2:]): "none must be a folder to be watched, got none",
     }.items():

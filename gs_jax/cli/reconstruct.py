@@ -170,7 +170,7 @@ def reconstruct_command(
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     how = {"track": track, "interval": frame_interval, "resume": resume}
     if watch:
-        check_watched(output, workers=workers.remote, resume=resume, force=force)
+        check_watched(output, workers=workers.remote, surface=surface is not None, resume=resume, force=force)
         with Progress() as progress:
             files = {"design_text": text, "camera": camera, "points": points, "frame": frame}
             return watch_folder(capture, plan, output, **files, **how, progress=progress)

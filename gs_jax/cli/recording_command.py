@@ -18,7 +18,7 @@ from .interrupt import RESUMABLE, partial_outputs
 from .options import UM, CaptureOptions, Number, depth_range
 
 # Failed frames that are named; others are only counted, and listed in the journal.
-_MAX_NAMED = 10
+MAX_NAMED = 10
 # Options that do not change the volumes.
 _OTHER_OPTIONS = ("capture", "design", "output", "points", "track", "resume", "watch", "force", "workers", "scheduler")
 
@@ -170,7 +170,7 @@ def reconstruct_recording(
     def on_failure(frame, reason):
         nonlocal failures
         failures += 1
-        if failures <= _MAX_NAMED:
+        if failures <= MAX_NAMED:
             messages.append(f"gs-jax: frame {frame} ({names[frame]}): {reason}")
         if series.finished:
             print_messages()
@@ -196,8 +196,8 @@ def reconstruct_recording(
     if points:
         click.echo(f"{points}: {written}")
     if series.failed:
-        numbers = ", ".join(map(str, sorted(series.failed)[:_MAX_NAMED]))
-        numbers += ", ..." if len(series.failed) > _MAX_NAMED else ""
+        numbers = ", ".join(map(str, sorted(series.failed)[:MAX_NAMED]))
+        numbers += ", ..." if len(series.failed) > MAX_NAMED else ""
         failed = f"{len(series.failed)} of {series.count} frames failed and are empty: {numbers}"
         click.echo(f"gs-jax: {output}: {failed}; --resume tries them again", err=True)
     return int(bool(series.failed))

@@ -13,24 +13,24 @@ from ..base.progress import Progress
 from .files import provenance_of
 from .interrupt import RESUMABLE, partial_outputs
 from .options import CaptureOptions
-from .recording_command import frames_of, print_notes, request_of, write_series_points
+from .recording_command import MAX_NAMED, frames_of, print_notes, request_of, write_series_points
 
 # The table of points is written again after this multiple of the time that it took last, and seconds at least.
 _SHARE, _PAUSE = 20, 1.0
-# Failed frames that are named.
-_MAX_NAMED = 10
 # Seconds for which a thread keeps the interpreter: a tenth of the default, so that threads wait shorter for each other.
 _SWITCH = 5e-4
 
 
-def check_watched(output: Path, *, workers: bool, resume: bool, force: bool) -> None:
-    """Raise `InputError` if the output cannot hold the volumes of a watched folder."""
+def check_watched(output: Path, *, workers: bool, surface: bool, resume: bool, force: bool) -> None:
+    """Raise `InputError` if the output cannot hold the volumes of a watched folder, or if options exclude `--watch`."""
     from ..io.volume_series import check_replaceable
 
     if output.suffix.lower() != ".zarr":
         raise InputError(f"-o must be VOLUME.zarr, which grows in time, with --watch, got {output}.")
     if workers:
-        raise InputError("--workers and --scheduler must not be given with --watch, which keeps the order of captures.")
+        raise InputError("--workers and --scheduler must not be given with --watch, which makes one volume at a time.")
+    if surface:
+        raise InputError("--surface must be used with a single capture, got --watch.")
     if not (resume or force):
         check_replaceable(output)
 
@@ -78,7 +78,7 @@ def watch_folder(
 
     def on_failure(number: int, reason: str) -> None:
         state.failures += 1
-        if state.failures <= _MAX_NAMED:
+        if state.failures <= MAX_NAMED:
             click.echo(f"gs-jax: frame {number} ({series.names[number]}): {reason}", err=True)
 
     click.echo(f"{folder}: watched until Ctrl-C", err=True)
@@ -120,7 +120,9 @@ class _State:
             middle, most = (_in_words(each) for each in np.percentile(self.delays, (50, 95)))
             lines.append(f"from a capture's last byte to its volume: {middle} at the median, {most} in 95 %")
         if left:
-            failed = f", {len(series.failed)} failed" if series.failed else ""
+            # A bad capture that replaced a good one has the volume of that.
+            bad = len(series.failed.keys() - series.finished)
+            failed = f", {bad} failed" if bad else ""
             which, it = ("capture has", "it") if left == 1 else ("captures have", "them")
             lines.append(f"{left} {which} no volume{failed}; --resume makes {it}")
         return lines

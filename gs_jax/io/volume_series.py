@@ -262,9 +262,10 @@ def check_replaceable(path: Path) -> None:
     with open(path / JOURNAL, "rb") as file:
         done = len({note["frame"] for note, _ in _lines(file) if not _is_other(note)})
     if head[1] is None or done < head[1]:
-        frames = f"{done} frames of a watched folder" if head[1] is None else f"{done} of {head[1]} frames"
-        of = "" if head[1] is None else " of an interrupted recording"
-        raise InputError(f"{path}: has {frames}{of}; give --resume to continue it, or --force to replace it.")
+        frames = f"{done} frame{'s' * (done != 1)} of a watched folder"
+        if head[1] is not None:
+            frames = f"{done} of {head[1]} frames of an interrupted recording"
+        raise InputError(f"{path}: has {frames}; give --resume to continue it, or --force to replace it.")
 
 
 def _lines(file) -> Iterator[tuple[Note, int]]:
