@@ -25,18 +25,23 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
     Raises
     ------
     InputError
-        If an output is an input, or an existing .toml or .csv file without `force`.
+        If an output is an input, a capture of an input's folder or pattern, or an existing .toml or .csv file without
+        `force`.
     """
-    existing_inputs = [path for path in inputs if path is not None and os.path.exists(path)]
     existing = [path for path in outputs if path is not None and os.path.exists(path)]
+    if not existing:
+        return
+    from ..io.recordings import capture_files
+
+    files = [file for path in inputs if path is not None for file in capture_files(path) or [path]]
+    existing_inputs = [path for path in files if os.path.exists(path)]
     for path in existing:
         if any(os.path.samefile(path, other) for other in existing_inputs):
             raise InputError(f"{path}: the output must be another file than the inputs, got an input.")
         if path.suffix.lower() in _WRITTEN_BY_HAND and not force:
             raise InputError(f"{path}: the output must be a new file, got an existing one; --force replaces it.")
-    if existing:
-        names, quiet = ", ".join(map(str, existing)), verbosity.get() == QUIET
-        click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
+    names, quiet = ", ".join(map(str, existing)), verbosity.get() == QUIET
+    click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
 
 
 def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:

@@ -74,10 +74,8 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     suffix = path.suffix.lower()
     if path.is_dir() and (suffix == ".zarr" or any((path / name).exists() for name in _ZARR_ROOTS)):
         yield _open_zarr(path, page, axes)
-    elif path.is_dir():
-        yield _open_files(path, [path / name for name in os.listdir(path)], page)
-    elif re.search(r"[*?[]", str(path)) and not path.exists():
-        yield _open_files(path, [Path(name) for name in glob.glob(str(path), recursive=True)], page)
+    elif (files := capture_files(path)) is not None:
+        yield _open_files(path, files, page)
     elif page is not None or suffix not in (".tif", ".tiff", ".npy"):
         yield None
     elif suffix == ".npy":
@@ -96,9 +94,19 @@ def _paged(path: Path, count: int, read: Callable[[int, Selection], Images]) -> 
     return Recording([f"{path.name}, page {page}" for page in range(1, count + 1)], read, [path])
 
 
-def _open_files(path: Path, matches: list[Path], page: int | str | None) -> Recording:
+def capture_files(path: Path) -> list[Path] | None:
+    """Captures of a folder or a pattern, in natural order; None if the path is neither."""
+    if path.is_dir():
+        matches = [path / name for name in os.listdir(path)]
+    elif re.search(r"[*?[]", str(path)) and not path.exists():
+        matches = [Path(name) for name in glob.glob(str(path), recursive=True)]
+    else:
+        return None
     files = [each for each in matches if each.suffix.lower() in CAPTURE_SUFFIXES and not each.name.startswith(".")]
-    files = sorted((each for each in files if not each.is_dir()), key=natural_key)
+    return sorted((each for each in files if not each.is_dir()), key=natural_key)
+
+
+def _open_files(path: Path, files: list[Path], page: int | str | None) -> Recording:
     if not files:
         raise InputError(f"{path}: no captures; their files end in {', '.join(CAPTURE_SUFFIXES)}.")
     read = lambda index, selection: read_images(files[index], selection._replace(page=page))
