@@ -254,6 +254,8 @@ def test_wrong_input_of_deconvolution_is_named():
         deconvolve(image, np.diag([1.0, np.nan, 1.0]))
     with pytest.raises(InputError, match="solver must be an object such as .*, got <class .*FISTA'>"):
         inspect.unwrap(deconvolve)(image, psf, FISTA)  # past the tests' check of annotations
+    with pytest.raises(InputError, match="tv_z must be 0 or more, got -1"):
+        ConvolutionADMM(tv_z=-1.0)
     with pytest.raises(InputError, match="psf must be at most the image's 20 x 60 pixels, got 41 x 41"):
         deconvolve(image[:20, :60], psf)
     with pytest.raises(InputError, match=r"no light above the darkest percent in plane 2\."):

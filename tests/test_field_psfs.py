@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from jax.test_util import check_grads
 from scipy.signal import convolve2d
 
-from gs_jax import FISTA, InputError, write_capture
+from gs_jax import FISTA, ConvolutionADMM, InputError, write_capture
 from gs_jax.__main__ import commands
 from gs_jax.projection.measured_field import FieldConvolutionOperator
 from gs_jax.reconstruction.deconvolution import deconvolve
@@ -122,5 +122,31 @@ def test_the_command_takes_places(tmp_path, monkeypatch):
     assert "components explain 9 PSFs" in result.stdout and "at 12 mm" in result.stdout
     plane = np.squeeze(tifffile.imread("v.ome.tif"))
     assert np.abs(np.subtract(np.unravel_index(plane.argmax(), SHAPE), MIDDLE + (-6, 8))).max() <= 1
-    wrong = CliRunner().invoke(commands, [*arguments, "--depths", "3"]).exception
-    assert isinstance(wrong, InputError) and "whose z_mm are the depths" in str(wrong)
+
+
+REFUSED = {
+    "depths": ("x_mm,y_mm,z_mm", 12, ["--depths", "3"], "whose z_mm are the depths"),
+    "tv_z": ("x_mm,y_mm,z_mm", 12, ["--tv-z", "0"], "--tv-z must not be given with --psf-places, got both."),
+    "order": ("x_mm,y_mm,capture", 1, [], "lines must be in the order of the PSFs, one for each"),
+    "unknown": ("x_mm,y_mm,z_mm", "", ["--voxel-um", "9", "-o", "v.zarr"], "OME-Zarr needs --depths and --voxel-um"),
+    "zero": ("x_mm,y_mm,z_mm", 0, ["--voxel-um", "9"], "z_mm must be positive with --voxel-um, got 0 (places.csv)."),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_places_that_the_volume_cannot_have_are_refused_before_files_are_read(tmp_path, monkeypatch, case):
+    monkeypatch.chdir(tmp_path)
+    header, last, options, words = REFUSED[case]
+    lines = [header.split(","), *([x, y, last] for x, y in GRID)]
+    with open("places.csv", "w", newline="") as file:
+        csv.writer(file).writerows(lines)
+    arguments = ["deconvolve", "none.tif", "none.tif", "--psf-places", "places.csv", "-o", "v.ome.tif", *options]
+    wrong = CliRunner().invoke(commands, arguments).exception
+    assert isinstance(wrong, InputError) and words in str(wrong)
+
+
+def test_solvers_that_the_field_does_not_allow_are_refused():
+    fit = fit_field(*measured(), SHAPE)
+    for solver in (ConvolutionADMM(tv_z=0.0), ConvolutionADMM(nonnegative=False)):
+        with pytest.raises(InputError, match="solver must be with tv_z=1 and nonnegative=True"):
+            deconvolve(np.ones(SHAPE), fit.operator, solver)

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from ..base.errors import InputError
+from ..base.errors import InputError, input_error
 from ..base.progress import Progress
 from .files import check_may_write, provenance_of
 from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, picture_options
@@ -104,7 +104,7 @@ def deconvolve_command(
     gs-jax deconvolve capture.tif psf.tif -o scene.tif
 
     \b
-    A volume, every second pixel, from PSFs at 10, 10.5, ... 20 mm:
+    A volume from PSFs at 10, 10.5, ... 20 mm, with squares of 2 x 2 pixels summed:
     gs-jax deconvolve capture.tif psfs/ --depths 10:20:0.5 --binning 2 -o volume.ome.tif
     """
     import numpy as np
@@ -112,27 +112,33 @@ def deconvolve_command(
     from ..io.captures import write_capture
     from ..io.files import check_output
     from ..io.plane_stacks import STACK_SUFFIXES, write_planes
-    from ..io.point_tables import read_positions
     from ..reconstruction.deconvolution import bin_pixels, deconvolve, make_solver
     from ..reconstruction.field_fit import fit_field
 
     check_output(output, STACK_SUFFIXES)
     files = [path for path in (*psf, psf_places, *camera.files) if path]
     check_may_write(output, inputs=(capture, *files))
-    if psf_places and depths:
-        raise InputError("--depths must not be given with --psf-places, whose z_mm are the depths, got both.")
-    if output.suffix.lower() == ".zarr" and not ((depths or psf_places) and voxel_um):
+    places = None
+    if psf_places:
+        if depths:
+            raise InputError("--depths must not be given with --psf-places, whose z_mm are the depths, got both.")
+        if weights["tv_z"] is not None:
+            raise InputError("--tv-z must not be given with --psf-places, got both.")
+        places = _read_places(psf_places, psf)
+        depths = None if np.isnan(places[:, 2]).any() else np.unique(places[:, 2]).tolist()
+    if output.suffix.lower() == ".zarr" and not (depths and voxel_um):
         raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
+    if depths and depths[0] <= 0 and voxel_um and output.suffix.lower() != ".npy":
+        raise input_error("z_mm", "positive with --voxel-um", f"{depths[0]:g}", psf_places)
     solver = make_solver(method, steps, weights)
     with Progress() as progress:
         with progress.step("Reading"):
             image = bin_pixels(camera.read(capture), binning)
             spots = np.stack([bin_pixels(spot, binning) for spot in camera.read_spots(psf, psf_page)])
         fit = None
-        if psf_places:
+        if places is not None:
             with progress.step("Fitting the PSFs"):
-                fit = fit_field(spots, read_positions(psf_places, psf)[0], image.shape)
-            depths = None if np.isnan(fit.depths).any() else fit.depths.tolist()
+                fit = fit_field(spots, places, image.shape)
         elif depths and len(depths) != len(spots):
             raise InputError(f"--depths must be one for each PSF, {len(spots)} in all, got {len(depths)} depths.")
         planes = deconvolve(
@@ -153,3 +159,15 @@ def deconvolve_command(
     z, rows, columns = planes.shape
     of = "" if z == 1 and not depths else f"{depth_range(depths)}, " if depths else f"{z} planes, "
     click.echo(f"{output}: {of}{rows} x {columns} pixels, {method}, at most {steps} steps")
+
+
+def _read_places(path, psf):
+    """Places of the sources, one for each PSF in their order; z is NaN where unknown."""
+    import numpy as np
+
+    from ..io.point_tables import read_positions
+
+    places, captures = read_positions(path, psf)
+    if not np.array_equal(captures, np.arange(len(places))):
+        raise input_error("lines", "in the order of the PSFs, one for each", "another column capture", path)
+    return places

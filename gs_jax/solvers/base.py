@@ -112,7 +112,7 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     Parameters
     ----------
     A
-        Operator from a volume to an image; a `Convolution` for `ConvolutionADMM`.
+        Operator from a volume to an image; a `ConvolutionOperator` for `ConvolutionADMM`.
     image
         Image to explain.
     solver
@@ -157,7 +157,7 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
 
 def check_options(solver: Any) -> None:
     """Raise an `InputError` if one of the solver's options is below its minimum."""
-    minima = {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0, "min_sensitivity": 0}
+    minima = {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0, "tv_z": 0, "min_sensitivity": 0}
     for name, minimum in minima.items():
         value = getattr(solver, name, minimum)
         if isinstance(value, int | float) and not value >= minimum:
