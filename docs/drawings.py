@@ -231,7 +231,7 @@ def array_frames() -> str:
             line(tip, 40, tip, 205, FAINT, 1, "3 3"),
             line(base, 30, base, 230, FAINT, 1, "3 3"),
             *arrow(tip, 190, 44, 0, "z", RAY),
-            text(tip + 52, 208, ".dat, .csv", color=RAY, anchor="middle"),
+            text(tip + 60, 208, ".dat, .csv", color=RAY, anchor="middle"),
             *arrow(base, 222, 44 * side, 0, "z"),
             text(base + 52 * side, 242, ".tif, .png, .xyz", anchor="middle"),
             f'<rect x="{left + 90}" y="290" width="140" height="110" {glass}/>',

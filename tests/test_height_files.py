@@ -26,7 +26,11 @@ NM = 1e-6
 KINDS = {
     "plano": {},
     "curved": {"orientation": "curved"},
-    "two radii": {"radius_of_curvature_mm": (2.0, 2.4, 2.0, 2.4)},
+    "unlike": {
+        "radius_of_curvature_mm": (2.0, 2.4, 2.0, 2.4),
+        "conic_constant": (0.0, -1.0, 0.5, 0.0),
+        "aperture_diameter_mm": (1.6, 1.4, 1.2, 1.6),
+    },
     "curved asphere": {"orientation": "curved", "conic_constant": -0.6, "aspheric_terms": (2e-3, -1e-4)},
 }
 
@@ -41,19 +45,19 @@ def design_of(kind: str) -> gs.Design:
 def height(design: gs.Design, x, y):
     """Height above the plate at a point of the design, by the formula of ISO 10110-12; NaN on walls."""
     lens: Any = design.lens
-    radii = np.broadcast_to(lens.radius_of_curvature_mm, len(CENTERS))
-    edge = lens.aperture_diameter_mm / 2
+    numbers = lens.radius_of_curvature_mm, lens.conic_constant, np.array(lens.aperture_diameter_mm) / 2
+    lenses = list(zip(*(np.broadcast_to(each, len(CENTERS)) for each in numbers), strict=True))
 
-    def sag(r, radius):
+    def sag(r, radius, conic):
         c = 1 / radius
         terms = sum(a * r**order for order, a in zip((4, 6), lens.aspheric_terms or (), strict=False))
-        return c * r**2 / (1 + np.sqrt(1 - (1 + lens.conic_constant) * c**2 * r**2)) + terms
+        return c * r**2 / (1 + np.sqrt(1 - (1 + conic) * c**2 * r**2)) + terms
 
-    top = max(sag(edge, radius) for radius in radii)
+    top = max(sag(edge, *shape) for *shape, edge in lenses)
     found, walls = (np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y))) for _ in range(2))
-    for (cx, cy), radius in zip(CENTERS, radii, strict=True):
-        r, rim = np.hypot(x - cx, y - cy), top - sag(edge, radius)
-        found = np.maximum(found, np.where(r <= edge, top - sag(np.minimum(r, edge), radius), 0))
+    for (cx, cy), (*shape, edge) in zip(CENTERS, lenses, strict=True):
+        r, rim = np.hypot(x - cx, y - cy), top - sag(edge, *shape)
+        found = np.maximum(found, np.where(r <= edge, top - sag(np.minimum(r, edge), *shape), 0))
         walls = np.maximum(walls, np.where((r > edge) & (r < edge + rim * math.tan(math.radians(5.1))), rim, 0))
     return np.where(walls > found + NM, np.nan, found), top
 
@@ -177,4 +181,10 @@ def test_the_command(tmp_path, monkeypatch):
             )
     with pytest.raises(gs.InputError, match="step of the grid must be at most 1000 um, got 1001 um"):
         write_heights("d.toml", "b.tif", step=1.001)
+    done = run("-o", "a.csv", "--force")
+    assert "gs-jax: replaced a.csv, a.csv.json" in done.stderr
+    design = design_of("plano")
+    ideal = design.model_copy(update={"lens": design.lens.model_copy(update={"focal_length_mm": 4.0})})
+    with pytest.raises(gs.InputError, match=r"`lens.focal_length_mm` must be R / \(n - 1\) = 4.651 mm, .* got 4"):
+        write_heights(ideal, "b.tif")
     assert not list(tmp_path.glob("b.*"))

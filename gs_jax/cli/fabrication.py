@@ -103,10 +103,11 @@ def heights_command(design: Path, output: Path, step_um: float, force: bool):
     with the design.
     """
     from ..design.design import design_text, read_design
+    from ..io.provenance import sidecar
     from ..mold.height_files import HEIGHT_SUFFIXES, write_heights
 
     check_output(output, HEIGHT_SUFFIXES)
-    check_may_write(output, inputs=(design,), force=force)
+    check_may_write(output, sidecar(output), inputs=(design,), force=force)
     microscope = read_design(design)
     provenance = provenance_of(design, design=design_text(microscope))
     with Progress() as progress, errors_name_file(design):
