@@ -84,14 +84,15 @@ def prepare_layers(
             else:
                 image, warnings = _correct_pixels(name, capture, imager.sensor)
         with progress.step("Reconstructing"):
-            volume, found, _, warning = volume_of(image, progress)
+            found = volume_of(image, progress)
         progress.check_cancelled()
-        layers = [volume_layer(volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
-        if found is not None:
-            layers.append(points_layer(found, f"{name}, {len(found)} points", mean_step(grid)))
-        z, y, x = volume.shape
+        layers = [volume_layer(found.volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
+        if found.points is not None:
+            layers.append(points_layer(found.points, f"{name}, {len(found.points)} points", mean_step(grid)))
+        z, y, x = found.volume.shape
         status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM_PER_MM:.4g} um laterally, {depth_range(planes)}"
-        return Result(layers, _capture_transform(imager.sensor), status, warnings + ([warning] if warning else []))
+        warnings += [found.warning] if found.warning else []
+        return Result(layers, _capture_transform(imager.sensor), status, warnings)
 
     return reconstruct
 
