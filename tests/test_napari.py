@@ -56,7 +56,7 @@ def viewer(napari):
 @pytest.fixture
 def widget(viewer, folder):
     """The widget of a viewer, with the toy's design and depths."""
-    from gs_jax.widget import Reconstruct
+    from gs_jax.widget.widget import Reconstruct
 
     made = Reconstruct(viewer)
     made.design_file.value, made.depths.value, made.voxel.value = folder / "design.toml", "18:22:1", 50.0

@@ -1,0 +1,1 @@
+"""napari plugin: a dock widget, and a sample capture."""

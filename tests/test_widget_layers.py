@@ -1,0 +1,44 @@
+"""What napari's widget makes of captures, without napari."""
+
+import re
+
+import numpy as np
+import pytest
+
+from gs_jax.base.progress import CancellableProgress, Cancelled
+from gs_jax.io.volumes import read_volume
+from gs_jax.widget.layers import newest_captures, prepare_layers
+
+from .test_cli import folder, run
+
+__all__ = ["folder"]
+
+
+def test_a_capture_becomes_what_the_command_writes(folder, monkeypatch, capsys):
+    progress = CancellableProgress(lambda: False)
+    make = prepare_layers(folder / "design.toml", "18:22:1", 50.0, "backproject", "none", True, progress)
+    result = make("seen", folder / "capture.tif")
+    (volume, described, _), (points, rings, _) = result.layers
+    assert described["name"] == "seen, backproject" and rings["name"] == f"seen, {len(points)} points"
+    assert result.status == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
+    words = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:1", "--voxel-um", "50", "-o", "v.tif")
+    assert run(monkeypatch, capsys, *words)[0] == 0
+    # Float32 sums in another order.
+    np.testing.assert_allclose(volume, read_volume(folder / "v.tif")[0], rtol=1e-5)
+
+
+def test_the_newest_capture_of_a_folder_is_made_until_the_user_cancels(tmp_path, folder):
+    pytest.importorskip("watchfiles", reason="no watchfiles: pip install 'gs-jax[live]'")
+    frames, cancelled = tmp_path / "run", []
+    frames.mkdir()
+    progress = CancellableProgress(lambda: bool(cancelled))
+    make = prepare_layers(folder / "design.toml", "18:22:1", 50.0, "backproject", "none", False, progress)
+    results = newest_captures(frames, make, progress)
+    for name in ("f1.tif", "f2.tif"):
+        (frames / name).write_bytes((folder / "capture.tif").read_bytes())
+        result = next(results)
+        assert re.match(rf"{name}, \d+ ms after it was written", result.status)
+        assert result.layers[0][1]["name"] == f"{name}, backproject"
+    cancelled.append(True)
+    with pytest.raises(Cancelled):
+        next(results)
