@@ -123,6 +123,7 @@ def test_a_cameras_offset(folder):
         (["--bad-pixels", "design.toml"], ["design.toml", "'.toml'"]),
         (["--dark", "capture.tif", "--offset", "16"], ["--offset", "--dark"]),
         (["--dark", "v.ome.tif"], ["v.ome.tif", "must be another file than the inputs"]),
+        (["--method", "surface", "--surface", "v.ome.tif"], ["v.ome.tif", "outputs must be different files"]),
     ],
 )
 def test_wrong_options_are_one_line(folder, options, words):

@@ -116,6 +116,18 @@ def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
     assert np.isfinite(volume).all() and volume.min() >= 0
 
 
+@pytest.mark.integration
+def test_a_surface_has_maps_beside_its_volume(folder, monkeypatch, capsys):
+    tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
+    options = "18:22:1 --voxel-um 50 --method surface --surface m.ome.tif -o v.tif -q".split()
+    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
+    assert status == 0 and "m.ome.tif: sheets leave" in out and ", one more " in out
+    brightness, depth, _ = tifffile.imread(folder / "m.ome.tif")
+    volume, _ = read_volume(folder / "v.tif")
+    np.testing.assert_allclose(volume.sum(0), brightness, rtol=1e-3, atol=1e-6 * brightness.max())
+    assert (np.nan_to_num(depth, nan=2e4) >= 18_000).all() and (np.nan_to_num(depth, nan=2e4) <= 22_000).all()
+
+
 def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):
     """The default voxel is a pixel as seen at the middle depth."""
     status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], "20", "-o", "v.tif")

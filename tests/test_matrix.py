@@ -10,6 +10,7 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -232,8 +233,15 @@ def one_map(case: Case, _) -> None:
 
 def from_imager(case: Case, _) -> None:
     given = case.design.model_copy(update={"provenance": {}})
-    depths = given.imaging.working_distance_mm
-    assert Design.from_imager(case.imager, name=given.name, working_distance_mm=depths) == given
+    known = {"name": given.name, "working_distance_mm": given.imaging.working_distance_mm}
+    if case.imager.band is None:
+        assert Design.from_imager(case.imager, **known) == given
+        return
+    with pytest.raises(InputError, match="`band` must be None"):
+        Design.from_imager(case.imager, **known)
+    # Materials become indices: the imager is equal, and the design is not.
+    imager = given.replace(bandwidth_nm=0.0).imager()
+    assert eqx.tree_equal(Design.from_imager(imager, **known).imager(), imager, rtol=1e-6, atol=1e-7)
 
 
 def tolerances(case: Case, _) -> None:

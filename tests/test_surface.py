@@ -8,6 +8,7 @@ import tifffile
 import trimesh
 
 import gs_jax as gs
+from gs_jax.io.provenance import read_provenance
 from gs_jax.io.surfaces import write_surface
 
 GRID = {"shape": (45, 45), "pitch": 0.08}
@@ -79,7 +80,8 @@ def test_files_hold_maps_in_um_and_a_mesh_in_mm(fit, tmp_path):
         pixels = tiff.asarray()
         assert 'PhysicalSizeX="80.0"' in (tiff.ome_metadata or "") and 'Name="depth_um"' in (tiff.ome_metadata or "")
     np.testing.assert_allclose(pixels[1], 1000 * (fit.depth[0] - 17.5), rtol=1e-5)
-    write_surface(tmp_path / "sheet.ply", *maps, grid)
+    write_surface(tmp_path / "sheet.ply", *maps, grid, provenance={"design": "made up"})
+    assert read_provenance(tmp_path / "sheet.ply")["design"] == "made up"
     mesh: Any = trimesh.load(tmp_path / "sheet.ply", process=False)
     slope = np.polyfit(mesh.vertices[:, 0], mesh.vertices[:, 2], 1)
     assert len(mesh.faces) > 500 and abs(slope[0] - 1.2) < 0.1

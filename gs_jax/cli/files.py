@@ -25,9 +25,15 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
     Raises
     ------
     InputError
-        If an output is an input, a capture of an input's folder or pattern, or an existing .toml or .csv file without
-        `force`.
+        If an output is an input, a capture of an input's folder or pattern, another output, or an existing .toml or
+        .csv file without `force`.
     """
+    given = [path for path in outputs if path is not None]
+    places = [os.path.realpath(path) for path in given]
+    for path, place in zip(given, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(f"{path}: outputs must be different files, got the same file for two.")
+    existing = [path for path in given if os.path.exists(path)]
     existing = [path for path in outputs if path is not None and os.path.exists(path)]
     if not existing:
         return

@@ -87,7 +87,7 @@ def sharp_depths(imager: Imager) -> tuple[float, float]:
         if in_focus > 0:
             sharp = focal_length, focal_length / float(clear_diameter(array)), 1 / in_focus, circle_of_confusion
             ends += [float(limit(*sharp)) for limit in (theory.near_limit, theory.far_limit)]
-    near, far = (float(imager.depth_of(np.asarray(end))) for end in (min(ends, default=0), max(ends, default=0)))
+    near, far = (float(imager.depth_of(np.asarray(end))) for end in (min(ends, default=0.0), max(ends, default=0.0)))
     near = max(near, float(imager.sample_surface))
     if not 0 < near < far < np.inf:
         why = "the sharp depths have no end" if ends and not far < np.inf else "no depth is in focus"

@@ -130,5 +130,5 @@ _READERS: dict[str, Callable[[Path], dict]] = {
     ".3mf": _from_3mf,
     ".stl": lambda path: _from_json_if_there(path.with_suffix(".json")),
     ".json": _from_json,
-    **dict.fromkeys((".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat"), _from_sidecar),
+    **dict.fromkeys((".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"), _from_sidecar),
 }

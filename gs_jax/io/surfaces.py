@@ -10,13 +10,13 @@ from ..grid import Grid
 from ..typing import PathLike
 from .files import atomic_write, check_output
 from .ngff import first_um, title, um
-from .provenance import NAMESPACE, Provenance
+from .provenance import NAMESPACE, Provenance, write_sidecar
 
 SURFACE_SUFFIXES = (".tif", ".tiff", ".ply")
 # Neighbours whose depths differ by more voxels than this lie on different parts of the scene.
 _STEEP = 4
 
-Maps = Float[np.ndarray, "layer y x"]
+Maps = Float[np.ndarray, "sheet y x"]
 
 
 def write_surface(
@@ -43,7 +43,7 @@ def write_surface(
     below
         Depth from which those of the file count, mm.
     provenance
-        Kept in the OME-TIFF.
+        Kept in the OME-TIFF, or beside a mesh.
 
     Raises
     ------
@@ -56,10 +56,11 @@ def write_surface(
         data = _mesh(brightness, depth, grid)
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
+        write_sidecar(path, provenance)
         return
-    layers = range(1, len(depth) + 1)
+    sheets = range(1, len(depth) + 1)
     names = [
-        f"{what}{f' {n}' if len(layers) > 1 else ''}" for n in layers for what in ("brightness", "depth_um", "sd_um")
+        f"{what}{f' {n}' if len(sheets) > 1 else ''}" for n in sheets for what in ("brightness", "depth_um", "sd_um")
     ]
     channels = np.stack([brightness, 1000 * depth, 1000 * depth_sd], 1).reshape(-1, *depth.shape[1:])
     y, x = first_um(grid)
@@ -75,7 +76,7 @@ def write_surface(
 
 
 def _mesh(brightness, depth, grid) -> bytes:
-    """Triangles between lit neighbours, of all layers, as PLY."""
+    """Triangles between lit neighbours, of all sheets, as PLY."""
     import trimesh  # 0.3 s that images do not need
 
     y, x = np.meshgrid(np.asarray(grid.y), np.asarray(grid.x), indexing="ij")

@@ -24,7 +24,7 @@ _ENOUGH = 0.95
 
 
 class SurfaceFit(NamedTuple):
-    """Sheets of a capture, `(layer, y, x)`.
+    """Sheets of a capture, `(sheet, y, x)`.
 
     Parameters
     ----------
@@ -39,9 +39,9 @@ class SurfaceFit(NamedTuple):
         explain of the capture, relative to its RMS.
     """
 
-    brightness: Float32[np.ndarray, "layer y x"]
-    depth: Float32[np.ndarray, "layer y x"]
-    depth_sd: Float32[np.ndarray, "layer y x"]
+    brightness: Float32[np.ndarray, "sheet y x"]
+    depth: Float32[np.ndarray, "sheet y x"]
+    depth_sd: Float32[np.ndarray, "sheet y x"]
     volume: Volume
     error: float
     free_error: float

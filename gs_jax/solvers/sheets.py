@@ -48,7 +48,7 @@ def widened(x, axis):
 
 
 def nearest(k, depth):
-    """1 where a layer is the nearest of a plane, else 0; ties are shared: `(layer, plane, y, x)`."""
+    """1 where a sheet is the nearest of a plane, else 0; ties are shared: `(sheet, plane, y, x)`."""
     away = jnp.abs(k[None] - depth[:, None])
     mine = (away <= away.min(0)[None]).astype(depth.dtype)
     return mine / mine.sum(0)[None]

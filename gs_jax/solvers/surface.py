@@ -1,8 +1,9 @@
 """Sheets fitted through a linear operator: a brightness and a depth for each column of a volume.
 
-What looks alike from all sides has no depth inside, so free voxels spread its light over the planes. A sheet has one
-depth at each place, which the views of the lenses fix together. The fit is Gauss-Newton's, from a few steps of
-Richardson-Lucy; each step takes one image and one adjoint, whatever it is for.
+Free voxels spread the light of an extended object over several planes, because all lenses see it nearly from the front.
+A sheet has one depth in each column, which all views determine together. The fit starts with a few steps of
+Richardson-Lucy, and continues with Gauss-Newton steps. Each step, of whatever kind, takes one product with the operator
+and one with its transpose.
 """
 
 from typing import NamedTuple
@@ -43,16 +44,16 @@ _SCHEDULE = (
 )
 # Differences between neighbours that count as edges: of depths, planes, and of roots of brightness, of their RMS.
 _EDGE_DEPTH, _EDGE_ROOT = 0.1, 0.3
-# Largest change of a depth in a Gauss-Newton step, planes: the gradient sees two planes.
+# Largest change of a depth in a Gauss-Newton step, planes: the derivative involves the two nearest planes.
 _MAX_MOVE = 1.0
-# The Hessian's diagonal leaves out what neighbours, brightness and the model's errors share: measured on sheets whose
-# depths are known, ray-traced or not, of 10,000 electrons.
+# Standard deviations by the Hessian's diagonal are too small by this factor, as it leaves out correlations with
+# neighbours and with brightness, and errors of the model. Measured on sheets of known depth, of 10,000 electrons.
 _UNDERSTATED = 3.6
-# Light of the start's dark columns, of the mean's, from which they may become brighter.
+# Least brightness of a column at the start, relative to the mean: by its root, none has no gradient.
 _FAINT = 1e-3
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
 _DAMPING = 1e-3
-# The start has the brightness nearly right and the depths not. So the preconditioner lets the depths go first.
+# At the start the brightness is nearly right and depths are not: the preconditioner lets depths change first.
 _BRIGHTNESS_LATER = 0.1
 _START = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS, min_sensitivity=0.3)
 
@@ -239,7 +240,7 @@ class Surface(eqx.Module):
             return state._replace(sheets=sheets, change=change, residual=residual, direction=direction)
 
         state = lax.switch(kind, (after_lucy, after_linearisation, after_probe, after_gradient))
-        # The steps have no common residual: they are taken as planned.
+        # Steps of different kinds have no common residual: none ends the schedule early.
         return state._replace(number=state.number + 1), misfit, jnp.ones((), light.dtype)
 
     @eqx.filter_jit
@@ -265,7 +266,7 @@ class Surface(eqx.Module):
         spread = safe_sqrt(divide((local * (k - mean[None]) ** 2).sum(0), local.sum(0)))
         apart = jnp.asarray(np.linspace(-1, 1, self.sheets) if self.sheets > 1 else np.zeros(1), x.dtype)
         depth = mean[None] + apart[:, None, None] * spread[None]
-        # Several layers part the planes between them (Lloyd's algorithm).
+        # Several sheets divide the planes among them (Lloyd's algorithm).
         for _ in range(8 if self.sheets > 1 else 0):
             mine = nearest(k, depth) * local[None]
             depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
@@ -295,7 +296,7 @@ class Surface(eqx.Module):
 
 
 def depth_of_sheets(state: State) -> tuple[Array, Array]:
-    """Depths `(layer, y, x)` and their standard deviations, in planes from the first."""
+    """Depths `(sheet, y, x)` and their standard deviations, in planes from the first."""
     depth = jnp.clip(interpolated(state.sheets.depth, state.sheets.root.shape[1:]), 0, state.lucy.x.shape[0] - 1)
     # Means over neighbours: four probes alone are noisy.
     rows, columns = (hats((n,), (max(n // 3, 2),), depth.dtype)[0] for n in state.information.shape[1:])

@@ -1,0 +1,233 @@
+"""Sheets fitted to ray-traced captures: depth, focus and volume, beside free voxels and the unrolled inversion.
+
+`ray_tracer.py` images a tilted snowflake, a curved leaf with veins, a hemisphere with texture, two sheets one behind
+the other, and blobs, which are no sheet, through the lenses of a design about the middle, onto 1024 x 1024 pixels of 9
+um. Noise is that of 10,000 or 500 electrons in the brightest pixel, and 2 of readout. Voxels are 80 um wide, planes 0.5
+mm apart. Columns: mean and standard deviation of the depth's error over lit columns; how many errors are within one
+predicted standard deviation; PSNR above an empty image or volume, blurred by one voxel, of the image in focus and of
+the volume with each emitter on its nearest plane, beside the unrolled inversion and 20 steps of Richardson-Lucy; what
+the sheets, and one sheet more, leave of the capture. Last, the time of a fit over that of the unrolled inversion, both
+with tables and programs at hand.
+
+    python -m experiments.surfaces [--design geomscope] [--out DIR]
+
+Writes `surfaces.md`, `surfaces.json` and `surfaces.png`; about twenty minutes on two cores.
+"""
+
+import time
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
+
+from experiments.common import Report, main, table
+from experiments.lens_scenes import cropped
+from experiments.ray_tracer import traced
+from gs_jax import Grid, Imager, Sensor, Surface, quality, rasterize, read_design
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.base.progress import Progress
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import reconstructor
+from gs_jax.reconstruction.surface_fit import surface_fitter
+from gs_jax.simulation.phantoms import snowflake
+
+PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
+ELECTRONS, READ = (10_000, 500), 2.0
+# Emitters of a scene, rays of each toward each lens, and distance from an emitter to the next, mm.
+EMITTERS, RAYS, APART = 100_000, 8, 0.02
+
+Emitters = Float[np.ndarray, "emitter 4"]
+
+
+def device(design: str, pixels: int = PIXELS) -> Imager:
+    """The lenses of a design about the middle, and a sensor there."""
+    imager = cropped(
+        read_design(Path(__file__).parents[1] / "design" / f"{design}.toml").imager(),
+        pixels,
+        reach=pixels * PITCH / 2 + 2.0,
+    )
+    return eqx.tree_at(lambda i: i.sensor, imager, Sensor((pixels, pixels), PITCH))
+
+
+def scenes(width: float) -> dict[str, Emitters]:
+    """Emitters `(x, y, z, intensity)` of each scene, for a sensor of this width, mm."""
+    near, far = DEPTHS
+    middle, half = (near + far) / 2, (far - near) / 2
+    flake = snowflake((middle, middle), 0.8 * width, width=min(0.7, 0.8 * width / 14.5), pitch=APART)
+    flake[:, 2] = middle + 0.9 * half * flake[:, 0] / (0.4 * width)
+    side = np.arange(-0.42 * width, 0.42 * width, APART)
+    x, y = (part.ravel() for part in np.meshgrid(side, side))
+
+    def sheet(inside, depth, light):
+        return np.column_stack([x, y, depth, light])[inside]
+
+    veins = np.minimum(np.abs(y), np.abs(((x - 0.7 * np.abs(y)) / 0.9 + 50) % 1.0 - 0.5) * 0.9) < 0.08
+    bent = 1 - 0.5 * (y / (0.25 * width)) ** 2
+    leaf = sheet(
+        (x / (0.4 * width)) ** 2 + (y / (0.25 * width)) ** 2 < 1,
+        middle + 0.8 * half * np.sin(2.2 * x / (0.4 * width)) * bent,
+        0.3 + veins,
+    )
+    radius = np.hypot(x, y) / (0.35 * width)
+    round_off = np.sqrt(np.maximum(1 - radius**2, 0))
+    dome = sheet(radius < 0.97, far - 0.3 - (far - near - 0.6) * round_off, texture(x, y, 1))
+    front = sheet(
+        (np.abs(x + 0.1 * width) < 0.25 * width) & (np.abs(y) < 0.3 * width), near + 0.8 + 0.05 * y, texture(x, y, 2)
+    )
+    behind = sheet(
+        (np.abs(x - 0.1 * width) < 0.25 * width) & (np.abs(y) < 0.3 * width), far - 0.8 + 0.1 * x, texture(x, y, 3)
+    )
+    rng = np.random.default_rng(0)
+    sizes = np.array([0.35 * width, 0.35 * width, half - 0.2])
+    blobs = rng.uniform(-sizes, sizes, (60, 3)) + [0, 0, middle]
+    blobs = (blobs[:, None] + rng.normal(0, 0.15, (60, 2000, 3))).reshape(-1, 3)
+    named = {"tilted snowflake": flake, "curved leaf": leaf, "hemisphere": dome}
+    both = np.concatenate([front, behind])
+    return named | {"two sheets": both, "blobs": np.column_stack([blobs, np.ones(len(blobs))])}
+
+
+def texture(x, y, seed: int) -> np.ndarray:
+    """Light that varies over about 0.1 mm, log-normal."""
+    rng = np.random.default_rng(seed)
+    frequencies, phases = rng.normal(0, 1 / 0.12, (40, 2)), rng.uniform(0, 2 * np.pi, 40)
+    waves = sum(np.cos(x * a + y * b + p) for (a, b), p in zip(frequencies, phases, strict=True))
+    return np.exp(0.8 * waves / np.sqrt(20))
+
+
+def capture(emitters: Emitters, imager: Imager, count: int = EMITTERS) -> np.ndarray:
+    """The image without noise: emitters are drawn in proportion to their light, and placed within their squares."""
+    share = np.cumsum(emitters[:, 3]) / emitters[:, 3].sum()
+    chosen = np.minimum(np.searchsorted(share, (np.arange(count) + 0.5) / count), len(emitters) - 1)
+    lit = emitters[chosen]
+    lit[:, :2] += np.random.default_rng(0).uniform(-APART / 2, APART / 2, (count, 2))
+    lit[:, 3] = 1.0
+    return traced(lit, imager, RAYS)
+
+
+def true_maps(emitters: Emitters, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Light and mean depth of each column, NaN where there are several, and the volume on the nearest planes."""
+    flat = grid.at([float(np.mean(DEPTHS))])
+
+    def moment(power):
+        at, light = np.full(len(emitters), float(np.mean(DEPTHS))), emitters[:, 3] * emitters[:, 2] ** power
+        return np.asarray(rasterize(np.column_stack([emitters[:, :2], at, light]), flat), np.float64)[0]
+
+    light = moment(0)
+    mean, square = (moment(power) / np.maximum(light, 1e-12) for power in (1, 2))
+    lit = (light > 0.2 * np.median(light[light > 0])) & (square - mean**2 < STEP**2)
+    planes, nearest = np.asarray(grid.depths), emitters.copy()
+    nearest[:, 2] = planes[np.abs(emitters[:, 2:3] - planes).argmin(1)]
+    return light, np.where(lit, mean, np.nan), np.asarray(rasterize(nearest, grid), np.float32)
+
+
+def gain(found: np.ndarray, true: np.ndarray) -> float:
+    """PSNR above that of nothing, both blurred by one voxel, dB."""
+    found, true = (gaussian_filter(part, (0, 1, 1)) for part in (found, true))
+    return quality(found, true).psnr_db - quality(np.zeros_like(true), true).psnr_db
+
+
+class Methods:
+    """What is compared, with the tables of one device: functions of an image and a progress display."""
+
+    def __init__(self, imager: Imager, progress: Progress):
+        self.grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0], DEPTHS[1] + 0.01, STEP), pitch=VOXEL)
+        fitter = lambda sheets: surface_fitter(imager, self.grid, Surface(sheets), optics="full", progress=progress)
+        inverter = lambda name: reconstructor(imager, self.grid, METHODS[name](20), progress=progress)
+        self.sheet, self.sheets = fitter(1), fitter(2)
+        self.unrolled, self.lucy = inverter("unrolled"), inverter("richardson-lucy")
+
+    def time_over_unrolled(self, image: np.ndarray, progress: Progress) -> float:
+        """Duration of a fit of one sheet over that of the unrolled inversion; both have run before."""
+        began = time.perf_counter()
+        self.sheet(image, progress)
+        between = time.perf_counter()
+        self.unrolled(image, progress)
+        return (between - began) / (time.perf_counter() - between)
+
+
+def noisy(clean: np.ndarray, electrons: int) -> np.ndarray:
+    """Shot noise of so many electrons in the brightest pixel, readout noise, and an offset."""
+    rng = np.random.default_rng(1)
+    image = rng.poisson(clean * electrons / clean.max()) + rng.normal(0, READ, clean.shape)
+    return (image + 100).astype(np.float32)
+
+
+def run(image: np.ndarray, name: str, emitters: Emitters, methods: Methods, progress: Progress) -> dict:
+    """Fit the capture of a scene, and invert it by free voxels."""
+    light, depth, volume = true_maps(emitters, methods.grid)
+    fit = (methods.sheets if name == "two sheets" else methods.sheet)(image, progress)
+    error, sd = fit.depth[0] - depth, fit.depth_sd[0]
+    known = np.isfinite(error)
+    results = {
+        "scene": name,
+        "in_focus_db": gain(fit.volume.sum(0)[None], light[None]),
+        "nearest_db": gain(fit.volume, volume),
+        "unrolled_db": gain(methods.unrolled(image, progress), volume),
+        "richardson_lucy_db": gain(methods.lucy(image, progress), volume),
+        "left": fit.error,
+        "left_by_one_more": fit.further_error,
+        "warning": fit.warning,
+    }
+    if len(fit.depth) == 1 and name != "blobs":
+        results |= {"bias_mm": float(error[known].mean()), "sd_mm": float(error[known].std())}
+        results["within_one_sd"] = float((np.abs(error[known]) < sd[known]).mean())
+    return results | {"maps": (fit.brightness[0], fit.depth[0], depth)}
+
+
+def picture(results: list[dict]) -> Figure:
+    """Brightness, depth and true depth of each sheet at the first exposure."""
+    sheets = [r for r in results if "sd_mm" in r and r["electrons"] == ELECTRONS[0]]
+    figure = Figure(figsize=(9, 2.9 * len(sheets)), layout="constrained")
+    half = PIXELS * PITCH / 2
+    for row, each in enumerate(sheets):
+        for column, title in enumerate(("brightness", "depth, mm", "true depth, mm")):
+            axes = figure.add_subplot(len(sheets), 3, 3 * row + column + 1)
+            colours = "gray" if column == 0 else "viridis"
+            shown = axes.imshow(each["maps"][column], cmap=colours, extent=(-half, half, half, -half))
+            if column:
+                shown.set_clim(*DEPTHS)
+            axes.set(title=f"{each['scene']}: {title}", xlabel="x, mm", ylabel="y, mm")
+            figure.colorbar(shown, ax=axes, shrink=0.8)
+    return figure
+
+
+def report(design: str, progress: Progress) -> Report:
+    imager = device(design)
+    methods, results = Methods(imager, progress), []
+    for name, emitters in scenes(PIXELS * PITCH).items():
+        clean = capture(emitters, imager)
+        for electrons in ELECTRONS:
+            image = noisy(clean, electrons)
+            results.append({"electrons": electrons} | run(image, name, emitters, methods, progress))
+    slower = methods.time_over_unrolled(noisy(np.ones(imager.sensor.shape), ELECTRONS[0]), progress)
+    number = lambda value, digits: "" if value is None else f"{value:.{digits}f}"
+    columns = ("scene", "electrons", "depth bias, mm", "SD, mm", "within 1 SD", "in focus, dB", "3-D, dB")
+    columns += ("unrolled, dB", "R-L, dB", "left, %", "one more, %", "warned")
+    rows = [
+        [
+            r["scene"],
+            str(r["electrons"]),
+            number(r.get("bias_mm"), 3),
+            number(r.get("sd_mm"), 3),
+            number(r.get("within_one_sd"), 2),
+            *(number(r[key], 1) for key in ("in_focus_db", "nearest_db", "unrolled_db", "richardson_lucy_db")),
+            *(number(100 * r[key], 1) for key in ("left", "left_by_one_more")),
+            "yes" if r["warning"] else "no",
+        ]
+        for r in results
+    ]
+    took = f"A fit takes {slower:.1f} times as long as the unrolled inversion."
+    text = f"# Sheets in ray-traced captures by {design}\n\n{markdown_table(columns, rows)}\n\n{took}\n"
+    kept = [{key: value for key, value in r.items() if key != "maps"} for r in results]
+    everything = {"scenes": kept, "time_over_unrolled": slower}
+    return Report(
+        {"surfaces.json": everything, "surfaces.md": text, "surfaces.png": picture(results)},
+        [table(columns, rows), took],
+    )
+
+
+if __name__ == "__main__":
+    main(report, {"--design": {"default": "geomscope"}})
