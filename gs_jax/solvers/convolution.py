@@ -26,7 +26,8 @@ class System(NamedTuple):
 
     `tv` and `l1` are absolute weights, `splits` is 1 with total variation and 0 without. `smooth` is the spectrum of
     `D'D + 1` within planes. `filters` are `(D'D + 1)^-1 psf*`, a plane each; None without differences along z, where
-    they are `psf.conj() / smooth`. `response` is the spectrum of `sum(psf filters)`.
+    they are `psf.conj() / smooth`. `response` is the spectrum of `sum(psf filters)`, and `inverse` that of
+    `1 / (gain^2 + response)`.
     """
 
     tv: Array
@@ -36,6 +37,7 @@ class System(NamedTuple):
     smooth: Array
     filters: Array | None
     response: Array
+    inverse: Array
 
 
 class Sums(NamedTuple):
@@ -145,7 +147,8 @@ class ConvolutionADMM(eqx.Module):
         x = jnp.zeros(A.scene_shape, image.dtype)
         sums = Sums(x[0], jnp.zeros((depths, self._axes(A), *size), image.dtype), x)
         penalty = Penalty(positive_or_one(_INITIAL_PENALTY * gain**2), jnp.ones_like(gain), jnp.array(MAX_CHANGES))
-        system = System(tv, l1, splits, gain, smooth, filters, response)
+        inverse = divide(jnp.ones_like(response), gain**2 + response)
+        system = System(tv, l1, splits, gain, smooth, filters, response, inverse)
         return State(system, sums, jnp.zeros_like(A.spectra), penalty, x, jnp.vdot(image, image) / 2)
 
     def step(
@@ -166,8 +169,7 @@ class ConvolutionADMM(eqx.Module):
     def _differences(self, x, following):
         """Differences of a plane, along the plane's axes and to the following plane."""
         return jnp.stack(
-            [jnp.roll(x, -1, 0) - x, jnp.roll(x, -1, 1) - x]
-            + ([] if following is None else [self.tv_z * (following - x)])
+            [_roll(x, -1, 0) - x, _roll(x, -1, 1) - x] + ([] if following is None else [self.tv_z * (following - x)])
         )
 
     def _prox(self, A, image, system, rho):
@@ -206,8 +208,7 @@ class ConvolutionADMM(eqx.Module):
         v = before[0](sums.image)
         target = jnp.fft.rfft2(v - (sums.image - v) / factor)
         seen = jnp.sum(A.spectra * spectra, axis=0)
-        inverse = divide(jnp.ones_like(response), gain**2 + response)
-        light = _scale(inverse, _scale(gain, target) - seen)
+        light = _scale(system.inverse, _scale(gain, target) - seen)
         convolved = jnp.fft.irfft2(seen + _scale(response, light), size)
         seen = divide(convolved, jnp.broadcast_to(gain, size))
         image_sum, v = update(seen, sums.image, before[0])
@@ -280,6 +281,13 @@ class ConvolutionADMM(eqx.Module):
         better = cost < state.cost
         best = jnp.where(better, scale * prox_scene(sums.scene), state.best)
         return spectra, best, jnp.where(better, cost, state.cost)
+
+
+def _roll(x, shift, axis):
+    """`jnp.roll` as a sum of two pads: XLA fuses pads with what follows, and takes half the time on a processor."""
+    places = shift % x.shape[axis], shift % x.shape[axis] - x.shape[axis]
+    pads = [[(by, -by, 0) if a == axis else (0, 0, 0) for a in range(x.ndim)] for by in places]
+    return sum(lax.pad(x, jnp.zeros((), x.dtype), pad) for pad in pads)
 
 
 def _scale(factor, spectrum):
