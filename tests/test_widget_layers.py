@@ -16,10 +16,10 @@ __all__ = ["folder"]
 
 def test_a_capture_becomes_what_the_command_writes(folder, monkeypatch, capsys):
     progress = CancellableProgress(lambda: False)
-    make = prepare_layers(folder / "design.toml", "18:22:1", 50.0, "backproject", "none", True, progress)
+    make = prepare_layers(folder / "design.toml", "18:22:1", 50.0, "backproject", "none", False, progress)
     result = make("seen", folder / "capture.tif")
-    (volume, described, _), (points, rings, _) = result.layers
-    assert described["name"] == "seen, backproject" and rings["name"] == f"seen, {len(points)} points"
+    ((volume, described, _),) = result.layers
+    assert described["name"] == "seen, backproject"
     assert result.status == "5 x 39 x 33 voxels (z, y, x), 50 um laterally, 5 depths from 18 to 22 mm"
     words = ("reconstruct", "capture.tif", "design.toml", "--depths", "18:22:1", "--voxel-um", "50", "-o", "v.tif")
     assert run(monkeypatch, capsys, *words)[0] == 0
