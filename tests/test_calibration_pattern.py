@@ -62,12 +62,16 @@ def test_chance_is_no_pattern_of_wide_spots():
 
 
 @pytest.mark.parametrize("layout", [hexagonal_layout, square_layout])
-def test_of_a_regular_array_the_pose_next_to_the_design_is_found(layout):
+@pytest.mark.parametrize(("turned", "moved"), [(0.0, 0j), (2.0, 0.7 + 0.9j)])
+def test_of_a_regular_array_the_pose_next_to_the_design_is_found(layout, turned, moved):
+    """The design is turned and moved already in the second: every other lens of the array fits as well."""
     centers = np.asarray(layout((9.0, 9.0), pitch=1.0))
-    spots = (centers @ (1, 1j) * 1.05 * np.exp(0.1j) + 0.2 - 0.3j)[np.argsort(np.hypot(*centers.T))][:20]
-    found = match_pattern(np.stack([spots.real, spots.imag], -1), centers, 1.0, 0.5, blurred=True)
+    factor, shift = 1.05 * np.exp(1j * (turned + 0.1)), moved + 0.2 - 0.3j
+    spots = (centers @ (1, 1j) * factor + shift)[np.argsort(np.hypot(*centers.T))][:20]
+    design = np.exp(1j * turned)
+    found = match_pattern(np.stack([spots.real, spots.imag], -1), centers, design, 0.5, blurred=True, shift=moved)
     assert not found.mirrored and found.on_lenses == 20
-    assert abs(found.factor - 1.05 * np.exp(0.1j)) < 1e-6 and abs(found.shift - (0.2 - 0.3j)) < 1e-6
+    assert abs(found.factor - factor) < 1e-6 and abs(found.shift - shift) < 1e-6
 
 
 @pytest.mark.integration

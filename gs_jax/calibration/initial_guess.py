@@ -1,5 +1,6 @@
 """Initial guess of a calibration: rotation, mirroring, shift and sensor distance from the pattern of the lenses."""
 
+import cmath
 import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -57,9 +58,10 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, fr
     for source, point in enumerate(sources.points):
         capture = int(sources.captures[source])
         in_capture = int((sources.captures == capture).sum())
-        scale, error = _scale(imager, point[2])
-        error = _FREE_SCALE if free_scale and blurs[source] > 1 else error
-        found = match_pattern(spots[capture], centers, scale, error, in_capture, blurred=bool(blurs[source] > 1))
+        factor, shift, error = _expected(imager, point)
+        blurred = bool(blurs[source] > 1)
+        error = _FREE_SCALE if free_scale and blurred else error
+        found = match_pattern(spots[capture], centers, factor, error, in_capture, blurred=blurred, shift=shift)
         matches.append((found, source))
     matches.sort(key=lambda match: -match[0].on_lenses)
     best = matches[0][0]
@@ -89,12 +91,15 @@ def guess_from_pose(spots: SpotLists, sources: Sources, imager: Imager) -> Initi
     return InitialGuess(imager, False, _locate_sources(spots, sources, imager))
 
 
-def _scale(imager: Imager, depth: float) -> tuple[float, float]:
-    """Expected scale of the pattern on the sensor, and its relative error."""
-    if np.isnan(depth):
-        return _SCALE, _SCALE_ERROR
-    scale = float(imager.scale(depth))
-    return scale, _DISTANCE_ERROR * (1 - 1 / scale)
+def _expected(imager: Imager, point) -> tuple[complex, complex, float]:
+    """Factor and shift of the pattern `p = s c - M q`, `s = 1 + M`, with the imager's pose; relative error of `s`."""
+    x, y = np.nan_to_num(point[:2])
+    scale, error = _SCALE, _SCALE_ERROR
+    if not np.isnan(point[2]):
+        scale = float(imager.scale(point[2]))
+        error = _DISTANCE_ERROR * (1 - 1 / scale)
+    factor = cmath.rect(scale, float(imager.rotation))
+    return factor, scale * complex(*np.asarray(imager.shift)) - (scale - 1) * complex(x, y), error
 
 
 def _explained(spots: SpotLists, guess: InitialGuess) -> int:
@@ -162,7 +167,7 @@ def _locate_sources(spots: SpotLists, sources: Sources, imager: Imager) -> Sourc
 def _locate(spots, depth: float, imager: Imager, radius: float) -> tuple[float, float, float]:
     """The source that most of the spots belong to, at a depth, or at any if that is NaN."""
     if np.isnan(depth):
-        match = match_pattern(spots, np.asarray(imager.array.centers, np.float64), *_scale(imager, depth))
+        match = match_pattern(spots, np.asarray(imager.array.centers, np.float64), _SCALE, _SCALE_ERROR)
         magnification = max(abs(match.factor) - 1, 1e-3)
         depth = max(float(imager.depth_of(imager.reduced_sensor_distance / magnification)), 1e-3)
     magnification = float(imager.magnification(depth))

@@ -23,7 +23,7 @@ _MIN_SPOTS, _MIN_SHARE = 6, 0.5
 # Of blurred spots: their distance from lenses of the pattern, over `match_radius`, which chance meets more often, and
 # the share that has to be on lenses.
 BLURRED, _BLURRED_SHARE = 3.0, 0.7
-# Of a similarity, how far it is from the list as it is must count less than a spot on a lens.
+# How far a similarity is from the expected one must count less than a spot on a lens.
 _FARTHEST = 1e3
 # Similarities that are tried at once.
 _BATCH = 20_000
@@ -54,17 +54,18 @@ class Similarity(NamedTuple):
 def match_pattern(
     spots: Float[np.ndarray, "spot 2"],
     centers: Float[np.ndarray, "lens 2"],
-    scale: float,
+    expected: complex | float,
     tolerance: float,
     sources: int = 1,
     *,
     blurred: bool = False,
+    shift: complex = 0j,
 ) -> Similarity:
     """Find the similarity from lens centers to spots `(x, y)`, mm, brightest first, of one of some sources.
 
-    `scale` is expected within a relative `tolerance`. Middles of `blurred` spots may be three times as far from lenses.
-    Of several similarities that fit equally, as with a regular array, it is the one nearest to the list as it is: not
-    mirrored, of this scale, turned and shifted the least.
+    The scale is that of the `expected` factor within a relative `tolerance`, the rotation is any. Middles of `blurred`
+    spots may be three times as far from lenses. Of several similarities that fit equally, as with a regular array, it
+    is the one nearest to what is expected: not mirrored, of this factor and `shift`, mm.
     """
     most = min(sources, _MOST_SOURCES)
     p, c = spots[: _TRIED * most] @ (1, 1j), centers @ (1, 1j)
@@ -79,17 +80,17 @@ def match_pattern(
     for mirrored in (False, True):
         lenses = c.conj() if mirrored else c
         factors = (p[other] - p[one])[:, None] / (lenses[second] - lenses[first])
-        pairs = np.argwhere(np.abs(np.abs(factors) / scale - 1) < tolerance)
+        pairs = np.argwhere(np.abs(np.abs(factors / expected) - 1) < tolerance)
         for start in range(0, len(pairs), _BATCH):
             pair, lens = pairs[start : start + _BATCH].T
             factor = factors[pair, lens]
-            shift = p[one[pair]] - factor * lenses[first[lens]]
-            count = (_nearest_lens(p, factor, shift, tree, mirrored)[0] < radius).sum(1)
-            away = np.abs(np.log(factor / scale)) + np.abs(shift) / np.abs(p).max() + mirrored
+            moved = p[one[pair]] - factor * lenses[first[lens]]
+            count = (_nearest_lens(p, factor, moved, tree, mirrored)[0] < radius).sum(1)
+            away = np.abs(np.log(factor / expected)) + np.abs(moved - shift) / np.abs(p).max() + mirrored
             rank = count - away / _FARTHEST
             top = int(rank.argmax())
             if rank[top] > highest:
-                found = {"factor": complex(factor[top]), "shift": complex(shift[top]), "on_lenses": int(count[top])}
+                found = {"factor": complex(factor[top]), "shift": complex(moved[top]), "on_lenses": int(count[top])}
                 best, highest = best._replace(mirrored=mirrored, **found), float(rank[top])
     if best.on_lenses < 2:
         return best
@@ -98,8 +99,8 @@ def match_pattern(
     distance, lens = (np.asarray(part)[0] for part in nearest)
     use = distance < radius
     lenses = (c.conj() if best.mirrored else c)[lens[use]]
-    factor, shift = np.linalg.lstsq(np.stack([lenses, np.ones_like(lenses)], -1), p[use])[0]
-    return best._replace(factor=complex(factor), shift=complex(shift))
+    factor, moved = np.linalg.lstsq(np.stack([lenses, np.ones_like(lenses)], -1), p[use])[0]
+    return best._replace(factor=complex(factor), shift=complex(moved))
 
 
 def _nearest_lens(p, factor, shift, tree, mirrored):
