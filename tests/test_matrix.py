@@ -21,12 +21,16 @@ from gs_jax import Design, Grid, InputError
 from gs_jax.apps.report.page import write_report
 from gs_jax.apps.tolerance.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
+from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
+from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.mold.height_files import write_heights
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+
+from .test_calibration_pattern import discs
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").glob("*.toml"))
 LENSES, PIXELS = 24, 600
@@ -206,6 +210,19 @@ def calibrate(case: Case, _) -> None:
     np.testing.assert_allclose(ours[seen], true[seen], atol=case.imager.sensor.pixel_pitch)
 
 
+def pattern(case: Case, _) -> None:
+    """Calibration by discs, as of a far white surface, of an array that is mirrored, turned, moved and smaller."""
+    design, far = case.imager, np.array([[*case.imager.sensor.origin, 1e4]])
+    array = dataclasses.replace(design.array, centers=0.98 * design.array.centers * jnp.array([1.0, -1.0]))
+    move = 0.02 * design.field_radius * jnp.array([1.0, -0.6])
+    actual = dataclasses.replace(design, array=array, rotation=design.rotation + 0.5, shift=design.shift + move)
+    middles = np.asarray(actual.sensor.to_pixels(np.asarray(actual.project(far))[:, 0]))
+    radius = 0.3 * float(nearest_neighbour_distances(np.asarray(array.centers)).mean()) / actual.sensor.pixel_pitch
+    found = gs.calibrate([discs(actual.sensor.shape, middles, radius)], far, design, fit=PATTERN_FITTED, blurred=[0])
+    assert found.mirrored
+    np.testing.assert_allclose(found.imager.centers, actual.centers, atol=0.05 * actual.sensor.pixel_pitch)
+
+
 def metrics(case: Case, _) -> None:
     magnification = case.design.imager().magnification(np.array(case.depths))
     np.testing.assert_allclose(case.sheet["magnification"], magnification, rtol=1e-5)
@@ -285,6 +302,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "points": points,
     **{method: partial(inverted, method) for method in METHODS},
     "calibrate": calibrate,
+    "pattern": pattern,
     "metrics": metrics,
     "map": one_map,
     "design": from_imager,
@@ -297,6 +315,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
 REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "points"): "3 or more lenses must agree on a point, got 1 lens",
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
+    ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
     ("geomscope-table1", "calibrate"): "of 20 bright spots on lenses",
 }
@@ -304,7 +323,7 @@ REFUSED: dict[tuple[str, str], str] = {
 WARNED = {("geomscope-table1", task) for task in ("points", "list-rl", "unrolled")}
 
 # `make test` runs one task of each kind for every device, these in turn and these always; `make integration` the rest.
-IN_TURN = (tuple(METHODS), ("points", "calibrate"))
+IN_TURN = (tuple(METHODS), ("points", "calibrate", "pattern"))
 ALWAYS = ("design", "map", "metrics", "mold", "optimise")
 # What people are told to use first; a report takes long, so once.
 ALSO = (

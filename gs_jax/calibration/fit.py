@@ -22,6 +22,7 @@ from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
 from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses, search_rotation
+from .pattern_matching import MIN_SPOTS
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
 from .spot_model import (
     FITTABLE,
@@ -169,6 +170,8 @@ def calibrate(
     if unknown_names := [name for name in fit if name not in FITTABLE]:
         raise InputError(f"fit must be some of {', '.join(FITTABLE)}, got {', '.join(unknown_names)}.")
     sources.check(len(images), imager, fit, blurred)
+    if blurred and (count := len(imager.array.centers)) < MIN_SPOTS:
+        raise InputError(f"captures: a pattern needs an array of {MIN_SPOTS} lenses or more, got {count}.")
     imager = with_surface(imager, fit)
     for number, image in enumerate(images, 1):
         _check_image(f"capture {number}", image, imager)

@@ -19,7 +19,7 @@ from .spots import SpotLists
 # Brightest spots of each source that pairs begin with, and that are matched; sources and neighbours at most.
 _FIRST, _TRIED, _MOST_SOURCES, _NEIGHBOURS = 5, 20, 3, 12
 # Fewest spots on lenses of a clear pattern, and their share of those tried.
-_MIN_SPOTS, _MIN_SHARE = 6, 0.5
+MIN_SPOTS, _MIN_SHARE = 6, 0.5
 # Of blurred spots: their distance from lenses of the pattern, over `match_radius`, which chance meets more often, and
 # the share that has to be on lenses.
 BLURRED, _BLURRED_SHARE = 3.0, 0.7
@@ -48,7 +48,7 @@ class Similarity(NamedTuple):
     @property
     def is_clear(self) -> bool:
         """Whether enough spots are on lenses: a share of those of one source."""
-        return self.on_lenses >= max(_MIN_SPOTS, self.share * self.tried / self.sources)
+        return self.on_lenses >= max(MIN_SPOTS, self.share * self.tried / self.sources)
 
 
 def match_pattern(
