@@ -4,9 +4,22 @@ import dataclasses
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from experiments.printed_array import FAR as FAR_MM, SHAPE, recipe
-from gs_jax import Imager, InputError, MicrolensArray, Sensor, calibrate, random_layout
+from gs_jax import (
+    Design,
+    Imager,
+    InputError,
+    MicrolensArray,
+    Sensor,
+    calibrate,
+    random_layout,
+    read_design,
+    write_capture,
+    write_design,
+)
+from gs_jax.__main__ import commands
 from gs_jax.calibration.blurred import find_blurred_spots, half_light_radius
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.calibration.pattern_matching import match_pattern
@@ -92,6 +105,24 @@ def test_a_white_surface_shows_rotation_shift_and_scale():
         calibrate(
             [white(actual)], np.repeat(FAR, 2, 0), design, fit=PATTERN_FITTED, captures=np.zeros(2, int), blurred=[0]
         )
+
+
+@pytest.mark.integration
+def test_the_command_takes_a_white_surface_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    actual, listed = device()
+    listed = dataclasses.replace(listed, array=dataclasses.replace(listed.array, size=(5.6, 5.6)))
+    write_design("listed.toml", Design.from_imager(listed, name="small", working_distance_mm=(18.0, 23.0)))
+    write_capture("white.tif", white(actual).astype(np.float32))
+    arguments = ["calibrate", "listed.toml", "--pattern", "white.tif", "-o", "found.toml"]
+    told = CliRunner().invoke(commands, arguments, catch_exceptions=False).stdout
+    assert "found.toml: 24 spots" in told and "the array mirrored (y to -y) and rotated" in told
+    found = read_design("found.toml")
+    np.testing.assert_allclose(found.imager().centers, actual.centers, atol=0.02 * actual.sensor.pixel_pitch)
+    assert found.imaging == read_design("listed.toml").imaging and (tmp_path / "found.png").exists()
+    assert set(found.provenance["calibrated_values"]) == {"rotation_deg", "shift_x_mm", "shift_y_mm", "scale"}
+    wrong = CliRunner().invoke(commands, [*arguments, "--force", "--hold", "scale"])
+    assert "apart from its neighbours, at the design's scale unless that is fitted, got" in str(wrong.exception)
 
 
 @pytest.mark.integration

@@ -140,8 +140,8 @@ def calibrate(
     blurred
         Captures, from 0, in which every lens has one wide spot of any shape: of a source out of focus or aberrated, or
         of an even white surface, whose middle is the source's place. Middles of such spots are on chief rays, and
-        weigh in inverse proportion to the spots' width. With `scale`, their pattern may be half as large as the
-        design's to one and a half times, which is the array's scale if the source is far.
+        weigh in inverse proportion to the spots' width. With `scale`, their pattern may have half to one and a half
+        times the size that the design's has.
     progress
         Shows how far the work is.
 
@@ -199,9 +199,11 @@ def calibrate(
             # Windows are as large as the pattern turned out to be.
             for k in blurred:
                 spots[k], blur[k] = find_blurred_spots_mm(images[k], guess.imager)
-        result = refine(spots, guess.imager, guess.sources, unknown, fit, progress=progress)
-        for numbers in (result.values, result.deviations):
-            numbers |= {name: guess.scale * value for name, value in numbers.items() if name == "scale"}
+        sources = guess.sources._replace(blur=blur)
+        result = refine(spots, guess.imager, sources, unknown, fit, progress=progress)
+        if "scale" in fit:
+            for numbers in (result.values, result.deviations):
+                numbers["scale"] *= guess.scale
         return result._replace(mirrored=guess.mirrored)
     fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
     lens_sd = _UNLISTED * match_radius(guess.imager.array.centers)
@@ -249,7 +251,7 @@ def refine(
     current, points, state = imager, sources.points, None
     assigned = data = None
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
-        offsets = trace_core_offsets(current, points[sources.blurs == 1, 2], fit)
+        offsets = trace_core_offsets(current, points[sources.sharp, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
         data = _observations(imager, sources, unknown, assigned, offsets)
         state = state or initial_unknowns(fit, data)

@@ -50,16 +50,16 @@ class InitialGuess(NamedTuple):
 def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, free_scale: bool = False) -> InitialGuess:
     """Guess from the clearest pattern; of several sources in a capture, from the one that explains most spots.
 
-    With `free_scale` the scale of blurred spots is the array's, of half to one and a half times the design's.
+    With `free_scale` the array behind blurred spots may have half to one and a half times the design's scale.
     `InputError` if no capture has a clear pattern.
     """
-    centers, blurs = np.asarray(imager.array.centers, np.float64), sources.blurs
+    centers = np.asarray(imager.array.centers, np.float64)
     matches = []
     for source, point in enumerate(sources.points):
         capture = int(sources.captures[source])
         in_capture = int((sources.captures == capture).sum())
         factor, shift, error = _expected(imager, point)
-        blurred = bool(blurs[source] > 1)
+        blurred = not sources.sharp[source]
         error = _FREE_SCALE if free_scale and blurred else error
         found = match_pattern(spots[capture], centers, factor, error, in_capture, blurred=blurred, shift=shift)
         matches.append((found, source))
@@ -67,8 +67,9 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, fr
     best = matches[0][0]
     if not best.is_clear:
         needs = "most captures must show spots of point sources through this array"
-        if blurs[matches[0][1]] > 1:
+        if not sources.sharp[matches[0][1]]:
             needs = "a pattern must show an image of each lens of this array, apart from its neighbours"
+            needs += "" if free_scale else ", at the design's scale unless that is fitted"
         raise InputError(f"captures: {needs}, got {best.on_lenses} of {best.tried} bright spots on lenses at best.")
     clear = [(match, source) for match, source in matches if match.is_clear]
     # Points that lack a coordinate determine less of the geometry.
@@ -77,10 +78,10 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, fr
     single = len(np.unique(sources.captures)) == len(sources.captures)
     guesses = []
     for match, source in clear[: 1 if single else _GUESSES]:
-        free = free_scale and bool(blurs[source] > 1) and not np.isnan(sources.points[source, 2])
+        free = free_scale and not sources.sharp[source] and not np.isnan(sources.points[source, 2])
         scale = abs(match.factor) / float(imager.scale(sources.points[source, 2])) if free else 1.0
         posed = _pose(match, sources.points[source], imager, scale)
-        if blurs[source] > 1:
+        if not sources.sharp[source]:
             posed = _pose_by_known(spots, sources, posed)
         guesses.append(InitialGuess(posed, match.mirrored, _locate_sources(spots, sources, posed), scale))
     return guesses[0] if len(guesses) == 1 else max(guesses, key=lambda guess: _explained(spots, guess))
@@ -131,7 +132,7 @@ def _pose_by_known(spots: SpotLists, sources: Sources, imager: Imager) -> Imager
 
     That source may show too few lenses for a pattern of its own.
     """
-    known = np.flatnonzero(~np.isnan(sources.points).any(1) & (sources.blurs == 1))
+    known = np.flatnonzero(~np.isnan(sources.points).any(1) & sources.sharp)
     best: tuple[int, float, tuple[float, float]] = 0, 1.0, (0.0, 0.0)
     centers, radius = np.asarray(imager.centers, np.float64), match_radius(imager.array.centers)
     for source in known:
@@ -157,7 +158,7 @@ def _locate_sources(spots: SpotLists, sources: Sources, imager: Imager) -> Sourc
         capture = int(sources.captures[source])
         missing = np.isnan(points[source])
         if missing.any():
-            radius = match_radius(imager.array.centers) * (BLURRED if sources.blurs[source] > 1 else 1)
+            radius = match_radius(imager.array.centers) * (1 if sources.sharp[source] else BLURRED)
             found = _locate(left[capture], points[source, 2], imager, radius)
             points[source] = np.where(missing, found, points[source])
         left[capture] = _remove_spots(left[capture], points[source], imager)

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from scipy.spatial import KDTree
 from skimage.feature import peak_local_max
 
@@ -63,10 +63,15 @@ class Sources(NamedTuple):
         """`blur` of each source, 1 of a sharp one."""
         return np.ones(len(self.captures)) if self.blur is None else self.blur[self.captures]
 
+    @property
+    def sharp(self) -> Bool[np.ndarray, " source"]:
+        """Whether each source has sharp spots."""
+        return self.blurs == 1
+
     def check(self, count: int, imager: Imager, fit: Sequence[str], blurred: Collection[int] = ()) -> None:
         """`InputError` unless each of `count` captures has a source where the imager's object may be.
 
-        Nor if the known coordinates cannot determine what is to be fitted, whatever the spots are.
+        Also if the known coordinates cannot determine what is to be fitted, whatever the spots are.
         """
         without = sorted(set(range(count)) - set(self.captures.tolist()))
         if not count or without or len(self.points) != len(self.captures):
@@ -152,7 +157,7 @@ def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: Co
     Blurred spots may be `blurred_radius` away. A source with an unknown coordinate has no spots. Lengths are in mm.
     """
     centers = np.asarray(imager.centers, np.float64)
-    sharp = sources.blurs == 1
+    sharp = sources.sharp
     predicted = np.asarray(predict_spots(imager, np.nan_to_num(sources.points, nan=1.0), offsets, sharp), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)
     seen = ((beside < imager.field_radius) | ~sharp[:, None]) & ~np.isnan(sources.points.sum(1))[:, None]
