@@ -23,6 +23,8 @@ from .sample import with_sample
 
 # Length of the longest arrow in the figure, in sides of the sensor.
 _LONGEST = 0.08
+# Least half range of its axis of scales.
+_LEAST_RANGE = 1e-3
 
 
 def apply_calibration(
@@ -153,6 +155,9 @@ def plot_residuals(result: Calibration) -> Figure:
     lines.plot(inverse, seen, ".", label="spots of a source")
     lines.set(xlabel="1/z', 1/mm", ylabel="scale of the pattern, s_z")
     lines.locator_params(axis="x", nbins=4)
+    # Of a single depth no digits that rounding leaves.
+    low, high = lines.get_ylim()
+    lines.set_ylim(min(low, (low + high) / 2 - _LEAST_RANGE), max(high, (low + high) / 2 + _LEAST_RANGE))
     worst = float(np.abs(seen - fitted).max()) if len(seen) else 0.0
     lines.set_title(f"s_z by depth (Eq. 1), off by up to {worst:.1e}", fontsize=9)
     lines.legend(fontsize=8)
