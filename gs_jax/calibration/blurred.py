@@ -1,8 +1,8 @@
 """Middles and widths of spots that are wide, of any shape: out of focus, aberrated, or a lens's image of a surface.
 
-The window of the mean shift is as wide as the spot itself, so that structure within the spot does not hold it, and
-ends half-way to the nearest neighbour, so that discs that touch do not draw each other's middles: what it then sees of
-a disc is all of it, and its edges.
+The window of the mean shift is as wide as the spot itself, so that it does not stop at structure within the spot. It
+ends half-way to the nearest neighbour, so that discs that touch do not shift each other's middles: it then contains the
+whole disc, with its edges.
 """
 
 import numpy as np
