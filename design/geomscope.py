@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import write_design
+from gs_jax.design.start import geomscope
 
 HERE = Path(__file__).parent
 

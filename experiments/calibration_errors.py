@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from experiments.common import Report, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 from gs_jax.geometry import chief_ray
 
 PLACES = np.array([[0.0, 0.0, 18.0], [0.0, 0.0, 20.5], [3.0, 0.0, 20.5], [0.0, 0.0, 23.0]])

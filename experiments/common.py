@@ -21,8 +21,8 @@ from rich.table import Table
 
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
+from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.pictures.style import PALETTE
 

@@ -26,7 +26,7 @@ from experiments.true_image import TWO_RINGS
 from gs_jax import Imager, ImagingOperator, RichardsonLucy, backproject_adjoint, forward
 from gs_jax.base.machine import describe
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 from gs_jax.geometry import envelope
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.projection.convolution import with_margin

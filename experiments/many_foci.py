@@ -28,8 +28,8 @@ from experiments.ray_tracer import traced
 from gs_jax import Grid, RichardsonLucy, random_layout, reconstruct, run_study
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.study import Study
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design
+from gs_jax.design.start import geomscope
 from gs_jax.simulation.phantoms import letters, rasterize
 
 # Ends of the depths, mm, and planes to be resolved.

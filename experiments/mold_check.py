@@ -20,8 +20,8 @@ from experiments.common import Report, main, table
 from gs_jax import Imager, MicrolensArray
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
+from gs_jax.design.start import geomscope
 from gs_jax.mold.export import Mesh, float32_mesh, read_mesh, write_mesh
 from gs_jax.mold.make import draw_solid
 from gs_jax.mold.measurement import measure_lenslets, summarize

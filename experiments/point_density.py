@@ -19,8 +19,8 @@ from experiments.common import OPTIONAL_PATH, Report, main, table
 from experiments.profiles import local_maxima
 from gs_jax import Grid, Imager
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
+from gs_jax.design.start import geomscope
 from gs_jax.detection.point_finder import find_points
 from gs_jax.metrics import localization
 from gs_jax.reconstruction.pipeline import reconstruct

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from gs_jax import simulate
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, write_design
+from gs_jax.design.start import geomscope
 from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Selection
 from gs_jax.io.recordings import open_recording

@@ -6,11 +6,10 @@ from .calibration.fit import calibrate as calibrate
 from .codesign.optimum import free as free, optimize as optimize
 from .codesign.search import run_study as run_study
 from .codesign.study import read_study as read_study
-from .design.builtin import geomscope as geomscope
 from .design.design import Design as Design, read_design as read_design, write_design as write_design
+from .design.start import geomscope as geomscope
 from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
-from .emission import EmissionBand as EmissionBand
 from .geometry import Imager as Imager
 from .grid import Grid as Grid
 from .io.captures import read_capture as read_capture, write_capture as write_capture
@@ -19,7 +18,7 @@ from .io.volumes import read_volume as read_volume, write_volume as write_volume
 from .layers import Layers as Layers, Sample as Sample
 from .layouts import random_layout as random_layout
 from .lenses import MicrolensArray as MicrolensArray
-from .materials import refractive_index as refractive_index
+from .materials import EmissionBand as EmissionBand, refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .pictures.volume_pictures import show as show

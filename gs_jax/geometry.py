@@ -26,9 +26,9 @@ from .base.arrays import (
     check_fields,
 )
 from .base.errors import input_error
-from .emission import EmissionBand
 from .layers import Layers, Sample, check_room, depth_of_reduced, object_index, object_surface, reduced_distance
 from .lenses import MicrolensArray
+from .materials import EmissionBand
 from .sensor import Sensor
 from .typing import Scalar, Scalars
 

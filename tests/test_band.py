@@ -11,7 +11,7 @@ import gs_jax as gs
 from gs_jax import InputError
 from gs_jax.design.datasheets import band_in_words, datasheet
 from gs_jax.optics.psf import psf_of_depth
-from gs_jax.optics.spectrum import emission_lines
+from gs_jax.optics.pupil import emission_lines
 from gs_jax.projection.point_sources import full_image_of_points
 
 

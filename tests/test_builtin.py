@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
+from gs_jax.design.start import geomscope
 from gs_jax.layouts import coverage, nearest_neighbour_distances
 
 DESIGNS = Path(__file__).parents[1] / "design"

@@ -37,7 +37,7 @@ from gs_jax.calibration.pattern_matching import match_pattern, match_shift
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
 from gs_jax.calibration.spots import Sources, Spots, find_spots
 from gs_jax.cli.calibrate import _NAMES
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance

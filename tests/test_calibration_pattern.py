@@ -20,9 +20,9 @@ from gs_jax import (
     write_design,
 )
 from gs_jax.__main__ import commands
-from gs_jax.calibration.blurred import find_blurred_spots, half_light_radius
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.calibration.pattern_matching import match_pattern
+from gs_jax.calibration.spots import find_blurred_spots, half_light_radius
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import hexagonal_layout, square_layout
 

@@ -13,8 +13,8 @@ from gs_jax.codesign.search_report import before_and_after, check_outputs, pictu
 from gs_jax.codesign.solve import NOT_FINITE
 from gs_jax.codesign.stages import problem_of, random_start
 from gs_jax.codesign.study import Study, read_study
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design, write_design
+from gs_jax.design.start import geomscope
 
 TERMS = [
     {"name": "lateral_resolution_um", "at_most": 40.0},

@@ -16,9 +16,9 @@ from gs_jax.codesign.search import initial_design, run_study
 from gs_jax.codesign.stages import problem_of
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import _OURS, TERMS
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design
+from gs_jax.design.start import geomscope
 from gs_jax.lenses import lenses_by_type
 from gs_jax.objectives.conditions import per_type
 from gs_jax.optics.apertures import clear_diameter

@@ -14,7 +14,7 @@ from gs_jax.codesign.fisher import crowded_bound, localization_bound
 from gs_jax.codesign.linear_error import lens_electrons, lit_density, lost_power, noise_density, spots, transfer_power
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 from gs_jax.geometry import Imager
 from gs_jax.objectives import Conditions, clear_diameter
 from gs_jax.optics.psf import diffraction_psf

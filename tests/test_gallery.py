@@ -8,7 +8,7 @@ from experiments import depth_scaling, fig6_usaf, gallery
 from experiments.ray_tracer import traced
 from gs_jax import Grid
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 
 pytestmark = pytest.mark.integration
 

@@ -16,7 +16,6 @@ ORDER = [
     "lenses",
     "sensor",
     "layers",
-    "emission",
     "materials",
     "geometry",
     "grid",

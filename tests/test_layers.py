@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 import gs_jax as gs
 from gs_jax.lenses import Orientation
 from gs_jax.optics import aberrations
-from gs_jax.optics.radiometry import solid_angle, transmittance
+from gs_jax.optics.pupil import solid_angle, transmittance
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
 
 FILTER, WINDOW = gs.Layers([2.0], [1.52]), gs.Layers([0.6, 0.55], [1.0, 1.51])

@@ -20,7 +20,7 @@ from gs_jax.codesign.study import Study
 from gs_jax.design.datasheets import datasheet
 from gs_jax.detection.view_samples import COARSE, search_grid
 from gs_jax.objectives.conditions import Conditions
-from gs_jax.optics.radiometry import solid_angle
+from gs_jax.optics.pupil import solid_angle
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
 
 DEPTHS, INDEX = np.array([20.0, 21.5, 23.0]), 1.43

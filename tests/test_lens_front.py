@@ -5,7 +5,7 @@ import pytest
 
 from experiments.lens_front import KINDS, decibels, limits_of, run, shown, study_of
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 
 
 def test_light_is_that_of_the_middle():

@@ -15,9 +15,9 @@ import tifffile
 from gs_jax import Grid, InputError
 from gs_jax.cli.watch_command import _State
 from gs_jax.io.captures import read_capture
+from gs_jax.io.recordings import WatchedFolder
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, check_replaceable, read_series
-from gs_jax.io.watched_folder import WatchedFolder
-from gs_jax.reconstruction import live
+from gs_jax.reconstruction import recording as live
 
 from .test_cli import folder, run
 from .test_recording import FRAMES, OPTIONS, expected, level, volumes

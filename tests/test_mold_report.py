@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from experiments import mold_check
 from gs_jax.base.errors import InputError
 from gs_jax.cli.fabrication import mold_command as mold
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import Design, read_design
+from gs_jax.design.start import geomscope
 from gs_jax.layouts import coverage
 from gs_jax.mold import make
 from gs_jax.mold.make import make_mold

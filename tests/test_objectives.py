@@ -11,8 +11,8 @@ from jax.test_util import check_grads
 from gs_jax import objectives
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.datasheets import datasheet
+from gs_jax.design.start import geomscope
 from gs_jax.geometry import Imager
 from gs_jax.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.objectives import Conditions

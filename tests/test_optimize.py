@@ -7,8 +7,8 @@ from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
 from gs_jax.cli.optimize import optimize_command as optimize, pareto_command as pareto
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design, write_design
+from gs_jax.design.start import geomscope
 
 STUDY = """
 design = "table1.toml"

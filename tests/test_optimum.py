@@ -16,7 +16,7 @@ from jax.test_util import check_grads
 
 import gs_jax as gs
 from gs_jax import InputError, objectives
-from gs_jax.codesign.lbfgsb import LBFGSB
+from gs_jax.codesign.solve import LBFGSB
 from gs_jax.objectives.conditions import per_type
 
 DEPTHS = np.array([18.0, 20.0, 22.0])

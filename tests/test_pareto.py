@@ -12,8 +12,8 @@ from gs_jax.codesign import stages
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study, read_study
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import write_design
+from gs_jax.design.start import geomscope
 from gs_jax.io.provenance import read_provenance
 
 STUDY = {

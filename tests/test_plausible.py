@@ -6,8 +6,8 @@ import pytest
 
 from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.cli.options import shipped_designs
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design, write_design
+from gs_jax.design.start import geomscope
 from gs_jax.design.validation import USUAL, slip
 
 from .helpers import needs

@@ -14,8 +14,8 @@ from experiments import point_density
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
+from gs_jax.design.start import geomscope
 from gs_jax.detection.clusters import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.view_samples import detection_stats

@@ -12,12 +12,12 @@ import tifffile
 
 from gs_jax import Grid
 from gs_jax.__main__ import main
-from gs_jax.apps.report import drawings, report_tables, views
+from gs_jax.apps.report import drawings, report_tables, report_tables as views
 from gs_jax.apps.report.drawings import line_chart
 from gs_jax.apps.report.page import write_report
 from gs_jax.base.errors import InputError
-from gs_jax.design.builtin import geomscope
 from gs_jax.design.design import read_design
+from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.optics.raytrace import trace_lenslet

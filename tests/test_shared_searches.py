@@ -14,7 +14,7 @@ from gs_jax.codesign.pareto import as_json, trade_off
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study
 from gs_jax.codesign.terms import TERMS, Term
-from gs_jax.design.builtin import geomscope
+from gs_jax.design.start import geomscope
 
 from .test_pareto import STUDY
 from .test_training import TINY

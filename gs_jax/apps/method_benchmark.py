@@ -32,7 +32,7 @@ from ..base.arrays import to_float32
 from ..base.errors import InputError
 from ..base.machine import available_memory, status_mib
 from ..base.progress import Progress
-from ..design.builtin import geomscope
+from ..design.start import geomscope
 from ..detection.clusters import find_clusters
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress

@@ -7,8 +7,8 @@ import click
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
-from .files import check_may_write, provenance_of
 from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, picture_options
+from .outputs import check_may_write, provenance_of
 
 _METHODS = ("admm", "fista", "richardson-lucy")
 

@@ -10,7 +10,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..io.files import check_output
-from .files import check_may_write, force_option, provenance_of
+from .outputs import check_may_write, force_option, provenance_of
 
 # Table of each option that is a key of the file, in the order of the questions.
 _TABLES = {

@@ -8,9 +8,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, make_folder, write_json
-from .files import check_may_write, force_option, provenance_of
-from .interrupt import PARTIAL, RESUMABLE, partial_outputs
 from .options import DESIGN, worker_options
+from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 
 @click.command(

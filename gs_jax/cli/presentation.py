@@ -8,10 +8,9 @@ import click
 from ..base.errors import errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
-from .files import check_may_write, provenance_of
-from .interrupt import PARTIAL, partial_outputs
 from .light import Light, sample_options
 from .options import DESIGN, CaptureOptions, capture_options
+from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 
 
 @click.command(

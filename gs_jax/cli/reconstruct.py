@@ -11,7 +11,6 @@ from ..base.errors import InputError, needs_extra
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output
-from .files import check_may_write, force_option, provenance_of
 from .light import Light, light_options
 from .options import (
     DESIGN,
@@ -26,6 +25,7 @@ from .options import (
     depth_range,
     worker_options,
 )
+from .outputs import check_may_write, force_option, provenance_of
 from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
 from .watch_command import check_watched, watch_folder
 
@@ -133,8 +133,8 @@ def reconstruct_command(
       --dark dark.tif --flat flat.tif --depths 18:22:0.25 -o volume.ome.tif
     """
     from ..design.design import design_text, read_design
-    from ..io.depth_frames import DepthFrame
     from ..io.point_tables import write_points
+    from ..io.provenance import DepthFrame
     from ..io.recordings import open_recording
     from ..io.surfaces import SURFACE_SUFFIXES, write_surface
     from ..io.volumes import VOLUME_SUFFIXES, write_volume

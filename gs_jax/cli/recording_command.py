@@ -13,9 +13,8 @@ import click
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
-from .files import provenance_of
-from .interrupt import RESUMABLE, partial_outputs
 from .options import UM, CaptureOptions, Number, depth_range
+from .outputs import RESUMABLE, partial_outputs, provenance_of
 
 # Failed frames that are named; others are only counted, and listed in the journal.
 MAX_NAMED = 10

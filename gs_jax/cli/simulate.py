@@ -8,9 +8,9 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
-from .files import check_may_write, provenance_of
 from .light import Light, check_beyond, light_options
 from .options import DESIGN, PSFS, SIMULATED, Number
+from .outputs import check_may_write, provenance_of
 
 PEAK = Number(1.0, 1e6, "electrons")
 ELECTRONS = Number(0.0, 1e9, "electrons")
@@ -94,7 +94,7 @@ def _placed(scene: Path, objects, grid, light: Light, imager):
     """A scene with depths from the array: what says that it counts from the sample is so already."""
     import numpy as np
 
-    from ..io.depth_frames import frame_of
+    from ..io.provenance import frame_of
 
     origin, said = light.origin(imager), frame_of(scene)
     if origin is not None and said == "array":

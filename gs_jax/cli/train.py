@@ -9,9 +9,8 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..base.workers import Workers
 from ..io.files import check_output, write_json
-from .files import check_may_write, provenance_of
-from .interrupt import RESUMABLE, partial_outputs
 from .options import worker_options
+from .outputs import RESUMABLE, check_may_write, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}

@@ -10,9 +10,8 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
-from .files import provenance_of
-from .interrupt import RESUMABLE, partial_outputs
 from .options import CaptureOptions
+from .outputs import RESUMABLE, partial_outputs, provenance_of
 from .recording_command import MAX_NAMED, frames_of, print_notes, request_of, write_series_points
 
 # The table of points is written again after this multiple of the time that it took last, and seconds at least.
@@ -51,10 +50,9 @@ def watch_folder(
 ) -> None:
     """Make a volume of each capture that comes, until an interrupt, and print a summary."""
     from ..io.captures import read_images
-    from ..io.recordings import Recording
+    from ..io.recordings import Recording, WatchedFolder
     from ..io.volume_series import VolumeSeries
-    from ..io.watched_folder import WatchedFolder
-    from ..reconstruction.live import reconstruct_live
+    from ..reconstruction.recording import reconstruct_live
 
     page = camera.page
     images = lambda index, selection: read_images(folder / series.names[index], selection._replace(page=page))

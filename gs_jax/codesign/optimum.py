@@ -17,8 +17,7 @@ from ..geometry import Imager
 from ..layers import check_room
 from ..lenses import EACH, type_of_lens
 from ..optics.apertures import pitch
-from .lbfgsb import LBFGSB
-from .solve import CONVERGED, NOT_FINITE, Bounds, Box, Solver, least_change, run, stepper
+from .solve import CONVERGED, LBFGSB, NOT_FINITE, Bounds, Box, Solver, least_change, run, stepper
 
 Values = dict[str, Float[Array, "..."]]
 
@@ -148,7 +147,7 @@ def optimize(
         What may change, of `gs_jax.free`.
     solver
         Of optimistix, a minimiser, or for residuals one of least squares; of optax, which runs all steps; or
-        `gs_jax.codesign.lbfgsb.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
+        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
     bounds
         Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
         beyond it is moved inside.

@@ -7,6 +7,7 @@ that progress can be shown and the state saved. A run that is interrupted and re
 range, for the solver that handles bounds itself.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,11 +21,26 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..base.arrays import as_float
 from ..base.errors import InputError
-from .lbfgsb import LBFGSB
 from .study import StageTable
 
 # Residuals of free parameters, of arguments that do not change within a run, and of a key that is new in every step.
 Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
+
+
+class LBFGSB:
+    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), which keeps bounds by itself."""
+
+    def of(self, objective: Callable[..., Float[Array, ""]]) -> Any:
+        """A smooth objective step by step: `init_state(x, bounds)`, `update(x, state, bounds)`.
+
+        Scale the variables to about one before: the first step is as long as the gradient.
+        """
+        # Here, so that the other solvers do without a package that is no longer maintained.
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
+            import jaxopt
+        return jaxopt.LBFGSB(objective, maxiter=1, tol=0.0, implicit_diff=False)
+
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | optax.GradientTransformation | LBFGSB
 

@@ -18,7 +18,7 @@ from ..objectives.conditions import Conditions, per_type
 from ..objectives.paraxial import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
-from ..optics.spectrum import emission_lines
+from ..optics.pupil import emission_lines
 from .design import Design
 
 # Depths of a datasheet whose caller names none.

@@ -20,10 +20,18 @@ from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..sensor import Sensor
 from ..typing import PathLike
-from .band import emission_band, inline_spectrum
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .imagers import sharp_depths, tables_of
-from .light_path import NO_SAMPLE, chosen_sample, layers_of, path_in_words, plate_index, sample_table
+from .light_path import (
+    NO_SAMPLE,
+    chosen_sample,
+    emission_band,
+    inline_spectrum,
+    layers_of,
+    path_in_words,
+    plate_index,
+    sample_table,
+)
 from .tables import (
     ArrayTable,
     CalibrationTable,

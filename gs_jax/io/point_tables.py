@@ -14,9 +14,8 @@ from jaxtyping import Float64, Int, Shaped
 
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike, Points
-from .depth_frames import SURFACE
 from .files import MAX_TEXT_BYTES, atomic_write, check_input, check_output, read_text, write_text
-from .provenance import Provenance, write_sidecar
+from .provenance import SURFACE, Provenance, write_sidecar
 
 POINTS_HEADER = "x_mm,y_mm,z_mm,intensity"
 MAX_POINTS, MAX_SOURCES = 1_000_000, 10_000

@@ -21,10 +21,9 @@ from jaxtyping import Float32
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
-from .depth_frames import surface_of
 from .files import JOURNAL, atomic_write, decoding, disk_errors_name
 from .ngff import CHUNK, frame_shards, image_attributes, plain_depths, um
-from .provenance import Provenance
+from .provenance import Provenance, surface_of
 
 Note = dict[str, Any]
 

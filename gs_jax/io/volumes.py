@@ -27,10 +27,9 @@ from jaxtyping import Array, Shaped
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
-from .depth_frames import moved, surface_of
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
-from .provenance import NAMESPACE, Provenance
+from .provenance import NAMESPACE, Provenance, moved, surface_of
 from .tiff import decode_page
 
 MAX_VOXELS = 10**10

@@ -21,9 +21,8 @@ from ..geometry import Imager, chief_ray
 from ..typing import Scalar, ScalarLike
 from .apertures import clear_diameter
 from .diffraction import Edges, abs2, fourier_transform, soft_aperture, trace_exit_pupil
-from .pupil import pupil_quadrature, pupil_radius, vogel_spiral
+from .pupil import emission_lines, pupil_quadrature, pupil_radius, vogel_spiral
 from .raytrace import Point, trace_lenslet
-from .spectrum import emission_lines
 from .theory import airy_sigma, cutoff_frequency
 
 # Rays of `geometric_psf` and `spot_image`; the quantile of their distances that is a spot's width; the smoothing of ray

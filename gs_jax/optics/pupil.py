@@ -1,19 +1,24 @@
-"""Points and rays over the pupil: the clear aperture of the mean lens, the light in each ray, and quadrature."""
+"""Points and rays over the pupil: the clear aperture of the mean lens, quadrature, and the light in each ray.
+
+How much of a point's light a ray carries follows from its solid angle, and from Fresnel losses at every face.
+`emission_lines` has the imager at each wavelength of its emission band.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
+from ..base.arrays import array_namespace
 from ..geometry import Imager
+from ..layers import object_indices
 from ..lenses import EACH, MicrolensArray, sag
-from ..typing import Coordinates, ScalarLike, Scalars
+from ..typing import Coordinates, Scalar, ScalarLike, Scalars
 from .apertures import clear_area
-from .radiometry import solid_angle, transmittance
-from .raytrace import refract, to_numpy
-from .spectrum import emission_lines
+from .raytrace import RefractedRay, dot, refract, secant, square_and_root, to_numpy
 from .theory import airy_sigma
 
 # Radii and angles of aperture profiles.
@@ -167,3 +172,91 @@ def pupil_quadrature(radius: ScalarLike, rings: int = 8) -> tuple[Float[Array, "
     unit = np.sqrt((nodes + 1) / 2)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     points = jnp.asarray(unit.reshape(-1, 2), radius.dtype) * radius
     return points, jnp.asarray(np.repeat(weights / (2 * around), around), radius.dtype)
+
+
+def solid_angle(imager: Imager, ray: RefractedRay) -> Scalars:
+    """Solid angle that the lens takes of an object point's light, per area of its curved side, 1/mm^2.
+
+    In air it is the Jacobian of the slope `q = a / h` by the point, times `(1 + q^2)^(-3/2)`, with the lateral distance
+    `a` and the height `h`: `|1 - a . grad h / h| / h^2`. The gradient follows from the equation of `_height`, where
+    the sag makes the glass thinner, or the air thicker. In a medium of index `n` the same rays fill
+    `cos / (n^2 cos_n)` of that, as `n sin` does not change.
+    """
+    h, square, array = ray.height, dot(ray.slope, ray.slope), imager.array
+    along = 0 * h
+    if array.thin_lens_focal_length is None:
+        growing = h * dot(ray.slope, ray.point) * ray.sag_slope_over_r
+        if array.orientation == "plano":
+            growing = -growing / square_and_root(array.refractive_index, square)[1]
+        along = (growing - ray.lengthening * h) / (1 - ray.lengthening)
+    longer = secant(ray.slope)
+    angle = abs(1 - along / h) / (longer * longer * longer * h * h)
+    if imager.sample is None:
+        return angle
+    n = imager.sample.refractive_index
+    return angle / (n**2 * _cosine(n, square) * longer)
+
+
+def transmittance(imager: Imager, ray: RefractedRay) -> Scalars:
+    """Fraction of the light that all faces transmit: Fresnel's equations, unpolarised; an ideal lens has no faces."""
+    array = imager.array
+    in_front = object_indices(imager.filters, imager.sample)
+    behind = [] if imager.windows is None else [1.0, *imager.windows.refractive_index[::-1]]
+    light = 1 + 0 * ray.height
+    if array.thin_lens_focal_length is None:
+        n, (before, after) = array.refractive_index, ray.curved
+        if array.orientation == "plano":
+            in_front, light = [*in_front, n], _fresnel(n, before, 1, after)
+        else:
+            in_front, behind, light = [*in_front, 1.0], [n, *(behind or [1.0])], _fresnel(1, before, n, after)
+    return light * _through(in_front, ray.slope) * _through(behind, ray.tangent)
+
+
+def _through(indices, slope: Coordinates) -> Scalars:
+    """Light that plane faces between media of these indices transmit; `slope` is the ray's in air."""
+    square = dot(slope, slope)
+    light, cosines = 1.0, [_cosine(n, square) for n in indices]
+    for k in range(len(indices) - 1):
+        light = light * _fresnel(indices[k], cosines[k], indices[k + 1], cosines[k + 1])
+    return light
+
+
+def _cosine(n: Scalar, square: Scalars) -> Scalars:
+    """Cosine of a ray's angle in a medium, by the square of its slope in air: `sqrt(1 - sin^2 / n^2)`."""
+    xp = array_namespace(square)
+    return xp.sqrt((1 + square - square / n**2) / (1 + square))
+
+
+def _fresnel(n_in, cos_in, n_out, cos_out):
+    across = (n_in * cos_in - n_out * cos_out) / (n_in * cos_in + n_out * cos_out)
+    along = (n_out * cos_in - n_in * cos_out) / (n_out * cos_in + n_in * cos_out)
+    return 1 - (across**2 + along**2) / 2
+
+
+def emission_lines(imager: Imager) -> list[tuple[Scalar, Imager]]:
+    """Share of the light and imager of each wavelength of the band; without a band, the imager itself."""
+    band, parts = imager.band, _dispersive(imager)
+    if band is None:
+        return [(1.0, imager)]
+    for part, shift in parts:
+        if shift.shape[1:] != part.refractive_index.shape:
+            shape = *shift.shape[:1], *part.refractive_index.shape
+            raise ValueError(f"`band` must have {shape} refractive indices of a part of the imager, got {shift.shape}.")
+
+    def line(k):
+        indices = [part.refractive_index + shift[k] for part, shift in parts]
+        places = lambda i: [i.band, i.wavelength, *(part.refractive_index for part, _ in _dispersive(i))]
+        return eqx.tree_at(places, imager, [None, band.wavelengths[k], *indices])
+
+    return [(band.weights[k], line(k)) for k in range(len(band))]
+
+
+def _dispersive(imager: Imager) -> list:
+    """Parts of an imager whose index depends on the wavelength, and their shifts."""
+    band, sample = imager.band, imager.sample
+    if band is None:
+        return []
+    cover = None if sample is None else sample.layers
+    parts = imager.array, imager.filters, imager.windows, sample, cover
+    shifts = band.lens, band.filters, band.windows, band.sample, band.cover
+    return [(part, shift) for part, shift in zip(parts, shifts, strict=True) if part is not None and shift is not None]

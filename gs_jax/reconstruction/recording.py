@@ -1,15 +1,20 @@
-"""Reconstruction of a recording frame by frame, in this process or by workers.
+"""Reconstruction of a recording frame by frame, in this process or by workers, or while a camera takes it.
 
-In this process frames are read ahead and written behind while one is computed.
+In this process frames are read ahead and written behind while one is computed. While a camera runs the newest capture
+comes first, the others when there is time. A capture is read when its file is told to have changed. If that fails, it
+may be half-written: it is read again at its next change, and given up when it has not changed for a while.
 """
 
+import math
+import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from ..base.arrays import check_finite
 from ..base.errors import InputError
@@ -158,3 +163,148 @@ def _read_ahead(reader: ThreadPoolExecutor, frames: Iterable[int], read: Callabl
         if len(waiting) > PREFETCH:
             yield waiting.popleft()
     yield from waiting
+
+
+# Seconds after which a file that cannot be read counts as bad, and for which to wait for changes at most.
+SETTLED, _WAIT = 2.0, 0.5
+
+
+class Done(NamedTuple):
+    """A volume that was written: its frame, seconds since the file's last change, and frames that wait."""
+
+    frame: int
+    delay: float
+    waiting: int
+
+
+def reconstruct_live(
+    series: VolumeSeries,
+    folder: Path,
+    changes: Callable[[float], list[str] | None],
+    read: Callable[[int], Frame],
+    make: Callable[[Frame], tuple[Volume, Note]],
+    *,
+    on_failure: Callable[[int, str], object] = lambda frame, reason: None,
+    on_done: Callable[[Done], object] = lambda done: None,
+) -> None:
+    """Make and write the volume of each capture of a folder, until `changes` returns None.
+
+    Frames are read, computed and written one after the other: overlapped, on two busy cores no more volumes are made,
+    and each comes later. A volume that is being written when this ends is written wholly.
+
+    Parameters
+    ----------
+    series
+        Destination, which grows. Its names are those of files in `folder`; those without a volume are made, too.
+    folder
+        The folder.
+    changes
+        Waits for some seconds at most; returns the names of captures that are new or were written to.
+    read
+        Maps a frame's number to the argument of `make`; raises `InputError` if the file is not whole.
+    make
+        Maps it to a volume and a note.
+    on_failure
+        Called with the number of a frame that was given up, and the reason.
+    on_done
+        Called when a volume has been written, in another thread.
+
+    Raises
+    ------
+    OSError
+        If a volume cannot be written.
+    """
+    queue = _Queue(series, folder)
+    # In another thread, so that Ctrl-C does not end it half-way.
+    writer = ThreadPoolExecutor(1)
+    try:
+        while (names := changes(queue.patience)) is not None:
+            for name in names:
+                queue.add(name)
+            if (frame := queue.pop()) is None:
+                continue
+            try:
+                stamp, image = queue.read(frame, read)
+                volume, note = check_volume(*make(image))
+                job = partial(_write, series, frame, volume, note, stamp, len(queue.waiting), on_done)
+            except _NotWhole:
+                continue
+            except InputError as error:
+                job = partial(series.fail, frame, str(error))
+                on_failure(frame, str(error))
+            writer.submit(job).result()
+    finally:
+        writer.shutdown()
+
+
+def _write(series: VolumeSeries, frame: int, volume: Volume, note: Note, stamp, waiting: int, on_done) -> None:
+    series.write(frame, volume, note)
+    on_done(Done(frame, time.time() - stamp.changed, waiting))
+
+
+class _NotWhole(Exception):
+    """A file that is read again when it changes."""
+
+
+class _Stamp(NamedTuple):
+    """Size of a file and time of its last change, by which it is seen whether it was written to."""
+
+    size: int
+    changed: float
+
+
+class _Queue:
+    """Frames to be made, the last one first, and frames that could not be read yet."""
+
+    def __init__(self, series: VolumeSeries, folder: Path):
+        self.series, self.folder = series, folder
+        self.numbers = {name: number for number, name in enumerate(series.names)}
+        self.waiting: dict[int, None] = dict.fromkeys(series.unfinished)
+        # What was read of each frame, and the times at which frames that are not whole are read for the last time.
+        self.stamps: dict[int, _Stamp | None] = {}
+        self.deadlines: dict[int, float] = {}
+
+    def add(self, name: str) -> None:
+        """Take a new capture, or one that was written to since it was read."""
+        frame = self.numbers.get(name)
+        if frame is None:
+            frame = self.numbers[name] = self.series.add(name)
+        elif frame not in self.stamps or self.stamps[frame] == self.stamp(frame):
+            return
+        self.deadlines.pop(frame, None)
+        self.waiting[frame] = None
+
+    def stamp(self, frame: int) -> _Stamp | None:
+        try:
+            found = os.stat(self.folder / self.series.names[frame])
+        except OSError:
+            return None
+        return _Stamp(found.st_size, found.st_mtime)
+
+    @property
+    def patience(self) -> float:
+        """Seconds for which to wait for captures."""
+        if self.waiting:
+            return 0.0
+        return min(_WAIT, max(0.0, min(self.deadlines.values(), default=math.inf) - time.monotonic()))
+
+    def pop(self) -> int | None:
+        """The frame to be read next."""
+        if self.waiting:
+            return self.waiting.popitem()[0]
+        return next((frame for frame, at in self.deadlines.items() if at <= time.monotonic()), None)
+
+    def read(self, frame: int, read: Callable[[int], Frame]) -> tuple[_Stamp, Frame]:
+        """Read a frame; `_NotWhole` if it may still be written, `InputError` if it is bad."""
+        is_last = self.deadlines.pop(frame, None) is not None
+        stamp = self.stamps[frame] = self.stamp(frame)
+        try:
+            image = read(frame)
+            if stamp is None or stamp != self.stamp(frame):
+                raise InputError(f"{self.series.names[frame]} must be whole, got one that is being written.")
+        except InputError as error:
+            if is_last or (stamp and time.time() - stamp.changed > SETTLED):
+                raise
+            self.deadlines[frame] = time.monotonic() + SETTLED
+            raise _NotWhole from error
+        return stamp, image

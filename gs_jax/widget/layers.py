@@ -85,8 +85,8 @@ def newest_captures(folder: Path, make: Callable[[str, Path], Result], progress:
     InputError
         If the folder cannot be watched.
     """
-    from ..io.watched_folder import WatchedFolder
-    from ..reconstruction.live import SETTLED
+    from ..io.recordings import WatchedFolder
+    from ..reconstruction.recording import SETTLED
 
     name, since = "", 0.0
     with WatchedFolder(folder) as watched:

@@ -20,7 +20,7 @@ from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
 from ...pictures.volume_pictures import color_table, make_slices, png_uri, slider_html, to_uint8
 from ...typing import Image, PathLike, Points
-from . import report_tables as tables, views
+from . import report_tables as tables, report_tables as views
 from .drawings import (
     Psfs,
     count_lenses,
