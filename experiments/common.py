@@ -24,7 +24,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
-from gs_jax.pictures.style import PALETTE
+from gs_jax.pictures import PALETTE
 
 OPTIONAL_PATH = {"type": Path, "nargs": "?"}
 # Resolution of all pictures of experiments.

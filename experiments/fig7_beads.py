@@ -24,7 +24,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design
 from gs_jax.detection.point_finder import find_points
 from gs_jax.io.captures import read_capture
-from gs_jax.pictures.style import draw_image
+from gs_jax.pictures import draw_image
 from gs_jax.simulation.phantoms import beads
 from gs_jax.simulation.synthetic import Camera, expose, simulate_points
 

@@ -33,7 +33,7 @@ from gs_jax.design.design import Design
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import quality
-from gs_jax.pictures.style import draw_image, label_of
+from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.simulation.phantoms import rasterize, snowflake
 from gs_jax.simulation.synthetic import Camera, electrons, expose, simulate_points

@@ -38,13 +38,13 @@ from gs_jax.apps.method_benchmark import render_points, timed
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import read_design
-from gs_jax.detection.clusters import find_clusters
+from gs_jax.detection.particles import find_clusters
 from gs_jax.detection.point_finder import find_points
 from gs_jax.detection.unet import pretrained, suppress
 from gs_jax.io.captures import read_capture
 from gs_jax.metrics import localization, quality
 from gs_jax.optics.theory import FWHM
-from gs_jax.pictures.style import draw_image, label_of
+from gs_jax.pictures import draw_image, label_of
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, reconstruct, voxel_grid
 from gs_jax.simulation.phantoms import letters, rasterize, snowflake

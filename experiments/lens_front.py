@@ -33,7 +33,7 @@ from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.light_path import reduced_depth
-from gs_jax.pictures.style import PALETTE
+from gs_jax.pictures import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"
 SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))

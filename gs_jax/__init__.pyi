@@ -11,7 +11,7 @@ from .design.start import geomscope as geomscope
 from .detection.point_finder import find_points as find_points
 from .detection.unet import suppress as suppress
 from .geometry import Imager as Imager
-from .grid import Grid as Grid
+from .grid import Grid as Grid, Sensor as Sensor
 from .io.captures import read_capture as read_capture, write_capture as write_capture
 from .io.point_tables import read_points as read_points, write_points as write_points
 from .io.volumes import read_volume as read_volume, write_volume as write_volume
@@ -21,7 +21,7 @@ from .lenses import MicrolensArray as MicrolensArray
 from .materials import EmissionBand as EmissionBand, refractive_index as refractive_index
 from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
-from .pictures.volume_pictures import show as show
+from .pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
 from .projection.forward_model import forward as forward, make_psf_model as make_psf_model
 from .projection.measured_psf import ConvolutionOperator as ConvolutionOperator
@@ -34,7 +34,6 @@ from .reconstruction.methods import BackProjection as BackProjection, PinholeRic
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .reconstruction.residual import forward_residual as forward_residual
 from .reconstruction.surface_fit import fit_surface as fit_surface
-from .sensor import Sensor as Sensor
 from .simulation.phantoms import rasterize as rasterize
 from .simulation.synthetic import Camera as Camera, expose as expose, simulate as simulate
 from .solvers.admm import ADMM as ADMM

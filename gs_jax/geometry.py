@@ -26,10 +26,10 @@ from .base.arrays import (
     check_fields,
 )
 from .base.errors import input_error
+from .grid import Sensor
 from .layers import Layers, Sample, check_room, depth_of_reduced, object_index, object_surface, reduced_distance
 from .lenses import MicrolensArray
 from .materials import EmissionBand
-from .sensor import Sensor
 from .typing import Scalar, Scalars
 
 # Limits of the wavelength, mm: others are in another unit.

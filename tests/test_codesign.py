@@ -6,11 +6,10 @@ import pytest
 
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import search, stages
-from gs_jax.codesign.checkpoint import Log, read_checkpoint
 from gs_jax.codesign.parameters import start_values
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.search_report import before_and_after, check_outputs, picture, write_outcome
-from gs_jax.codesign.solve import NOT_FINITE
+from gs_jax.codesign.solve import NOT_FINITE, Log, read_checkpoint
 from gs_jax.codesign.stages import problem_of, random_start
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.design import read_design, write_design

@@ -21,7 +21,7 @@ from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.volumes import write_volume
 from gs_jax.optics.raytrace import trace_lenslet
-from gs_jax.pictures.volume_pictures import downsample, make_slices
+from gs_jax.pictures import downsample, make_slices
 
 from .browser import browser, watched
 from .test_cli import DESIGN, run

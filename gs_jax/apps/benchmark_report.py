@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ..base.machine import describe
 from ..io.files import atomic_write, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
-from ..pictures.style import line_of
+from ..pictures import line_of
 from .method_benchmark import STEPS
 
 COLUMNS = (

@@ -22,7 +22,7 @@ from ..design.diagnostics import findings
 from ..design.start import geomscope
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
-from ..grid import Grid
+from ..grid import Grid, Sensor
 from ..io.captures import write_capture
 from ..io.files import make_folder, write_figure, write_json, write_text
 from ..io.point_tables import write_points
@@ -31,7 +31,6 @@ from ..layouts import nearest_neighbour_distances
 from ..metrics import Localization, Quality, localization, quality
 from ..mold.make import make_mold
 from ..reconstruction.pipeline import reconstruct
-from ..sensor import Sensor
 from ..simulation.phantoms import letters, random_points, rasterize
 from ..simulation.synthetic import Camera, expose, simulate
 from ..solvers.richardson_lucy import RichardsonLucy

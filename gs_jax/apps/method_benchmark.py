@@ -33,11 +33,11 @@ from ..base.errors import InputError
 from ..base.machine import available_memory, status_mib
 from ..base.progress import Progress
 from ..design.start import geomscope
-from ..detection.clusters import find_clusters
+from ..detection.particles import find_clusters
 from ..detection.point_finder import find_points
 from ..detection.unet import pretrained, suppress
 from ..geometry import Imager
-from ..grid import Grid
+from ..grid import Grid, Sensor
 from ..lenses import MicrolensArray
 from ..metrics import localization, quality
 from ..optics.apertures import clear_diameter
@@ -47,7 +47,6 @@ from ..projection.operators import ImagingOperator
 from ..reconstruction.inverse_problem import subtract_offset
 from ..reconstruction.methods import BackProjection, PinholeRichardsonLucy
 from ..reconstruction.pipeline import reconstruct
-from ..sensor import Sensor
 from ..simulation.synthetic import Camera, electrons, expose, simulate_points
 from ..solvers.admm import ADMM
 from ..solvers.base import lambda_max, solve

@@ -5,8 +5,8 @@ from pathlib import Path
 import click
 
 from ..base.errors import InputError
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..io.files import check_output, make_folder, write_json
 from .options import DESIGN, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
@@ -31,8 +31,8 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
     from rich.console import Console
 
     from ..codesign import search
-    from ..codesign.checkpoint import checkpoint_path
     from ..codesign.search_report import before_and_after, check_outputs, write_outcome
+    from ..codesign.solve import checkpoint_path
 
     check_outputs(output)
     beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))

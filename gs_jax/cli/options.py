@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from ..base.workers import Workers
+from ..base.machine import Workers
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000

@@ -11,8 +11,8 @@ from typing import Any
 import click
 
 from ..base.errors import InputError
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from .options import UM, CaptureOptions, Number, depth_range
 from .outputs import RESUMABLE, partial_outputs, provenance_of
 
@@ -221,7 +221,7 @@ def request_of(provenance: dict[str, str], names: list[str] | None = None) -> di
 
 def write_series_points(path, series, track, provenance, frame) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
-    from ..detection.tracking import track as track_particles
+    from ..detection.particles import track as track_particles
     from ..io.point_tables import write_points_in_time
 
     points, particles = 0, 0

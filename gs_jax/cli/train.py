@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from ..base.errors import InputError
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..io.files import check_output, write_json
 from .options import worker_options
 from .outputs import RESUMABLE, check_may_write, partial_outputs, provenance_of

@@ -18,13 +18,13 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from ..base.errors import InputError
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..design.design import Design
 from ..typing import PathLike
-from .checkpoint import Log
 from .parameters import NAMES, Values, significant, start_values
 from .search import load
+from .solve import Log
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import LimitTable, Study, TermTable
 from .targets import Row, worst_entry

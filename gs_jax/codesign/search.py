@@ -15,16 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.errors import InputError, errors_name_file
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..design.design import Design, read_design
 from ..design.light_path import reduced_depth, reduced_sensor_distance, sample_table
 from ..lenses import lenses_by_type
 from ..optics.lens_types import interleave
 from ..typing import PathLike
-from .checkpoint import Log, read_checkpoint, write_checkpoint
 from .parameters import new_design, start_values
-from .solve import State
+from .solve import Log, State, read_checkpoint, write_checkpoint
 from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
 from .study import Study, read_study
 from .targets import Row

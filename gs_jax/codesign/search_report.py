@@ -17,7 +17,7 @@ from ..design.validation import of_each
 from ..io.files import check_output, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import lenses_by_type
-from ..pictures.style import PALETTE
+from ..pictures import PALETTE
 from ..typing import PathLike
 from .search import Outcome
 from .stages import best_end

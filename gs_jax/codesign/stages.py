@@ -15,16 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..base.errors import InputError
+from ..base.machine import Workers
 from ..base.progress import Progress
-from ..base.workers import Workers
 from ..design.design import Design
 from ..design.light_path import object_begins
 from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
-from .checkpoint import Log, restore_state
 from .parameters import Values, candidate, evaluated, start_values
-from .solve import NOT_FINITE, Bounds, Box, State, Stepper, run, solver_of, stepper
+from .solve import NOT_FINITE, Bounds, Box, Log, State, Stepper, restore_state, run, solver_of, stepper
 from .study import MOST_TYPES, StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_entry
 from .terms import with_terms

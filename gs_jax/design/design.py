@@ -13,12 +13,12 @@ from pydantic import Field, ValidationError, model_validator
 
 from ..base.errors import InputError, InputWarning
 from ..geometry import LONGEST, SHORTEST, Imager
+from ..grid import Sensor
 from ..io.files import write_text
 from ..io.toml import Table, one_line, read_toml
 from ..layers import Sample
 from ..lenses import MicrolensArray
 from ..materials import index_of
-from ..sensor import Sensor
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .imagers import sharp_depths, tables_of

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from ..base.errors import InputError, errors_name_file, input_error
-from ..sensor import Sensor
+from ..grid import Sensor
 from ..typing import PathLike
 from .captures import DTYPES, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
 from .pixel_defects import count_saturated, fill_bad_pixels, find_hot_in_capture, find_hot_in_dark

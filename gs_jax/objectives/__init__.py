@@ -15,20 +15,14 @@ Examples
 """
 
 from .conditions import Conditions as Conditions, clear_diameter as clear_diameter
-from .lens_shape import (
+from .formulas import (
     aperture_gap as aperture_gap,
-    edge_slope as edge_slope,
-    sag as sag,
-    spacing as spacing,
-    surface_radius as surface_radius,
-    uncovered_distance as uncovered_distance,
-)
-from .paraxial import (
     approximate_depth_of_field as approximate_depth_of_field,
     axial_resolution as axial_resolution,
     blur as blur,
     coverage as coverage,
     depth_of_field as depth_of_field,
+    edge_slope as edge_slope,
     f_number as f_number,
     far_limit as far_limit,
     field_of_view as field_of_view,
@@ -41,9 +35,13 @@ from .paraxial import (
     near_limit as near_limit,
     numerical_aperture as numerical_aperture,
     occupancy as occupancy,
+    sag as sag,
     sensor_blur as sensor_blur,
+    spacing as spacing,
     strehl as strehl,
+    surface_radius as surface_radius,
     thickness as thickness,
+    uncovered_distance as uncovered_distance,
     wavefront_error as wavefront_error,
 )
 from .spot_size import encircled_radius as encircled_radius, spot_width as spot_width

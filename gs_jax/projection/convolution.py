@@ -13,8 +13,8 @@ from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
+from ..grid import Sensor
 from ..optics.diffraction import phasor
-from ..sensor import Sensor
 from .linear_map import LinearMap
 
 

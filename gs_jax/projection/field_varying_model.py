@@ -17,11 +17,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
-from ..grid import Grid
+from ..grid import Grid, Sensor
 from ..optics.apertures import clear_area
 from ..optics.field_varying import FieldVaryingPsf, PolarGrid, StrayLight, polar_weights
 from ..optics.psf_core import ring_edges
-from ..sensor import Sensor
 from .bilinear import Shapes, volume_to_image
 from .convolution import scan_in_groups, sum_of_convolutions, upsample_by_two, with_margin
 from .linear_map import LinearMap

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import Imager, chief_ray, envelope, field_limit
-from ..grid import Grid
+from ..grid import Grid, Sensor
 from ..optics.psf_core import ring_light
-from ..sensor import Sensor
 
 # Squared distance, mm^2, added for rays off the sensor: outside the field of every lens, where the envelope and all
 # its derivatives vanish.

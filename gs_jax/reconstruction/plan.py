@@ -109,7 +109,7 @@ class Plan:
                 return Result(surface.volume, points, statistics, warning or surface.warning, surface)
             volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
             if self.suppress == "clusters":
-                from ..detection.clusters import find_clusters
+                from ..detection.particles import find_clusters
 
                 with progress.step("Clustering"):
                     points = find_clusters(volume, self.grid)

@@ -16,7 +16,7 @@ from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
-from ..grid import Grid
+from ..grid import Grid, Sensor
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
 from ..layers import object_index
@@ -26,7 +26,6 @@ from ..optics.lens_types import relative_areas, split_by_type
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps
-from ..sensor import Sensor
 from ..typing import Number, PathLike
 
 Counts = UInt8[Array | np.ndarray, "row column"] | UInt16[Array | np.ndarray, "row column"]

@@ -23,7 +23,7 @@ from ...design.light_path import object_begins
 from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
-from ...objectives.paraxial import third_order_wavefront
+from ...objectives.formulas import third_order_wavefront
 from ...optics import aberrations
 from ...optics.psf import least_samples, spot_image
 

@@ -10,10 +10,9 @@ from jaxtyping import Array, Float, Int
 from scipy.signal import fftconvolve
 
 from ...geometry import Imager, envelope
-from ...grid import Grid
+from ...grid import Grid, Sensor
 from ...optics.psf import spot_image
 from ...optics.raytrace import to_numpy
-from ...sensor import Sensor
 from ...simulation.phantoms import random_points
 from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples
 

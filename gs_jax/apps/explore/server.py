@@ -20,7 +20,7 @@ import numpy as np
 from ...base.errors import InputError, needs_extra
 from ...codesign.study import Study
 from ...design.design import Design, write_design
-from ...pictures.volume_pictures import png_uri, to_uint8
+from ...pictures import png_uri, to_uint8
 from ..report.drawings import draw_layout, line_chart
 from ..report.page import render
 from .evaluation import (

@@ -21,7 +21,7 @@ from ...layouts import cell_edges
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
 from ...optics.psf import least_samples, spot_image
-from ...pictures.style import round_length
+from ...pictures import round_length
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
 _FRAME, _DASHES = (56, 428, 12, 246), ("", "7 4", "2 3", "9 3 2 3", "4 4", "1 4", "12 4")

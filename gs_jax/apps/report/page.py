@@ -18,9 +18,9 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
-from ...pictures.volume_pictures import color_table, make_slices, png_uri, slider_html, to_uint8
+from ...pictures import color_table, make_slices, png_uri, slider_html, to_uint8
 from ...typing import Image, PathLike, Points
-from . import report_tables as tables, report_tables as views
+from . import report_tables as tables
 from .drawings import (
     Psfs,
     count_lenses,
@@ -102,7 +102,7 @@ def write_report(
         "calibration": tables.calibration_rows(design),
         "calibration_summary": tables.calibration_summary(design),
         "tolerance": tables.tolerance_table(tolerance) if tolerance else None,
-        "capture": None if image is None else views.capture_view(np.asarray(image)),
+        "capture": None if image is None else tables.capture_view(np.asarray(image)),
         "volume": None,
         "points": None,
         **_origins(design, provenance, origins or {}),
@@ -120,16 +120,16 @@ def write_report(
                 "shape": volume.shape,
                 "pitch_um": 1000 * grid.pitch,
                 "depths": np.asarray(grid.depths, float),
-                "slider": slider_html(make_slices(volume, grid, views.SLICE_BYTES)),
-                "projections": views.make_projections(volume, grid),
+                "slider": slider_html(make_slices(volume, grid, tables.SLICE_BYTES)),
+                "projections": tables.make_projections(volume, grid),
             }
-            context["views"]["volume"] = views.voxel_view(volume, grid)
+            context["views"]["volume"] = tables.voxel_view(volume, grid)
         if points is not None:
             points = np.asarray(points, float)
             listed = points[np.argsort(-points[:, 3], kind="stable")[:_LISTED_POINTS]]
             context["points"] = {"count": len(points), "listed": listed.tolist()}
             if len(points):
-                context["views"]["points"] = views.point_view(points, grid)
+                context["views"]["points"] = tables.point_view(points, grid)
     write_text(path, render("report.html", context), [".html"])
 
 
@@ -232,6 +232,6 @@ def _mold(design: Design) -> dict[str, Any]:
     if design.lens.focal_length_mm is not None:
         return {"views": {}, "no_mold": "an ideal lens has no surface."}
     try:
-        return {"views": {"mold": views.mold_view(design.imager().array)}, "no_mold": ""}
+        return {"views": {"mold": tables.mold_view(design.imager().array)}, "no_mold": ""}
     except (InputError, ValueError) as error:
         return {"views": {}, "no_mold": str(error)}

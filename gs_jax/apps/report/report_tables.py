@@ -18,7 +18,7 @@ from ...grid import Grid
 from ...io.files import read_text
 from ...lenses import MicrolensArray
 from ...mold.solids import MoldShape, preview_solid
-from ...pictures.volume_pictures import display_range, downsample, png_uri, to_base64, to_uint8
+from ...pictures import display_range, downsample, png_uri, to_base64, to_uint8
 from ...typing import PathLike
 
 # Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.diagnostics`.

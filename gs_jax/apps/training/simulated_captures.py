@@ -17,12 +17,11 @@ from scipy.ndimage import gaussian_filter
 
 from ...base.arrays import to_float32
 from ...geometry import Imager
-from ...grid import Grid
+from ...grid import Grid, Sensor
 from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ...lenses import MicrolensArray
 from ...optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf, make_polar_grid
 from ...projection.forward_model import forward
-from ...sensor import Sensor
 from ...simulation.synthetic import Camera, electrons, expose
 from ...typing import Volume
 

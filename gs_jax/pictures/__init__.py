@@ -1,1 +1,0 @@
-"""Pictures of volumes: projections to scale, slices to look through, and both as text of a page."""
