@@ -150,13 +150,13 @@ def color_table(name: str) -> list[int]:
     return colormaps[name](np.arange(256), bytes=True)[:, :3].ravel().tolist()
 
 
-def png_uri(image: UInt8[np.ndarray, "row column"], colors: str = "gray") -> str:
-    """An image in the colors of a map of matplotlib as PNG in a data URI."""
+def png_uri(image: UInt8[np.ndarray, "row column"], colors: str = "gray", transparent: int | None = None) -> str:
+    """An image in the colors of a map of matplotlib, one value of which may be transparent, as PNG in a data URI."""
     picture = Image.fromarray(image, mode="L" if colors == "gray" else "P")
     if colors != "gray":
         picture.putpalette(color_table(colors))
     file = io.BytesIO()
-    picture.save(file, "PNG")
+    picture.save(file, "PNG", **({} if transparent is None else {"transparency": transparent}))
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from gs_jax import Grid
 from gs_jax.io.point_tables import write_points
+from gs_jax.io.surfaces import write_surface
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.reconstruction import pipeline
 
@@ -109,6 +110,23 @@ def test_napari_opens_files_to_scale(viewer, tmp_path, name):
     for depth, shown in ((18000, 0), (18500, 1), (19000, 0)):
         viewer.dims.set_point(0, depth)
         assert len(points._view_data) == shown
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_sheets_are_a_depth_map_and_a_surface_in_the_same_place(viewer, tmp_path, lit):
+    """Also a dark sheet, which has no triangles."""
+    from npe2 import PluginManager
+
+    PluginManager.instance().discover()
+    grid = Grid([18.0, 19.0], (5, 4), 0.04, (1.0, -2.0))
+    depth = np.full((1, 5, 4), 18.5 if lit else np.nan, np.float32)
+    write_surface(tmp_path / "s.ome.tif", np.ones_like(depth), depth, 0.01 * depth, grid)
+    shown, surface = viewer.open(tmp_path / "s.ome.tif", plugin="gs-jax")
+    assert (type(shown).__name__, type(surface).__name__) == ("Image", "Surface")
+    np.testing.assert_allclose(shown.extent.world, [[-2080, 940], [-1920, 1060]])
+    if lit:
+        np.testing.assert_allclose(surface.extent.world, [[18500, -2080, 940], [18500, -1920, 1060]])
+        assert len(surface.faces) == 2 * 4 * 3 and shown.data[2, 2] == 18500
 
 
 def test_a_file_becomes_what_the_command_writes(widget, viewer, folder, monkeypatch, capsys):

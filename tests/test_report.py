@@ -19,6 +19,7 @@ from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
+from gs_jax.io.surfaces import write_surface
 from gs_jax.io.volumes import write_volume
 from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.pictures import downsample, make_slices
@@ -67,6 +68,9 @@ def made(tmp_path_factory):
     tifffile.imwrite(folder / "capture.tif", rng.integers(0, 900, (96, 80), np.uint16))
     (folder / "tolerance.json").write_text(json.dumps(TOLERANCE))
     words = [folder / "design.toml", folder / "volume.ome.tif", "--points", folder / "points.csv"]
+    maps = np.where(volume[:1] > 0.1, [[[1.0]], [[19.0]], [[0.1]]], np.nan).astype(np.float32)[:, None]
+    write_surface(folder / "sheet.ome.tif", np.nan_to_num(maps[0]), maps[1], maps[2], GRID)
+    words += ["--surface", folder / "sheet.ome.tif"]
     words += ["--capture", folder / "capture.tif", "--tolerance", folder / "tolerance.json", "--bad-pixels", "none"]
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stop:
         patch.setattr(sys, "argv", ["gs-jax", "report", *map(str, words), "-q", "-o", str(folder / "report.html")])
@@ -79,7 +83,7 @@ def made(tmp_path_factory):
 def test_the_page_has_all_parts_and_no_path(made):
     text = (made / "report.html").read_text()
     parts = re.findall(r'<section id="(\w+)">', text)
-    first = ["device", "datasheet", "psf", "mtf", "layout", "capture", "volume", "points"]
+    first = ["device", "datasheet", "psf", "mtf", "layout", "capture", "volume", "surface", "points"]
     assert parts == [*first, "mold", "calibration", "tolerance", "origin", "cite"]
     assert set(re.findall(r'href="#(\w+)"', text)) == {*parts, "main"}
     assert str(made) not in text and "private-folder" not in text and "/home/" not in text
@@ -125,7 +129,7 @@ def test_keys_move_the_slider_and_the_slice(made, browser):
         assert said.inner_text() == "18 mm"
 
 
-@pytest.mark.parametrize("name, fewest", [("volume", 60), ("points", 20), ("mold", 20)])
+@pytest.mark.parametrize("name, fewest", [("volume", 60), ("surface", 5), ("points", 20), ("mold", 20)])
 def test_views_in_space_are_drawn_and_turn(made, browser, name, fewest):
     """Of many colours, others when a key, then the mouse turns them, and as at first after 0."""
     colours = """c => { const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;

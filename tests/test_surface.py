@@ -8,8 +8,11 @@ import tifffile
 import trimesh
 
 import gs_jax as gs
+from gs_jax.base.progress import Progress
+from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
-from gs_jax.io.surfaces import write_surface
+from gs_jax.io.surfaces import read_surface, write_surface
+from gs_jax.reconstruction.surface_fit import surface_fitter
 
 GRID = {"shape": (45, 45), "pitch": 0.08}
 DEPTHS = np.arange(18.0, 22.1, 0.5)
@@ -32,12 +35,14 @@ def emitters(depth) -> np.ndarray:
     return np.column_stack([x, y, depth(x, y), light])
 
 
+def capture(depth, electrons=1000) -> np.ndarray:
+    image = np.asarray(gs.simulate(emitters(depth), scope(), optics="near", psf="geometric"))
+    return np.random.default_rng(0).poisson(image * electrons / image.max()).astype(np.float32)
+
+
 @pytest.fixture(scope="module")
 def fit():
-    scene = emitters(lambda x, y: 20 + 1.2 * x)
-    image = np.asarray(gs.simulate(scene, scope(), optics="near", psf="geometric"))
-    image = np.random.default_rng(0).poisson(image * 1000 / image.max()).astype(np.float32)
-    return gs.fit_surface(image, scope(), gs.Grid(DEPTHS, **GRID), optics="near")
+    return gs.fit_surface(capture(lambda x, y: 20 + 1.2 * x), scope(), gs.Grid(DEPTHS, **GRID), optics="near")
 
 
 def test_the_depth_of_a_tilted_sheet_is_found(fit):
@@ -48,6 +53,21 @@ def test_the_depth_of_a_tilted_sheet_is_found(fit):
     assert np.nanstd(error) < 0.08 and abs(np.nanmean(error)) < 0.05 and np.isfinite(error).mean() > 0.7
     assert fit.error < fit.free_error and fit.warning is None
     assert np.isnan(fit.depth[0, 0, 0]) and (fit.depth_sd[np.isfinite(fit.depth)] > 0).all()
+
+
+def test_frames_start_from_the_one_before_unless_the_scene_is_another():
+    """A sheet that moves away is followed; another one is not."""
+    grid = gs.Grid(DEPTHS, **GRID)
+    follow = surface_fitter(scope(), grid, gs.Surface(), optics="near", progress=Progress(), in_time=True)
+    inner = np.abs(np.asarray(grid.x)) < 1.1
+    started = []
+    for slope, middle in ((1.2, 20.0), (1.2, 20.1), (1.2, 20.2), (-1.2, 19.5)):
+        found = follow(capture(lambda x, y, slope=slope, middle=middle: middle + slope * x), Progress())
+        error = (found.depth[0] - (middle + slope * np.asarray(grid.x))[None])[np.ix_(inner, inner)]
+        assert np.nanstd(error) < 0.08 and abs(np.nanmean(error)) < 0.05 and found.warning is None
+        started.append(bool(np.isfinite(found.further_error)))
+        assert np.isnan(found.depth_sd).all() != started[-1]
+    assert started == [True, False, False, True]
 
 
 @pytest.mark.integration
@@ -80,11 +100,32 @@ def test_files_hold_maps_in_um_and_a_mesh_in_mm(fit, tmp_path):
         pixels = tiff.asarray()
         assert 'PhysicalSizeX="80.0"' in (tiff.ome_metadata or "") and 'Name="depth_um"' in (tiff.ome_metadata or "")
     np.testing.assert_allclose(pixels[1], 1000 * (fit.depth[0] - 17.5), rtol=1e-5)
+    write_surface(tmp_path / "maps.ome.tif", *maps, grid)
+    read = read_surface(tmp_path / "maps.ome.tif")
+    for found, given in zip(read[:3], maps, strict=True):
+        np.testing.assert_allclose(found, given, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(read.grid.x), np.asarray(grid.x), atol=1e-6)
+    read_layers: Any = reader(str(tmp_path / "maps.ome.tif"))
+    (depth, shown, kind), ((vertices, faces, light), _, other) = read_layers(str(tmp_path / "maps.ome.tif"))
+    assert (kind, other) == ("image", "surface") and 0 <= light.min() < light.max() <= 1
+    np.testing.assert_allclose(depth, 1000 * fit.depth[0], rtol=1e-5)
+    np.testing.assert_allclose((vertices[:, 0] / 1000).min(), np.nanmin(fit.depth), atol=0.1)
+    np.testing.assert_allclose([shown["translate"][1], vertices[0, 2] % 80], [-1760, 0], atol=1e-3)
+    assert len(faces) > 500
     write_surface(tmp_path / "sheet.ply", *maps, grid, provenance={"design": "made up"})
     assert read_provenance(tmp_path / "sheet.ply")["design"] == "made up"
     mesh: Any = trimesh.load(tmp_path / "sheet.ply", process=False)
     slope = np.polyfit(mesh.vertices[:, 0], mesh.vertices[:, 2], 1)
     assert len(mesh.faces) > 500 and abs(slope[0] - 1.2) < 0.1
+
+
+def test_files_without_sheets_are_refused(fit, tmp_path):
+    gs.write_volume(tmp_path / "v.ome.tif", fit.volume, gs.Grid(DEPTHS, **GRID))
+    with pytest.raises(gs.InputError, match="channels must be brightness, depth_um, sd_um"):
+        read_surface(tmp_path / "v.ome.tif")
+    tifffile.imwrite(tmp_path / "grey.tif", np.zeros((9, 9), np.uint16))
+    with pytest.raises(gs.InputError, match="grey.tif"):
+        read_surface(tmp_path / "grey.tif")
 
 
 def test_dark_captures_and_single_planes_are_finite():

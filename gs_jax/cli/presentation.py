@@ -21,6 +21,7 @@ from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 @click.argument("volume", type=Path, required=False)
 @click.option("-o", "--output", type=Path, required=True, help="REPORT.html.")
 @click.option("--points", type=Path, help="POINTS.csv: points for a table and a 3-D view.")
+@click.option("--surface", type=Path, help="SURFACE.ome.tif of `gs-jax reconstruct`: maps and a 3-D view.")
 @click.option("--capture", type=Path, help="CAPTURE.tif: the capture of VOLUME.")
 @click.option("--tolerance", type=Path, help="TOLERANCE.json of `gs-jax tolerance -o`.")
 @sample_options
@@ -31,8 +32,9 @@ def report_command(
     """Write one page, for any browser and without a network, about the microscope of DESIGN and a reconstruction.
 
     VOLUME is an output of `gs-jax reconstruct`. The page has the device to scale, the datasheet and violated
-    assumptions, spots and contrast over depth and field, the layout and the mold; the capture, volume and points that
-    are given; the results of calibration and tolerances; and the files that it was made from. It is below 15 MB.
+    assumptions, spots and contrast over depth and field, the layout and the mold; the capture, volume, surface and
+    points that are given; the results of calibration and tolerances; and the files that it was made from. It is below
+    15 MB.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
@@ -41,10 +43,11 @@ def report_command(
     from ..design.design import design_text, read_design
     from ..io.point_tables import read_points
     from ..io.provenance import read_provenance
+    from ..io.surfaces import read_surface
     from ..io.volumes import read_volume
 
-    points, capture, tolerance = files["points"], files["capture"], files["tolerance"]
-    inputs = (design, volume, points, capture, tolerance)
+    points, surface, capture, tolerance = (files[name] for name in ("points", "surface", "capture", "tolerance"))
+    inputs = (design, volume, points, surface, capture, tolerance)
     check_output(output, [".html"])
     with needs_extra("report"):
         import_module("jinja2")
@@ -54,6 +57,8 @@ def report_command(
     microscope, results = light.design(read_design(design)), {}
     if volume:
         results["volume"], results["grid"] = read_volume(volume)
+    if surface:
+        results["surface"] = read_surface(surface)
     if points:
         results["points"] = read_points(points)
     if capture:

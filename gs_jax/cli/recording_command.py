@@ -76,17 +76,17 @@ def open_frames(capture: Path, camera: CaptureOptions, plan):
 
     stack = ExitStack()
     atexit.register(stack.close)
-    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
+    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan, in_time=False)
 
 
-def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):
+def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False, in_time: bool = True):
     """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`.
 
-    `is_live` compiles all before the first frame comes.
+    `is_live` compiles all before the first frame comes; `in_time`: frames follow each other, those of a worker do not.
     """
     import numpy as np
 
-    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
+    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress(), in_time=in_time)
     if is_live:
         with suppress(InputError):
             reconstruct(_image_to_compile_for(plan), Progress())

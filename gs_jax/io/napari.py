@@ -1,4 +1,4 @@
-"""Layers of napari in um: volumes, volumes in time and points; and the reader that `napari.yaml` names.
+"""Layers of napari in um: volumes, volumes in time, points and sheets; and the reader that `napari.yaml` names.
 
 napari's own readers of OME-TIFF ignore the position of the first voxel, and those of CSV know pixels only.
 """
@@ -15,6 +15,7 @@ from ..grid import Grid
 from ..typing import Points
 from .ngff import display_range
 from .point_tables import POINTS_HEADER, read_points
+from .surfaces import SurfaceMaps, read_surface, surface_mesh
 from .volume_series import Series, read_series
 from .volumes import VOLUME_SUFFIXES, read_volume
 
@@ -54,7 +55,10 @@ def _read_volume(path) -> list[Layer]:
     try:
         voxels, grid = read_volume(path)
     except InputError as error:
-        raise ValueError(f"not a volume of gs_jax: {error}") from error
+        try:
+            return surface_layers(read_surface(path), Path(path).name)
+        except InputError:
+            raise ValueError(f"neither a volume nor a surface of gs_jax: {error}") from error
     return [volume_layer(voxels, grid, Path(path).name)]
 
 
@@ -87,6 +91,32 @@ def points_layer(points: Points, name: str, thickness: float = 0.25) -> Layer:
         "blending": "translucent_no_depth",
     }
     return _UM * points[:, 2::-1] / scale, options | _AXES, "points"
+
+
+def surface_layers(maps: SurfaceMaps, name: str) -> list[Layer]:
+    """A depth map for each sheet, um, and a surface of all sheets, coloured by brightness, for the view in space."""
+    grid, mesh = maps.grid, surface_mesh(maps.brightness, maps.depth, maps.grid)
+    lit = maps.depth[np.isfinite(maps.depth)]
+    low, high = (_UM * float(part(lit)) for part in (np.min, np.max)) if lit.size else (0.0, 1.0)
+    options: dict[str, Any] = {
+        "scale": (_UM * grid.pitch, _UM * grid.pitch),
+        "translate": (_UM * float(grid.y[0]), _UM * float(grid.x[0])),
+        "contrast_limits": (low, max(high, low + 1.0)),
+        "colormap": "viridis",
+        "axis_labels": ("y", "x"),
+        "units": ("um", "um"),
+    }
+    names = [f"{name}, depth, um" + (f", sheet {n + 1}" if len(maps.depth) > 1 else "") for n in range(len(maps.depth))]
+    layers: list[Layer] = [
+        (_UM * depth, options | {"name": each}, "image") for depth, each in zip(maps.depth, names, strict=True)
+    ]
+    vertices, light, faces = mesh
+    if not len(faces):
+        # napari draws no empty surface.
+        corner = [float(grid.x[0]), float(grid.y[0]), float(grid.depths[0])]
+        vertices, light, faces = np.tile(corner, (3, 1)), np.zeros(3), np.array([[0, 1, 2]])
+    shown: dict[str, Any] = {"name": f"{name}, surface", "contrast_limits": (0.0, 1.0), "colormap": "gray"}
+    return [*layers, ((_UM * vertices[:, ::-1], faces, light), shown | {"shading": "none"} | _AXES, "surface")]
 
 
 def _series_layer(series: Series, name: str) -> Layer:

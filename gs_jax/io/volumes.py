@@ -138,7 +138,7 @@ def _check_declared(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None
         raise input_error("voxels", "float32, or integers up to 16 bits", dtype, path)
 
 
-def _checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
+def checked_grid(path: Path, depths: list[float], shape: tuple[int, int], pitches, first) -> Grid:
     """Grid of depths, pitches `(y, x)` and centre of the first voxel `(y, x)`, mm; centred if `first` is None.
 
     Its depths are from the array, also where those of the file count from the sample's surface.
@@ -242,14 +242,14 @@ def _grid_of_ome(path: Path, root: ElementTree.Element, shape: tuple[int, int, i
         if str(index) not in planes:
             raise InputError(f"{path}: no `PositionZ` of plane {index + 1}; a depth for each plane is needed.")
     ordered = [planes[str(index)] for index in range(shape[0])]
-    depths = [_length(path, plane, "PositionZ", "reference frame") for plane in ordered]
-    pitches = [_length(path, pixels, f"PhysicalSize{axis}", "µm") for axis in "YX"]
+    depths = [ome_length(path, plane, "PositionZ", "reference frame") for plane in ordered]
+    pitches = [ome_length(path, pixels, f"PhysicalSize{axis}", "µm") for axis in "YX"]
     placed = all(ordered[0].get(f"Position{axis}") is not None for axis in "YX")
-    first = [_length(path, ordered[0], f"Position{axis}", "reference frame") for axis in "YX"] if placed else None
-    return _checked_grid(path, depths, shape[1:], pitches, first)
+    first = [ome_length(path, ordered[0], f"Position{axis}", "reference frame") for axis in "YX"] if placed else None
+    return checked_grid(path, depths, shape[1:], pitches, first)
 
 
-def _length(path: Path, element: ElementTree.Element, name: str, default_unit: str) -> float:
+def ome_length(path: Path, element: ElementTree.Element, name: str, default_unit: str) -> float:
     """An attribute of OME-XML in mm; `default_unit` is the schema's, where the attribute `...Unit` is missing."""
     text, unit = element.get(name), element.get(f"{name}Unit", default_unit)
     try:
@@ -292,7 +292,7 @@ def _read_zarr(path: Path) -> tuple[np.ndarray, Grid]:
     _check_declared(path, array.shape, array.dtype)
     depths, rows, columns = array.shape
     z = [_mm(first[0] + index * scale[0], 1.0) for index in range(depths)]
-    grid = _checked_grid(path, z, (rows, columns), scale[1:], first[1:])
+    grid = checked_grid(path, z, (rows, columns), scale[1:], first[1:])
     with decoding(path, "OME-Zarr"):
         return np.asarray(array[...], dtype=np.float32), grid
 

@@ -164,7 +164,8 @@ def reconstructor(
     Returns
     -------
     Callable
-        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface` to the volume.
+        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface` and its state
+        to start from to the volume.
 
     Warns
     -----
@@ -192,7 +193,7 @@ def reconstructor(
     modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
     problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
-    def volume_of(image, progress, method=method):
+    def volume_of(image, progress, method=method, start=None):
         light, background = prepare_data(image, model)
         target = 0.0
         # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
@@ -206,7 +207,7 @@ def reconstructor(
         light = light - background
         if not isinstance(method, Unrolled | Surface):
             light = np.asarray(problem.detrend(light), light.dtype)
-        return run_solver(method, light, problem, progress, target, read)
+        return run_solver(method, light, problem, progress, target, read, start)
 
     return volume_of
 
@@ -278,14 +279,14 @@ def _wider_voxels(grid):
     return f"--voxel-um {2000 * grid.pitch:.4g}"
 
 
-def run_solver(solver, light, problem, progress, target_cost=0.0, read=None):
+def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, start=None):
     """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target.
 
-    Returns the estimate, or `read(solver, state)`.
+    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or `read(solver, state)`.
     """
     # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
-    state = _start(compiled, light, problem)
+    state = _start(compiled, light, problem) if start is None else start
     quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else "twice the --binning"
     with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):

@@ -85,15 +85,19 @@ class Plan:
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights)
 
-    def prepare(self, progress: Progress) -> Callable[[Image, Progress], Result]:
-        """Compute what all images share; return the function that reconstructs one."""
+    def prepare(self, progress: Progress, *, in_time: bool = False) -> Callable[[Image, Progress], Result]:
+        """Compute what all images share; return the function that reconstructs one.
+
+        `in_time`: the images follow each other, so that a surface is fitted from the last one on.
+        """
         clean = volume_of = fit = None
         if self.suppress == "unet":
             from ..detection.unet import read_weights, suppress
 
             clean = partial(suppress, network=read_weights(self.weights) if self.weights else None)
         if isinstance(self.method, Surface):
-            fit = surface_fitter(self.imager, self.grid, self.method, optics=self.optics, progress=progress)
+            how = {"optics": self.optics, "progress": progress, "in_time": in_time}
+            fit = surface_fitter(self.imager, self.grid, self.method, **how)
         elif self.suppress != "points":
             options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
             volume_of = reconstructor(self.imager, self.grid, self.method, **options, progress=progress)

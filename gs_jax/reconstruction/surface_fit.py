@@ -12,7 +12,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import PsfModel
-from ..solvers.surface import Surface, depth_of_sheets
+from ..solvers.surface import RESTARTED_STEPS, Surface, depth_of_sheets, restarted
 from ..typing import Image, Volume
 from .pipeline import check_call, reconstructor
 
@@ -21,6 +21,8 @@ _DARK = 0.03
 # What one more sheet leaves unexplained, of what these leave, below which these are too few. Where they are enough it
 # was 0.98 or more, for clouds of points and further sheets 0.70 to 0.87.
 _ENOUGH = 0.95
+# What a fit that starts from the last one may leave unexplained, of what the last one that started afresh left.
+_CHANGED = 1.1
 
 
 class SurfaceFit(NamedTuple):
@@ -36,7 +38,8 @@ class SurfaceFit(NamedTuple):
         The sheets on the planes of the grid, by linear shares of two planes.
     error, free_error, further_error
         RMS of what the sheets, the few steps of free voxels from which they start, and a fit with one more sheet do not
-        explain of the capture, relative to its RMS.
+        explain of the capture, relative to its RMS; the last two, and `depth_sd`, are NaN in those frames of a
+        recording that start from the one before.
     """
 
     brightness: Float32[np.ndarray, "sheet y x"]
@@ -106,9 +109,13 @@ def fit_surface(
 
 
 def surface_fitter(
-    imager: Imager, grid: Grid, method: Surface, *, optics: PsfModel | str, progress: Progress
+    imager: Imager, grid: Grid, method: Surface, *, optics: PsfModel | str, progress: Progress, in_time: bool = False
 ) -> Callable[[Image, Progress], SurfaceFit]:
-    """Prepare `fit_surface` for many images; parameters and errors as there."""
+    """Prepare `fit_surface` for many images; parameters and errors as there.
+
+    `in_time`: the images follow each other. Each fit starts from the last one, in a third of the steps and without one
+    more sheet, unless the scene has changed so much that it explains less than the last one that started afresh did.
+    """
     depths = np.asarray(grid.depths, np.float64)
     step = float(np.abs(np.gradient(depths)).mean()) if depths.size > 1 else 0.0
 
@@ -120,13 +127,29 @@ def surface_fitter(
         places = (np.interp(planes, np.arange(depths.size), depths), step * sd)
         depth, depth_sd = (np.where(dark, np.nan, part).astype(np.float32) for part in places)
         volume = np.asarray(solver.estimate(state), np.float32)
-        return SurfaceFit(brightness, depth, depth_sd, volume, error, free, error)
+        return SurfaceFit(brightness, depth, depth_sd, volume, error, free, error), state
 
     prepared = reconstructor(imager, grid, method, optics=optics, progress=progress, read=read)
-    further = dataclasses.replace(method, sheets=method.sheets + 1)
+    short = dataclasses.replace(method, steps=RESTARTED_STEPS)
+    further = dataclasses.replace(short, sheets=method.sheets + 1)
 
     def fit_of(image, progress):
-        fit = prepared(image, progress)
-        return fit._replace(further_error=prepared(image, progress, further).error)
+        fit, state = prepared(image, progress)
+        one_more, _ = prepared(image, progress, further, restarted(state, further.sheets, afresh=True))
+        return fit._replace(further_error=one_more.error), state
 
-    return fit_of
+    afresh, last = 0.0, None
+
+    def next_fit_of(image, progress):
+        nonlocal afresh, last
+        if last is not None:
+            fit, state = prepared(image, progress, short, restarted(last, method.sheets, afresh=False))
+            if fit.error < _CHANGED * afresh:
+                last = state
+                unknown = dict.fromkeys(("free_error", "further_error"), float("nan"))
+                return fit._replace(depth_sd=np.full_like(fit.depth_sd, np.nan), **unknown)
+        fit, last = fit_of(image, progress)
+        afresh = fit.error
+        return fit
+
+    return next_fit_of if in_time else lambda image, progress: fit_of(image, progress)[0]

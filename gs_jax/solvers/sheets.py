@@ -4,12 +4,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from ..base.arrays import divide, safe_sqrt
 from .richardson_lucy import hat_functions
 
+# Voxels from one knot of the depth to the next.
+_SPACING = 5
+# Least brightness of a column at the start, relative to the mean: by its root, none has no gradient.
+_FAINT = 1e-3
 # Classes of brightness among which the noise is fitted, and steps of that.
 _CLASSES, _NOISE_STEPS = 32, 60
 
@@ -38,6 +43,32 @@ def interpolated(depth, shape):
     """Depths at all columns from those at knots."""
     rows, columns = hats(shape, depth.shape[1:], depth.dtype)
     return jnp.einsum("yk,zkl,xl->zyx", rows, depth, columns)
+
+
+def first_sheets(x, background, count):
+    """Start of a fit, from free voxels `x`: depths about which the light is, and the light of a column."""
+    planes, *shape = x.shape
+    knots = [max(-(-n // _SPACING), 2) for n in shape]
+    rows, columns = hats(shape, knots, x.dtype)
+    unit = divide(x, jnp.broadcast_to(x.max(), x.shape))
+    # Squared, because the background is in all planes.
+    local = jnp.einsum("yk,zyx,xl->zkl", rows, unit**2, columns)
+    local = widened(widened(local, 1), 2)
+    local = local - (local.min(0) if planes > 2 else jnp.zeros_like(local[0]))[None]
+    k = jnp.arange(planes, dtype=x.dtype)[:, None, None]
+    # Where it is dark, the mean of all.
+    faint = 0.05 * local.sum(0).mean() + jnp.finfo(x.dtype).tiny
+    overall = divide((k * local).sum(), local.sum())
+    mean = ((k * local).sum(0) + faint * overall) / (local.sum(0) + faint)
+    spread = safe_sqrt(divide((local * (k - mean[None]) ** 2).sum(0), local.sum(0)))
+    apart = jnp.asarray(np.linspace(-1, 1, count) if count > 1 else np.zeros(1), x.dtype)
+    depth = mean[None] + apart[:, None, None] * spread[None]
+    # Several sheets divide the planes among them (Lloyd's algorithm).
+    for _ in range(8 if count > 1 else 0):
+        mine = nearest(k, depth) * local[None]
+        depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
+    bright = (nearest(k, interpolated(depth, tuple(shape))) * x[None]).sum(1)
+    return Sheets(safe_sqrt(bright + _FAINT * bright.mean()), depth, background)
 
 
 def widened(x, axis):

@@ -6,6 +6,7 @@ Richardson-Lucy, and continues with Gauss-Newton steps. Each step, of whatever k
 and one with its transpose.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -27,12 +28,11 @@ from .richardson_lucy import (
     extrapolate,
     momentum_after,
 )
-from .sheets import Sheets, hats, interpolated, nearest, noise_variance, squared_derivatives, volume_of, widened
+from .sheets import Sheets, first_sheets, hats, interpolated, noise_variance, squared_derivatives, volume_of
 
-# Voxels from one knot of the depth to the next.
-_SPACING = 5
-# Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end.
-_FIRST, _ROUNDS, _GRADIENTS, _PROBES = 10, 5, 3, 4
+# Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end;
+# Gauss-Newton steps from a given start.
+_FIRST, _ROUNDS, _GRADIENTS, _PROBES, _RESTARTED = 10, 5, 3, 4, 2
 # What a step is for.
 _LUCY, _LINEARISE, _PROBE, _GRADIENT = range(4)
 _SCHEDULE = (
@@ -42,6 +42,8 @@ _SCHEDULE = (
     _LINEARISE,
     *(_PROBE,) * _PROBES,
 )
+# Steps from a given start, without probes at the end: some rounds, and the misfit after them.
+RESTARTED_STEPS = 1 + _RESTARTED * (1 + _GRADIENTS) + 1
 # Differences between neighbours that count as edges: of depths, planes, and of roots of brightness, of their RMS.
 _EDGE_DEPTH, _EDGE_ROOT = 0.1, 0.3
 # Largest change of a depth in a Gauss-Newton step, planes: the derivative involves the two nearest planes.
@@ -49,8 +51,6 @@ _MAX_MOVE = 1.0
 # Standard deviations by the Hessian's diagonal are too small by this factor, as it leaves out correlations with
 # neighbours and with brightness, and errors of the model. Measured on sheets of known depth, of 10,000 electrons.
 _UNDERSTATED = 3.6
-# Least brightness of a column at the start, relative to the mean: by its root, none has no gradient.
-_FAINT = 1e-3
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
 _DAMPING = 1e-3
 # At the start the brightness is nearly right and depths are not: the preconditioner lets depths change first.
@@ -150,11 +150,8 @@ class Surface(eqx.Module):
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
         lucy = _START.init(A, image)
-        _, rows, columns = lucy.x.shape
-        knots = [max(-(-n // _SPACING), 2) for n in (rows, columns)]
-        zeros = lambda *shape: jnp.zeros(shape, image.dtype)
-        background = zeros(BACKGROUND_KNOTS, BACKGROUND_KNOTS)
-        none = Sheets(zeros(self.sheets, rows, columns), zeros(self.sheets, *knots), background)
+        none = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda: first_sheets(lucy.x, lucy.knots, self.sheets)))
+        zeros = lambda count: jnp.zeros(count, image.dtype)
         number = jnp.zeros((), jnp.int32)
         return State(lucy, none, none, none, none, zeros(3), none.depth, jnp.zeros_like(image), zeros(2), number)
 
@@ -201,7 +198,9 @@ class Surface(eqx.Module):
             new = divide(volume * jnp.maximum(back, 0), sensitivity)
             momentum = momentum_after(new, volume, x, momentum)
             lucy = LucyState(new, sensitivity, momentum, background_step(background, pulled))
-            sheets = lax.cond(following == _LUCY, lambda: state.sheets, lambda: self._first_sheets(lucy))
+            sheets = lax.cond(
+                following == _LUCY, lambda: state.sheets, lambda: first_sheets(lucy.x, lucy.knots, self.sheets)
+            )
             return state._replace(lucy=lucy, sheets=sheets, errors=state.errors.at[0].set(misfit))
 
         def after_linearisation():
@@ -248,31 +247,6 @@ class Surface(eqx.Module):
         is_start = state.number < _FIRST
         return lax.cond(is_start, lambda: state.lucy.x, lambda: volume_of(state.sheets, state.lucy.x.shape[0]))
 
-    def _first_sheets(self, lucy):
-        """Depths about which the light is, squared, because the background is in all planes; the light of a column."""
-        x = lucy.x
-        planes, *shape = x.shape
-        knots = [max(-(-n // _SPACING), 2) for n in shape]
-        rows, columns = hats(shape, knots, x.dtype)
-        unit = divide(x, jnp.broadcast_to(x.max(), x.shape))
-        local = jnp.einsum("yk,zyx,xl->zkl", rows, unit**2, columns)
-        local = widened(widened(local, 1), 2)
-        local = local - (local.min(0) if planes > 2 else jnp.zeros_like(local[0]))[None]
-        k = jnp.arange(planes, dtype=x.dtype)[:, None, None]
-        # Where it is dark, the mean of all.
-        faint = 0.05 * local.sum(0).mean() + jnp.finfo(x.dtype).tiny
-        overall = divide((k * local).sum(), local.sum())
-        mean = ((k * local).sum(0) + faint * overall) / (local.sum(0) + faint)
-        spread = safe_sqrt(divide((local * (k - mean[None]) ** 2).sum(0), local.sum(0)))
-        apart = jnp.asarray(np.linspace(-1, 1, self.sheets) if self.sheets > 1 else np.zeros(1), x.dtype)
-        depth = mean[None] + apart[:, None, None] * spread[None]
-        # Several sheets divide the planes among them (Lloyd's algorithm).
-        for _ in range(8 if self.sheets > 1 else 0):
-            mine = nearest(k, depth) * local[None]
-            depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
-        bright = (nearest(k, interpolated(depth, tuple(shape))) * x[None]).sum(1)
-        return Sheets(safe_sqrt(bright + _FAINT * bright.mean()), depth, lucy.knots)
-
     def _prior(self, at, vector):
         """Product of the penalties' Hessian, with the weights that edges have now, and a vector."""
         unit = jnp.mean(at.root**2)
@@ -293,6 +267,20 @@ class Surface(eqx.Module):
             divide(vector.depth, depth),
             later * divide(vector.background, mean[2] + damping.background),
         )
+
+
+@partial(jax.jit, static_argnames=("count", "afresh"))
+def restarted(state: State, count: int, *, afresh: bool) -> State:
+    """State after the steps of Richardson-Lucy, of so many sheets: those that they give (afresh), or the last ones."""
+    lucy = state.lucy
+    sheets = first_sheets(lucy.x, lucy.knots, count) if afresh else state.sheets
+    none = jax.tree.map(jnp.zeros_like, sheets)
+    number = jnp.full((), _FIRST, jnp.int32)
+    new = State(
+        lucy, sheets, none, none, none, jnp.zeros_like(state.diagonal), none.depth, state.inverse, state.errors, number
+    )
+    # The steps overwrite their state.
+    return jax.tree.map(jnp.copy, new)
 
 
 def depth_of_sheets(state: State) -> tuple[Array, Array]:

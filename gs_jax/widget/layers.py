@@ -43,7 +43,8 @@ def prepare_layers(
         As the command.
     """
     from ..design.design import read_design
-    from ..io.napari import mean_step, points_layer, volume_layer
+    from ..io.napari import mean_step, points_layer, surface_layers, volume_layer
+    from ..io.surfaces import SurfaceMaps
     from ..reconstruction.plan import Plan
 
     try:
@@ -67,6 +68,8 @@ def prepare_layers(
             found = volume_of(image, progress)
         progress.check_cancelled()
         layers = [volume_layer(found.volume, grid, f"{name}, {method if suppress == 'none' else suppress}")]
+        if fit := found.surface:
+            layers += surface_layers(SurfaceMaps(fit.brightness, fit.depth, fit.depth_sd, grid), name)
         if found.points is not None:
             layers.append(points_layer(found.points, f"{name}, {len(found.points)} points", mean_step(grid)))
         z, y, x = found.volume.shape

@@ -18,6 +18,7 @@ from ...geometry import Imager
 from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
+from ...io.surfaces import SurfaceMaps
 from ...pictures import color_table, make_slices, png_uri, slider_html, to_uint8
 from ...typing import Image, PathLike, Points
 from . import report_tables as tables
@@ -31,6 +32,7 @@ from .drawings import (
     mtf,
     simulate_psfs,
 )
+from .sheet_pictures import sheet_pictures, surface_view
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
@@ -47,6 +49,7 @@ def write_report(
     *,
     volume: Num[Array | np.ndarray, "z y x"] | None = None,
     grid: Grid | None = None,
+    surface: SurfaceMaps | None = None,
     points: Points | None = None,
     image: Image | None = None,
     tolerance: Mapping[str, Any] | None = None,
@@ -67,6 +70,8 @@ def write_report(
         The microscope.
     volume, grid
         A reconstruction of shape `grid.volume_shape`, and the positions of its voxels.
+    surface
+        Sheets, as `read_surface` reads them.
     points
         `(x, y, z, intensity)`, mm.
     image
@@ -104,6 +109,7 @@ def write_report(
         "tolerance": tables.tolerance_table(tolerance) if tolerance else None,
         "capture": None if image is None else tables.capture_view(np.asarray(image)),
         "volume": None,
+        "surface": None,
         "points": None,
         **_origins(design, provenance, origins or {}),
         **_optics(design, progress),
@@ -124,6 +130,12 @@ def write_report(
                 "projections": tables.make_projections(volume, grid),
             }
             context["views"]["volume"] = tables.voxel_view(volume, grid)
+        if surface is not None:
+            sheets, low, high = sheet_pictures(surface)
+            shape, pitch = surface.depth.shape, 1000 * surface.grid.pitch
+            context["surface"] = {"sheets": sheets, "low": low, "high": high, "shape": shape, "pitch_um": pitch}
+            if view := surface_view(surface):
+                context["views"]["surface"] = view
         if points is not None:
             points = np.asarray(points, float)
             listed = points[np.argsort(-points[:, 3], kind="stable")[:_LISTED_POINTS]]

@@ -71,10 +71,12 @@ const scenes = {
   },
   mesh(scene) {
     const shares = new Uint16Array(bytes(scene.corners).buffer), facets = new Uint32Array(bytes(scene.facets).buffer);
+    // A sheet has its own light and the colours of depths, from either side.
+    const own = scene.light && bytes(scene.light), across = (a, b, c) => (own[a / 3] + own[b / 3] + own[c / 3]) / 765;
     const n = shares.length / 3, [low, high] = scene.box, at = new Float32Array(3 * n), on = new Float32Array(3 * n);
     for (let i = 0; i < 3 * n; i++) at[i] = low[i % 3] + shares[i] / 65535 * (high[i % 3] - low[i % 3]);
     const draw = (view, context) => {
-      const {width: w, height: h} = view.canvas, {paper, part} = theme();
+      const {width: w, height: h} = view.canvas, {paper, part: stone} = theme();
       const image = context.createImageData(w, h), out = new Uint32Array(image.data.buffer), deep = new Float32Array(w * h).fill(Infinity);
       out.fill((255 << 24 | paper[2] << 16 | paper[1] << 8 | paper[0]) >>> 0);
       for (let i = 0; i < n; i++) on.set(view.place(at[3 * i], at[3 * i + 1], at[3 * i + 2]), 3 * i);
@@ -85,7 +87,9 @@ const scenes = {
         if (area === 0) continue;
         let [nx, ny, nz] = [by * cz - bz * cy, bz * cx - bx * cz, area];
         const size = Math.hypot(nx, ny, nz) * (nz > 0 ? -1 : 1);
-        const light = 0.3 + 0.7 * Math.max(0, (nx * -0.45 + ny * -0.6 + nz * -0.66) / size);
+        const lit = 0.3 + 0.7 * Math.max(0, (nx * -0.45 + ny * -0.6 + nz * -0.66) / size);
+        const part = own ? color("viridis", (shares[a + 2] + shares[b + 2] + shares[c + 2]) / 196605) : stone;
+        const light = own ? 0.2 + 0.8 * Math.sqrt(across(a, b, c)) : lit;
         const shade = (255 << 24 | light * part[2] << 16 | light * part[1] << 8 | light * part[0]) >>> 0;
         const top = Math.max(0, Math.ceil(ay + Math.min(0, by, cy) - 0.01)), bottom = Math.min(h - 1, Math.floor(ay + Math.max(0, by, cy) + 0.01));
         const left = Math.max(0, Math.ceil(ax + Math.min(0, bx, cx) - 0.01)), right = Math.min(w - 1, Math.floor(ax + Math.max(0, bx, cx) + 0.01));
@@ -99,7 +103,7 @@ const scenes = {
       }
       context.putImageData(image, 0, 0);
     };
-    return {draw, yaw: 0.5, pitch: Math.PI / 2 + 0.75, upright: true, bare: true};
+    return own ? {draw, yaw: 0.55, pitch: -0.45, upright: false} : {draw, yaw: 0.5, pitch: Math.PI / 2 + 0.75, upright: true, bare: true};
   },
 };
 

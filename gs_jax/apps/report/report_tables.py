@@ -305,16 +305,20 @@ def point_view(points: Float[np.ndarray, "point 4"], grid: Grid | None) -> dict[
 
 
 def mold_view(array: MicrolensArray) -> dict[str, Any]:
-    """The mold for the browser: vertices as fractions of its box, and facets."""
+    """The mold for the browser."""
     mesh = preview_solid(array, MoldShape()).to_mesh64()
-    vertices = mesh.vert_properties[:, :3]
-    low, high = vertices.min(0), vertices.max(0)
+    return mesh_view(mesh.vert_properties[:, :3], mesh.tri_verts)
+
+
+def mesh_view(vertices: np.ndarray, facets: np.ndarray) -> dict[str, Any]:
+    """A mesh for the browser: vertices as fractions of its box, and facets."""
+    low, high = vertices.min(0).astype(float), vertices.max(0).astype(float)
     fractions = np.round((vertices - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
     return {
         "kind": "mesh",
-        "count": len(mesh.tri_verts),
+        "count": len(facets),
         "corners": to_base64(fractions),
-        "facets": to_base64(mesh.tri_verts.astype(np.uint32)),
+        "facets": to_base64(facets.astype(np.uint32)),
         "box": [low.tolist(), high.tolist()],
     }
 
