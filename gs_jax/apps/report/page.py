@@ -32,7 +32,7 @@ from .drawings import (
     mtf,
     simulate_psfs,
 )
-from .sheet_pictures import sheet_pictures, surface_view
+from .surface_views import sheet_pictures, surface_view
 
 PAPER = {
     "text": "F. Tian, J. Hu, W. Yang, “GEOMScope: Large Field-of-View 3D Lensless Microscopy with Low Computational "
