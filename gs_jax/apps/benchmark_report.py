@@ -41,10 +41,7 @@ def write_records(path: Path, records: Records, provenance: Provenance | None = 
 def write(records: Records, skipped: Records, folder: Path, provenance: Provenance | None = None) -> None:
     """Write `benchmark.json`, `.csv`, `.md` and `.png`, and `benchmark-notes.json`.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be written to.
+    Raises `InputError` if the folder cannot be written to.
     """
     write_records(folder / "benchmark.json", records, provenance)
     notes = {"machine": describe(), "slopes": time_exponents(records), "left_out": skipped}

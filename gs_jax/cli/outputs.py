@@ -31,11 +31,8 @@ force_option = click.option("--force", is_flag=True, help="Replace existing .tom
 def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force: bool = False) -> None:
     """Check the outputs before any work; when the command succeeds, report on standard error what was replaced.
 
-    Raises
-    ------
-    InputError
-        If an output is an input, a capture of an input's folder or pattern, another output, or an existing .toml or
-        .csv file without `force`.
+    Raises `InputError` if an output is an input, a capture of an input's folder or pattern, another output, or an
+    existing .toml or .csv file without `force`.
     """
     given = [path for path in outputs if path is not None]
     places = [os.path.realpath(path) for path in given]

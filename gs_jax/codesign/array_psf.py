@@ -169,12 +169,8 @@ def array_spectrum(
 def spectral_flatness(spectrum: Float[Array, "point frequency"], *, floor: Real = _FLOOR) -> Float[Array, ""]:
     """Geometric over arithmetic mean of a power spectrum, averaged over points; 1 for a white one.
 
-    Parameters
-    ----------
-    spectrum
-        Of `array_spectrum`, without the lowest frequencies, which every layout has: above `1 / (s_z field_radius)`.
-    floor
-        Added to the power, so that a missing frequency counts as this.
+    `spectrum`: of `array_spectrum`, without the lowest frequencies, which every layout has: above
+    `1 / (s_z field_radius)`. `floor`: added to the power, so that a missing frequency counts as this.
     """
     power = spectrum + floor
     return jnp.mean(jnp.exp(jnp.mean(jnp.log(power), axis=1)) / jnp.mean(power, axis=1))

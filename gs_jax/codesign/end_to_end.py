@@ -105,12 +105,7 @@ def footprints(
     dots, and the loss depends on how each lens's grid falls on the pixels: it changes by a tenth of a dB when a lens
     moves by 2 um. With this blur the modulation is below 1 %.
 
-    Parameters
-    ----------
-    imager, grid
-        As for `forward`.
-    psf
-        As for `forward`, with room for the blur.
+    `imager`, `grid`: as for `forward`. `psf`: as for `forward`, with room for the blur.
     """
     dtype = imager.sensor_distance.dtype
     if psf is None:

@@ -214,13 +214,8 @@ def crowded_bound(
 ) -> Float[Array, "depth 3"]:
     """Cramer-Rao bound of x, y, z in a crowded scene, for points as bright as an emitter of 40 um x 40 um, mm.
 
-    Parameters
-    ----------
-    parts
-        The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are
-        those of the points.
-    places
-        `(x, y)` of points, mm. The result is the root mean square over them.
+    `parts`: the lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are
+    those of the points. `places`: `(x, y)` of points, mm. The result is the root mean square over them.
     """
     spots = [_spot(*part, parts) for part in parts]
     prior = jnp.asarray(PRIOR[:3], parts[0][1].depths.dtype)

@@ -182,10 +182,7 @@ def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size
     They lack the phase of the transfer function. Light beyond the window is folded back into it. The square root of
     `transfer_power` is interpolated between 24 frequencies.
 
-    Parameters
-    ----------
-    size
-        Pixels along a side, odd.
+    `size`: pixels along a side, odd.
     """
     dtype, pixel = at.depths.dtype, imager.sensor.pixel_pitch
     own = jnp.asarray(np.linspace(0, np.sqrt(0.5), _READ), dtype)

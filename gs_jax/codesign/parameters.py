@@ -172,10 +172,7 @@ def new_design(design: Design, imager: Imager, at: Conditions, values: Values) -
     Lengths and the refractive index are to four decimals (0.1 um), conics and aspheric terms to seven significant
     digits.
 
-    Raises
-    ------
-    InputError
-        If the values make no microscope.
+    Raises `InputError` if the values make no microscope.
     """
     values = start_values(imager, at) | values
     shared = ("sensor_distance_mm", "refractive_index", "depth_span_mm")

@@ -169,11 +169,8 @@ class _Saver:
 def initial_design(design: Design, study: Study) -> Design:
     """Apply the sample, the orientation and the lens types of a study to a design.
 
-    Raises
-    ------
-    InputError
-        If it has no such sample, its depths are in front of that, its lenses have another number of types, or are ideal
-        thin lenses, which have no radii.
+    Raises `InputError` if it has no such sample, its depths are in front of that, its lenses have another number of
+    types, or are ideal thin lenses, which have no radii.
     """
     if study.sample is not None:
         table = sample_table(design, study.sample)

@@ -278,10 +278,7 @@ def write_checkpoint(path: PathLike, log: Log, study: Study, design: Design, sta
 def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, bytes]:
     """Read the log, and the state for `restore_state`, empty between two starts.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not a checkpoint, or belongs to another study or design.
+    Raises `InputError` if the file cannot be read, is not a checkpoint, or belongs to another study or design.
     """
     head, _, state = check_input(path).read_bytes().partition(b"\n")
     try:
@@ -301,10 +298,7 @@ def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, 
 def restore_state(path: Path, state: bytes, like: State) -> State:
     """Restore the state of a checkpoint; `like` is a state of the same solver.
 
-    Raises
-    ------
-    InputError
-        If the file is truncated.
+    Raises `InputError` if the file is truncated.
     """
     with decoding(path, "checkpoint"):
         return eqx.tree_deserialise_leaves(io.BytesIO(state), like)

@@ -57,10 +57,7 @@ class Stage(NamedTuple):
 def problem_of(design: Design, study: Study) -> Problem:
     """The problem that a study poses for a design.
 
-    Raises
-    ------
-    InputError
-        If a free parameter does not exist in the design, or depths may come to lie behind the plate.
+    Raises `InputError` if a free parameter does not exist in the design, or depths may come to lie behind the plate.
     """
     _check_free(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
@@ -292,10 +289,7 @@ def best_end(log: Log, stage: int) -> dict[str, Any]:
 
     Costs of Adam are random, but it has a single start unless it is the first stage.
 
-    Raises
-    ------
-    InputError
-        If none reached a finite cost.
+    Raises `InputError` if none reached a finite cost.
     """
     ends = [end for end in log.ends if end["stage"] == stage and end["reason"] != NOT_FINITE]
     if not ends:

@@ -210,10 +210,7 @@ def read_study(path: PathLike) -> Study:
 def parent_path(path: PathLike, study: Study) -> Path:
     """Path of the initial design of a study.
 
-    Raises
-    ------
-    InputError
-        If the study names none.
+    Raises `InputError` if the study names none.
     """
     if study.design is None:
         raise InputError(f"{path}: `design` must be the file of a design, relative to the study, got nothing.")

@@ -120,10 +120,7 @@ def check_term(name: str) -> None:
     `Term`s. Python callers may also put theirs into `TERMS`; workers of a search get them. A name `"module:name"` is
     that of a `Term`, or of a callable of an imager and `Conditions`, in a module that Python can import.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
+    Raises `ValueError` if there is none.
     """
     if name not in TERMS and ":" in name:
         TERMS[name] = _imported(name)

@@ -70,10 +70,8 @@ def inline_centers(path: Path, data: dict[str, Any]) -> None:
 
     Columns of the file that are called as keys of `[lens]` become these keys.
 
-    Raises
-    ------
-    InputError
-        If one of its keys is wrong, or the file is, or `[lens]` has a key that the file has a column for.
+    Raises `InputError` if one of its keys is wrong, or the file is, or `[lens]` has a key that the file has a column
+    for.
     """
     array = data.get("array")
     if not isinstance(array, dict):
@@ -190,10 +188,7 @@ def other_reading(centers: np.ndarray, half: np.ndarray) -> str:
 def write_centers(path: PathLike, centers: Float[np.ndarray, "lens 2"], provenance: Provenance | None = None) -> None:
     """Writes lens centres, mm, as the CSV file that the key `array.centers_file` names.
 
-    Raises
-    ------
-    InputError
-        As `check_output`, for `.csv`.
+    Raises `InputError` as `check_output`, for `.csv`.
     """
     rows = [",".join(map(str, row)) for row in centers.tolist()]
     write_text(path, "\n".join([CENTERS_HEADER, *rows]) + "\n", [".csv"])

@@ -30,17 +30,9 @@ _STREHL_DOMAIN = 0.1
 def findings(design: Design, sheet: dict[str, Any], *, circle_of_confusion: float | None = None) -> list[str]:
     """What violates what, in short sentences; empty if nothing does.
 
-    Parameters
-    ----------
-    design, sheet
-        A microscope and its datasheet.
-    circle_of_confusion
-        As for `datasheet`.
+    `design`, `sheet`: a microscope and its datasheet. `circle_of_confusion`: as for `datasheet`.
 
-    Raises
-    ------
-    InputError
-        As `datasheet`.
+    Raises `InputError` as `datasheet`.
     """
     parts = parts_of(design, sheet["depth_mm"], circle_of_confusion=circle_of_confusion)
     focus = _focus(design, sheet, parts, circle_of_confusion_of(design, circle_of_confusion))

@@ -74,10 +74,7 @@ def sample_tables(sample: Sample) -> dict[str, Any]:
 def sharp_depths(imager: Imager) -> tuple[float, float]:
     """Nearest and farthest depth in focus for any lens type (Eq. 8), with a circle of confusion of two pixels, mm.
 
-    Raises
-    ------
-    InputError
-        If no depth is in focus, or the depth of field is infinite.
+    Raises `InputError` if no depth is in focus, or the depth of field is infinite.
     """
     v, circle_of_confusion, ends = float(imager.reduced_sensor_distance), 2 * imager.sensor.pixel_pitch, []
     for which in lenses_by_type(imager.array):

@@ -177,10 +177,7 @@ _SOME = 100
 def slips(data: Mapping[str, Any]) -> list[str]:
     """Questions about numbers of a design's tables that would be usual in another unit.
 
-    Parameters
-    ----------
-    data
-        The tables of a file; entries that are not numbers are ignored.
+    `data`: the tables of a file; entries that are not numbers are ignored.
     """
     found = [(key, place, value) for key in USUAL for place, value in _values(data, key)]
     return [question for key, place, value in found if (question := slip(key, value, place))]

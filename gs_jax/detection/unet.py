@@ -219,10 +219,7 @@ def write_weights(path: PathLike, network: UNet, provenance: Provenance | None =
 def read_weights(path: PathLike) -> UNet:
     """Read a network that `write_weights` wrote, in float32. Nothing in the file is executed.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or does not hold the finite arrays of a network.
+    Raises `InputError` if the file cannot be read, or does not hold the finite arrays of a network.
     """
     return weights.read_weights(path, _skeleton)
 

@@ -50,10 +50,7 @@ class Readout(NamedTuple):
     def region(self, sensor: Sensor) -> Sensor:
         """Return the pixels that the camera read out of a whole sensor, as in the file.
 
-        Raises
-        ------
-        InputError
-            If the region exceeds the sensor, less than 2 x 2 pixels are left, or a mosaic is binned.
+        Raises `InputError` if the region exceeds the sensor, less than 2 x 2 pixels are left, or a mosaic is binned.
         """
         row, column, rows, columns = self.roi or (0, 0, *sensor.shape)
         if not (0 <= row <= sensor.shape[0] - rows and 0 <= column <= sensor.shape[1] - columns):
@@ -272,10 +269,7 @@ def flat_field_gain(
 ) -> tuple[Float32[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
     """Relative gain of each pixel, with a mean of 1, and which pixels are too dark to tell; these have 1.
 
-    Raises
-    ------
-    InputError
-        If the median of the flat field is not above the dark.
+    Raises `InputError` if the median of the flat field is not above the dark.
     """
     light = correct(flat, dark)
     middle = float(np.median(light))

@@ -50,10 +50,7 @@ def check_input(path: PathLike) -> Path:
 def read_text(path: PathLike, most: int = MAX_TEXT_BYTES) -> str:
     """Read a UTF-8 file of at most `most` bytes, without its byte order mark.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, is too large or is not UTF-8.
+    Raises `InputError` if it cannot be read, is too large or is not UTF-8.
     """
     path = check_input(path)
     if path.stat().st_size > most:
@@ -75,11 +72,8 @@ def check_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
 def check_output(path: PathLike, suffixes: Sequence[str]) -> Path:
     """Return a path that can be written; for calls before a long computation.
 
-    Raises
-    ------
-    InputError
-        If the suffix is none of `suffixes`, the folder is missing or not writable, or the path is a device or a folder,
-        other than a Zarr image that `.zarr` would replace.
+    Raises `InputError` if the suffix is none of `suffixes`, the folder is missing or not writable, or the path is a
+    device or a folder, other than a Zarr image that `.zarr` would replace.
     """
     check_suffix(path, suffixes)
     _check_target(Path(path))
@@ -127,12 +121,8 @@ def atomic_write(path: PathLike) -> Iterator[Path]:
     After any exception the new file is removed and the old one is unchanged. A link stays a link: its target is
     replaced.
 
-    Raises
-    ------
-    InputError
-        As `check_output`, before anything is written.
-    OSError
-        If it cannot be written whole: with a number and the name of `path`.
+    Raises `InputError` as `check_output`, before anything is written; `OSError` if it cannot be written whole: with a
+    number and the name of `path`.
     """
     target = Path(os.path.realpath(path))
     _check_target(target)

@@ -74,10 +74,7 @@ def fill_bad_pixels(
 ) -> Float32[np.ndarray, "row column"]:
     """Replace bad pixels by the median of their good 3 x 3 neighbours; larger defects are filled from their edge.
 
-    Raises
-    ------
-    ValueError
-        If all pixels are bad.
+    Raises `ValueError` if all pixels are bad.
     """
     image, bad = np.array(image, np.float32), bad.copy()
     if bad.all():

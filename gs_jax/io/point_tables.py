@@ -139,10 +139,8 @@ def read_positions(
     capture from 1, or the name of its file. Without that column there is a line per capture, in their order. An empty
     cell and a missing column are unknown.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, the header has other columns, or a cell is neither empty nor allowed.
+    Raises `InputError` if the file cannot be read, the header has other columns, or a cell is neither empty nor
+    allowed.
     """
     lines = csv.DictReader(io.StringIO(read_text(path), newline=""), skipinitialspace=True, restkey="", restval="")
     names = [name.strip() for name in lines.fieldnames or []]
@@ -177,11 +175,8 @@ def _capture(path: PathLike, place: str, cell: str, captures: Sequence[PathLike]
 def read_table(path: PathLike, header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
     """Read the numbers of a CSV file whose first line is `header`; without rows the shape is `(0, column)`.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, has another header, a line with too many or too few values, a value that is not
-        a finite number, or more than `max_rows` rows.
+    Raises `InputError` if it cannot be read, has another header, a line with too many or too few values, a value that
+    is not a finite number, or more than `max_rows` rows.
     """
     names = header.split(",")
     text = read_text(path, max(MAX_TEXT_BYTES, max_rows * len(names) * _NUMBER_BYTES))

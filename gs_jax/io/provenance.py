@@ -58,10 +58,7 @@ def write_sidecar(path: PathLike, provenance: Provenance | None) -> None:
 def read_provenance(path: PathLike) -> dict[str, str]:
     """Read the provenance of a file; empty if it has none.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is of no format that `gs_jax` writes.
+    Raises `InputError` if it cannot be read, or is of no format that `gs_jax` writes.
     """
     suffix = check_suffix(path, tuple(_READERS))
     if suffix != ".zarr":

@@ -49,11 +49,8 @@ def decode_plane(path: Path, tiff: tifffile.TiffFile, index: int) -> np.ndarray:
 def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
     """Pixels of a page whose declared size has been checked.
 
-    Raises
-    ------
-    InputError
-        If a part of the page is missing (tifffile would fill it with zeros), no decoder of its compression is
-        installed, or it is damaged.
+    Raises `InputError` if a part of the page is missing (tifffile would fill it with zeros), no decoder of its
+    compression is installed, or it is damaged.
     """
     _check_segments(path, page)
     try:

@@ -137,10 +137,7 @@ def check_mesh_reader(path: Path) -> None:
 def read_mesh(path: PathLike) -> Mesh:
     """Reads an STL or 3MF file, in mm, and merges equal vertices.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is too large, has another format, or holds no facet.
+    Raises `InputError` if the file cannot be read, is too large, has another format, or holds no facet.
     """
     path = check_input(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -178,10 +175,7 @@ def make_mask(array: MicrolensArray, shape: MoldShape = MoldShape()) -> Mask:
 
     The plan uses the frame of the part with +y up: it shows the sheet as the mold from above, from the plano side.
 
-    Raises
-    ------
-    InputError
-        If the plate is infinite, or lenses cover all of it.
+    Raises `InputError` if the plate is infinite, or lenses cover all of it.
     """
     if array.size is None:
         raise InputError("`array.size_mm` must be finite, got an infinite plate.")
@@ -213,10 +207,7 @@ def write_mask(path: PathLike, mask: Mask, provenance: Provenance | None = None)
 
     Layers are OUTLINE, OPENINGS and MARKS (GDSII: 0, 1 and 2). DXF and SVG are in mm, GDSII in um.
 
-    Raises
-    ------
-    InputError
-        As `check_output`; for GDSII without `gdstk`.
+    Raises `InputError` as `check_output`; for GDSII without `gdstk`.
     """
     path = check_output(path, MASK_SUFFIXES)
     layers = {"OUTLINE": [mask.outline], "OPENINGS": mask.openings, "MARKS": mask.marks}

@@ -35,10 +35,7 @@ class HeightMap:
 
     Rows are ordered from the largest y to the smallest, in the frame of the maker, columns from the smallest x.
 
-    Raises
-    ------
-    InputError
-        If the plate is infinite, or `step` leaves fewer than `MIN_POINTS` points on a side.
+    Raises `InputError` if the plate is infinite, or `step` leaves fewer than `MIN_POINTS` points on a side.
     """
 
     array: MicrolensArray

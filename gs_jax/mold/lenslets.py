@@ -193,10 +193,7 @@ def tessellate(lenslet: Lenslet, radius: float, chord: float) -> Tessellation:
     principal curvature. Interior vertices are moved outward by the mean depth of the facets, so that thickness and
     volume are unbiased.
 
-    Raises
-    ------
-    RuntimeError
-        If the facets do not converge; they do for slopes up to `MAX_SLOPE`.
+    Raises `RuntimeError` if the facets do not converge; they do for slopes up to `MAX_SLOPE`.
     """
     profile = _profile(lenslet, radius)
     circumradius = math.sqrt(2 * (1 / profile.max_curvature) * chord - chord**2)

@@ -57,10 +57,7 @@ def measure_lenslets(mesh: Mesh, array: MicrolensArray, *, scale: float = 1.0) -
     The mesh is in the frame of the part and `scale` times as large as the array, the design, which assigns facets to
     lenslets and gives the aspheric terms.
 
-    Raises
-    ------
-    ValueError
-        If the mesh has no facet near any lenslet.
+    Raises `ValueError` if the mesh has no facet near any lenslet.
     """
     # Depths below the plane of the vertices.
     vertices = mesh.vertices.astype(float) / scale + (0, 0, float(array.substrate_thickness))

@@ -105,13 +105,9 @@ def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progres
 
     `chord` is the chordal tolerance, the largest distance between a facet and the lens surface, mm.
 
-    Raises
-    ------
-    InputError
-        If a lens lies outside the plate, or the plate is infinite.
-    ValueError
-        If lenses coincide, rims are too steep, the plate is too thin, or `chord` is not positive, too coarse, or so
-        fine that it takes more than `MAX_FACETS`.
+    Raises `InputError` if a lens lies outside the plate, or the plate is infinite; `ValueError` if lenses coincide,
+    rims are too steep, the plate is too thin, or `chord` is not positive, too coarse, or so fine that it takes more
+    than `MAX_FACETS`.
     """
     check_array(array)
     lenslets, thickness = lenslets_of(array), plate_thickness(array)
@@ -266,10 +262,7 @@ def _label_outline(label: str, *, height: float, width: float) -> m3.CrossSectio
 def lenslets_volume(array: MicrolensArray) -> float:
     """Volume of the lenses above the base, mm^3, by quadrature.
 
-    Raises
-    ------
-    InputError
-        If a lens lies outside the plate, or the plate is infinite.
+    Raises `InputError` if a lens lies outside the plate, or the plate is infinite.
     """
     lenslets = lenslets_of(array)
     if array.alike:

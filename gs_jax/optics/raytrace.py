@@ -89,10 +89,7 @@ def secant(slope: Coordinates) -> Scalars:
 def refract(imager: Imager, depth: Scalars, point: Coordinates, field: Coordinates) -> RefractedRay:
     """Trace the ray from a field point through a point of the curved side, or of an ideal lens, to the sensor.
 
-    Raises
-    ------
-    InputError
-        If the lenses differ.
+    Raises `InputError` if the lenses differ.
     """
     imager.array.check_alike()
     if imager.array.thin_lens_focal_length is not None:

@@ -63,10 +63,7 @@ def prepare_model(imager: Imager, grid: Grid, optics: PsfModel | str, progress: 
 def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
     """Bin an image to the model's pixels, above the camera's offset; return it and the background in it.
 
-    Raises
-    ------
-    InputError
-        If a pixel is not finite.
+    Raises `InputError` if a pixel is not finite.
     """
     check_finite("image", image)
     light = sum_squares(subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype)), model.binning)

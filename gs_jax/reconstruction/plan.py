@@ -63,10 +63,7 @@ class Plan:
     ) -> "Plan":
         """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
 
-        Raises
-        ------
-        InputError
-            If options exclude each other, or the volume would not fit into memory.
+        Raises `InputError` if options exclude each other, or the volume would not fit into memory.
         """
         if suppress != "none" and method != "backproject":
             raise InputError(f"--suppress {suppress} must be used with --method backproject, got {method}.")

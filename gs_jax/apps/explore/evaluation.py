@@ -101,10 +101,8 @@ def make_sliders(design: Design) -> dict[str, Slider]:
 def complete_values(sliders: dict[str, Slider], values: Values) -> Values:
     """A value for every slider; those that are missing are at their start.
 
-    Raises
-    ------
-    InputError
-        If there is no such slider, a value is out of range, or the nearest depth is not below the farthest.
+    Raises `InputError` if there is no such slider, a value is out of range, or the nearest depth is not below the
+    farthest.
     """
     if unknown := [name for name in values if name not in sliders]:
         raise InputError(f"the sliders are {', '.join(sliders)}, got {unknown[0]!r}.")

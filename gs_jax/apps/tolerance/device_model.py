@@ -230,10 +230,7 @@ def depth_arguments(
     Points are, at each of the depths, in the middle of the plate and half-way to its corners. The default sources are
     on the axis at the nearest, the middle and the farthest depth, and a field radius beside it at the middle one.
 
-    Raises
-    ------
-    InputError
-        If fewer than two lenses see a point or a source.
+    Raises `InputError` if fewer than two lenses see a point or a source.
     """
     if imager.tilt is None:
         imager = dataclasses.replace(imager, tilt=np.zeros(2))

@@ -45,10 +45,7 @@ class ToleranceSpec(Table):
 def read_tolerances(path: PathLike) -> ToleranceSpec:
     """Read a TOML file whose keys are the fields of `ToleranceSpec`; missing ones have their defaults.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a key does not exist or has a wrong value.
+    Raises `InputError` if the file cannot be read, or a key does not exist or has a wrong value.
     """
     try:
         return ToleranceSpec.model_validate(read_toml(path))
