@@ -40,7 +40,6 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
         if places.count(place) > 1:
             raise InputError(f"{path}: outputs must be different files, got the same file for two.")
     existing = [path for path in given if os.path.exists(path)]
-    existing = [path for path in outputs if path is not None and os.path.exists(path)]
     if not existing:
         return
     from ..io.recordings import capture_files

@@ -5,9 +5,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -15,97 +13,8 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..layers import check_room
-from ..lenses import EACH, type_of_lens
-from ..optics.apertures import pitch
+from .parameters import Free
 from .solve import CONVERGED, LBFGSB, NOT_FINITE, Bounds, Box, Solver, least_change, run, stepper
-
-Values = dict[str, Float[Array, "..."]]
-
-_OF_ARRAY = (
-    "centers",
-    "radius_of_curvature",
-    "aperture_diameter",
-    "conic_constant",
-    "aspheric_terms",
-    "refractive_index",
-    "substrate_thickness",
-    "size",
-)
-_OF_IMAGER = ("sensor_distance", "rotation", "shift", "tilt", "wavelength")
-_OF_LAYERS = (
-    "filters.thickness",
-    "filters.refractive_index",
-    "windows.thickness",
-    "windows.refractive_index",
-    "sample.refractive_index",
-    "sample.surface",
-)
-
-
-class Free(NamedTuple):
-    """Which numbers of an imager are free; `gs_jax.free` makes it."""
-
-    names: tuple[str, ...]
-
-    def values(self, imager: Imager) -> Values:
-        """The free numbers by name. What lenses have of their own is one number for each lens type."""
-        if missing := [name for name in self.names if _leaf(imager, name) is None]:
-            raise InputError(f"free: {missing[0]} must be a number of the imager (it may be zero), got None.")
-        if "pitch" in self.names and len(imager.array.centers) < 2:
-            raise InputError("free: pitch must be that of two lenses or more, got a single lens.")
-        values = {name: _leaf(imager, name) for name in self.names}
-        for name in self.names:
-            if (types := _types(imager, name)) is not None:
-                # A number that all types share may differ between them in a search.
-                values[name] = jnp.broadcast_to(values[name], len(types))[np.unique(types, return_index=True)[1]]
-        return values
-
-    def replaced(self, imager: Imager, values: Values) -> Imager:
-        """The imager with other numbers. A pitch scales the lens centres and the plate about the middle."""
-        names = [name for name in self.names if name != "pitch"]
-        types = [_types(imager, name) for name in names]
-        numbers = [values[n] if each is None else values[n][each] for n, each in zip(names, types, strict=True)]
-        scale = values["pitch"] / _leaf(imager, "pitch") if "pitch" in self.names else None
-        imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, numbers)
-        if scale is None:
-            return imager
-        lengths = lambda i: [i.array.centers] if i.array.size is None else [i.array.centers, i.array.size]
-        return eqx.tree_at(lengths, imager, replace_fn=lambda length: scale * length)
-
-
-def free(*names: str) -> Free:
-    """Which numbers of an imager a search may change.
-
-    *Host.*
-
-    Parameters
-    ----------
-    names
-        Fields of `Imager` and of `MicrolensArray`: `"sensor_distance"`, `"rotation"`, `"shift"`, `"tilt"`,
-        `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
-        `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`, `"size"`. Where lenses differ, radius,
-        aperture and conic constant are free for each lens type, and the type of each lens stays. `"pitch"` is the mean
-        distance of nearest neighbours: it scales the pattern and the plate. Of layers, one number each:
-        `"filters.thickness"`, `"windows.thickness"`, and with `"refractive_index"` in place of that; of the medium
-        `"sample.refractive_index"`, `"sample.surface"`.
-
-    Raises
-    ------
-    InputError
-        If there is no such field, or none is named.
-
-    Examples
-    --------
-    >>> import gs_jax as gs
-    >>> gs.free("centers", "sensor_distance").names
-    ('centers', 'sensor_distance')
-    """
-    known = (*_OF_IMAGER, *_OF_ARRAY, *_OF_LAYERS, "pitch")
-    if wrong := [name for name in names if name not in known]:
-        raise InputError(f"free: names must be among {', '.join(known)}, got {wrong[0]!r}.")
-    if not names:
-        raise InputError(f"free: at least one name must be given, of {', '.join(known)}.")
-    return Free(tuple(dict.fromkeys(names)))
 
 
 class Optimum(NamedTuple):
@@ -227,17 +136,3 @@ def _map(name, free, bounds, box):
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
         raise InputError(f"bounds of {name} must be finite, the lower one first, got {low} to {high}.")
     return (Box if box else Bounds)(low, high)
-
-
-def _leaf(imager, name):
-    if name == "pitch":
-        return pitch(imager.array.centers)[0]
-    at: Any = imager.array if name in _OF_ARRAY else imager
-    for part in name.split("."):
-        at = None if at is None else getattr(at, part)
-    return at
-
-
-def _types(imager, name) -> np.ndarray | None:
-    """The type of each lens, where lenses have a number of their own."""
-    return type_of_lens(imager.array) if name in EACH and not imager.array.alike else None

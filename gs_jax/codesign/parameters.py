@@ -1,4 +1,6 @@
-"""The parameters of a co-design: what of an imager, and of its depths, a study may free.
+"""The parameters of a co-design: what of an imager a search may free, and what of its depths a study may.
+
+`Free` names numbers of an imager as its fields do, for `gs_jax.optimize`. The rest is for studies.
 
 `evaluated` gives the imager of a design and its `Conditions`, `start_values` their parameters by name, `candidate` the
 imager and conditions of other values, differentiable in all of them, and `new_design` a design file's. Names carry the
@@ -10,6 +12,7 @@ in the order of their first lenses; the type of each lens stays.
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,17 +32,18 @@ from ..optics.apertures import pitch, voronoi_cells
 
 Values = dict[str, Float[Array, "..."]]
 
-NAMES = (
-    "sensor_distance_mm",
-    "radius_of_curvature_mm",
-    "aperture_diameter_mm",
-    "refractive_index",
-    "conic_constant",
-    "aspheric_terms",
-    "pitch_mm",
-    "centers_mm",
-    "depth_span_mm",
-)
+# What `Free` calls the parameters of a study; the span of the depths is none of an imager's.
+_FIELDS = {
+    "sensor_distance_mm": "sensor_distance",
+    "radius_of_curvature_mm": "radius_of_curvature",
+    "aperture_diameter_mm": "aperture_diameter",
+    "refractive_index": "refractive_index",
+    "conic_constant": "conic_constant",
+    "aspheric_terms": "aspheric_terms",
+    "pitch_mm": "pitch",
+    "centers_mm": "centers",
+}
+NAMES = (*_FIELDS, "depth_span_mm")
 
 # Aspheric terms of a lens without any, where they are free.
 _TERMS = 2
@@ -49,6 +53,107 @@ _DIGITS = 4
 _SIGNIFICANT = 7
 # Of lenses that differ: enough for the mean clear aperture of a type to 1e-3, an eighth of the work of all.
 _EDGES = 64
+
+
+_OF_ARRAY = (
+    "centers",
+    "radius_of_curvature",
+    "aperture_diameter",
+    "conic_constant",
+    "aspheric_terms",
+    "refractive_index",
+    "substrate_thickness",
+    "size",
+)
+_OF_IMAGER = ("sensor_distance", "rotation", "shift", "tilt", "wavelength")
+_OF_LAYERS = (
+    "filters.thickness",
+    "filters.refractive_index",
+    "windows.thickness",
+    "windows.refractive_index",
+    "sample.refractive_index",
+    "sample.surface",
+)
+
+
+class Free(NamedTuple):
+    """Which numbers of an imager are free; `gs_jax.free` makes it."""
+
+    names: tuple[str, ...]
+
+    def values(self, imager: Imager) -> Values:
+        """The free numbers by name. What lenses have of their own is one number for each lens type."""
+        if missing := [name for name in self.names if _leaf(imager, name) is None]:
+            raise InputError(f"free: {missing[0]} must be a number of the imager (it may be zero), got None.")
+        if "pitch" in self.names and len(imager.array.centers) < 2:
+            raise InputError("free: pitch must be that of two lenses or more, got a single lens.")
+        values = {name: _leaf(imager, name) for name in self.names}
+        for name in self.names:
+            if (types := _types(imager, name)) is not None:
+                # A number that all types share may differ between them in a search.
+                values[name] = jnp.broadcast_to(values[name], len(types))[np.unique(types, return_index=True)[1]]
+        return values
+
+    def replaced(self, imager: Imager, values: Values) -> Imager:
+        """The imager with other numbers. A pitch scales the lens centres and the plate about the middle."""
+        names = [name for name in self.names if name != "pitch"]
+        types = [_types(imager, name) for name in names]
+        numbers = [values[n] if each is None else values[n][each] for n, each in zip(names, types, strict=True)]
+        scale = values["pitch"] / _leaf(imager, "pitch") if "pitch" in self.names else None
+        imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, numbers)
+        if scale is None:
+            return imager
+        lengths = lambda i: [i.array.centers] if i.array.size is None else [i.array.centers, i.array.size]
+        return eqx.tree_at(lengths, imager, replace_fn=lambda length: scale * length)
+
+
+def free(*names: str) -> Free:
+    """Which numbers of an imager a search may change.
+
+    *Host.*
+
+    Parameters
+    ----------
+    names
+        Fields of `Imager` and of `MicrolensArray`: `"sensor_distance"`, `"rotation"`, `"shift"`, `"tilt"`,
+        `"wavelength"`; `"centers"`, `"radius_of_curvature"`, `"aperture_diameter"`, `"conic_constant"`,
+        `"aspheric_terms"`, `"refractive_index"`, `"substrate_thickness"`, `"size"`. Where lenses differ, radius,
+        aperture and conic constant are free for each lens type, and the type of each lens stays. `"pitch"` is the mean
+        distance of nearest neighbours: it scales the pattern and the plate. Of layers, one number each:
+        `"filters.thickness"`, `"windows.thickness"`, and with `"refractive_index"` in place of that; of the medium
+        `"sample.refractive_index"`, `"sample.surface"`.
+
+    Raises
+    ------
+    InputError
+        If there is no such field, or none is named.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> gs.free("centers", "sensor_distance").names
+    ('centers', 'sensor_distance')
+    """
+    known = (*_OF_IMAGER, *_OF_ARRAY, *_OF_LAYERS, "pitch")
+    if wrong := [name for name in names if name not in known]:
+        raise InputError(f"free: names must be among {', '.join(known)}, got {wrong[0]!r}.")
+    if not names:
+        raise InputError(f"free: at least one name must be given, of {', '.join(known)}.")
+    return Free(tuple(dict.fromkeys(names)))
+
+
+def _leaf(imager, name):
+    if name == "pitch":
+        return pitch(imager.array.centers)[0]
+    at: Any = imager.array if name in _OF_ARRAY else imager
+    for part in name.split("."):
+        at = None if at is None else getattr(at, part)
+    return at
+
+
+def _types(imager, name) -> np.ndarray | None:
+    """The type of each lens, where lenses have a number of their own."""
+    return type_of_lens(imager.array) if name in EACH and not imager.array.alike else None
 
 
 def evaluated(
@@ -109,61 +214,33 @@ def _largest_magnification(design: Design, near: float, far: float, free: Mappin
     return reduced_sensor_distance(design, distance, index) / reduced_depth(design, nearest, index)
 
 
+def _fields_of(imager: Imager) -> dict[str, str]:
+    """What `Free` calls the parameters that an imager has, by their names; a single lens has no pitch."""
+    single = len(imager.array.centers) == 1
+    return {name: field for name, field in _FIELDS.items() if not (single and field == "pitch")}
+
+
 def start_values(imager: Imager, at: Conditions) -> Values:
-    """Every parameter by name. Of lenses that differ, radius, aperture and conic constant have one value a type."""
-    array = imager.array
-    first = np.unique(type_of_lens(array), return_index=True)[1]
-    numbers = [getattr(array, name) for name in EACH]
-    if len(first) > 1:
-        # A number that all types share may differ between them in a search.
-        numbers = [jnp.broadcast_to(number, len(array.centers))[first] for number in numbers]
-    radius, diameter, conic = numbers
-    return {
-        "sensor_distance_mm": imager.sensor_distance,
-        "radius_of_curvature_mm": radius,
-        "aperture_diameter_mm": diameter,
-        "refractive_index": array.refractive_index,
-        "conic_constant": conic,
-        "aspheric_terms": array.aspheric_terms,
-        "pitch_mm": _pitch(imager),
-        "centers_mm": array.centers,
-        "depth_span_mm": at.depths[-1] - at.depths[0],
-    }
+    """Every parameter by name. Of lenses that differ, radius, aperture and conic constant have one value a type.
 
-
-def _pitch(imager: Imager) -> Float[Array, ""]:
-    """Mean distance of nearest neighbours; 1 for a single lens."""
-    centers = imager.array.centers
-    return pitch(centers)[0] if len(centers) > 1 else jnp.ones((), centers.dtype)
+    The pitch of a single lens is 1.
+    """
+    fields, span = _fields_of(imager), at.depths[-1] - at.depths[0]
+    numbers = Free(tuple(fields.values())).values(imager)
+    own = {name: numbers[field] for name, field in fields.items()}
+    return {"pitch_mm": jnp.ones_like(span), "depth_span_mm": span} | own
 
 
 def candidate(imager: Imager, at: Conditions, values: Values) -> tuple[Imager, Conditions]:
     """An imager and its conditions with some parameters replaced; differentiable in all of them.
 
-    Parameters
-    ----------
-    values
-        By name, any subset of `NAMES`. A pitch scales the pattern and the plate about the middle; `centers_mm` are the
-        centres before that, and the imager's own if `at` has `cells`.
+    `values`: by name, any subset of `NAMES`. A pitch scales the pattern and the plate about the middle; `centers_mm`
+    are the centres before that, and the imager's own if `at` has `cells`.
     """
     values = start_values(imager, at) | values
-    scale = values["pitch_mm"] / _pitch(imager)
-    replaced = {
-        "centers": scale * values["centers_mm"],
-        "size": None if imager.array.size is None else scale * imager.array.size,
-        "refractive_index": values["refractive_index"],
-        "aspheric_terms": values["aspheric_terms"],
-        **{name: of_lenses(imager, values[key]) for name, key in zip(EACH, LENS_KEYS, strict=True)},
-    }
-    array = dataclasses.replace(imager.array, **replaced)
+    numbers = {field: values[name] for name, field in _fields_of(imager).items()}
     depths = depths_between(at.middle.depths[0], values["depth_span_mm"], at.depths.size)
-    imager = dataclasses.replace(imager, array=array, sensor_distance=values["sensor_distance_mm"])
-    return imager, dataclasses.replace(at, depths=depths)
-
-
-def of_lenses(imager: Imager, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A value for each lens, given one for each type; a single number stays."""
-    return value if value.ndim == 0 else value[type_of_lens(imager.array)]
+    return Free(tuple(numbers)).replaced(imager, numbers), dataclasses.replace(at, depths=depths)
 
 
 def new_design(design: Design, imager: Imager, at: Conditions, values: Values) -> Design:
@@ -174,10 +251,11 @@ def new_design(design: Design, imager: Imager, at: Conditions, values: Values) -
 
     Raises `InputError` if the values make no microscope.
     """
-    values = start_values(imager, at) | values
+    start = start_values(imager, at)
+    values = start | values
     shared = ("sensor_distance_mm", "refractive_index", "depth_span_mm")
     numbers = {name: round(float(values[name]), _DIGITS) for name in shared}
-    scale = float(values["pitch_mm"] / _pitch(imager))
+    scale = float(values["pitch_mm"] / start["pitch_mm"])
     size = [round(scale * side, _DIGITS) for side in design.array.size_mm]
     # Rounding may not push a lens off the plate.
     half = np.array(size) / 2
@@ -206,6 +284,6 @@ def significant(value: Float[Array, "..."]) -> Float64[np.ndarray, "..."]:
 
 def _of_lenses_rounded(imager: Imager, name: str, value: Float[Array, "..."]) -> float | list[float]:
     """One number if all types come to the same."""
-    numbers = of_lenses(imager, value)
+    numbers = value if value.ndim == 0 else value[type_of_lens(imager.array)]
     numbers = np.round(np.asarray(numbers, float), _DIGITS) if name.endswith("_mm") else significant(numbers)
     return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

@@ -1,7 +1,6 @@
 """Report of a search: a table, a figure, JSON, and the design with its provenance."""
 
 import datetime
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from rich.table import Table
 
+from ..design.datasheets import six_digits
 from ..design.design import Design, write_design
 from ..design.validation import of_each
 from ..io.files import check_output, write_figure, write_json
@@ -86,7 +86,7 @@ def write_outcome(
 
 def as_records(outcome: Outcome) -> list[dict[str, Any]]:
     """Terms before and after as records for a JSON file; `None` stands for infinity."""
-    ends = lambda row: [_finite(row.low), _finite(row.high)]
+    ends = lambda row: [six_digits(row.low), six_digits(row.high)]
     return [
         {
             "term": term.name,
@@ -103,12 +103,8 @@ def as_records(outcome: Outcome) -> list[dict[str, Any]]:
     ]
 
 
-def _finite(x: float) -> float | None:
-    return float(f"{x:.6g}") if math.isfinite(x) else None
-
-
 def _plain(record: dict[str, Any]) -> dict[str, Any]:
-    return {key: _finite(x) if isinstance(x, float) else x for key, x in record.items()}
+    return {key: six_digits(x) if isinstance(x, float) else x for key, x in record.items()}
 
 
 def picture(outcome: Outcome) -> Figure:

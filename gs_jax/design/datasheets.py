@@ -72,25 +72,25 @@ def datasheet(
     depths, imager, centers = _checked(design, depths), design.imager(), np.array(design.array.centers_mm)
     parts = parts_of(design, depths, circle_of_confusion=circle_of_confusion)
     distances = nearest_neighbour_distances(centers)
-    columns = [_columns(*part) for part in parts]
+    columns = [columns_of(*part) for part in parts]
     best = np.argmin([column["spot_width_um"] for column in columns], 0)
     shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
     for name in ("lenses_per_point", "occupancy"):
         shown[name] = np.sum([column[name] for column in columns], 0).tolist()
     lenses = [len(imager.array.centers) for imager, _ in parts]
-    mean = lambda values: _round(float(np.average(values, weights=lenses)))
+    mean = lambda values: six_digits(float(np.average(values, weights=lenses)))
     return {
         "depth_mm": depths,
-        **{name: [_round(value) for value in values] for name, values in shown.items()},
+        **{name: [six_digits(value) for value in values] for name, values in shown.items()},
         "f_number": mean([float(objectives.f_number(*part)) for part in parts]),
         "numerical_aperture": mean([float(objectives.numerical_aperture(*part)) for part in parts]),
         "focal_length_mm": mean([float(imager.array.focal_length) for imager, _ in parts]),
-        "pitch_mm": _round(float(distances.mean())),
-        "pitch_sd_mm": _round(float(distances.std())) if len(centers) > 1 else 0.0,
+        "pitch_mm": six_digits(float(distances.mean())),
+        "pitch_sd_mm": six_digits(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
         **_light_path(imager),
         **_over_the_band(imager, depths[len(depths) // 2]),
-        "coverage": _round(sum(float(objectives.coverage(*part)) for part in parts)),
+        "coverage": six_digits(sum(float(objectives.coverage(*part)) for part in parts)),
         **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
     }
 
@@ -102,16 +102,16 @@ def _light_path(imager: Imager) -> dict[str, Any]:
         if layers is not None:
             thickness = float(layers.total)
             found |= {
-                f"{side}_layers_mm": _round(thickness),
-                f"{side}_layers_reduced_mm": _round(thickness - float(layers.shortening)),
+                f"{side}_layers_mm": six_digits(thickness),
+                f"{side}_layers_reduced_mm": six_digits(thickness - float(layers.shortening)),
             }
     if imager.sample is not None:
-        found["sample_index"] = _round(float(imager.sample.refractive_index))
-        found["sample_surface_mm"] = _round(float(imager.sample_surface))
+        found["sample_index"] = six_digits(float(imager.sample.refractive_index))
+        found["sample_surface_mm"] = six_digits(float(imager.sample_surface))
     if found and imager.array.alike:
         air = dataclasses.replace(imager, filters=None, windows=None, sample=None)
         shift = _depth_in_focus(imager) - _depth_in_focus(air)
-        found["focus_shift_mm"] = _round(shift)
+        found["focus_shift_mm"] = six_digits(shift)
     return found
 
 
@@ -125,10 +125,10 @@ def _over_the_band(imager: Imager, depth: float) -> dict[str, Any]:
     focus = [float(objectives.focus_distance(*per_type(one, at)[best])[0]) for one in each]
     width = [1000 * row[best] for row in widths]
     return {
-        "band_nm": [_round(1e6 * float(one.wavelength)) for one in each],
-        "band_depth_mm": _round(depth),
-        "band_focus_distance_mm": [_round(value) for value in focus],
-        "band_spot_width_um": [_round(value) for value in width],
+        "band_nm": [six_digits(1e6 * float(one.wavelength)) for one in each],
+        "band_depth_mm": six_digits(depth),
+        "band_focus_distance_mm": [six_digits(value) for value in focus],
+        "band_spot_width_um": [six_digits(value) for value in width],
     }
 
 
@@ -173,12 +173,13 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
             "focal_length_mm": array.focal_length,
             "clear_diameter_mm": objectives.clear_diameter(imager, at),
         }
-        spots = {name: [_round(float(x)) for x in column[name]] for name in ("spot_width_um", "spot_radius_um")}
-        found.append({"lenses": len(array.centers), **{k: _round(float(x)) for k, x in numbers.items()}, **spots})
+        spots = {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", "spot_radius_um")}
+        found.append({"lenses": len(array.centers), **{k: six_digits(float(x)) for k, x in numbers.items()}, **spots})
     return found
 
 
-def _columns(imager: Imager, at: Conditions) -> dict[str, Any]:
+def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
+    """The columns of a datasheet by name, for lenses that are alike; may be traced."""
     wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
     width, radius = _spot_sizes(imager, at)
     magnification = imager.magnification(at.depths)
@@ -289,8 +290,8 @@ def _plain(value: float | None) -> str:
     return "inf" if value is None else f"{value:.4g}"
 
 
-def _round(value: float) -> float | None:
-    """Six digits, more than any of the formulas is worth."""
+def six_digits(value: float) -> float | None:
+    """Six digits, more than any of the formulas is worth; None stands for what is not finite."""
     return float(f"{value:.6g}") if math.isfinite(value) else None
 
 

@@ -244,24 +244,12 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
 
     Values are separated by semicolons, tabs, commas or blanks, the first of these in the first line. Blanks about
     values, empty lines and those that begin with `#` are ignored, but the last of these before the numbers is the
-    header if it has as many names.
+    header if it has as many names. `wanted` are the names of the columns x and y, by default those with a usual name,
+    or the first and the second of two; `most` is the largest number of rows, and `also` names further columns, which
+    are read if the header has them.
 
-    Parameters
-    ----------
-    path
-        Table of text.
-    wanted
-        Names of the columns x and y. By default those with a usual name, or the first and the second of two.
-    most
-        Largest number of rows.
-    also
-        Names of further columns, which are read if the header has them.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, lacks the columns, or has lines of different length, cells in them that are not
-        finite numbers, too many rows, or a further column twice.
+    Raises `InputError` if the file cannot be read, lacks the columns, or has lines of different length, cells in them
+    that are not finite numbers, too many rows, or a further column twice.
     """
     lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), 1) if line.strip()]
     body = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]

@@ -17,14 +17,12 @@ from ...codesign.parameters import candidate, depths_between, evaluated, start_v
 from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
-from ...design.datasheets import circle_of_confusion_of
+from ...design.datasheets import circle_of_confusion_of, columns_of
 from ...design.design import Design
 from ...design.light_path import object_begins
 from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type
-from ...objectives.formulas import third_order_wavefront
-from ...optics import aberrations
 from ...optics.psf import least_samples, spot_image
 
 # Depths of the datasheet, and the indices of those at which spots are shown, at these shares of the field radius.
@@ -34,6 +32,11 @@ SIZE = 49
 _LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm")
 # As in `gs_jax.design.diagnostics`: spots so many times wider than Eq. 5 and so much uncovered plate are reported.
 _FAR, _MAX_UNCOVERED = 2.0, 0.005
+# Columns of the datasheet that are shown, of the type with the narrowest spot at each depth.
+_NUMBERS = (
+    *("lateral_resolution_um", "axial_resolution_um", "spot_width_um", "spot_radius_um"),
+    *("blur_um", "depth_of_field_mm", "strehl_on_axis"),
+)
 
 Values = dict[str, float]
 
@@ -160,8 +163,8 @@ def evaluate_design(start: Start, values: Values, terms: tuple[str, ...] = ()) -
 def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
     imager, at = _moved(start, values)
     parts = per_type(imager, at)
-    by_type = [_numbers_of_type(*part) for part in parts]
-    numbers = {name: jnp.stack([each[name] for each in by_type]) for name in by_type[0]}
+    by_type = [columns_of(*part) for part in parts]
+    numbers = {name: jnp.stack([each[name] for each in by_type]) for name in _NUMBERS}
     sharpest = jnp.argmin(numbers["spot_width_um"], 0)
     numbers = {name: jnp.take_along_axis(each, sharpest[None], 0)[0] for name, each in numbers.items()}
     numbers |= {"magnification": imager.magnification(at.depths), "occupancy": objectives.occupancy(imager, at)}
@@ -180,19 +183,6 @@ def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
     entries = {name: evaluate_term(name, imager, at, key) for name in terms}
     diameters = jnp.stack([objectives.clear_diameter(*part) for part in parts])
     return (at.depths, numbers, scalars, entries, diameters), sharpest
-
-
-def _numbers_of_type(imager: Imager, at: Conditions) -> dict[str, Array]:
-    axis = aberrations.linear_rms(third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype)))[:, 0]
-    return {
-        "lateral_resolution_um": 1000 * objectives.lateral_resolution(imager, at),
-        "axial_resolution_um": 1000 * objectives.axial_resolution(imager, at),
-        "spot_width_um": 1000 * objectives.spot_width(imager, at),
-        "spot_radius_um": 1000 * objectives.encircled_radius(imager, at),
-        "blur_um": 1000 * objectives.sensor_blur(imager, at),
-        "depth_of_field_mm": objectives.depth_of_field(imager, at),
-        "strehl_on_axis": aberrations.strehl(axis, imager.wavelength),
-    }
 
 
 def _moved(start: Start, values: Mapping[str, Any]) -> tuple[Imager, Conditions]:
