@@ -3,7 +3,7 @@ from ._version import __version__ as __version__
 from .base.errors import InputError as InputError
 from .base.progress import Progress as Progress
 from .calibration.fit import calibrate as calibrate
-from .codesign.optimum import optimize as optimize
+from .codesign.search import optimize as optimize
 from .codesign.parameters import free as free
 from .codesign.search import run_study as run_study
 from .codesign.study import read_study as read_study

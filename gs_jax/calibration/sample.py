@@ -8,7 +8,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..design.design import Design
-from ..design.imagers import sample_tables
+from ..design.light_path import sample_tables
 from ..design.light_path import layers_of, sample_table
 from ..geometry import Imager
 from ..layers import Layers, object_surface

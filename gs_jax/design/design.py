@@ -21,7 +21,7 @@ from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
-from .imagers import sharp_depths, tables_of
+from .light_path import sharp_depths, tables_of
 from .light_path import (
     NO_SAMPLE,
     chosen_sample,

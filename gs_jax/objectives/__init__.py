@@ -44,4 +44,4 @@ from .formulas import (
     uncovered_distance as uncovered_distance,
     wavefront_error as wavefront_error,
 )
-from .spot_size import encircled_radius as encircled_radius, spot_width as spot_width
+from .formulas import encircled_radius as encircled_radius, spot_width as spot_width
