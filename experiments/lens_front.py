@@ -31,8 +31,8 @@ from gs_jax.codesign.pareto import searcher, sweep_of
 from gs_jax.codesign.search import initial_design
 from gs_jax.codesign.study import Study, read_study
 from gs_jax.codesign.terms import TERMS
+from gs_jax.design.conversion import reduced_depth
 from gs_jax.design.design import Design, read_design
-from gs_jax.design.light_path import reduced_depth
 from gs_jax.pictures import PALETTE
 
 FOLDER = Path(__file__).parents[1] / "design"

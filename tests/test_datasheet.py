@@ -16,7 +16,7 @@ from gs_jax.design.design import read_design
 from gs_jax.design.diagnostics import findings
 from gs_jax.design.start import geomscope
 from gs_jax.objectives.conditions import per_type
-from gs_jax.objectives.formulas import third_order_wavefront
+from gs_jax.objectives.quantities import third_order_wavefront
 from gs_jax.optics import theory
 from gs_jax.optics.aberrations import linear_rms
 from gs_jax.optics.apertures import clear_diameter, pitch, voronoi_cells

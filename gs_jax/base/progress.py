@@ -190,15 +190,7 @@ class CancellableProgress(Progress):
         self._tasks: list[_Task] = []
 
     @contextmanager
-    def counter(
-        self,
-        description: str,
-        total: int | None,
-        *,
-        quarter: str = "",
-        rate: str = "",
-        words: Callable[[], str] | None = None,
-    ) -> Iterator[Callable[[], None]]:
+    def counter(self, description: str, total: int | None, **shown: Any) -> Iterator[Callable[[], None]]:
         """As `Progress.counter`; of nested tasks, `state` tells the innermost."""
         self.check_cancelled()
         task = _Task(description, total)

@@ -235,12 +235,9 @@ def search_rotation(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths
     step = within / imager.field_radius
     magnifications = np.linspace(far, near, max(int(np.ceil((near - far) / step)) + 1, 2))
     steps = np.floor(_ROTATION / _ROTATION_STEP)
-    rotated = [_rotate(imager, turn) for turn in np.arange(-steps, steps + 1) * _ROTATION_STEP]
+    turns = imager.rotation + jnp.asarray(np.arange(-steps, steps + 1) * _ROTATION_STEP, imager.rotation.dtype)
+    rotated = [eqx.tree_at(lambda i: i.rotation, imager, turn) for turn in turns]
     return max(rotated, key=lambda one: max(_concentration(spots, one, m, within) for m in magnifications))
-
-
-def _rotate(imager: Imager, angle: float) -> Imager:
-    return eqx.tree_at(lambda i: i.rotation, imager, imager.rotation + jnp.asarray(angle, imager.rotation.dtype))
 
 
 def _concentration(spots, imager: Imager, magnification: float, within: float) -> float:

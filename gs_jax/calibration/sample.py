@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError
+from ..design.conversion import layers_of, sample_table, sample_tables
 from ..design.design import Design
-from ..design.light_path import sample_tables
-from ..design.light_path import layers_of, sample_table
 from ..geometry import Imager
 from ..layers import Layers, object_surface
 from ..materials import index_of

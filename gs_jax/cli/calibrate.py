@@ -164,7 +164,7 @@ def _with_sample(light: Light, design, default: str) -> Light:
 
 def _other_samples(light: Light, design) -> str:
     """The names of a design's samples, if the sources are taken to be in air."""
-    from ..design.light_path import AIR, NO_SAMPLE
+    from ..design.conversion import AIR, NO_SAMPLE
 
     names = [*(["sample"] if design.sample != NO_SAMPLE else []), *design.samples]
     return f"; if they were in a sample: --sample {' or '.join(names)}" if light.sample == AIR and names else ""

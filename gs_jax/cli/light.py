@@ -30,7 +30,7 @@ class Light(NamedTuple):
 
     def design(self, design) -> Any:
         """The design with these in place of its own, whose working distance begins in the object's medium."""
-        from ..design.light_path import object_begins, sample_table
+        from ..design.conversion import object_begins, sample_table
 
         changes: dict[str, Any] = {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
         if self.sample is not None:

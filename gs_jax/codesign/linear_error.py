@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
 from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
-from ..objectives.formulas import occupancy
+from ..objectives.quantities import occupancy
 from ..optics import theory
 from ..optics.pupil import pupil_quadrature
 from ..optics.raytrace import trace_lenslet

@@ -22,8 +22,8 @@ from pydantic import ValidationError
 
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
+from ..design.conversion import reduced_depth, reduced_sensor_distance
 from ..design.design import Design
-from ..design.light_path import reduced_depth, reduced_sensor_distance
 from ..geometry import Imager
 from ..io.toml import one_line
 from ..lenses import EACH, type_of_lens

@@ -26,7 +26,7 @@ from .parameters import NAMES, Values, significant, start_values
 from .search import load
 from .solve import Log
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
-from .study import LimitTable, Study, TermTable
+from .study import Study, TermTable
 from .targets import Row, worst_entry
 from .terms import unit_of, with_terms
 
@@ -106,8 +106,9 @@ def sweep_of(design: Design, study: Study) -> Sweep:
     """The sweep of a study for a design; `InputError` if it does not fit the design or moves no limit."""
     if not study.pareto:
         raise InputError("`pareto` must be one or two tables, got none.")
-    moving = [_term(limit) for limit in study.pareto]
-    kept = [term for term in study.terms if term.is_goal or all(not _same(term, limit) for limit in moving)]
+    tables = [{"name": limit.name, limit.kind: limit.targets[0], "weight": 30.0} for limit in study.pareto]
+    moving, moved = list(map(TermTable.model_validate, tables)), [(limit.name, limit.kind) for limit in study.pareto]
+    kept = [term for term in study.terms if term.is_goal or (term.name, term.kind) not in moved]
     wider = study.model_copy(update={"terms": (*kept, *moving)})
     return Sweep(problem_of(design, wider), kept, moving)
 
@@ -146,14 +147,6 @@ def searcher(sweep: Sweep):
         return Point(values, rows_of(terms, entries, values))
 
     return search
-
-
-def _term(limit: LimitTable) -> TermTable:
-    return TermTable.model_validate({"name": limit.name, limit.kind: limit.targets[0], "weight": 30.0})
-
-
-def _same(term: TermTable, other: TermTable) -> bool:
-    return (term.name, term.kind) == (other.name, other.kind)
 
 
 def _with_targets(kept, moving, limits) -> list[TermTable]:

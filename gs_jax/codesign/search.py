@@ -1,35 +1,15 @@
-"""Run a study: from a design to a better design.
+"""Search for a better microscope: by a study, or by a loss of your own.
 
 A study (`gs_jax.codesign.study`) has free parameters, terms with targets, and stages of solvers. The first stage may
 start from several points; the best goes on to the next stage. A log of all steps and the solver's state make a
-checkpoint.
+checkpoint. `optimize` takes any loss; studies are this with terms by name.
 """
 
 import contextlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
-
-from ..base.errors import InputError, errors_name_file
-from ..base.machine import Workers
-from ..base.progress import Progress
-from ..design.design import Design, read_design
-from ..design.light_path import reduced_depth, reduced_sensor_distance, sample_table
-from ..lenses import lenses_by_type
-from ..optics.lens_types import interleave
-from ..typing import PathLike
-from .parameters import new_design, start_values
-from .solve import Log, State, read_checkpoint, write_checkpoint
-from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
-from .study import Study, read_study
-from .targets import Row
-
-import math
-from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -38,12 +18,35 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, errors_name_file, short_repr
+from ..base.machine import Workers
+from ..base.progress import Progress
+from ..design.conversion import reduced_depth, reduced_sensor_distance, sample_table
+from ..design.design import Design, read_design
 from ..geometry import Imager
 from ..layers import check_room
-from .parameters import Free
-from .solve import CONVERGED, LBFGSB, NOT_FINITE, Bounds, Box, Solver, least_change, run, stepper
-
+from ..lenses import lenses_by_type
+from ..optics.lens_types import interleave
+from ..typing import PathLike
+from .parameters import Free, new_design, start_values
+from .solve import (
+    CONVERGED,
+    LBFGSB,
+    NOT_FINITE,
+    Bounds,
+    Box,
+    Log,
+    Solver,
+    State,
+    least_change,
+    read_checkpoint,
+    run,
+    stepper,
+    write_checkpoint,
+)
+from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
+from .study import Study, read_study
+from .targets import Row
 
 # Seconds between two checkpoints.
 _EVERY = 10.0
@@ -208,7 +211,8 @@ def initial_design(design: Design, study: Study) -> Design:
         raise InputError(f"`kinds` must be at most {count}, the number of lenses, got {study.kinds}.")
     radius = np.ravel(design.lens.radius_of_curvature_mm)[0] * _relative_focal_lengths(design, study, study.kinds)
     which = interleave(np.array(design.array.centers_mm), study.kinds)
-    return _with(design, radius_of_curvature_mm=tuple(radius[which].tolist()))
+    lens = design.lens.model_copy(update={"radius_of_curvature_mm": tuple(radius[which].tolist())})
+    return design.model_copy(update={"lens": lens})
 
 
 def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndarray:
@@ -218,10 +222,6 @@ def _relative_focal_lengths(design: Design, study: Study, types: int) -> np.ndar
     share = (np.arange(types) + 0.5) / types
     behind = 1 / reduced_sensor_distance(design, design.imaging.sensor_distance_mm)
     return (np.mean(ends) + behind) / (ends[0] + share * (ends[1] - ends[0]) + behind)
-
-
-def _with(design: Design, **lens) -> Design:
-    return design.model_copy(update={"lens": design.lens.model_copy(update=lens)})
 
 
 class Optimum(NamedTuple):

@@ -113,7 +113,8 @@ def picture(outcome: Outcome) -> Figure:
     layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
     _draw_layout(layout, outcome.design)
     asked = outcome.study.terms
-    steps = [step for step in outcome.log.steps if _is_best(step, outcome)]
+    best = lambda stage: best_end(outcome.log, stage)["start"]
+    steps = [step for step in outcome.log.steps if step["start"] == best(step["stage"])]
     places = np.arange(1, len(steps) + 1)
     cost.semilogy(places, [max(step["cost"], 1e-12) for step in steps], "k")
     cost.set(xlabel="step", ylabel="cost", title="cost of the best start")
@@ -127,11 +128,6 @@ def picture(outcome: Outcome) -> Figure:
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
     terms.legend(fontsize=7.5, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
-
-
-def _is_best(step: dict[str, Any], outcome: Outcome) -> bool:
-    """Whether a step belongs to the best start of its stage."""
-    return step["start"] == best_end(outcome.log, step["stage"])["start"]
 
 
 def _draw_layout(axes: Axes, design: Design) -> None:

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
+from ..design.conversion import object_begins
 from ..design.design import Design
-from ..design.light_path import object_begins
 from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions

@@ -18,7 +18,6 @@ from ..typing import PathLike
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000
 UNITS = ("mm", "um", "px")
-ORIGINS = ("center", "corner")
 # Keys of `[lens]` that may have a number for each lens, and columns of these names in the file of the centres.
 LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
 # As headers write them; both letters that look like a Greek mu.
@@ -168,7 +167,8 @@ def unit_of_file(path: PathLike, columns: tuple[str, str] | None = None) -> str 
 
 def _unit_in(names: tuple[str, str] | None) -> str | None:
     """The unit that names of columns end in or have in brackets; None if they say none or two."""
-    found = {unit for name in names or () for unit in UNITS if _says(name, unit)}
+    says = lambda name, unit: re.search(rf"(?<![a-z])(?:{_UNIT[unit]})(?![a-z])", name.lower())
+    found = {unit for name in names or () for unit in UNITS if says(name, unit)}
     return found.pop() if len(found) == 1 else None
 
 
@@ -201,10 +201,6 @@ def _unit(path: Path, names: tuple[str, str] | None, unit: str | None) -> str:
         header = ",".join(names or ())
         raise InputError(f"{path}: the unit must be that of the header {header:.120}, got {unit}.")
     return unit or found or "mm"
-
-
-def _says(name: str, unit: str) -> bool:
-    return re.search(rf"(?<![a-z])(?:{_UNIT[unit]})(?![a-z])", name.lower()) is not None
 
 
 def _mirrored(rows: Any) -> Any:

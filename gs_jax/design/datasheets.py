@@ -15,7 +15,7 @@ from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..layouts import check_positive, nearest_neighbour_distances
 from ..objectives.conditions import Conditions, per_type
-from ..objectives.formulas import third_order_wavefront
+from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
 from ..optics.pupil import emission_lines

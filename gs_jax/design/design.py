@@ -21,8 +21,7 @@ from ..lenses import MicrolensArray
 from ..materials import index_of
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
-from .light_path import sharp_depths, tables_of
-from .light_path import (
+from .conversion import (
     NO_SAMPLE,
     chosen_sample,
     emission_band,
@@ -31,6 +30,8 @@ from .light_path import (
     path_in_words,
     plate_index,
     sample_table,
+    sharp_depths,
+    tables_of,
 )
 from .tables import (
     ArrayTable,

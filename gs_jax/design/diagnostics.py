@@ -11,7 +11,7 @@ import numpy as np
 from .. import objectives
 from ..geometry import Imager
 from ..objectives.conditions import Conditions
-from ..objectives.formulas import third_order_wavefront
+from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.raytrace import trace_lenslet
 from .datasheets import circle_of_confusion_of, parts_of

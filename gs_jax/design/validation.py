@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..lenses import sag_slope_over_r
 from .centers import LENS_KEYS, other_reading
-from .light_path import check_band, check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
+from .conversion import check_band, check_path, object_begins, plate_index, reduced_depth, reduced_sensor_distance
 
 MIN_SPACING_MM = 1e-3
 # Radii at which the slope of a lens is checked.

@@ -78,10 +78,6 @@ def _from_json_if_there(path: Path) -> dict:
     return _from_json(path) if path.exists() else {}
 
 
-def _from_sidecar(path: Path) -> dict:
-    return _from_json_if_there(sidecar(path))
-
-
 def _from_tiff(path: Path) -> dict:
     with tifffile.TiffFile(path, is_ome=False) as tiff:
         text = tiff.pages.first.description
@@ -130,7 +126,10 @@ _READERS: dict[str, Callable[[Path], dict]] = {
     ".3mf": _from_3mf,
     ".stl": lambda path: _from_json_if_there(path.with_suffix(".json")),
     ".json": _from_json,
-    **dict.fromkeys((".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"), _from_sidecar),
+    **dict.fromkeys(
+        (".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"),
+        lambda path: _from_json_if_there(sidecar(path)),
+    ),
 }
 
 

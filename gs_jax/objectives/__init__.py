@@ -15,7 +15,7 @@ Examples
 """
 
 from .conditions import Conditions as Conditions, clear_diameter as clear_diameter
-from .formulas import (
+from .quantities import (
     aperture_gap as aperture_gap,
     approximate_depth_of_field as approximate_depth_of_field,
     axial_resolution as axial_resolution,
@@ -23,6 +23,7 @@ from .formulas import (
     coverage as coverage,
     depth_of_field as depth_of_field,
     edge_slope as edge_slope,
+    encircled_radius as encircled_radius,
     f_number as f_number,
     far_limit as far_limit,
     field_of_view as field_of_view,
@@ -38,10 +39,10 @@ from .formulas import (
     sag as sag,
     sensor_blur as sensor_blur,
     spacing as spacing,
+    spot_width as spot_width,
     strehl as strehl,
     surface_radius as surface_radius,
     thickness as thickness,
     uncovered_distance as uncovered_distance,
     wavefront_error as wavefront_error,
 )
-from .formulas import encircled_radius as encircled_radius, spot_width as spot_width

@@ -9,7 +9,6 @@ diffraction or rays, whichever the width of the spot asks for.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -79,15 +78,6 @@ def diffraction_psf(
     """
     pixels = _pixel_energy(imager, depth, size, field, offset, radius, edges, samples)
     return pixels / jnp.sum(pixels)
-
-
-@partial(jax.jit, static_argnames=("size", "samples"))
-def window_fraction(
-    imager: Imager, depth: ScalarLike, *, size: int, samples: int = 4, **options: Any
-) -> Float[Array, ""]:
-    """Fraction of the light through the pupil in the window of `diffraction_psf`, which has the same arguments."""
-    pupil = {"field": (0.0, 0.0), "offset": (0.0, 0.0), "radius": None, "edges": None} | options
-    return jnp.sum(_pixel_energy(imager, depth, size, samples=samples, **pupil))
 
 
 @partial(jax.jit, static_argnames=("size",))

@@ -17,9 +17,9 @@ from ...codesign.parameters import candidate, depths_between, evaluated, start_v
 from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
+from ...design.conversion import object_begins
 from ...design.datasheets import circle_of_confusion_of, columns_of
 from ...design.design import Design
-from ...design.light_path import object_begins
 from ...geometry import Imager
 from ...lenses import lenses_by_type
 from ...objectives.conditions import Conditions, per_type

@@ -11,9 +11,9 @@ from jaxtyping import Float, Num
 
 from ...base.errors import InputError
 from ...base.machine import describe
+from ...design.conversion import NO_SAMPLE, object_begins
 from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design, span_of
-from ...design.light_path import NO_SAMPLE, object_begins
 from ...grid import Grid
 from ...io.files import read_text
 from ...lenses import MicrolensArray

@@ -17,7 +17,7 @@ from ...design.design import Design
 from ...geometry import Imager, check_beyond
 from ...layouts import check_positive
 from ...objectives.conditions import Conditions
-from ...objectives.formulas import axial_resolution
+from ...objectives.quantities import axial_resolution
 from .device_model import (
     CONSTANT,
     ERROR_FIELDS,

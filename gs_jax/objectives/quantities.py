@@ -1,7 +1,7 @@
-"""Quantities by formulas: paraxial and third-order optics (Eqs. 4-11), and the array's geometry.
+"""Quantities of an imager: by paraxial and third-order optics (Eqs. 4-11), by the array's geometry, by exact rays.
 
-The first are resolution, focus, light and Strehl ratio, the others spacing, gaps between apertures, height and slope of
-the lenses.
+The first are resolution, focus, light and Strehl ratio, the next spacing, gaps between apertures, height and slope of
+the lenses, the last the size of a point's spot over the field of a lens.
 """
 
 import math
@@ -12,10 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
-from ..geometry import Imager
+from ..geometry import Imager, envelope
 from ..layers import object_index
 from ..optics import aberrations, theory
 from ..optics.aberrations import WavefrontCoefficients
+from ..optics.pupil import pupil_quadrature
+from ..optics.raytrace import trace_lenslet
 from .conditions import (
     Depths,
     as_conditions,
@@ -26,17 +28,6 @@ from .conditions import (
     field_radius,
     finite_plate,
 )
-
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
-
-from ..base.arrays import safe_sqrt
-from ..geometry import Imager, envelope
-from ..optics import theory
-from ..optics.pupil import pupil_quadrature
-from ..optics.raytrace import trace_lenslet
-from .conditions import Depths, as_conditions, best_type, clear_diameter, field_heights, field_radius
 
 
 @by_type

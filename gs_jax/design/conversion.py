@@ -1,4 +1,7 @@
-"""The layers, the sample and the emission band of a `Design`, as the geometry takes them."""
+"""Between a design's tables and the geometry: layers, sample and emission band, and the tables of an imager.
+
+Tables of an imager are in the file's units, with the fewest decimals that reproduce its numbers.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,22 +11,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from ..base.errors import InputError, short_repr
+from ..geometry import Imager
 from ..io.point_tables import read_columns
 from ..layers import Layers, Sample, object_surface, reduced_distance
-from ..materials import EmissionBand, index_of
-from .tables import ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
-
-from typing import Any
-
-import numpy as np
-
-from ..base.errors import InputError
-from ..geometry import Imager
-from ..layers import Layers, Sample
 from ..lenses import lenses_by_type
+from ..materials import EmissionBand, index_of
 from ..optics import theory
 from ..optics.apertures import clear_diameter
-
+from .tables import ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
 
 # The name of no sample, and the table of none.
 AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
