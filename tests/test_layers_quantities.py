@@ -13,7 +13,7 @@ from gs_jax import InputError, objectives
 from gs_jax.apps.explore.evaluation import make_sliders
 from gs_jax.apps.report.drawings import draw_section
 from gs_jax.apps.report.report_tables import device_rows
-from gs_jax.apps.tolerance.tolerance_analysis import tolerance
+from gs_jax.apps.tolerance_analysis import tolerance
 from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.codesign.linear_error import lens_electrons
 from gs_jax.codesign.study import Study

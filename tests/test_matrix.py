@@ -19,7 +19,7 @@ import pytest
 import gs_jax as gs
 from gs_jax import Design, Grid, InputError
 from gs_jax.apps.report.page import write_report
-from gs_jax.apps.tolerance.tolerance_analysis import tolerance
+from gs_jax.apps.tolerance_analysis import tolerance
 from gs_jax.base.errors import InputWarning
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.codesign.study import Study

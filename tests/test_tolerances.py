@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.optics_check import optiland_rays
 from gs_jax import Design, Imager, InputError, MicrolensArray, Sensor
-from gs_jax.apps.report.report_tables import tolerance_table
-from gs_jax.apps.tolerance.device_model import (
+from gs_jax.apps.device_model import (
     CONSTANT,
     ERROR_FIELDS,
     depth_arguments,
@@ -28,15 +27,10 @@ from gs_jax.apps.tolerance.device_model import (
     standard_deviations,
     step_squares,
 )
-from gs_jax.apps.tolerance.tolerance_analysis import (
-    Outcome,
-    combine_changes,
-    make_problem,
-    measure_devices,
-    tolerance,
-)
-from gs_jax.apps.tolerance.tolerance_report import as_json, picture, rank_tolerances, sentences, summarise_changes
-from gs_jax.apps.tolerance.tolerance_spec import ToleranceSpec, read_tolerances
+from gs_jax.apps.report.report_tables import tolerance_table
+from gs_jax.apps.tolerance_analysis import Outcome, combine_changes, make_problem, measure_devices, tolerance
+from gs_jax.apps.tolerance_report import as_json, picture, rank_tolerances, sentences, summarise_changes
+from gs_jax.apps.tolerance_spec import ToleranceSpec, read_tolerances
 from gs_jax.cli.fabrication import tolerance_command as command
 from gs_jax.geometry import envelope
 from gs_jax.objectives import Conditions

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from ..apps.tolerance.tolerance_spec import ToleranceSpec
+from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
@@ -172,9 +172,9 @@ def tolerance_command(
     import numpy as np
     from rich.console import Console
 
-    from ..apps.tolerance.tolerance_analysis import tolerance
-    from ..apps.tolerance.tolerance_report import as_json, picture, sentences, tables
-    from ..apps.tolerance.tolerance_spec import read_tolerances
+    from ..apps.tolerance_analysis import tolerance
+    from ..apps.tolerance_report import as_json, picture, sentences, tables
+    from ..apps.tolerance_spec import read_tolerances
     from ..design.design import design_text, read_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions

@@ -2,7 +2,8 @@
 
 A sensor sees only a part of the light that a diffuser or lens array casts, also from points beyond its edges. So the
 scene is larger than the image: it holds every point whose PSF reaches the sensor, and the image is the middle of the
-sum of its planes' convolutions (Antipa et al., DiffuserCam, Optica 5, 1, 2018).
+sum of its planes' convolutions (Antipa et al., DiffuserCam, Optica 5, 1, 2018). PSFs that vary over the field are
+convolutions with a few kernels, weighted by smooth maps.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Complex, Float, Num
 
-from ..base.arrays import as_shape
+from ..base.arrays import as_float, as_shape
 from ..base.errors import InputError
 from .linear_map import LinearMap
 from .operators import as_matrix, no_structure, transpose
@@ -135,3 +136,68 @@ def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, 
     corner = [(n - m) // 2 for n, m in zip(size, image_shape, strict=True)]
     rows, columns = (slice(a, a + m) for a, m in zip(corner, image_shape, strict=True))
     return rows, columns
+
+
+class FieldConvolutionOperator(lx.AbstractLinearOperator):
+    """Imaging through PSFs that vary over the field: the image is the sum of `kernel * (weight scene)` over components.
+
+    *Differentiable*, a `lineax` operator; its transpose `.T` is the exact adjoint. So few components describe the PSF
+    everywhere when it varies smoothly (Flicker and Rigaut, J. Opt. Soc. Am. A 22, 504, 2005; of random multifocal
+    masks: Yanny et al., Light Sci. Appl. 9, 171, 2020). `fit_field` of `gs_jax.reconstruction.field_fit` finds them.
+
+    Parameters
+    ----------
+    kernels
+        Of each plane, the component's point being at `(high // 2, wide // 2)`.
+    weights
+        Of each component over the scene, whose size is that of `scene_size(image_shape, (high, wide))`.
+    image_shape
+        `(rows, columns)` of the sensor.
+    """
+
+    components: ConvolutionOperator
+    weights: Float[Array, "depth component down across"]
+
+    def __init__(
+        self,
+        kernels: Float[Array | np.ndarray, "depth component high wide"],
+        weights: Float[Array | np.ndarray, "depth component down across"],
+        image_shape: tuple[int, int],
+    ):
+        self.components = ConvolutionOperator(kernels.reshape(-1, *kernels.shape[2:]), image_shape)
+        self.weights = as_float(weights).astype(self.components.spectra.real.dtype)
+        expected = (*kernels.shape[:2], *self.components.scene_shape[1:])
+        if self.weights.shape != expected:
+            raise ValueError(f"`weights` must be {expected}, got {self.weights.shape}.")
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """`(rows, columns)` of the sensor."""
+        return self.components.image_shape
+
+    @property
+    def scene_shape(self) -> tuple[int, int, int]:
+        """`(depth, tall, wide)` of scenes."""
+        depths, _, tall, wide = self.weights.shape
+        return depths, tall, wide
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the sensor within a plane of the scene."""
+        return self.components.window
+
+    def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
+        """The image of a scene."""
+        light = self.weights * jnp.asarray(vector, self.weights.dtype)[:, None]
+        return self.components.mv(light.reshape(self.components.scene_shape))
+
+    def in_structure(self) -> ShapeDtypeStruct:
+        return ShapeDtypeStruct(self.scene_shape, self.weights.dtype)
+
+    def out_structure(self) -> ShapeDtypeStruct:
+        return self.components.out_structure()
+
+    transpose, as_matrix = transpose, as_matrix
+
+
+no_structure(FieldConvolutionOperator)

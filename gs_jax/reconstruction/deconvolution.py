@@ -11,8 +11,7 @@ from ..base.arrays import check_finite
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
-from ..projection.measured_field import FieldConvolutionOperator
-from ..projection.measured_psf import ConvolutionOperator
+from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator
 from ..solvers.admm import ADMM
 from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA

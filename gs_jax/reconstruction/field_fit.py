@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from ..base.errors import input_error
-from ..projection.measured_field import FieldConvolutionOperator
-from ..projection.measured_psf import middle, scene_size
+from ..projection.measured_psf import FieldConvolutionOperator, middle, scene_size
 from .inverse_problem import subtract_offset
 
 # Default error of the decomposition, relative to the PSFs' RMS.

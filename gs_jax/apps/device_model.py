@@ -24,8 +24,8 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Float64, Int, Key
 
-from ...base.errors import InputError
-from ...calibration.spot_model import (
+from ..base.errors import InputError
+from ..calibration.spot_model import (
     FITTED,
     CoreOffsets,
     Observations,
@@ -36,14 +36,14 @@ from ...calibration.spot_model import (
     residuals,
     trace_core_offsets,
 )
-from ...geometry import Imager
-from ...lenses import MicrolensArray
-from ...objectives.conditions import Conditions, clear_diameter
-from ...objectives.quantities import spot_width
-from ...optics.diffraction import axial_strehl
-from ...optics.raytrace import to_numpy
-from ...optics.theory import FWHM
-from ...typing import ScalarLike
+from ..geometry import Imager
+from ..lenses import MicrolensArray
+from ..objectives.conditions import Conditions, clear_diameter
+from ..objectives.quantities import spot_width
+from ..optics.diffraction import axial_strehl
+from ..optics.raytrace import to_numpy
+from ..optics.theory import FWHM
+from ..typing import ScalarLike
 from .tolerance_spec import ToleranceSpec
 
 # The field of `Errors` that each tolerance sets.

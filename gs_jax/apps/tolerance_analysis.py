@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64
 
-from ...base.errors import InputError
-from ...base.progress import Progress
-from ...design.datasheets import parts_of
-from ...design.design import Design
-from ...geometry import Imager, check_beyond
-from ...layouts import check_positive
-from ...objectives.conditions import Conditions
-from ...objectives.quantities import axial_resolution
+from ..base.errors import InputError
+from ..base.progress import Progress
+from ..design.datasheets import parts_of
+from ..design.design import Design
+from ..geometry import Imager, check_beyond
+from ..layouts import check_positive
+from ..objectives.conditions import Conditions
+from ..objectives.quantities import axial_resolution
 from .device_model import (
     CONSTANT,
     ERROR_FIELDS,
@@ -142,7 +142,7 @@ def tolerance(
         Where devices are evaluated, from the plate, mm; by default five over the working distance.
     sources
         Positions `(x, y, z)` of the point sources that devices are calibrated with, mm; by default those of
-        `gs_jax.apps.tolerance.device_model.depth_arguments`.
+        `gs_jax.apps.device_model.depth_arguments`.
     max_width
         Of spots in the object, mm; by default 1.2 times the design's, depth by depth.
     min_strehl

@@ -4,9 +4,9 @@ from typing import Any
 
 from pydantic import Field, ValidationError
 
-from ...base.errors import InputError
-from ...io.files import PathLike
-from ...io.toml import Table, one_line, read_toml
+from ..base.errors import InputError
+from ..io.files import PathLike
+from ..io.toml import Table, one_line, read_toml
 
 
 def _field(default: float, most: float, unit: str, title: str, *, least: float = 0.0) -> Any:
@@ -28,7 +28,7 @@ class ToleranceSpec(Table):
     - index: PDMS changes by -4.5e-4 per kelvin, so 4 to 5 kelvins; published values differ by as much;
     - sensor distance: a spacer that is measured with callipers;
     - roughness: lenses written with 12 bits of grey have 6 nm (doi:10.37188/lam.2022.047), plain layers tens;
-    - layers and pixels: a two-photon printer with grey levels; see `gs_jax.apps.tolerance.device_model`.
+    - layers and pixels: a two-photon printer with grey levels; see `gs_jax.apps.device_model`.
     """
 
     position_um: float = _field(3.0, 1000.0, "um", "position of each lens, along x and y")
