@@ -15,44 +15,102 @@ from gs_jax import Imager
 PARTS = 4
 # At most so many neighbours cut an aperture.
 NEIGHBOURS = 16
+# Depth of a tile, mm, and the angle between its rays, which spreads them evenly.
+DEEP, TURN = 0.01, np.pi * (3 - 5**0.5)
 
 
-def traced(emitters: np.ndarray, imager: Imager, rays: int) -> np.ndarray:
+def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -> np.ndarray:
     """Image emitters `(x, y, z, intensity)`; a pixel gets its share of each intensity.
 
     `rays` go from each emitter toward each lens, random but reproducible. Apertures end at their disc and where a
     neighbour's surface is higher, which is half-way for identical lenses.
+
+    With a `tile`, mm, emitters within a square of that width and a hundredth of a millimetre in depth share the rays of
+    their mean place, displaced by the magnification: many times the rays for the same time. Spots must hardly change
+    within a tile.
     """
+    images = np.zeros((PARTS, *imager.sensor.shape))
+    emitters = np.asarray(emitters, np.float64)
+    first = np.arange(len(emitters) + 1)
+    if tile:
+        place = np.floor(emitters[:, :3] / (tile, tile, DEEP)).astype(int)
+        order = np.lexsort(place.T)
+        emitters, place = emitters[order], place[order]
+        first = np.r_[0, np.flatnonzero((np.diff(place, axis=0) != 0).any(1)) + 1, len(emitters)]
+    _traced(emitters, first, *_lenses(imager), images, rays)
+    return images.sum(0)
+
+
+def bundles(places: np.ndarray, imager: Imager, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays of each place `(x, y, z)` toward each lens land: x, y, mm, and their share of the place's light.
+
+    Returns `(place, lens, ray, 3)`, and the magnification of each place. Lost rays have no share.
+    """
+    lenses = _lenses(imager)
+    landed, magnification = np.zeros((len(places), len(lenses[0]), rays, 3)), np.zeros(len(places))
+    _bundles(np.asarray(places, np.float64), *lenses, landed, magnification)
+    return landed, magnification
+
+
+def _lenses(imager: Imager):
+    """Lenses, the numbers of their nearest neighbours, what all share, and whether the curved side is in front."""
     centers = np.asarray(imager.centers, np.float64)
-    near = np.argsort(np.linalg.norm(centers[:, None] - centers, axis=-1))[:, 1 : NEIGHBOURS + 1]
+    apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
     a = imager.array
+    touching = (apart < float(np.max(a.aperture_diameter))).sum(1).max()
+    near = np.argsort(apart)[:, 1 : min(NEIGHBOURS + 1, touching)]
     each = a.radius_of_curvature, a.conic_constant, a.aperture_diameter / 2
     lenses = np.column_stack([centers, *(np.broadcast_to(np.asarray(x, np.float64), len(centers)) for x in each)])
     curve_first = a.orientation == "curved"
     shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
     numbers = tuple(float(x) for x in shared)
-    images = np.zeros((PARTS, *imager.sensor.shape))
-    _traced(np.asarray(emitters, np.float64), lenses, near, numbers, curve_first, images, rays)
-    return images.sum(0)
+    return lenses, near, numbers, curve_first
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
-def _traced(emitters, lenses, near, numbers, curve_first, images, rays):
+def _traced(emitters, first, lenses, near, numbers, curve_first, images, rays):
     for part in prange(PARTS):
         np.random.seed(part)
-        for number in range(part, len(emitters), PARTS):
+        landed = np.empty((rays, 3))
+        for number in range(part, len(first) - 1, PARTS):
+            tile = emitters[first[number] : first[number + 1]]
             for lens in range(len(lenses)):
                 others = lenses[near[lens]]
                 others[:, :2] -= lenses[lens, :2]
-                _add_spot(images[part], emitters[number], lenses[lens], others, numbers, curve_first, rays)
+                _add_spots(images[part], tile, lenses[lens], others, numbers, curve_first, landed)
 
 
 @njit(fastmath=True, error_model="numpy")
-def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
-    n, t, v, pixel = numbers
+def _bundles(places, lenses, near, numbers, curve_first, landed, magnification):
+    np.random.seed(PARTS)
+    for number in range(len(places)):
+        place = places[number, 0], places[number, 1], places[number, 2]
+        for lens in range(len(lenses)):
+            others = lenses[near[lens]]
+            others[:, :2] -= lenses[lens, :2]
+            magnification[number] = _land(landed[number, lens], place, lenses[lens], others, numbers, curve_first)
+
+
+@njit(fastmath=True, error_model="numpy")
+def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
+    place = tile[:, 0].mean(), tile[:, 1].mean(), tile[:, 2].mean()
+    magnification = _land(landed, place, lens, others, numbers, curve_first)
+    pixel = numbers[3]
+    for x, y, share in landed:
+        if share > 0:
+            for one in tile:
+                row = math.floor((y - magnification * (one[1] - place[1])) / pixel + image.shape[0] / 2)
+                column = math.floor((x - magnification * (one[0] - place[0])) / pixel + image.shape[1] / 2)
+                if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
+                    image[row, column] += share * one[3]
+
+
+@njit(fastmath=True, error_model="numpy")
+def _land(landed, place, lens, others, numbers, curve_first):
+    """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
+    n, t, v, _ = numbers
     radius, conic, aperture = lens[2:]
-    x, y, z, intensity = emitter
-    x, y = x - lens[0], y - lens[1]
+    x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]
     sag = _sag(aperture**2, radius, conic)
     # The disc of the front plane through which light reaches the aperture.
     if curve_first:
@@ -62,9 +120,11 @@ def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
         air = math.hypot(x, y) / (z + t / n)
         glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (z + t / n)
         disc, toward = aperture + sag * air / n / 2 + (t + sag) * aperture / z, glass * (t - sag / 2)
-    light = intensity * disc**2 / (4 * rays)
+    rays = len(landed)
+    light, start = disc**2 / (4 * rays), 2 * np.pi * np.random.random()
     for i in range(rays):
-        r, turn = disc * math.sqrt((i + np.random.random()) / rays), 2 * np.pi * np.random.random()
+        landed[i, 2] = 0
+        r, turn = disc * math.sqrt((i + np.random.random()) / rays), start + i * TURN
         sign = -1 if curve_first else 1
         front = r * math.cos(turn) + sign * x * toward, r * math.sin(turn) + sign * y * toward
         # Isotropic emitter: solid angle of an element of the front plane.
@@ -85,10 +145,10 @@ def _add_spot(image, emitter, lens, others, numbers, curve_first, rays):
         if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
         way = to_sensor / ray[2]
-        row = math.floor((lens[1] + last[1] + way * ray[1]) / pixel + image.shape[0] / 2)
-        column = math.floor((lens[0] + last[0] + way * ray[0]) / pixel + image.shape[1] / 2)
-        if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
-            image[row, column] += light * passed * again * z / length**3
+        landed[i, 0] = lens[0] + last[0] + way * ray[0]
+        landed[i, 1] = lens[1] + last[1] + way * ray[1]
+        landed[i, 2] = light * passed * again * z / length**3
+    return (v + t / n) / z if curve_first else v / (z + t / n)
 
 
 @njit(fastmath=True, error_model="numpy")

@@ -1,0 +1,354 @@
+"""Judge of designs: scenes of four kinds, ray-traced with equal exposure, and what is reconstructed of them.
+
+Letters with bars, beads, tilted sheets and dense texture lie at three depths of a span, at random places and turns.
+`experiments/ray_tracer.py`, which shares no code with `gs_jax`, images them through the lenses about the middle, onto
+the middle of the design's own sensor. Photon and read noise are those of one exposure time for all designs: 20,000,
+3,000 or 500 electrons in the brightest pixel of `geomscope`. Volumes are reconstructed with the full model on a grid
+that is the same for all, 40 x 40 x 300 um, three planes about each depth: by Richardson-Lucy, with the best of three
+numbers of steps for each scene, and by the unrolled inversion. Scores, after the best gain: PSNR and SSIM; the contrast
+of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of two designs are of the same
+scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with its own noise.
+
+    python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--records FILE] [--out DIR]
+
+Writes the records after each scene, from which the next run goes on, and then `design_judge.md` and `design_judge.png`;
+about six minutes of a core for each design.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.common import Report, main, table
+from experiments.lens_scenes import cropped
+from experiments.ray_tracer import traced
+from experiments.surfaces import texture
+from gs_jax import Grid, Imager, RichardsonLucy, Unrolled, find_points, localization, quality, rasterize, read_design
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
+from gs_jax.io.files import make_folder, write_json
+from gs_jax.reconstruction.inverse_problem import (
+    InverseProblem,
+    lens_type_geometries,
+    num_detrend_modes,
+    prepare_data,
+    prepare_model,
+)
+from gs_jax.reconstruction.methods import METHODS
+from gs_jax.reconstruction.pipeline import run_solver
+from gs_jax.simulation.phantoms import letters
+
+FOLDER = Path(__file__).parents[1] / "design"
+# Those for 18 to 23 mm; the first defines the exposures.
+DESIGNS = ("geomscope", "geomscope-exposure", "geomscope-optimized", "geomscope-asphere", "geomscope-table1")
+DESIGNS += ("geomscope-targets",)
+KINDS = ("letters", "beads", "tilted sheets", "texture")
+VOXEL, PLANE, READ_NOISE = 0.04, 0.3, 2.0
+# Distance of emitters, of which so many share rays, mm; and squares of a scene that the bootstrap draws, along a side.
+APART, TILE, SQUARES = 0.01, 0.1, 3
+# Bars: their period and size, mm. A bead's diameter, and beads at each depth.
+PERIOD, SIZE, BEAD, BEADS = 0.12, 0.48, 0.06, 10
+
+
+class Settings(NamedTuple):
+    """What designs are judged by; lengths in mm.
+
+    `sensor` is the width of the sensor's middle; lenses beyond it by 0.4 mm are left out. `rays` go from each tile of
+    the scene to each lens.
+    """
+
+    span: tuple[float, float] = (18.0, 23.0)
+    sensor: float = 8.0
+    field: float = 2.2
+    around: int = 1
+    kinds: tuple[str, ...] = KINDS
+    exposures: tuple[int, ...] = (20_000, 3_000, 500)
+    methods: tuple[str, ...] = ("richardson-lucy", "unrolled")
+    steps: tuple[int, ...] = (3, 6, 12)
+    rays: int = 600
+
+    @property
+    def depths(self) -> np.ndarray:
+        """Depths of the scenes: the middle, and 0.4 mm from both ends."""
+        return np.array([self.span[0] + 0.4, sum(self.span) / 2, self.span[1] - 0.4])
+
+    @property
+    def grid(self) -> Grid:
+        planes = PLANE * np.arange(-self.around, self.around + 1)
+        count = round(self.field / VOXEL) | 1
+        return Grid(np.add.outer(self.depths, planes).ravel(), (count, count), VOXEL)
+
+
+class Scene(NamedTuple):
+    """Emitters `(x, y, z, intensity)`; the middles of beads; bars `(x, y, depth)` across x."""
+
+    emitters: np.ndarray
+    points: np.ndarray
+    bars: np.ndarray
+
+
+def scene(kind: str, draw: int, settings: Settings = Settings()) -> Scene:
+    """A scene of a kind; each draw has other places."""
+    rng = np.random.default_rng([draw, KINDS.index(kind)])
+    half, turn = settings.field / 2, rng.uniform(0, 2 * np.pi)
+    third = turn + 2 * np.pi / 3 * np.arange(3)
+    around = lambda radius, angle: radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    places, others = around(0.45 * half, third), around(0.55 * half, third + np.pi / 3)
+    points, bars, parts = np.zeros((0, 3)), np.zeros((0, 3)), []
+    if kind == "beads":
+        at = rng.uniform(0.15 - half, half - 0.15, (3 * BEADS, 2))
+        points = np.column_stack([at, np.repeat(settings.depths, BEADS)])
+        count = 40
+        r, way = BEAD / 2 * np.sqrt((np.arange(count) + 0.5) / count), np.arange(count) * np.pi * (3 - 5**0.5)
+        disc = np.column_stack([r * np.cos(way), r * np.sin(way), 0 * r])
+        dots = (points[:, None] + disc).reshape(-1, 3)
+        return Scene(np.column_stack([dots, np.ones(len(dots))]), points, bars)
+    for depth, place, other in zip(settings.depths, places, others, strict=True):
+        if kind == "letters":
+            letter = letters(rng.choice(list("ABEGHKRSXZ")), depth=depth, height=0.6 * half, pitch=APART)
+            x, y = lattice(SIZE)
+            some = np.mod(x / PERIOD, 1) < 0.5
+            lines = np.column_stack([x[some], y[some], np.full(some.sum(), depth), np.full(some.sum(), APART**2)])
+            parts += [letter + [*place, 0, 0], lines + [*other, 0, 0]]
+            bars = np.vstack([bars, [*other, depth]])
+        elif kind == "tilted sheets":
+            x, y = lattice(0.8 * half)
+            slope, way = 0.55 * PLANE / (0.4 * half), rng.uniform(0, 2 * np.pi)
+            z = depth + slope * (x * np.cos(way) + y * np.sin(way))
+            parts.append(np.column_stack([x + place[0], y + place[1], z, texture(x, y, int(rng.integers(2**31)))]))
+        else:
+            x, y = lattice(1.3 * half)
+            light = texture(x, y, int(rng.integers(2**31)))
+            parts.append(np.column_stack([x + 0.6 * place[0], y + 0.6 * place[1], np.full_like(x, depth), light]))
+    emitters = np.concatenate(parts)
+    # So that emitters form no lattice.
+    emitters[:, :2] += rng.uniform(-APART / 2, APART / 2, (len(emitters), 2))
+    return Scene(emitters, points, bars)
+
+
+def lattice(side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a square about the origin."""
+    along = (np.arange(round(side / APART)) + 0.5) * APART - side / 2
+    x, y = np.meshgrid(along, along)
+    return x.ravel(), y.ravel()
+
+
+def device(imager: Imager, settings: Settings) -> Imager:
+    """The middle of a sensor, and the lenses near it."""
+    pixels = 2 * round(settings.sensor / float(imager.sensor.pixel_pitch) / 2)
+    return cropped(imager, pixels, settings.sensor / 2 + 0.4)
+
+
+def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
+    """The image without noise: the share of all light in each pixel."""
+    light = one.emitters.copy()
+    light[:, 3] /= light[:, 3].sum()
+    return traced(light, imager, settings.rays, TILE)
+
+
+class Methods:
+    """The reconstructions of a device, with its tables: functions of an image that return volumes by name."""
+
+    def __init__(self, imager: Imager, settings: Settings):
+        self.imager, self.grid, self.settings = imager, settings.grid, settings
+        self.model = prepare_model(imager, self.grid, "full", Progress())
+        problem = partial(InverseProblem, self.model.imager, self.grid, self.model.optics)
+        lucy, self.unrolled = METHODS["richardson-lucy"](1), Unrolled.pretrained()
+        assert isinstance(lucy, RichardsonLucy)
+        self.lucy: RichardsonLucy = lucy
+        self.problem = problem()
+        modes = num_detrend_modes(self.model.imager, self.model.optics)
+        self.unmatched = problem(lens_type_geometries(imager, self.grid), modes)
+        self.start = jax.jit(lambda problem, light: self.lucy.init(problem.operator, light))
+        self.step = jax.jit(lambda problem, light, state: self.lucy.step(problem.operator, light, state)[0])
+
+    def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
+        """Volume by each method, Richardson-Lucy's with the number of its steps."""
+        light, background = prepare_data(image, self.model)
+        found = {}
+        if "richardson-lucy" in self.settings.methods:
+            state = self.start(self.problem, light)
+            for number in range(1, max(self.settings.steps) + 1):
+                state = self.step(self.problem, light, state)
+                if number in self.settings.steps:
+                    found[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
+        if "unrolled" in self.settings.methods:
+            found["unrolled"] = run_solver(self.unrolled, light - background, self.unmatched, Progress())
+        return found
+
+
+def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: Grid) -> dict[str, Any]:
+    """PSNR, SSIM, mean squares over the squares of a scene relative to the squared peak, and the contrast of bars."""
+    found = quality(volume, truth)
+    error = ((found.gain * volume - truth) / truth.max()) ** 2
+    squares = [part.mean() for rows in np.array_split(error, SQUARES, 1) for part in np.array_split(rows, SQUARES, 2)]
+    record = {"psnr_db": found.psnr_db, "ssim": found.ssim, "squares": [float(x) for x in squares]}
+    if len(one.bars):
+        ratio = [contrast(volume, bar, grid) / contrast(truth, bar, grid) for bar in one.bars]
+        record["contrast"] = float(np.mean(ratio))
+    return record
+
+
+def contrast(volume: np.ndarray, bar: np.ndarray, grid: Grid) -> float:
+    """Amplitude of the bars' period over the mean, in the plane of the bars."""
+    plane = volume[np.abs(np.asarray(grid.depths) - bar[2]).argmin()]
+    x, y = np.asarray(grid.x) - bar[0], np.asarray(grid.y) - bar[1]
+    lines = plane[np.abs(y) < 0.4 * SIZE][:, near := np.abs(x) < SIZE / 2].mean(0)
+    wave = np.exp(2j * np.pi * x[near] / PERIOD)
+    # Without the mean of the wave, which is not of whole periods on the voxels.
+    return float(2 * abs(np.mean(lines * (wave - wave.mean()))) / max(lines.mean(), 1e-12))
+
+
+def judged(
+    imager: Imager, one: Scene, clean: np.ndarray, brightest: float, methods: Methods, seed: int = 0
+) -> dict[str, Any]:
+    """Scores of each exposure and method; `brightest` is the brightest pixel of the reference's image."""
+    grid, records = methods.grid, {}
+    truth = np.asarray(rasterize(one.emitters, grid), np.float32)
+    for exposure in methods.settings.exposures:
+        rng = np.random.default_rng([seed, exposure])
+        image = rng.poisson(clean * (exposure / brightest)) + rng.normal(0, READ_NOISE, clean.shape)
+        image = image.astype(np.float32)
+        tried = {name: scores(v, truth, one, grid) for name, v in methods.volumes(image).items()}
+        record: dict[str, Any] = {"unrolled": tried["unrolled"]} if "unrolled" in tried else {}
+        if steps := [name for name in tried if name.startswith("richardson-lucy")]:
+            best = max(steps, key=lambda name: tried[name]["psnr_db"])
+            record["richardson-lucy"] = tried[best] | {"steps": int(best.split()[-1])}
+        if len(one.points):
+            record["f1"] = localization(find_points(image, imager, grid), one.points).f1
+        records[str(exposure)] = record
+    return records
+
+
+class Judge:
+    """Judge designs scene by scene, and keep the records in a file, from which another judge goes on."""
+
+    def __init__(self, file: Path, settings: Settings, reference: Imager):
+        self.file, self.settings, self.reference = file, settings, device(reference, settings)
+        as_json = json.loads(json.dumps(settings._asdict()))
+        self.kept = json.loads(file.read_text()) if file.exists() else {"settings": as_json, "scenes": {}, "found": {}}
+        if self.kept["settings"] != as_json:
+            raise InputError(f"{file} must be of the settings {as_json}, got {self.kept['settings']}.")
+
+    def judge(self, name: str, imager: Imager, draws: Sequence[int], progress: Progress) -> dict[str, Any]:
+        """Records of a design by kind of scene and draw."""
+        small, methods = device(imager, self.settings), None
+        lenses = np.concatenate([np.ravel(x) for x in jax.tree.leaves(small)])
+        mark = f"{name} {hashlib.sha256(lenses.tobytes()).hexdigest()[:8]}"
+        records = self.kept["found"].setdefault(mark, {})
+        for draw in draws:
+            for kind in progress.track(list(self.settings.kinds), name):
+                key = f"{kind} {draw}"
+                if key in records:
+                    continue
+                one, methods = scene(kind, draw, self.settings), methods or Methods(small, self.settings)
+                clean = image_of(one, small, self.settings)
+                records[key] = judged(small, one, clean, self.brightest(key, one), methods, draw)
+                write_json(self.file, self.kept)
+        return records
+
+    def brightest(self, key: str, one: Scene) -> float:
+        """Brightest pixel of the reference's image."""
+        if key not in self.kept["scenes"]:
+            clean = image_of(one, self.reference, self.settings)
+            self.kept["scenes"][key] = float(clean.max())
+        return self.kept["scenes"][key]
+
+
+def difference(records: dict, others: dict, key: str, exposure: int, method: str) -> tuple[float, float, float]:
+    """PSNR of one design less that of another, dB, and its 95 % interval, over the draws of a kind of scene."""
+    parts = [k for k in records if k.startswith(f"{key} ") and k in others]
+    ours, theirs = (
+        np.concatenate([one[k][str(exposure)][method]["squares"] for k in parts]) for one in (records, others)
+    )
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(0, len(ours), (4000, len(ours)))
+    many = 10 * np.log10(theirs[drawn].mean(1) / ours[drawn].mean(1))
+    low, high = np.quantile(many, (0.025, 0.975))
+    return float(10 * np.log10(theirs.mean() / ours.mean())), float(low), float(high)
+
+
+def mean_of(records: dict, key: str, exposure: int, read) -> float:
+    """Mean over the draws of what `read` takes of a record."""
+    return float(np.mean([read(one[str(exposure)]) for k, one in records.items() if k.startswith(f"{key} ")]))
+
+
+def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...], list[list[str]]]:
+    """PSNR by each method, SSIM by the second, F1 or contrast; differences from the reference with intervals."""
+    names, first, method, rows = list(found), next(iter(found)), settings.methods[-1], []
+    for kind in settings.kinds:
+        for exposure in settings.exposures:
+            row = [kind, str(exposure)]
+            for name in names:
+                read = partial(mean_of, found[name], kind, exposure)
+                cell = " / ".join(f"{read(lambda r, m=m: r[m]['psnr_db']):.1f}" for m in settings.methods)
+                cell += f", {read(lambda r: r[method]['ssim']):.2f}"
+                if kind == "beads":
+                    cell += f", F1 {read(lambda r: r['f1']):.2f}"
+                if kind == "letters":
+                    cell += f", bars {read(lambda r: r[method]['contrast']):.2f}"
+                if name != first:
+                    more, low, high = difference(found[name], found[first], kind, exposure, method)
+                    cell += f" ({more:+.1f}: {low:+.1f} to {high:+.1f})"
+                row.append(cell)
+            rows.append(row)
+    return ("scene", "electrons", *names), rows
+
+
+def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
+    """Maxima over the depths of the truth and of volumes by the last method, at the second exposure, of each kind."""
+    kept = json.loads(file.read_text())
+    figure = Figure(figsize=(2.6 * (len(names) + 1), 2.8 * len(settings.kinds)), dpi=100, layout="constrained")
+    axes = figure.subplots(len(settings.kinds), len(names) + 1, squeeze=False)
+    exposure = settings.exposures[min(1, len(settings.exposures) - 1)]
+    for column, imager in enumerate([None, *names.values()]):
+        methods = Methods(device(imager, settings), settings) if imager else None
+        for row, kind in enumerate(settings.kinds):
+            one, axis = scene(kind, 0, settings), axes[row, column]
+            truth = shown = np.asarray(rasterize(one.emitters, settings.grid))
+            if methods:
+                clean = image_of(one, methods.imager, settings)
+                rng = np.random.default_rng(0)
+                counts = rng.poisson(clean * (exposure / kept["scenes"][f"{kind} 0"]))
+                image = (counts + rng.normal(0, READ_NOISE, clean.shape)).astype(np.float32)
+                volume = methods.volumes(image)[settings.methods[-1]]
+                shown = quality(volume, truth).gain * volume
+            half = settings.field / 2
+            axis.imshow(shown.max(0), cmap="gray", vmin=0, vmax=truth.max(), extent=(-half, half, half, -half))
+            axis.set_title(f"{list(names)[column - 1] if column else 'truth'}: {kind}", fontsize=8)
+            axis.tick_params(labelsize=7)
+    return figure
+
+
+def report(designs: list[Path], span: list[float], draws: int, records: Path, progress: Progress) -> Report:
+    settings = Settings(span=(span[0], span[1]))
+    files = designs or [FOLDER / f"{name}.toml" for name in DESIGNS]
+    reference = read_design(FOLDER / f"{DESIGNS[0]}.toml").imager()
+    make_folder(records.parent)
+    judge = Judge(records, settings, reference)
+    imagers = {read_design(file).name or file.stem: read_design(file).imager() for file in files}
+    found = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
+    columns, rows = rows_of(found, settings)
+    few = dict(list(imagers.items())[:2])
+    shown = picture(few, judge.file, settings)
+    return Report({"design_judge.md": markdown_table(columns, rows), "design_judge.png": shown}, [table(columns, rows)])
+
+
+if __name__ == "__main__":
+    main(
+        report,
+        {
+            "designs": {"type": Path, "nargs": "*"},
+            "--span": {"type": float, "nargs": 2, "default": [18.0, 23.0]},
+            "--draws": {"type": int, "default": 1},
+            "--records": {"type": Path, "default": Path("out/design_judge/records.json")},
+        },
+    )

@@ -1,0 +1,58 @@
+"""The judge of designs: its scenes, its scores, and records that a second run goes on from."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, scene
+from experiments.ray_tracer import traced
+from gs_jax import Imager, MicrolensArray, Sensor, rasterize
+from gs_jax.base.errors import InputError
+
+IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scenes_lie_on_the_grid_at_all_three_depths(kind):
+    settings = Settings()
+    one = scene(kind, 1, settings)
+    volume = np.asarray(rasterize(one.emitters, settings.grid), float)
+    assert volume.sum() == pytest.approx(one.emitters[:, 3].sum(), rel=1e-3)
+    assert (volume.reshape(3, -1).sum(1) > 0.2 * volume.sum()).all()
+    assert not np.array_equal(one.emitters, scene(kind, 2, settings).emitters)
+
+
+def test_the_contrast_of_bars_falls_with_blur():
+    settings = Settings()
+    one = scene("letters", 0, settings)
+    truth = np.asarray(rasterize(one.emitters, settings.grid), float)
+    sharp, soft = (contrast(gaussian_filter(truth, (0, s, s)), one.bars[1], settings.grid) for s in (0, 1))
+    # A Gaussian of 40 um leaves exp(-2 (pi 40 / 120)^2) of 120 um, and light leaves the ends of the bars.
+    assert 0.8 < sharp < 1.1 and soft / sharp == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), abs=0.08)
+
+
+def test_differences_are_of_pairs():
+    record = lambda factor: {"letters 0": {"500": {"unrolled": {"squares": [factor * x for x in range(1, 10)]}}}}
+    more, low, high = difference(record(0.1), record(1.0), "letters", 500, "unrolled")
+    assert (more, low, high) == pytest.approx((10, 10, 10))
+
+
+def test_records_of_other_settings_are_refused(tmp_path):
+    file = tmp_path / "records.json"
+    file.write_text(json.dumps({"settings": {}, "scenes": {}, "found": {}}))
+    with pytest.raises(InputError, match="must be of the settings"):
+        Judge(file, Settings(), IMAGER)
+
+
+@pytest.mark.integration
+def test_emitters_that_share_rays_make_the_same_image():
+    """Sums of squares of 8 pixels are the same to 3 % of their root mean square, the noise of 800,000 rays."""
+    rng = np.random.default_rng(0)
+    emitters = np.column_stack([rng.uniform(-0.2, 0.2, (4000, 2)), np.full(4000, 20.0), np.ones(4000)])
+    own, shared = traced(emitters, IMAGER, 200), traced(emitters, IMAGER, 400, 0.1)
+    squares = lambda image: image.reshape(25, 8, 25, 8).sum((1, 3))
+    assert shared.sum() == pytest.approx(own.sum(), rel=2e-3)
+    error = squares(shared) - squares(own)
+    assert np.linalg.norm(error) < 0.03 * np.linalg.norm(squares(own))
