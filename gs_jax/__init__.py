@@ -76,6 +76,7 @@ Better designs, and their molds:
 
 How good it is:
 
+    cross_validated      Score a method on a capture: reconstruct without some lenses, predict their light, and compare
     forward_residual     Image a volume again, and compare the image with the capture
     quality              PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best
     localization         Match found points with true ones, each at most once, and score them

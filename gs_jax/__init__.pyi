@@ -29,6 +29,7 @@ from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,
     ImagingOperator as ImagingOperator,
 )
+from .reconstruction.cross_validation import cross_validated as cross_validated
 from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
 from .reconstruction.pipeline import reconstruct as reconstruct

@@ -12,6 +12,7 @@ from gs_jax.cli.options import Depths
 from gs_jax.design.design import read_design
 from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_points
+from gs_jax.io.provenance import SCORE, read_provenance
 from gs_jax.io.volumes import read_volume, write_volume
 
 from .helpers import needs
@@ -126,6 +127,19 @@ def test_a_surface_has_maps_beside_its_volume(folder, monkeypatch, capsys):
     volume, _ = read_volume(folder / "v.tif")
     np.testing.assert_allclose(volume.sum(0), brightness, rtol=1e-3, atol=1e-6 * brightness.max())
     assert (np.nan_to_num(depth, nan=2e4) >= 18_000).all() and (np.nan_to_num(depth, nan=2e4) <= 22_000).all()
+
+
+@pytest.mark.integration
+def test_a_score_is_told_and_kept(folder, monkeypatch, capsys):
+    """In the file's provenance, from which a report reads it."""
+    image = np.random.default_rng(0).integers(7, 90, (96, 80)).astype(np.uint16)
+    tifffile.imwrite(folder / "capture.tif", image)
+    options = "20 --voxel-um 50 --score -o v.tif -q".split()
+    status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
+    assert status == 0 and "v.tif: lenses that were left out are predicted" in out
+    assert read_provenance(folder / "v.tif")[SCORE] in out
+    status, _, err = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options, "--suppress", "clusters")
+    assert status == 2 and "--score must be used with --suppress none" in err
 
 
 def test_one_depth_and_the_default_voxel(folder, monkeypatch, capsys):

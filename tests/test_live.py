@@ -259,6 +259,7 @@ def test_wrong_input_is_one_line(folder, monkeypatch, capsys):
         (*last, "v.tif"): "-o must be VOLUME.zarr, which grows in time, with --watch, got v.tif",
         (*WATCH, "--workers", "2"): "--workers and --scheduler must not be given with --watch",
         (*WATCH, "--method", "surface", "--surface", "s.ply"): "--surface must be used with a single capture",
+        (*WATCH, "--score"): "--score must be used with a single capture",
         (WATCH[0], "capture.tif", *WATCH[2:]): "capture.tif must be a folder to be watched, got a file",
         (WATCH[0], "none", *WATCH[2:]): "none must be a folder to be watched, got none",
     }.items():

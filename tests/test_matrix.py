@@ -193,6 +193,12 @@ def inverted(method: str, case: Case, _) -> None:
     assert volume[1][lit].mean() > 2 * volume[1][~lit].mean()
 
 
+def scored(case: Case, _) -> None:
+    method = METHODS["richardson-lucy"](10)
+    found = gs.cross_validated(case.of_truth, case.imager, case.grid, method, optics=case.optics)
+    assert found.noise < found.error < 0.95 and found.folds.shape == (4,)
+
+
 def calibrate(case: Case, _) -> None:
     places = case.points[[0, 2], :3]
     images = [case.capture(np.append(place, 1.0)[None]) for place in places]
@@ -301,6 +307,7 @@ def reported(case: Case, folder: Path) -> None:
 TASKS: dict[str, Callable[[Case, Path], None]] = {
     "points": points,
     **{method: partial(inverted, method) for method in METHODS},
+    "score": scored,
     "calibrate": calibrate,
     "pattern": pattern,
     "metrics": metrics,
@@ -314,6 +321,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
 # What is refused, and by which words.
 REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "points"): "3 or more lenses must agree on a point, got 1 lens",
+    ("one lens", "score"): "2 or more lenses",
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",

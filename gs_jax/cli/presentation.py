@@ -42,7 +42,7 @@ def report_command(
     from ..apps.report.report_tables import read_tolerance
     from ..design.design import design_text, read_design
     from ..io.point_tables import read_points
-    from ..io.provenance import read_provenance
+    from ..io.provenance import SCORE, read_provenance
     from ..io.surfaces import read_surface
     from ..io.volumes import read_volume
 
@@ -67,6 +67,8 @@ def report_command(
     if tolerance:
         results["tolerance"] = read_tolerance(tolerance)
     origins = {path.name: read_provenance(path) for path in inputs[1:] if path}
+    if volume and (score := origins[volume.name].get(SCORE)):
+        results["notes"] = {"volume": f"Of the capture, {score}."}
     provenance = camera.recorded(provenance_of(*inputs, design=design_text(microscope)))
     with Progress() as progress, errors_name_file(design):
         write_report(output, microscope, **results, origins=origins, provenance=provenance, progress=progress)

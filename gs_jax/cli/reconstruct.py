@@ -26,7 +26,13 @@ from .options import (
     worker_options,
 )
 from .outputs import check_may_write, force_option, provenance_of
-from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
+from .recording_command import (
+    check_recording,
+    reconstruct_recording,
+    recording_options,
+    residual_in_words,
+    score_in_words,
+)
 from .watch_command import check_watched, watch_folder
 
 
@@ -90,6 +96,12 @@ from .watch_command import check_watched, watch_folder
     type=Path,
     help="SURFACE.ome.tif or .ply: also write brightness and depth of --method surface, as maps in um or a mesh in mm.",
 )
+@click.option(
+    "--score",
+    is_flag=True,
+    help="Also reconstruct four times without a quarter of the lenses, predict their light, and tell how well: a score "
+    "without ground truth.",
+)
 @light_options
 @recording_options
 @worker_options
@@ -103,6 +115,7 @@ def reconstruct_command(
     output: Path,
     points: Path | None,
     surface: Path | None,
+    score: bool,
     weights: Path | None,
     force: bool,
     frame_interval: float | None,
@@ -134,7 +147,7 @@ def reconstruct_command(
     """
     from ..design.design import design_text, read_design
     from ..io.point_tables import write_points
-    from ..io.provenance import DepthFrame
+    from ..io.provenance import SCORE, DepthFrame
     from ..io.recordings import open_recording
     from ..io.surfaces import SURFACE_SUFFIXES, write_surface
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
@@ -146,6 +159,9 @@ def reconstruct_command(
         check_output(surface, SURFACE_SUFFIXES)
         if method_options["method"] != "surface":
             raise InputError(f"--surface must be used with --method surface, got {method_options['method']}.")
+    if score and (method_options["suppress"] != "none" or method_options["method"] == "surface"):
+        got = "--suppress {suppress} and --method {method}".format(**method_options)
+        raise InputError(f"--score must be used with --suppress none and methods of free voxels, got {got}.")
     if output.suffix.lower() == ".zarr":
         with needs_extra("zarr"):
             import_module("zarr")
@@ -170,7 +186,9 @@ def reconstruct_command(
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     how = {"track": track, "interval": frame_interval, "resume": resume}
     if watch:
-        check_watched(output, workers=workers.remote, surface=surface is not None, resume=resume, force=force)
+        check_watched(
+            output, {"--surface": surface, "--score": score}, workers=workers.remote, resume=resume, force=force
+        )
         with Progress() as progress:
             files = {"design_text": text, "camera": camera, "points": points, "frame": frame}
             return watch_folder(capture, plan, output, **files, **how, progress=progress)
@@ -178,8 +196,9 @@ def reconstruct_command(
         given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
         given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
-        if recording and surface:
-            raise InputError(f"--surface must be used with a single capture, got {len(recording.names)} frames.")
+        if recording and (surface or score):
+            option = "--surface" if surface else "--score"
+            raise InputError(f"{option} must be used with a single capture, got {len(recording.names)} frames.")
         if recording:
             files = {"design_text": text, "capture": capture, "camera": camera, "points": points, "frame": frame}
             with workers:
@@ -193,9 +212,11 @@ def reconstruct_command(
         with xla_only() if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
+        predicted = score_in_words(plan.score(image, progress)) if score else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=text))
             provenance |= frame.note if imager.sample is not None else {}
+            provenance |= {SCORE: predicted} if predicted else {}
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if points and result.points is not None:
                 write_points(points, *frame.points(result.points, result.statistics), provenance=provenance)
@@ -208,6 +229,8 @@ def reconstruct_command(
     click.echo(f"{output}: {size}, {depth_range(shown)}")
     if residual:
         click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
+    if predicted:
+        click.echo(f"{output}: {predicted}")
     if fit := result.surface:
         others = f"one more {fit.further_error:.1%}, free voxels {fit.free_error:.1%}"
         click.echo(f"{surface or output}: sheets leave {fit.error:.1%} of the capture unexplained (RMS), {others}")

@@ -4,6 +4,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -20,16 +21,19 @@ _SHARE, _PAUSE = 20, 1.0
 _SWITCH = 5e-4
 
 
-def check_watched(output: Path, *, workers: bool, surface: bool, resume: bool, force: bool) -> None:
-    """Raise `InputError` if the output cannot hold the volumes of a watched folder, or if options exclude `--watch`."""
+def check_watched(output: Path, single: dict[str, Any], *, workers: bool, resume: bool, force: bool) -> None:
+    """Raise `InputError` if the output cannot hold the volumes of a watched folder, or if options exclude `--watch`.
+
+    `single` are options of single captures.
+    """
     from ..io.volume_series import check_replaceable
 
     if output.suffix.lower() != ".zarr":
         raise InputError(f"-o must be VOLUME.zarr, which grows in time, with --watch, got {output}.")
     if workers:
         raise InputError("--workers and --scheduler must not be given with --watch, which makes one volume at a time.")
-    if surface:
-        raise InputError("--surface must be used with a single capture, got --watch.")
+    if option := next((name for name, value in single.items() if value), None):
+        raise InputError(f"{option} must be used with a single capture, got --watch.")
     if not (resume or force):
         check_replaceable(output)
 

@@ -28,6 +28,8 @@ Provenance = Mapping[str, str]
 
 # Namespace of annotations and metadata, and key of the table among others.
 NAMESPACE, KEY = "gs_jax/provenance", "provenance"
+# Key of a volume's cross-validation in words, which a report shows beside the volume.
+SCORE = "score"
 
 
 def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> dict[str, str]:

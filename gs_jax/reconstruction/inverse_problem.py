@@ -115,6 +115,8 @@ class InverseProblem(eqx.Module):
         If given, back-projection with these geometries replaces the adjoint.
     detrend_modes
         Number of low cosine modes per axis that least squares leave out of the image.
+    kept
+        1 for pixels that are explained, and 0 for those that are left out; None keeps all.
     """
 
     imager: Imager
@@ -122,9 +124,23 @@ class InverseProblem(eqx.Module):
     optics: PsfModel
     back_projections: tuple[LensTypeGeometry, ...] | None = None
     detrend_modes: int = eqx.field(static=True, default=0)
+    kept: Float[Array | np.ndarray, "row column"] | None = None
 
     @property
     def operator(self) -> Operator:
+        A = self._of_all_pixels
+        if self.kept is None:
+            return A
+        kept = jnp.asarray(self.kept)
+        forward, back, squares = A, A.T, A
+        if isinstance(A, UnmatchedAdjointOperator):
+            forward, back, squares = A.forward, A.back, A.least_squares or A.forward
+        shown = lambda some: lx.FunctionLinearOperator(lambda x: kept * some.mv(x), some.in_structure())
+        read = lx.FunctionLinearOperator(lambda image: back.mv(kept * image), back.in_structure())
+        return UnmatchedAdjointOperator(shown(forward), read, shown(squares), kept)
+
+    @property
+    def _of_all_pixels(self) -> Operator:
         A = ImagingOperator(self.imager, self.grid, self.optics)
         least_squares = A
         if self.detrend_modes:

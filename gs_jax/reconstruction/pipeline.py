@@ -164,8 +164,9 @@ def reconstructor(
     Returns
     -------
     Callable
-        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface` and its state
-        to start from to the volume.
+        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface`, its state to
+        start from, and pixels to keep (`kept`: 1, and 0 for those that are left out, in the pixels of `prepare_model`),
+        to the volume.
 
     Warns
     -----
@@ -193,21 +194,25 @@ def reconstructor(
     modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
     problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
-    def volume_of(image, progress, method=method, start=None):
+    def volume_of(image, progress, method=method, start=None, kept=None):
         light, background = prepare_data(image, model)
         target = 0.0
         # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
         if stop_at_discrepancy and not isinstance(method, Unrolled | Surface):
             target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
+        solver = method
         if isinstance(method, PinholeRichardsonLucy):
-            return run_solver(method.solver(background), light, problem, progress, target)
-        if isinstance(method, RichardsonLucy):
+            solver = method.solver(background)
+        elif isinstance(method, RichardsonLucy):
             solver = dataclasses.replace(method, background=method.background + jnp.asarray(background))
-            return run_solver(solver, light, problem, progress, target)
-        light = light - background
-        if not isinstance(method, Unrolled | Surface):
-            light = np.asarray(problem.detrend(light), light.dtype)
-        return run_solver(method, light, problem, progress, target, read, start)
+        else:
+            light = light - background
+            if not isinstance(method, Unrolled | Surface):
+                light = np.asarray(problem.detrend(light), light.dtype)
+        if kept is None:
+            return run_solver(solver, light, problem, progress, target, read, start)
+        some = dataclasses.replace(problem, kept=kept)
+        return run_solver(solver, kept * light, some, progress, target * kept.mean(), read)
 
     return volume_of
 
@@ -229,8 +234,16 @@ def _check(method, optics, *arguments):
         raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(optics)}.")
 
 
-def _backproject_views(views, method, image, progress):
-    """Sum the back-projections of all types of lenses, weighted."""
+def _backproject_views(views, method, image, progress, kept=None):
+    """Sum the back-projections of all types of lenses, weighted; of kept pixels, in place of all."""
+    if kept is not None:
+        # Squares of pixels, and those that fill none.
+        side = image.shape[0] // kept.shape[0]
+        missing = [(0, n - side * m) for n, m in zip(image.shape, kept.shape, strict=True)]
+        kept = np.pad(np.repeat(np.repeat(kept, side, 0), side, 1), missing, mode="edge")
+        share = _backproject_views(views, dataclasses.replace(method, normalize=True), kept, progress)
+        volume = _backproject_views(views, method, kept * image, progress)
+        return np.divide(volume, share, out=np.zeros_like(volume), where=share > 0)
     if len(views) == 1:
         return _backproject(image, views[0].imager, views[0].grid, method, progress)
     plain = dataclasses.replace(method, normalize=False)

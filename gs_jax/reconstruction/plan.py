@@ -16,6 +16,7 @@ from ..optics.lens_types import blur_warning, sharpness
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
+from .cross_validation import CrossValidation, cross_validated
 from .methods import METHODS, Method
 from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
@@ -129,6 +130,13 @@ class Plan:
 
     def check(self, volume: Volume, image: Image, progress: Progress) -> ForwardResidual:
         return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
+
+    def score(self, image: Image, progress: Progress) -> CrossValidation:
+        """How well lenses are predicted from the others; `InputError` with suppression, and with sheets."""
+        if self.suppress != "none":
+            raise InputError(f"--score must be used with --suppress none, got {self.suppress}.")
+        options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
+        return cross_validated(image, self.imager, self.grid, self.method, **options, progress=progress)
 
     def _find_points(self, image: Image, sharp: Any, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
         from ..detection.background import subtract_background

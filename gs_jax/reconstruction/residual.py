@@ -96,12 +96,13 @@ def _compare(model, light):
     spread = model.std() * light.std()
     correlation = np.mean((model - model.mean()) * (light - light.mean())) / spread if spread > 0 else 0.0
     # Any volume explains a dark capture.
-    regions = _rms_of_regions(residual) / (rms if rms > 0 else 1)
+    regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
     error = np.sqrt(np.mean(residual**2)) / rms if rms > 0 else 0.0
     return ForwardResidual(float(error), float(correlation), regions)
 
 
-def _rms_of_regions(image):
+def rms_of_regions(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "region_row region_column"]:
+    """RMS in each of 16 x 16 regions of the sensor."""
     first = [np.unique(np.linspace(0, n, _REGIONS, endpoint=False).astype(int)) for n in image.shape]
     sums = lambda part: np.add.reduceat(np.add.reduceat(part, first[0], 0), first[1], 1)
     return np.sqrt(sums(image**2) / sums(np.ones_like(image)))
@@ -123,6 +124,15 @@ def noise_variance(image: Shaped[np.ndarray, "row column"]) -> Float64[np.ndarra
     return (np.array(median) / _NORMAL_MEDIAN) ** 2
 
 
+def binned_variance(
+    image: Shaped[np.ndarray, "row column"], shape: tuple[int, ...]
+) -> Float64[np.ndarray, "binned_row binned_column"]:
+    """Variance of the noise in each pixel of the capture that is binned to this shape."""
+    side, variance = image.shape[0] // shape[0], noise_variance(image)
+    squares = (np.arange(n) * side // _SQUARE for n in shape)
+    return side**2 * variance[np.ix_(*(np.minimum(s, n - 1) for s, n in zip(squares, variance.shape, strict=True)))]
+
+
 def discrepancy_target(
     image: Shaped[np.ndarray, "row column"], light: Float[np.ndarray, "binned_row binned_column"], *, counts: bool
 ) -> float:
@@ -139,10 +149,7 @@ def discrepancy_target(
     """
     from scipy.ndimage import uniform_filter  # imported here: back-projection does without SciPy
 
-    side = image.shape[0] // light.shape[0]
-    variance = noise_variance(image)
-    squares = (np.arange(n) * side // _SQUARE for n in light.shape)
-    variance = side**2 * variance[np.ix_(*(np.minimum(s, n - 1) for s, n in zip(squares, variance.shape, strict=True)))]
+    side, variance = image.shape[0] // light.shape[0], binned_variance(image, light.shape)
     if counts:
         # In the dark, where negative pixels count as 0, the divergence is of the order of the noise.
         mean = np.maximum(uniform_filter(np.asarray(light, np.float64), max(_SQUARE // side, 1)), np.sqrt(variance))

@@ -31,11 +31,15 @@ class UnmatchedAdjointOperator(eqx.Module):
         From volumes to images, and from images to volumes.
     least_squares
         Operator for least squares, which use its exact adjoint; by default `forward`.
+    kept
+        1 for pixels that count, and 0 for those that are left out; `forward` is zero there, and `back` does not read
+        them. None keeps all.
     """
 
     forward: lx.AbstractLinearOperator
     back: lx.AbstractLinearOperator
     least_squares: lx.AbstractLinearOperator | None = None
+    kept: Float[Array, "..."] | None = None
 
     @property
     def T(self) -> "UnmatchedAdjointOperator":
@@ -52,6 +56,11 @@ class UnmatchedAdjointOperator(eqx.Module):
 
 
 Operator = lx.AbstractLinearOperator | UnmatchedAdjointOperator
+
+
+def kept_pixels(A: Operator) -> Float[Array, "..."] | None:
+    """The pixels that an operator does not leave out; None if it keeps all."""
+    return A.kept if isinstance(A, UnmatchedAdjointOperator) else None
 
 
 @runtime_checkable

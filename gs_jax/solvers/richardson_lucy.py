@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Num
 from ..base.arrays import divide
 from ..base.errors import InputError
 from ..typing import Real
-from .base import Operator, as_image, check_options, differences, differences_adjoint, magnitude, norm
+from .base import Operator, as_image, check_options, differences, differences_adjoint, kept_pixels, magnitude, norm
 
 # Default number of background knots along each side: their spacing is wider than the stray light of a spot.
 BACKGROUND_KNOTS = 8
@@ -132,7 +132,7 @@ class RichardsonLucy(eqx.Module):
         new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
         momentum = momentum_after(new, point, x, momentum)
         residual = divide(norm(new - x), norm(new))
-        state = State(new, sensitivity, momentum, background_step(knots, ratio))
+        state = State(new, sensitivity, momentum, background_step(knots, ratio, kept_pixels(A)))
         return state, kl_divergence(image, expected), residual
 
     def estimate(self, state: State) -> Float[Array, "..."]:
@@ -148,14 +148,18 @@ def bilinear_background(knots: Float[Array, "knot knot"] | None, image: Float[Ar
 
 
 def background_step(
-    knots: Float[Array, "knot knot"] | None, ratio: Float[Array, "..."]
+    knots: Float[Array, "knot knot"] | None, ratio: Float[Array, "..."], kept: Float[Array, "..."] | None = None
 ) -> Float[Array, "knot knot"] | None:
-    """Richardson-Lucy step of the background: multiplies each knot by the mean ratio under its hat function."""
+    """Richardson-Lucy step of the background: multiplies each knot by the mean ratio under its hat function.
+
+    The mean is over the pixels that are kept; in others the ratio is 0.
+    """
     if knots is None:
         return None
     rows, columns = (hat_functions(n, len(knots), knots.dtype) for n in ratio.shape)
     # A sensor may have fewer pixels than knots.
-    return divide(knots * (rows.T @ ratio @ columns), jnp.outer(rows.sum(0), columns.sum(0)))
+    count = jnp.outer(rows.sum(0), columns.sum(0)) if kept is None else rows.T @ kept @ columns
+    return divide(knots * (rows.T @ ratio @ columns), count)
 
 
 def hat_functions(size, count, dtype):

@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
 from ..typing import PathLike
-from .base import Operator, UnmatchedAdjointOperator, as_image, check_options, norm
+from .base import Operator, UnmatchedAdjointOperator, as_image, check_options, kept_pixels, norm
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
@@ -197,7 +197,7 @@ class Unrolled(eqx.Module):
         ]
         layers = jax.tree.map(lambda leaf: leaf[number], self.layers)
         new = ahead * 2 * jax.nn.sigmoid(_apply_network(layers, jnp.stack(channels, -1)))
-        lucy = LucyState(new, sensitivity, momentum, background_step(knots, ratio))
+        lucy = LucyState(new, sensitivity, momentum, background_step(knots, ratio, kept_pixels(A)))
         return lucy, kl_divergence(image, expected), divide(norm(new - x), norm(new))
 
     def estimate(self, state: State) -> Float[Array, "..."]:
@@ -267,7 +267,7 @@ def _start_gradients(A, image, lucy: LucyState) -> ConjugateGradients:
     variance = _blur(_blur(x, 1), 2) * divide(jnp.vdot(x, x), jnp.sum(x))
     residual = _least_squares_operator(A).T.mv(image)
     product = jnp.vdot(residual, variance * residual)
-    noise, cost = jnp.mean(residual_image**2), jnp.vdot(image, image) / 2
+    noise, cost = jnp.mean(residual_image**2, where=_where_kept(A)), jnp.vdot(image, image) / 2
     return ConjugateGradients(jnp.zeros_like(x), residual, residual, variance, noise, product, cost)
 
 
@@ -284,6 +284,10 @@ def _gradient_step(A, state: ConjugateGradients):
     direction = residual + divide(new, product) * direction
     after = ConjugateGradients(weights, residual, direction, variance, noise, new, cost - length * product / 2)
     return after, cost, divide(norm(length * step), norm(variance * weights))
+
+
+def _where_kept(A: Operator) -> Array | None:
+    return None if (kept := kept_pixels(A)) is None else kept > 0
 
 
 def _least_squares_operator(A: Operator) -> lx.AbstractLinearOperator:

@@ -1,0 +1,186 @@
+"""Score of a reconstruction without ground truth: how well it predicts the light of lenses that it did not use."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from ..base.errors import InputError, short_repr
+from ..base.progress import Progress
+from ..geometry import Imager
+from ..grid import Grid
+from ..projection.forward_model import PsfModel, forward
+from ..solvers.surface import Surface
+from ..typing import Image, Volume
+from .inverse_problem import ImageModel, InverseProblem, num_detrend_modes, prepare_data, prepare_model
+from .methods import BackProjection, Method
+from .pipeline import check_call, reconstructor
+from .residual import binned_variance, rms_of_regions
+
+
+class CrossValidation(NamedTuple):
+    """How well a method predicts pixels that it did not use; no ground truth is needed.
+
+    Parameters
+    ----------
+    error
+        RMS of the difference between prediction and capture, relative to that of the capture above its background: 0 if
+        all is predicted, 1 for an empty volume.
+    noise
+        The same of the capture's noise alone, as far as its pixels tell: no prediction has less.
+    folds
+        The error of each fold, relative to the RMS of its own pixels.
+    regions
+        The error in squares of the sensor, relative to the whole capture's RMS.
+    """
+
+    error: float
+    noise: float
+    folds: Float[np.ndarray, " fold"]
+    regions: Float[np.ndarray, "row column"]
+
+    @property
+    def score_db(self) -> float:
+        """The error in dB better than an empty volume, `-20 log10(error)`: larger is better."""
+        return -20 * math.log10(max(self.error, 1e-12))
+
+    @property
+    def best_db(self) -> float:
+        """The score of a perfect volume: noise cannot be predicted."""
+        return -20 * math.log10(max(self.noise, 1e-12))
+
+
+def cross_validated(
+    image: Image,
+    imager: Imager,
+    grid: Grid,
+    method: Method = BackProjection(),
+    *,
+    optics: PsfModel | str = "full",
+    stop_at_discrepancy: bool = False,
+    folds: int = 4,
+    progress: Progress | None = None,
+) -> CrossValidation:
+    """Score a method on a capture: reconstruct without some lenses, predict their light, and compare.
+
+    *Host.* Takes as long as `folds` reconstructions.
+
+    Sub-images overlap, so that light cannot be divided by lenses. Pixels can: each belongs to the nearest lens, whose
+    light is most of its light, and each lens to one of the folds, those of neighbours differing. A fold is
+    reconstructed from the pixels of all others; its own count nowhere, not as dark. A voxel is seen through a dozen
+    lenses, so the others know it. The image of that volume predicts the pixels of the fold, with a gain that fits it
+    best to the pixels that were used. A pixel was so either used or predicted, and its noise is independent of the
+    prediction: a method that fits noise, or what the model lacks, to some lenses is wrong about the others.
+    `forward_residual` sees pixels that were fitted, and improves with every step.
+
+    Images are compared as iterative methods see them: above the camera's offset, with pixels as wide as voxels, without
+    background that is smooth or that the optics lack. That background is the whole capture's, a few numbers that are
+    the same for all methods. Squares count equally, so bright pixels count most, as they do in the PSNR of volumes.
+
+    Compare methods, options and calibrations on one capture by `score_db`; scores of different scenes differ. It does
+    not see a volume's unit, nor where lenses see nothing.
+
+    Parameters
+    ----------
+    image, imager, grid, method, optics, stop_at_discrepancy, progress
+        As for `reconstruct`; not `Surface`.
+    folds
+        2 or more, at most as many as lenses.
+
+    Raises
+    ------
+    InputError
+        As for `reconstruct`; if there are not so many folds, or the method is `Surface`.
+
+    Examples
+    --------
+    >>> import gs_jax as gs
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> import numpy as np
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> found = gs.cross_validated(image, scope, grid, gs.RichardsonLucy(steps=5), optics="near", folds=3)
+    >>> print(found.error < 1, found.folds.shape)
+    True (3,)
+    """
+    check_call(image, imager, grid, method, optics)
+    if isinstance(method, Surface):
+        raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
+    progress = progress or Progress()
+    model = prepare_model(imager, grid, optics, progress)
+    options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
+    volume_of = reconstructor(imager, grid, method, **options)
+    light, compare = comparison(image, model, grid, is_named=isinstance(optics, str))
+    residual, parts = np.zeros_like(light), []
+    for kept in progress.track(kept_pixels_of_folds(model.imager, folds), "Cross-validating"):
+        rest = compare(volume_of(image, progress, kept=kept), kept)
+        left_out = kept == 0
+        residual[left_out] = rest[left_out]
+        parts.append(_relative(rest[left_out], light[left_out]))
+    noise = math.sqrt(binned_variance(np.asarray(image), light.shape).mean())
+    rms = float(np.sqrt(np.mean(light**2)))
+    # Any volume predicts a dark capture.
+    regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
+    return CrossValidation(
+        _relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
+    )
+
+
+def comparison(
+    image: Image, model: ImageModel, grid: Grid, *, is_named: bool
+) -> tuple[Float[np.ndarray, "row column"], Callable[[Volume, np.ndarray], np.ndarray]]:
+    """Return the light of a capture without background, and what a volume leaves of it.
+
+    The function takes a volume and the pixels (1, and 0 for others) to which its gain is fitted.
+    """
+    light, background = prepare_data(image, model)
+    modes = num_detrend_modes(model.imager, model.optics) if is_named else 0
+    problem = InverseProblem(model.imager, grid, model.optics, detrend_modes=modes)
+    without_trend = lambda image: np.asarray(problem.detrend(image), np.float64)
+    light = without_trend(light - background)
+    parts = model.imager, grid, model.optics
+
+    def residual(volume, kept):
+        shown = without_trend(forward(jnp.asarray(volume, model.imager.sensor_distance.dtype), *parts))
+        energy = np.vdot(kept * shown, shown)
+        return light - (max(np.vdot(kept * shown, light) / energy, 0) if energy > 0 else 0) * shown
+
+    return light, residual
+
+
+def kept_pixels_of_folds(imager: Imager, count: int) -> list[Float[np.ndarray, "row column"]]:
+    """For each fold, 1 for pixels of other folds, and 0 for its own.
+
+    Raises
+    ------
+    InputError
+        Unless there are 2 or more folds, and at least as many lenses.
+    """
+    centers = np.asarray(imager.centers)
+    if len(centers) < 2:
+        raise InputError("a capture must be seen by 2 or more lenses to be predicted by others, got 1 lens.")
+    if not (isinstance(count, int) and 2 <= count <= len(centers)):
+        raise InputError(f"folds must be 2 to {len(centers)}, the number of lenses, got {short_repr(count)}.")
+    pixels = np.moveaxis(np.indices(imager.sensor.shape), 0, -1)
+    own = folds_of_lenses(centers, count)[KDTree(np.asarray(imager.sensor.to_pixels(centers))).query(pixels)[1]]
+    return [np.asarray(own != fold, imager.sensor_distance.dtype) for fold in range(count)]
+
+
+def folds_of_lenses(centers: Float[np.ndarray, "lens 2"], count: int) -> Int[np.ndarray, " lens"]:
+    """Fold of each lens: from the middle outwards, the one whose nearest lens is farthest."""
+    folds = np.full(len(centers), -1)
+    for lens in np.argsort(np.hypot(*(centers - centers.mean(0)).T), kind="stable"):
+        apart = np.hypot(*(centers - centers[lens]).T)
+        folds[lens] = np.argmax([apart[folds == fold].min(initial=np.inf) for fold in range(count)])
+    return folds
+
+
+def _relative(residual, light):
+    energy = float(np.sum(light**2))
+    return float(np.sqrt(np.sum(residual**2) / energy)) if energy > 0 else 0.0
