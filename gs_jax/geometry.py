@@ -16,15 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .base.arrays import (
-    FINITE,
-    POSITIVE,
-    Rule,
-    array_namespace,
-    as_float,
-    as_float_or_none,
-    check_fields,
-)
+from .base.arrays import FINITE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields
 from .base.errors import input_error
 from .grid import Sensor
 from .layers import Layers, Sample, check_room, depth_of_reduced, object_index, object_surface, reduced_distance

@@ -296,12 +296,7 @@ def _observations(imager: Imager, sources: Sources, unknown, spots: Spots, offse
 
 
 def self_calibrate(
-    image: Image,
-    imager: Imager,
-    grid: Grid,
-    *,
-    fit: Sequence[str] = SELF_FITTED,
-    progress: Progress | None = None,
+    image: Image, imager: Imager, grid: Grid, *, fit: Sequence[str] = SELF_FITTED, progress: Progress | None = None
 ) -> Calibration:
     """Find rotation and tilt in a capture of unknown points, from a design that is right to some degrees.
 

@@ -23,15 +23,7 @@ from ..optics.lens_types import FIELDS
 from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
 from ..typing import Image
-from .spot_model import (
-    MAX_MOVES,
-    MOVE_TOLERANCE,
-    WINDOW,
-    CoreOffsets,
-    blurred_radius,
-    match_radius,
-    predict_spots,
-)
+from .spot_model import MAX_MOVES, MOVE_TOLERANCE, WINDOW, CoreOffsets, blurred_radius, match_radius, predict_spots
 
 # Half width of the square that the window sees, pixels.
 _HALF = 4

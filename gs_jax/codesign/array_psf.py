@@ -134,9 +134,7 @@ def mean_inverse_views(
 
 @jax.jit
 def array_spectrum(
-    imager: Imager,
-    points: Float[Array | np.ndarray, "point 3"],
-    frequencies: Float[Array | np.ndarray, "frequency 2"],
+    imager: Imager, points: Float[Array | np.ndarray, "point 3"], frequencies: Float[Array | np.ndarray, "frequency 2"]
 ) -> Float[Array, "point frequency"]:
     """Power spectrum of the array PSF of each point: `|sum_j C_j exp(-2 pi i k.(s_z c_j))|^2 / sum_j C_j^2`.
 

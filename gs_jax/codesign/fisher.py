@@ -23,6 +23,7 @@ variance would not distinguish a sharp core in stray light from no core. The noi
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,13 +45,7 @@ Parameters = Float[Array, "4"]
 
 
 def mean_images(
-    parameters: Parameters,
-    imager: Imager,
-    *,
-    photons: Real,
-    spot: Spot,
-    corners: Float[Array, "lens 2"],
-    size: int,
+    parameters: Parameters, imager: Imager, *, photons: Real, spot: Spot, corners: Float[Array, "lens 2"], size: int
 ) -> Float[Array, "lens row column"]:
     """The mean image of a point in the window of each lens, electrons, without background.
 
@@ -148,12 +143,8 @@ def cramer_rao(
     points: Float[Array | np.ndarray, "point 3"],
     imager: Imager,
     *,
-    photons: Real,
-    spot: Spot,
-    background: Real = 0.0,
-    read_noise: Real = 2.0,
-    size: int = 15,
     prior: tuple[float, float, float, float] = PRIOR,
+    **options: Any,
 ) -> Float[Array, "point 3"]:
     """Cramer-Rao bound of `x, y, z` of single points of unknown brightness, as standard deviations, mm.
 
@@ -164,17 +155,15 @@ def cramer_rao(
     ----------
     points
         `(x, y, z)`, mm.
-    imager, photons, spot, background, read_noise, size
-        As for `fisher_information`.
     prior
         Standard deviations of x, y, z, mm, and of the logarithm of the brightness.
+    imager, options
+        As for `fisher_information`.
     """
     points, scale = jnp.asarray(points), jnp.asarray(prior, imager.sensor_distance.dtype)
 
     def bound(point):
-        information = fisher_information(
-            point, imager, photons=photons, spot=spot, background=background, read_noise=read_noise, size=size
-        )
+        information = fisher_information(point, imager, **options)
         # Scaled to a unit diagonal: lengths and brightness differ by orders of magnitude.
         total = information + jnp.diag(scale**-2)
         unit = jnp.diag(total) ** -0.5

@@ -37,13 +37,7 @@ def evaluate(name: str, imager: Imager, at: Conditions, key: Key[Array, ""]) -> 
 
 
 def residual(
-    table: TermTable,
-    target: Float[Array, ""],
-    imager: Imager,
-    at: Conditions,
-    key: Key[Array, ""],
-    *,
-    margin: float,
+    table: TermTable, target: Float[Array, ""], imager: Imager, at: Conditions, key: Key[Array, ""], *, margin: float
 ) -> Float[Array, " entry"]:
     """Residual of a term, relative to its target: zero where a limit holds, so that its square is smooth.
 

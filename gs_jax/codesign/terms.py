@@ -63,10 +63,7 @@ TERMS: dict[str, Term] = {
     "lateral_resolution_um": Term("lateral resolution in focus (Eq. 5)", _scaled(UM, objectives.lateral_resolution)),
     "axial_resolution_um": Term("axial resolution in focus (Eq. 6)", _scaled(UM, objectives.axial_resolution)),
     "depth_of_field_mm": Term("depth of field (Eq. 8)", _in_the_middle(objectives.depth_of_field)),
-    "depth_of_field_eq7_mm": Term(
-        "depth of field (Eq. 7)",
-        _in_the_middle(objectives.approximate_depth_of_field),
-    ),
+    "depth_of_field_eq7_mm": Term("depth of field (Eq. 7)", _in_the_middle(objectives.approximate_depth_of_field)),
     "focus_offset": Term("focus from the middle of the depths, 1 at their ends", objectives.focus_offset),
     "blur_um": Term("diameter of the thin lens's blur, in the object", _scaled(UM, objectives.blur)),
     "strehl": Term("Strehl ratio over the field (Eqs. 9, 10)", objectives.log_strehl, log=True),
@@ -81,10 +78,7 @@ TERMS: dict[str, Term] = {
     "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),
     "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing)),
     "web_mm": Term("mask left between neighbouring apertures", _of_imager(objectives.aperture_gap)),
-    "hole_mm": Term(
-        "distance of a place on the plate from a lens",
-        _of_imager(objectives.uncovered_distance),
-    ),
+    "hole_mm": Term("distance of a place on the plate from a lens", _of_imager(objectives.uncovered_distance)),
     "coverage": Term("share of the plate that is clear aperture", objectives.coverage),
     "sag_mm": Term("height of a whole lens", objectives.sag),
     "ghosts": Term("RMS sidelobe of the array PSF over its peak", ghosts, random=True),
@@ -100,10 +94,7 @@ TERMS: dict[str, Term] = {
     "crowded_precision_um": Term(
         "least error of locating a point in a scene, x, y, z, for an exposure", crowded_precision
     ),
-    "edge_slope_deg": Term(
-        "slope at the clear aperture's rim",
-        _scaled(180 / math.pi, objectives.edge_slope),
-    ),
+    "edge_slope_deg": Term("slope at the clear aperture's rim", _scaled(180 / math.pi, objectives.edge_slope)),
     "least_radius_mm": Term("least radius of curvature of a lens's surface", objectives.surface_radius),
 }
 

@@ -21,11 +21,7 @@ UNITS = ("mm", "um", "px")
 # Keys of `[lens]` that may have a number for each lens, and columns of these names in the file of the centres.
 LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
 # As headers write them; both letters that look like a Greek mu.
-_UNIT = {
-    "mm": r"mm|millimet(?:er|re)s?",
-    "um": "[uµμ]m|microns?|micromet(?:er|re)s?",
-    "px": "px|pix|pixels?",
-}
+_UNIT = {"mm": r"mm|millimet(?:er|re)s?", "um": "[uµμ]m|microns?|micromet(?:er|re)s?", "px": "px|pix|pixels?"}
 
 
 class CentersTable(Table):

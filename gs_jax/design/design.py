@@ -33,15 +33,7 @@ from .conversion import (
     sharp_depths,
     tables_of,
 )
-from .tables import (
-    ArrayTable,
-    CalibrationTable,
-    ImagingTable,
-    LayersTable,
-    LensTable,
-    SampleTable,
-    SensorTable,
-)
+from .tables import ArrayTable, CalibrationTable, ImagingTable, LayersTable, LensTable, SampleTable, SensorTable
 from .validation import check_whole, doubts, of_each, slips
 
 

@@ -136,13 +136,13 @@ def _strehl(design: Design, sheet: dict[str, Any], imager: Imager, at: Condition
     half = np.asarray(aberrations.linear_field_radius(array, pupil, reduced, v, wavelength)) * 1000
     found = [
         f"The wavefront error on the axis is {_span(waves)} waves RMS, and Eq. 9 holds below about {_STREHL_DOMAIN}: "
-        "the Strehl ratios only say that the image is far from diffraction-limited.",
+        "the Strehl ratios only say that the image is far from diffraction-limited."
     ]
     if design.lens.focal_length_mm is not None:  # an ideal lens: all of it is defocus
         return found
     found.append(
         f"By Eqs. 9 and 10 the Strehl ratio halves {_span(half)} um beside the axis, "
-        f"not at the field radius of {_length(sheet['field_radius_mm'])}.",
+        f"not at the field radius of {_length(sheet['field_radius_mm'])}."
     )
     paraxial = sheet["focus_distance_mm"]
     if paraxial[0] is not None and aberrations.balanced_rms(error).spherical[0, 0] > _STREHL_DOMAIN * wavelength:

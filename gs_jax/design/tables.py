@@ -42,10 +42,7 @@ Index = Annotated[
     number_or_name,
     Field(description=f"a number from 1 to 5, or one of {_NAMES}"),
 ]
-LensIndex = Annotated[
-    Annotated[Material, Tag(NAME)] | Annotated[float, Field(gt=1, le=5), Tag(ONE)],
-    number_or_name,
-]
+LensIndex = Annotated[Annotated[Material, Tag(NAME)] | Annotated[float, Field(gt=1, le=5), Tag(ONE)], number_or_name]
 _Line = Annotated[tuple[Wavelength, Annotated[float, Field(ge=0, le=1e30)]], Field(strict=False)]
 Spectrum = Annotated[
     tuple[_Line, ...],

@@ -22,16 +22,7 @@ from ...io.surfaces import SurfaceMaps
 from ...pictures import color_table, make_slices, png_uri, slider_html, to_uint8
 from ...typing import Image, PathLike, Points
 from . import report_tables as tables
-from .drawings import (
-    Psfs,
-    count_lenses,
-    draw_layout,
-    draw_section,
-    ideal_mtf,
-    line_chart,
-    mtf,
-    simulate_psfs,
-)
+from .drawings import Psfs, count_lenses, draw_layout, draw_section, ideal_mtf, line_chart, mtf, simulate_psfs
 from .surface_views import sheet_pictures, surface_view
 
 PAPER = {
