@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gs_jax.codesign import layout_terms
+from gs_jax.codesign import terms
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design
@@ -57,9 +57,7 @@ def test_values_and_gradients_are_finite(parent, name):
 def test_scenes_are_imaged_whole(monkeypatch, distance):
     """However far the sensor may move: all images of a scene's corners by the lenses that see them."""
     design, found = small_design(CENTERS, 1.2, 0.05, 2.0, (800, 600)), {}
-    monkeypatch.setattr(
-        layout_terms, "reconstruction_loss", lambda *_, **options: found.update(options) or jnp.ones(())
-    )
+    monkeypatch.setattr(terms, "reconstruction_loss", lambda *_, **options: found.update(options) or jnp.ones(()))
     free = {"sensor_distance_mm": (2.0, distance)}
     far = candidate(*evaluated(design, free=free), {"sensor_distance_mm": jnp.array(distance)})
     TERMS["reconstruction_error"].function(*far, jax.random.key(0))
