@@ -9,8 +9,8 @@ import pytest
 
 import gs_jax as gs
 from gs_jax.calibration.sample import with_sample
-from gs_jax.io.napari import reader
 from gs_jax.io.provenance import DepthFrame, frame_of
+from gs_jax.widget.layers import reader
 
 from .test_cli import run
 

@@ -10,12 +10,12 @@ from click.testing import CliRunner
 from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
 from gs_jax.io.captures import read_capture, write_capture
-from gs_jax.io.napari import reader
 from gs_jax.io.point_tables import read_points, write_points
 from gs_jax.io.provenance import made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.io.weights import read_weights, write_weights
 from gs_jax.mold.export import Mesh, read_mesh, write_mesh
+from gs_jax.widget.layers import reader
 
 ORIGIN = {"software": "gs_jax 1", "command": "gs-jax 'a <b> & \"c\"'", "design": 'name = "µ"\n\n[sensor]\n'}
 VOXELS = np.random.default_rng(0).random((3, 5, 4), np.float32)

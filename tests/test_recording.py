@@ -18,13 +18,13 @@ from gs_jax.base.errors import InputError
 from gs_jax.design.design import read_design
 from gs_jax.io import ngff, volume_series
 from gs_jax.io.captures import Selection
-from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.recordings import open_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries, halve
 from gs_jax.projection.backprojection import backproject
 from gs_jax.reconstruction.pipeline import reconstruct
 from gs_jax.reconstruction.recording import PREFETCH, reconstruct_frames
+from gs_jax.widget.layers import reader
 
 from .test_cli import folder, run
 

@@ -9,10 +9,10 @@ import trimesh
 
 import gs_jax as gs
 from gs_jax.base.progress import Progress
-from gs_jax.io.napari import reader
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.surfaces import read_surface, write_surface
 from gs_jax.reconstruction.surface_fit import surface_fitter
+from gs_jax.widget.layers import reader
 
 GRID = {"shape": (45, 45), "pitch": 0.08}
 DEPTHS = np.arange(18.0, 22.1, 0.5)

@@ -1,4 +1,7 @@
-"""What napari's widget shows: layers of a reconstruction, in um, and a sample capture. Needs no napari."""
+"""Layers of napari in um: of a reconstruction, and of files, by the reader that `napari.yaml` names. Needs no napari.
+
+napari's own readers of OME-TIFF ignore the position of the first voxel, and those of CSV know pixels only.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -7,14 +10,22 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
+from jaxtyping import Num
 
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress
 from ..cli.options import DESIGN, CaptureOptions, Depths, depth_range
+from ..grid import Grid
+from ..io.ngff import display_range
+from ..io.point_tables import POINTS_HEADER, read_points
+from ..io.surfaces import SurfaceMaps, read_surface, surface_mesh
+from ..io.volume_series import Series, read_series
+from ..io.volumes import VOLUME_SUFFIXES, read_volume
+from ..typing import Points
 
 # Seconds between looks whether the user cancelled.
 _POLL_INTERVAL = 0.1
-_UM_PER_MM = 1000.0
+_UM = 1000.0
 
 
 class Result(NamedTuple):
@@ -43,8 +54,6 @@ def prepare_layers(
         As the command.
     """
     from ..design.design import read_design
-    from ..io.napari import mean_step, points_layer, surface_layers, volume_layer
-    from ..io.surfaces import SurfaceMaps
     from ..reconstruction.plan import Plan
 
     try:
@@ -53,7 +62,7 @@ def prepare_layers(
         raise InputError(f"Depths {error.message}") from error
     imager = read_design(design).imager()
     options = {"method": method, "suppress": suppress, "points": points}
-    plan = Plan.of(imager, planes, voxel_um / _UM_PER_MM or None, **options)
+    plan = Plan.of(imager, planes, voxel_um / _UM or None, **options)
     grid, volume_of = plan.grid, plan.prepare(progress)
 
     def reconstruct(name: str, capture: Path | np.ndarray) -> Result:
@@ -73,7 +82,7 @@ def prepare_layers(
         if found.points is not None:
             layers.append(points_layer(found.points, f"{name}, {len(found.points)} points", mean_step(grid)))
         z, y, x = found.volume.shape
-        status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM_PER_MM:.4g} um laterally, {depth_range(planes)}"
+        status = f"{z} x {y} x {x} voxels (z, y, x), {grid.pitch * _UM:.4g} um laterally, {depth_range(planes)}"
         warnings += [found.warning] if found.warning else []
         return Result(layers, _capture_transform(imager.sensor), status, warnings)
 
@@ -133,8 +142,8 @@ def _capture_transform(sensor) -> dict[str, Any]:
     pitch, (x, y) = sensor.pixel_pitch, map(float, sensor.origin)
     first = [middle - (n - 1) / 2 * pitch for middle, n in zip((y, x), sensor.shape, strict=True)]
     return {
-        "scale": (_UM_PER_MM * pitch, _UM_PER_MM * pitch),
-        "translate": tuple(_UM_PER_MM * each for each in first),
+        "scale": (_UM * pitch, _UM * pitch),
+        "translate": tuple(_UM * each for each in first),
         "units": ("um", "um"),
         "axis_labels": ("y", "x"),
     }
@@ -153,3 +162,117 @@ def sample() -> list[Any]:
     image = np.asarray(expose(light, Camera(), jax.random.key(0), peak_electrons=2e4))
     limits = tuple(map(float, np.percentile(image, (1, 99.95))))
     return [(image, {"name": "beads", "contrast_limits": limits} | _capture_transform(imager.sensor), "image")]
+
+
+Layer = tuple[Any, dict[str, Any], str]
+
+_AXES: dict[str, Any] = {"axis_labels": ("z", "y", "x"), "units": ("um", "um", "um")}
+# Diameter of the ring around a point, um.
+_RING = 300.0
+
+
+def reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
+    """Return the function that reads this path, or None if it is not ours: napari then asks other readers."""
+    if isinstance(path, list):
+        return None
+    suffix = Path(path).suffix.lower()
+    if suffix in VOLUME_SUFFIXES:
+        return _read_volume
+    return _read_points if suffix == ".csv" and _has_points(path) else None
+
+
+def _has_points(path: str) -> bool:
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            return file.readline().startswith(POINTS_HEADER)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _read_points(path) -> list[Layer]:
+    return [points_layer(read_points(path), Path(path).name)]
+
+
+def _read_volume(path) -> list[Layer]:
+    if (series := read_series(path)) is not None:
+        return [_series_layer(series, Path(path).name)]
+    try:
+        voxels, grid = read_volume(path)
+    except InputError as error:
+        try:
+            return surface_layers(read_surface(path), Path(path).name)
+        except InputError:
+            raise ValueError(f"neither a volume nor a surface of gs_jax: {error}") from error
+    return [volume_layer(voxels, grid, Path(path).name)]
+
+
+def volume_layer(volume: Num[np.ndarray, "depth y x"], grid: Grid, name: str) -> Layer:
+    """A volume, with the display range that files of it have too."""
+    first = _UM * np.array([float(grid.depths[0]), float(grid.y[0]), float(grid.x[0])])
+    scale = _UM * np.array([mean_step(grid), grid.pitch, grid.pitch])
+    options = {"scale": scale, "translate": first, "contrast_limits": display_range(volume), "name": name}
+    return volume, options | _AXES, "image"
+
+
+def mean_step(grid: Grid) -> float:
+    """Mean distance of planes, mm; for a single plane the lateral pitch."""
+    return float(np.diff(np.asarray(grid.depths, np.float64)).mean()) if grid.depths.size > 1 else grid.pitch
+
+
+def points_layer(points: Points, name: str, thickness: float = 0.25) -> Layer:
+    """Points as rings, shown in planes that are less than half of `thickness` from them, mm."""
+    points = np.asarray(points, np.float64)
+    # napari shows points within half a data unit of a plane.
+    scale = np.array([_UM * thickness, 1.0, 1.0])
+    options = {
+        "features": {"intensity": points[:, 3]},
+        "size": _RING,
+        "scale": scale,
+        "name": name,
+        "face_color": "transparent",
+        "border_color": "cyan",
+        "border_width": 0.15,
+        "blending": "translucent_no_depth",
+    }
+    return _UM * points[:, 2::-1] / scale, options | _AXES, "points"
+
+
+def surface_layers(maps: SurfaceMaps, name: str) -> list[Layer]:
+    """A depth map for each sheet, um, and a surface of all sheets, coloured by brightness, for the view in space."""
+    grid, mesh = maps.grid, surface_mesh(maps.brightness, maps.depth, maps.grid)
+    lit = maps.depth[np.isfinite(maps.depth)]
+    low, high = (_UM * float(part(lit)) for part in (np.min, np.max)) if lit.size else (0.0, 1.0)
+    options: dict[str, Any] = {
+        "scale": (_UM * grid.pitch, _UM * grid.pitch),
+        "translate": (_UM * float(grid.y[0]), _UM * float(grid.x[0])),
+        "contrast_limits": (low, max(high, low + 1.0)),
+        "colormap": "viridis",
+        "axis_labels": ("y", "x"),
+        "units": ("um", "um"),
+    }
+    names = [f"{name}, depth, um" + (f", sheet {n + 1}" if len(maps.depth) > 1 else "") for n in range(len(maps.depth))]
+    layers: list[Layer] = [
+        (_UM * depth, options | {"name": each}, "image") for depth, each in zip(maps.depth, names, strict=True)
+    ]
+    vertices, light, faces = mesh
+    if not len(faces):
+        # napari draws no empty surface.
+        corner = [float(grid.x[0]), float(grid.y[0]), float(grid.depths[0])]
+        vertices, light, faces = np.tile(corner, (3, 1)), np.zeros(3), np.array([[0, 1, 2]])
+    shown: dict[str, Any] = {"name": f"{name}, surface", "contrast_limits": (0.0, 1.0), "colormap": "gray"}
+    return [*layers, ((_UM * vertices[:, ::-1], faces, light), shown | {"shading": "none"} | _AXES, "surface")]
+
+
+def _series_layer(series: Series, name: str) -> Layer:
+    """Volumes in time, which napari reads as it shows them."""
+    multiscale = len(series.levels) > 1
+    options = {
+        "scale": series.scale,
+        "translate": series.first,
+        "contrast_limits": series.display,
+        "name": name,
+        "axis_labels": ("t", *_AXES["axis_labels"]),
+        "units": ("s" if series.interval else "pixel", *_AXES["units"]),
+        "multiscale": multiscale,
+    }
+    return series.levels if multiscale else series.levels[0], options, "image"
