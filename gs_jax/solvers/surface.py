@@ -32,7 +32,7 @@ from .sheets import Sheets, first_sheets, hats, interpolated, noise_variance, sq
 
 # Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end;
 # Gauss-Newton steps from a given start.
-_FIRST, _ROUNDS, _GRADIENTS, _PROBES, _RESTARTED = 10, 5, 3, 4, 2
+_FIRST, _ROUNDS, _GRADIENTS, _PROBES, _RESTARTED = 10, 7, 3, 4, 2
 # What a step is for.
 _LUCY, _LINEARISE, _PROBE, _GRADIENT = range(4)
 _SCHEDULE = (
@@ -51,6 +51,8 @@ _MAX_MOVE = 1.0
 # Standard deviations by the Hessian's diagonal are too small by this factor, as it leaves out correlations with
 # neighbours and with brightness, and errors of the model. Measured on sheets of known depth, of 10,000 electrons.
 _UNDERSTATED = 3.6
+# Share of a Gauss-Newton step that is taken: depths of whole steps, of few gradients each, swing about their limit.
+_SHARE = 0.7
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
 _DAMPING = 1e-3
 # At the start the brightness is nearly right and depths are not: the preconditioner lets depths change first.
@@ -311,6 +313,7 @@ def _probe(state, following):
 
 def _moved(state, change):
     root, depth, background = state.sheets
+    change = jax.tree.map(lambda part: _SHARE * part, change)
     return Sheets(
         jnp.abs(root + jnp.clip(change.root, -root, root)),
         jnp.clip(depth + jnp.clip(change.depth, -_MAX_MOVE, _MAX_MOVE), 0, state.lucy.x.shape[0] - 1),
