@@ -148,6 +148,23 @@ def chord(x2, y2, limit2, begin, end):
 
 
 @inline
+def hole_limit2(tables):
+    """Squared distance below which the weight of a ring is zero; without a hole, negative."""
+    numbers = tables.numbers
+    return numbers[3] - ONE / numbers[4] if numbers[0] > ZERO and numbers[3] > ZERO else -ONE
+
+
+@inline
+def hole(x2, y2, limit2, begin, end, first, last):
+    """The voxels of a row, from `begin` to `end`, in a ring's hole, from those of the row before: `(first, last)`."""
+    if y2 >= limit2:
+        return begin, begin
+    if first >= last:
+        first, last = begin, end
+    return chord(x2, y2, limit2, first, last)
+
+
+@inline
 def pixel_and_fraction(pixel, fraction, pixels):
     """The pixel below a ray, which has a neighbour above it also at the sensor's edge."""
     low = min(max(np.int64(pixel), 0), pixels - 2)
