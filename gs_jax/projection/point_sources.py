@@ -19,8 +19,8 @@ from ..optics.field_varying import CORE_REACH, kernel_size, make_polar_grid, tra
 from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
 from ..typing import Points
-from .field_varying_model import stray_light_image
 from .rays import Envelope, RingLight
+from .stray_light import stray_light_image
 
 # Positions of a stamp within a pixel, along each axis: the error is at most a tenth of a pixel.
 STEPS = 5
