@@ -73,7 +73,7 @@ class StrayLight(eqx.Module):
     the tables, `v'`, mm. `grid`: the nodes.
     """
 
-    table: Float[Array, "depth order harmonic radius field"]
+    table: Float[Array, "depth harmonic radius order field"]
     area: Float[Array, ""]
     sensor_distance: Float[Array, ""]
     grid: PolarGrid = eqx.field(static=True)
@@ -211,7 +211,7 @@ def stray_light_table(
     grid: PolarGrid,
     cores: PsfCores,
     ends: Sequence[float] = RINGS,
-) -> Float32[np.ndarray, "order harmonic radius field"]:
+) -> Float32[np.ndarray, "harmonic radius order field"]:
     """Maps each harmonic of the object over the fields to the image's over the radii, at one depth.
 
     Order 0 is the mean lens, less its cores; order 1 its change with the clear area, 1/mm^2. The angle on
@@ -237,7 +237,7 @@ def stray_light_table(
     finest = np.pi * np.maximum(grid.nodes(grid.radii), 0.5)
     low_pass = 1 / (1 + (np.arange(grid.angles // 2 + 1) / finest[:, None]) ** _FILTER_ORDER)
     spectra = np.fft.rfft(around).real * low_pass
-    return spectra.transpose(0, 3, 2, 1).astype(np.float32)
+    return spectra.transpose(3, 2, 0, 1).astype(np.float32)
 
 
 def _bin_polar(grid, landing, light):

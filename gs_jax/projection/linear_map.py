@@ -171,7 +171,9 @@ def _run_on_cpu(*arrays, call):
         return call(*arrays)
     _, x = call.split(arrays)
     single = {y.dtype for y in jax.eval_shape(call, *arrays)} == {jnp.dtype(jnp.float32)}
-    suitable = single and all(a.dtype != jnp.float64 for a in x) and call.static.image[1] >= _LEAST_COLUMNS
+    # Of images; the rows of other arrays are long enough.
+    columns = getattr(call.static, "image", (0, _LEAST_COLUMNS))[1]
+    suitable = single and all(a.dtype != jnp.float64 for a in x) and columns >= _LEAST_COLUMNS
     return call(*arrays, function=cpu_kernel(name) if suitable else None)
 
 

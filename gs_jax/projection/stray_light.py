@@ -21,7 +21,9 @@ from ..optics.field_varying import PolarGrid, StrayLight, polar_weights
 from .linear_map import LinearMap
 
 # Lenses whose stray light is computed at once, which bounds the memory.
-_LENSES = 64
+_LENSES = 112
+# Kernels take sixteen lenses at once, and read so many pixels beyond a window.
+_SPARE = 16
 # Linear interpolations blur the stray light by about this variance, in squared pixels. A Wiener filter undoes that
 # where the blur leaves more than this share of a frequency's power.
 _BLUR, _NOISE = 0.7, 0.02
@@ -42,36 +44,38 @@ def stray_light_image(
     # The spots' pattern grows with the sensor's distance, and the coarse pixels with it.
     pixel = polar_grid.pixel * v
     to_polar, to_pixels = _to_polar_table(polar_grid), _to_pixels_table(polar_grid)
-    inner, outer = to_polar.patch, to_pixels.patch
+    inner, outer = to_polar.side, to_pixels.side
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / polar_grid.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
-    nodes = jnp.pad(nodes, [(0, 0), (inner + 1, inner + 1), (inner + 1, inner + 1)])
-    table = optics.table.astype(dtype)
+    nodes = jnp.pad(nodes, [(0, 0), *[(inner + 1, inner + 1 + _SPARE)] * 2])
+    # One matrix for both orders.
+    table = optics.table.astype(dtype).reshape(*optics.table.shape[:3], -1)
+    half_turn = (jnp.arange(polar_grid.angles // 2 + 1) % 2 == 1)[:, None, None]
 
     def add_lenses(image, lenses):
         centers, excess = lenses
+        places = _window_places(centers, origin.astype(dtype), polar_grid.step, nodes.shape[1:], inner)
 
         def add_depth(spots, plane):
             nodes, table = plane
-            start, fraction = _window_start(centers, origin.astype(dtype), polar_grid.step, nodes.shape, inner)
-            objects = _interpolated_windows(nodes, start, fraction, inner)
-            polar = _times_table(to_polar, (), objects.reshape(len(centers), -1).T)
-            spectrum = jnp.fft.rfft(polar.reshape(polar_grid.fields, polar_grid.angles, -1), axis=1)
-            images = lax.complex(*(_mix_harmonics(table, part, excess) for part in (spectrum.real, spectrum.imag)))
-            return spots + images, None
+            objects = _windows(Windows(nodes.shape, inner), places, nodes)
+            polar = _times_table(to_polar, (), objects.reshape(-1, len(centers)))
+            spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
+            parts = jnp.concatenate([spectrum.real, spectrum.imag], -1)
+            return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)], 1), None
 
-        empty = jnp.zeros((polar_grid.radii, polar_grid.angles // 2 + 1, len(centers)), dtype)
-        spots = lax.scan(jax.checkpoint(add_depth), lax.complex(empty, empty), (nodes, table))[0]
+        empty = jnp.zeros((polar_grid.angles // 2 + 1, polar_grid.radii, 2 * len(centers)), dtype)
+        spots = lax.scan(jax.checkpoint(add_depth), empty, (nodes, table))[0]
         # The image lies opposite to the object: half a turn.
-        half_turn = (jnp.arange(polar_grid.angles // 2 + 1) % 2 == 1)[None, :, None]
-        polar = jnp.fft.irfft(jnp.where(half_turn, -spots, spots), polar_grid.angles, axis=1).reshape(-1, len(centers))
-        spots = _times_table(to_pixels, (), polar).T.reshape(-1, outer, outer)
-        start, fraction = _window_start(centers, jnp.asarray(imager.sensor.origin, dtype), pixel, image.shape, outer)
-        return _add_interpolated_windows(image, spots, start, fraction), None
+        spots = lax.complex(*jnp.split(jnp.where(half_turn, -spots, spots), 2, -1))
+        polar = jnp.fft.irfft(spots, polar_grid.angles, axis=0).reshape(-1, len(centers))
+        spots = _times_table(to_pixels, (), polar).reshape(outer, outer, -1)
+        places = _window_places(centers, jnp.asarray(imager.sensor.origin, dtype), pixel, image.shape, outer)
+        return image + _windows.T(Windows(image.shape, outer), places, spots), None
 
     # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.
-    image = jnp.zeros([n + 2 * outer + 2 for n in coarse], dtype)
+    image = jnp.zeros([n + 2 * outer + 2 + _SPARE for n in coarse], dtype)
     image = lax.scan(jax.checkpoint(add_lenses), image, _lens_groups(imager, optics, dtype))[0]
-    image = image[outer + 1 : -outer - 1, outer + 1 : -outer - 1]
+    image = lax.dynamic_slice(image, (outer + 1, outer + 1), coarse)
     rows, columns = (
         _upsampling_matrix(fine, rough, imager.sensor.pixel_pitch / pixel, dtype)
         for fine, rough in zip(imager.sensor.shape, coarse, strict=True)
@@ -79,18 +83,12 @@ def stray_light_image(
     return (rows @ image @ columns.T) * (imager.sensor.pixel_pitch / pixel) ** 2
 
 
-def _mix_harmonics(table, spectrum, excess):
-    """Harmonics `(field, harmonic, lens)` of the object to those of the image `(radius, harmonic, lens)`."""
-    product = lambda table, part: jnp.einsum("mrf,fml->rml", table, part)
-    return product(table[0], spectrum) + product(table[1], spectrum * excess[None, None])
-
-
 def _lens_groups(imager, optics, dtype):
-    """Centres and excess areas of the lenses, `_LENSES` at a time; the last are filled up with lenses far away."""
+    """Centres and excess areas of lenses, at most `_LENSES` a group; the last are filled up with lenses far away."""
     centers, excess = imager.centers.astype(dtype), clear_area(imager.array).astype(dtype) - optics.area.astype(dtype)
     count = len(excess)
     groups = -(-count // _LENSES)
-    size = -(-count // groups)
+    size = -(-count // (groups * _SPARE)) * _SPARE
     missing = groups * size - count
     centers = jnp.pad(centers, [(0, missing), (0, 0)], constant_values=1e6)
     return centers.reshape(groups, size, 2), jnp.pad(excess, (0, missing)).reshape(groups, size)
@@ -108,51 +106,64 @@ def to_nodes(volume, grid, polar_grid):
     return jnp.einsum("ay,dyx,bx->dab", rows, volume, columns)
 
 
-def _window_start(centers, origin, step, shape, size):
+class Windows(NamedTuple):
+    """Shape of an image, with `_SPARE` lines at its end, and side of the windows about lenses."""
+
+    shape: tuple[int, int]
+    side: int
+
+
+def _window_places(centers, origin, step, shape, side):
     """First `(row, column)` of the window about each lens on nodes with this step, and the fraction of a node."""
-    middle = (jnp.asarray(shape, centers.dtype) - 1) / 2
+    middle = (jnp.asarray(shape, centers.dtype) - _SPARE - 1) / 2
     place = ((centers - origin[None]) / step)[:, ::-1] + middle[None]
     whole = jnp.floor(lax.stop_gradient(place))
-    return whole.astype(jnp.int32) - size // 2, place - whole
+    return whole.astype(jnp.int32) - side // 2, place - whole
 
 
-def _interpolated_windows(nodes, start, fraction, size):
-    """Square windows of the nodes, centred on the lenses: `(lens, size, size)`; zero where they end."""
-    windows = _read_windows((nodes.shape, (size + 1, size + 1)), start, nodes)
+def _interpolate_windows(windows, places, image):
+    """Windows `(row, column, lens)` of an image, centred on the lenses; zero if they are not within it."""
+    start, fraction = places
+    read = _read_windows(windows, start, image)
     down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
-    windows = (1 - down) * windows[:, :-1] + down * windows[:, 1:]
-    return (1 - right) * windows[..., :-1] + right * windows[..., 1:]
+    read = (1 - down) * read[:, :-1] + down * read[:, 1:]
+    return jnp.moveaxis((1 - right) * read[..., :-1] + right * read[..., 1:], 0, -1)
 
 
-def _add_interpolated_windows(image, spots, start, fraction):
-    """The adjoint of `_interpolated_windows`, added to an image."""
+def _spread_windows(windows, places, spots):
+    """The adjoint of `_interpolate_windows`."""
+    start, fraction = places
     down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    spots = jnp.moveaxis(spots, -1, 0)
     spots = jnp.pad((1 - down) * spots, [(0, 0), (0, 1), (0, 0)]) + jnp.pad(down * spots, [(0, 0), (1, 0), (0, 0)])
     spots = jnp.pad((1 - right) * spots, [(0, 0), (0, 0), (0, 1)]) + jnp.pad(right * spots, [(0, 0), (0, 0), (1, 0)])
-    return image + _read_windows.T((image.shape, spots.shape[1:]), start, spots)
+    return _read_windows.T(windows, start, spots)
 
 
-def _gather_windows(shapes, start, image):
-    """Windows of an image, `shapes` being of both; zero if they are not within it."""
+_windows = LinearMap(_interpolate_windows, _spread_windows, kernels=("read_windows", "add_windows"))
+
+
+def _gather_windows(windows, start, image):
+    """Windows with one more line each way, `(lens, row, column)`; zero if they are not within the image."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
-    return lax.gather(image, start, dimensions, shapes[1], mode="fill", fill_value=0)
+    image = image[: windows.shape[0] - _SPARE, : windows.shape[1] - _SPARE]
+    return lax.gather(image, start, dimensions, (windows.side + 1, windows.side + 1), mode="fill", fill_value=0)
 
 
-def _add_windows(shapes, start, windows):
+def _add_windows(windows, start, values):
     """The transpose of `_gather_windows`, window by window: JAX before 0.11.1 compiles a scatter-add slowly for GPUs.
 
-    On a CPU it takes 0.8 to 2.5 of the time of a scatter-add, a hundredth of all; a gather, by which each pixel
-    looks into every window, takes 2 to 15.
+    A gather, by which each pixel looks into every window, takes 2 to 15 times as long as a scatter-add on a CPU.
     """
-    shape, size = shapes
-    within = ((start >= 0) & (start <= jnp.asarray(np.subtract(shape, size), start.dtype)[None])).all(1)
-    windows = jnp.where(within[:, None, None], windows, 0)
+    size = windows.side + 1
+    within = ((start >= 0) & (start <= jnp.asarray(windows.shape, start.dtype)[None] - size - _SPARE)).all(1)
+    values = jnp.where(within[:, None, None], values, 0)
 
     def add(image, one):
-        at, window = one
-        return lax.dynamic_update_slice(image, lax.dynamic_slice(image, at, size) + window, at), None
+        at, value = one
+        return lax.dynamic_update_slice(image, lax.dynamic_slice(image, at, (size, size)) + value, at), None
 
-    return lax.scan(add, jnp.zeros(shape, windows.dtype), (start, windows))[0]
+    return lax.scan(add, jnp.zeros(windows.shape, values.dtype), (start, values))[0]
 
 
 _read_windows = LinearMap(_gather_windows, _add_windows)
@@ -174,30 +185,41 @@ def _wiener_matrix(count: int) -> Float[np.ndarray, "pixel pixel"]:
     return kernel[np.arange(count)[:, None] - np.arange(count)]
 
 
-class _Rows(NamedTuple):
-    """The rows of a sparse matrix, in parts with about as many entries.
+class Entries(NamedTuple):
+    """Entries of a sparse matrix, row after row: the first of each row, their places within a row, and their shares."""
 
-    `parts`: columns and shares `(row, entry)` of each, filled up with zeros. `order`: the place of each row among all
-    the parts' rows.
-    """
-
-    parts: tuple[tuple[np.ndarray, np.ndarray], ...]
-    order: np.ndarray
+    start: np.ndarray
+    place: np.ndarray
+    share: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Table:
-    """A sparse matrix and its transpose; `patch` is the side of the square of pixels."""
+class SparseTable:
+    """A sparse matrix by rows and by columns; `side` is that of the square of pixels."""
 
-    patch: int
-    rows: _Rows
-    transposed: _Rows
+    side: int
+    rows: Entries
+    columns: Entries
 
 
-def _times_rows(rows, columns):
+def _times_entries(entries, x):
     """Both directions gather whole rows: the scatter of a transpose is much slower."""
-    products = [_times_part(index, weight.astype(columns.dtype), columns) for index, weight in rows.parts]
-    return jnp.concatenate(products).at[rows.order].get(mode="promise_in_bounds")
+    parts, order = _equal_parts(entries)
+    products = [_times_part(place, share.astype(x.dtype), x) for place, share in parts]
+    return jnp.concatenate(products).at[order].get(mode="promise_in_bounds")
+
+
+def _equal_parts(entries):
+    """Places and shares of the rows with 1, 2, 3-4, ... entries, filled up with zeros, and the order of all rows."""
+    count = np.diff(entries.start)
+    size = np.ceil(np.log2(np.maximum(count, 1))).astype(int)
+    parts = []
+    for one in np.unique(size):
+        number = np.arange(max(count[size == one].max(), 1))
+        exists = number < count[size == one][:, None]
+        at = np.where(exists, entries.start[:-1][size == one][:, None] + number, 0)
+        parts.append((np.where(exists, entries.place[at], 0), np.where(exists, entries.share[at], 0)))
+    return parts, np.argsort(np.argsort(size, kind="stable")).astype(np.int32)
 
 
 def _times_part(index, weight, columns):
@@ -211,22 +233,24 @@ def _times_part(index, weight, columns):
 
 
 _times_table = LinearMap(
-    lambda table, _, columns: _times_rows(table.rows, columns),
-    lambda table, _, columns: _times_rows(table.transposed, columns),
+    lambda table, _, x: _times_entries(table.rows, x),
+    lambda table, _, x: _times_entries(table.columns, x),
+    kernels=("times_rows", "times_columns"),
 )
 
 
 @cache
-def _to_polar_table(polar_grid: PolarGrid) -> _Table:
+def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
     """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
     reach = math.ceil(polar_grid.nodes(polar_grid.fields)[-2])
     node, polar, share = polar_weights(polar_grid, polar_grid.fields, *_square(reach))
+    polar = _angle_first(polar_grid, polar_grid.fields, polar)
     side, polars = 2 * reach + 1, polar_grid.fields * polar_grid.angles
-    return _Table(side, _by_row(polar, node, share, polars), _by_row(node, polar, share, side**2))
+    return SparseTable(side, _by_row(polar, node, share, polars), _by_row(node, polar, share, side**2))
 
 
 @cache
-def _to_pixels_table(polar_grid: PolarGrid) -> _Table:
+def _to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
     """From polar nodes to the pixels about a lens: the density of light, interpolated, so that none is lost.
 
     About the axis the nodes are closer than the pixels, and are shared by the four around them instead.
@@ -241,8 +265,14 @@ def _to_pixels_table(polar_grid: PolarGrid) -> _Table:
     share = share / np.where(whole, total[node], np.repeat(polar_grid.areas(polar_grid.radii), polar_grid.angles)[node])
     parts = [(pixel, node, share), *_near_axis(polar_grid, reach)]
     pixel, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
+    node = _angle_first(polar_grid, polar_grid.radii, node)
     side, polars = 2 * reach + 1, polar_grid.radii * polar_grid.angles
-    return _Table(side, _by_row(pixel, node, share, side**2), _by_row(node, pixel, share, polars))
+    return SparseTable(side, _by_row(pixel, node, share, side**2), _by_row(node, pixel, share, polars))
+
+
+def _angle_first(polar_grid, radii, node):
+    """Numbers of nodes `(radius, angle)` as those of `(angle, radius)`."""
+    return node % polar_grid.angles * radii + node // polar_grid.angles
 
 
 def _near_axis(polar_grid: PolarGrid, reach: int):
@@ -265,19 +295,8 @@ def _square(reach: int):
     return x.ravel(), y.ravel()
 
 
-def _by_row(row, column, share, rows) -> _Rows:
-    """Entries of a sparse matrix, sorted by row; parts have rows of 1, 2, 3-4, 5-8, ... entries."""
+def _by_row(row, place, share, rows) -> Entries:
+    """Entries sorted by row."""
     sorting = np.argsort(row, kind="stable")
-    row, column, share = row[sorting], column[sorting], share[sorting]
-    number = np.arange(row.size) - np.searchsorted(row, row)
-    count = np.bincount(row, minlength=rows)
-    size = np.ceil(np.log2(np.maximum(count, 1))).astype(int)
-    parts = []
-    for one in np.unique(size):
-        place = np.cumsum(size == one) - 1
-        mine = size[row] == one
-        shape = np.count_nonzero(size == one), max(count[size == one].max(), 1)
-        index, weight, at = np.zeros(shape, np.int32), np.zeros(shape), (place[row[mine]], number[mine])
-        index[at], weight[at] = column[mine], share[mine]
-        parts.append((index, weight))
-    return _Rows(tuple(parts), np.argsort(np.argsort(size, kind="stable")).astype(np.int32))
+    start = np.searchsorted(row[sorting], np.arange(rows + 1)).astype(np.int32)
+    return Entries(start, place[sorting].astype(np.int32), share[sorting])

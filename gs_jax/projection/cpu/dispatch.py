@@ -1,4 +1,4 @@
-"""Calls of numba kernels through XLA's FFI, which replace functions of `bilinear` and `convolution` on a CPU."""
+"""Calls of numba kernels through XLA's FFI, which replace functions of this folder's parent on a CPU."""
 
 import ctypes
 import os
@@ -18,7 +18,7 @@ from numba import cfunc, types
 from ...geometry import FALLOFF, field_limit
 from ..convolution import spectrum
 from ..rays import Envelope, Rays
-from . import ffi, fftconv, kernels
+from . import ffi, fftconv, kernels, windows
 from .simd import FAST, WIDTH
 
 # The handler's name for XLA, and the version of the structures that it reads. XLA refuses one that it does not support.
@@ -32,6 +32,10 @@ KERNELS = {
     "rays_vjp": kernels.rays_vjp,
     "convolve": fftconv.overlap_save,
     "correlate": fftconv.overlap_save,
+    "read_windows": windows.read_windows,
+    "add_windows": windows.add_windows,
+    "times_rows": windows.times_rows,
+    "times_columns": windows.times_rows,
 }
 _table = np.zeros(ffi.FIRST_KERNEL + len(KERNELS), np.int64)
 
@@ -153,6 +157,28 @@ def _overlap_save(name, kernels, images, shapes, shift):
     results = [ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     table = np.stack([np.cos(angles), np.sin(angles)], -1).astype(np.float32)
     return _call(name, results, plan, table, spectra, *images)
+
+
+def read_windows(windows, places, image):
+    shape = windows.side, windows.side, len(places[0])
+    return _call("read_windows", ShapeDtypeStruct(shape, jnp.float32), *places, image)
+
+
+def add_windows(windows, places, values):
+    return _call("add_windows", ShapeDtypeStruct(windows.shape, jnp.float32), *places, values)
+
+
+def times_rows(matrix, _, x):
+    return _times("times_rows", matrix.rows, x)
+
+
+def times_columns(matrix, _, x):
+    return _times("times_columns", matrix.columns, x)
+
+
+def _times(kernel, entries, x):
+    result = ShapeDtypeStruct((len(entries.start) - 1, x.shape[1]), jnp.float32)
+    return _call(kernel, result, entries.start, entries.place, entries.share.astype(np.float32), x)
 
 
 @cache

@@ -1,0 +1,123 @@
+"""Windows of an image about lenses, and sparse matrices times columns of lenses, as numba kernels.
+
+A kernel `(job, part)` as in `kernels`. The number of lenses, the last axis, is a multiple of sixteen.
+"""
+
+import numpy as np
+
+from . import rows, simd
+from .gather import align, scratch
+from .rows import ONE, PARTS, ZERO
+from .simd import WIDTH, inline
+
+# Bytes of sixteen numbers, and of a square of them.
+_STEP = 4 * WIDTH
+_TILE = _STEP * WIDTH
+
+
+@inline
+def _within(row, column, side, tall, wide):
+    """Whether a window, and the lines between whose pixels it lies, end before the image's spare columns."""
+    return row >= 0 and column >= 0 and row + side < tall and column + side + WIDTH < wide
+
+
+def read_windows(job_address, part, _):
+    """Image to windows `(row, column, lens)`, interpolated linearly; a part is a band of their rows."""
+    job = rows.job_at(job_address)
+    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    tall, wide = rows.size(job, 2, 0), rows.size(job, 2, 1)
+    side, lenses = rows.size(job, 3, 0), rows.size(job, 3, 2)
+    tiles = scratch(2 * WIDTH * WIDTH)
+    at_rows = align(tiles)
+    at_columns = at_rows + _TILE
+    for block in range(0, lenses, WIDTH):
+        for i in range(part * side // job[PARTS], (part + 1) * side // job[PARTS]):
+            at_result = rows.address(job, 3) + 4 * (i * side * lenses + block)
+            for j in range(0, side, WIDTH):
+                for n in range(WIDTH):
+                    row, column = np.int64(start[block + n, 0]), np.int64(start[block + n, 1])
+                    down, right, value = fraction[block + n, 0], fraction[block + n, 1], simd.zeros()
+                    if _within(row, column, side, tall, wide):
+                        at = rows.address(job, 2) + 4 * ((row + i) * wide + column + j)
+                        before = (ONE - down) * simd.load(at) + down * simd.load(at + 4 * wide)
+                        after = (ONE - down) * simd.load(at + 4) + down * simd.load(at + 4 + 4 * wide)
+                        value = before + right * (after - before)
+                    simd.store(at_rows + _STEP * n, value)
+                simd.transpose(at_rows, at_columns)
+                for m in range(min(WIDTH, side - j)):
+                    simd.store(at_result + 4 * (j + m) * lenses, simd.load(at_columns + _STEP * m))
+    rows.keep_alive((tiles,))
+
+
+def add_windows(job_address, part, _):
+    """The adjoint of `read_windows`; a part is a band of rows of the image."""
+    job = rows.job_at(job_address)
+    start, fraction = rows.integers(job, 0)[:, :, 0], rows.floats(job, 1)[:, :, 0]
+    side, lenses = rows.size(job, 2, 0), rows.size(job, 2, 2)
+    tall, wide = rows.size(job, 3, 0), rows.size(job, 3, 1)
+    top, bottom = part * tall // job[PARTS], (part + 1) * tall // job[PARTS]
+    rows.floats(job, 3)[top:bottom] = ZERO
+    # A row of each window, with zeros before and after it.
+    length = rows.padded(side) + 3 * WIDTH
+    lines = scratch(WIDTH * (length + 2 * WIDTH))
+    at_columns = align(lines)
+    at_rows = at_columns + _TILE
+    at_lines = at_rows + _TILE + _STEP
+    for block in range(0, lenses, WIDTH):
+        first, last = side, 0
+        for n in range(WIDTH):
+            row, column = np.int64(start[block + n, 0]), np.int64(start[block + n, 1])
+            if _within(row, column, side, tall, wide):
+                first, last = min(first, top - 1 - row), max(last, bottom - row)
+        for i in range(max(first, 0), min(last, side)):
+            at_row = rows.address(job, 2) + 4 * (i * side * lenses + block)
+            for j in range(0, side, WIDTH):
+                for m in range(WIDTH):
+                    exists = j + m < side
+                    simd.store(
+                        at_columns + _STEP * m, simd.load(at_row + 4 * (j + m) * lenses) if exists else simd.zeros()
+                    )
+                simd.transpose(at_columns, at_rows)
+                for n in range(WIDTH):
+                    simd.store(at_lines + 4 * (n * length + j), simd.load(at_rows + _STEP * n))
+            for n in range(WIDTH):
+                row, column = np.int64(start[block + n, 0]) + i, np.int64(start[block + n, 1])
+                if not _within(row - i, column, side, tall, wide) or row + 1 < top or row >= bottom:
+                    continue
+                down, right = fraction[block + n, 0], fraction[block + n, 1]
+                at_line, at_upper = at_lines + 4 * n * length, rows.address(job, 3) + 4 * (row * wide + column)
+                at_lower = at_upper + 4 * wide
+                for j in range(0, 4 * (side + 1), _STEP):
+                    value = (ONE - right) * simd.load(at_line + j) + right * simd.load(at_line + j - 4)
+                    if row >= top:
+                        simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * value)
+                    if row + 1 < bottom:
+                        simd.store(at_lower + j, simd.load(at_lower + j) + down * value)
+    rows.keep_alive((lines,))
+
+
+def times_rows(job_address, part, _):
+    """A sparse matrix (first entry of each row, columns, shares) times `(column, lens)`; a part is some rows."""
+    job = rows.job_at(job_address)
+    start, column, share = rows.integers(job, 0)[:, 0, 0], rows.integers(job, 1)[:, 0, 0], rows.floats(job, 2)[:, 0, 0]
+    lenses, count = rows.size(job, 3, 1), rows.size(job, 4, 0)
+    whole = lenses // (4 * WIDTH) * 4 * WIDTH
+    for row in range(part * count // job[PARTS], (part + 1) * count // job[PARTS]):
+        begin, end = np.int64(start[row]), np.int64(start[row + 1])
+        at_result = rows.address(job, 4) + 4 * row * lenses
+        for lens in range(0, whole, 4 * WIDTH):
+            a, b, c, d = simd.zeros(), simd.zeros(), simd.zeros(), simd.zeros()
+            for entry in range(begin, end):
+                at, factor = rows.address(job, 3) + 4 * (np.int64(column[entry]) * lenses + lens), share[entry]
+                a, b = a + factor * simd.load(at), b + factor * simd.load(at + _STEP)
+                c, d = c + factor * simd.load(at + 2 * _STEP), d + factor * simd.load(at + 3 * _STEP)
+            at = at_result + 4 * lens
+            simd.store(at, a)
+            simd.store(at + _STEP, b)
+            simd.store(at + 2 * _STEP, c)
+            simd.store(at + 3 * _STEP, d)
+        for lens in range(whole, lenses, WIDTH):
+            a = simd.zeros()
+            for entry in range(begin, end):
+                a = a + share[entry] * simd.load(rows.address(job, 3) + 4 * (np.int64(column[entry]) * lenses + lens))
+            simd.store(at_result + 4 * lens, a)
