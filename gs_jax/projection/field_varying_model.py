@@ -1,8 +1,11 @@
 """The field-varying forward model: the spots' cores on the sensor's pixels, and the stray light on coarse pixels."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager
@@ -16,6 +19,8 @@ from .stray_light import stray_light_image, to_nodes
 
 # Depths whose cores are convolved at once.
 _DEPTHS = 1
+# Share of a voxel by which whole numbers of voxels may differ from a pixel.
+_ROUNDING = 0.02
 
 
 def full_image(
@@ -29,17 +34,23 @@ def full_image(
 
 
 def _cores_image(volume, imager, grid, optics):
-    """The inner ring on the sensor's pixels, the others, whose cores are wider, on pixels twice as large."""
+    """The inner ring on the sensor's pixels, the others, whose cores are wider, on pixels twice as large.
+
+    The light of the others comes from voxels as wide as these pixels, if that is several of the volume's.
+    """
     sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
     size = optics.wide_kernels.shape[-1]
     wide, wide_half = with_margin(imager, optics.kernel.shape[-1]), with_margin(_half_resolution(imager), size)
-    dtype = volume.dtype
+    dtype, nodes = volume.dtype, optics.stray_light.grid
+    voxels_per_pixel = 2 * sensor.pixel_pitch / (grid.pitch * nodes.pixel / nodes.step)
+    outer_grid, outer_volume = _wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
 
     def sharp(imager, plane, number):
-        depth, voxels, distortion, light, _, _ = plane
+        depth, inner, outer, distortion, light, _, _ = plane
+        grid_here, voxels = (outer_grid, outer) if number else (grid, inner)
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * distortion[number]
-        at = grid.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
+        at = grid_here.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
         if imager.tilt is not None:
             # The distortion is about the lens's axis, which is tilted.
             offset = (1 / distortion[number] - 1) * imager.axis_offset(depth[None])[0]
@@ -60,11 +71,31 @@ def _cores_image(volume, imager, grid, optics):
         return fine, coarse + sum_of_convolutions(outer, wide_kernels, whole=True, symmetric=True)
 
     kernels = (part.astype(dtype) for part in (optics.kernel, optics.wide_kernels))
-    planes = grid.depths, volume, optics.distortion, optics.light, *kernels
+    planes = grid.depths, volume, outer_volume, optics.distortion, optics.light, *kernels
     whole = [n + size - 1 for n in wide_half.sensor.shape]
     dark = jnp.zeros(sensor.shape, dtype), jnp.zeros(whole, dtype)
     fine, coarse = scan_in_groups(add_depths, dark, planes, _DEPTHS)
     return fine + upsample_by_two(coarse, size, sensor.shape)
+
+
+def _wider_voxels(grid, volume, factor):
+    """A grid of voxels that are wider by a whole factor, and the volume's light, shared linearly by these."""
+    for axis in (1, 2):
+        size = volume.shape[axis]
+        count = 2 * math.ceil(size / factor / 2) + 1
+        # Of the first of the new voxels, in the old ones.
+        first = (size - 1) / 2 - factor * (count - 1) / 2
+        padding = [(0, 0)] * 3
+        padding[axis] = (start := factor - 1 - math.floor(first), start + factor + 1)
+        padded = jnp.pad(volume, padding)
+        taps = range(math.floor(first) - factor + 1, math.floor(first) + factor + 1)
+        volume = sum(
+            (1 - abs(tap - first) / factor)
+            * lax.slice_in_dim(padded, tap + start, tap + start + factor * (count - 1) + 1, factor, axis)
+            for tap in taps
+            if abs(tap - first) < factor
+        )
+    return Grid(grid.depths, volume.shape[1:], factor * grid.pitch, grid.origin), volume
 
 
 def _half_resolution(imager: Imager) -> Imager:
