@@ -1,6 +1,8 @@
 """The field-varying forward model: the spots' cores on the sensor's pixels, and the stray light on coarse pixels."""
 
 import math
+import operator
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -80,22 +82,25 @@ def _cores_image(volume, imager, grid, optics):
 
 def _wider_voxels(grid, volume, factor):
     """A grid of voxels that are wider by a whole factor, and the volume's light, shared linearly by these."""
-    for axis in (1, 2):
-        size = volume.shape[axis]
-        count = 2 * math.ceil(size / factor / 2) + 1
-        # Of the first of the new voxels, in the old ones.
-        first = (size - 1) / 2 - factor * (count - 1) / 2
-        padding = [(0, 0)] * 3
-        padding[axis] = (start := factor - 1 - math.floor(first), start + factor + 1)
-        padded = jnp.pad(volume, padding)
-        taps = range(math.floor(first) - factor + 1, math.floor(first) + factor + 1)
-        volume = sum(
-            (1 - abs(tap - first) / factor)
-            * lax.slice_in_dim(padded, tap + start, tap + start + factor * (count - 1) + 1, factor, axis)
-            for tap in taps
-            if abs(tap - first) < factor
-        )
+    if factor == 1:
+        return grid, volume
+    volume = _share_lines(_share_lines(volume, factor, 1), factor, 2)
     return Grid(grid.depths, volume.shape[1:], factor * grid.pitch, grid.origin), volume
+
+
+def _share_lines(volume, factor, axis):
+    size = volume.shape[axis]
+    count = 2 * math.ceil(size / factor / 2) + 1
+    # Place of the first new line, and the first line that shares its light with it.
+    place = (size - 1) / 2 - factor * (count - 1) / 2
+    first = math.floor(place) - factor + 1
+    padding = [(0, 0)] * volume.ndim
+    padding[axis] = -first, factor * (count + 1) - size + first
+    padded, parts = jnp.pad(volume, padding), []
+    for number in range(2 * factor):
+        lines = lax.slice_in_dim(padded, number, number + factor * (count - 1) + 1, factor, axis)
+        parts.append(max(1 - abs(first + number - place) / factor, 0) * lines)
+    return reduce(operator.add, parts)
 
 
 def _half_resolution(imager: Imager) -> Imager:

@@ -61,7 +61,7 @@ def stray_light_image(
             polar = _times_table(to_polar, (), objects.reshape(-1, len(centers)))
             spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
             parts = jnp.concatenate([spectrum.real, spectrum.imag], -1)
-            return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)], 1), None
+            return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)[None, None]], 1), None
 
         empty = jnp.zeros((polar_grid.angles // 2 + 1, polar_grid.radii, 2 * len(centers)), dtype)
         spots = lax.scan(jax.checkpoint(add_depth), empty, (nodes, table))[0]
