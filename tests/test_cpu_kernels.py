@@ -19,6 +19,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backprojec
 from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.rays import Envelope, RingLight, trace
+from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpolate_windows, times_table
 
 from .helpers import scene
 
@@ -66,6 +67,33 @@ def compare(*calls):
         # Sums of both signs: rounding is relative to the largest.
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * float(jnp.abs(b).max()))
     return expected
+
+
+def test_windows_and_sparse_tables_are_those_of_xla():
+    rng = np.random.default_rng(0)
+    windows, lenses = Windows((61, 75), 19), 32
+    # Some end beyond the image.
+    start = jnp.asarray(rng.integers(-4, 30, (lenses, 2)), jnp.int32)
+    places = start, jnp.asarray(rng.random((lenses, 2)), jnp.float32)
+    image = jnp.asarray(rng.random(windows.shape), jnp.float32)
+    values = jnp.asarray(rng.random((windows.side, windows.side, lenses)), jnp.float32)
+    row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), rng.random(400)
+    row[:60] = 7
+    entries = by_row(row, column, share, 50), by_row(column, row, share, 90)
+    table = SparseTable(0, *entries)
+    x, y = (jnp.asarray(rng.random((n, 80)), jnp.float32) for n in (90, 50))
+    read, _, product, transposed = compare(
+        (interpolate_windows, windows, places, image),
+        (interpolate_windows.T, windows, places, values),
+        (times_table, table, (), x),
+        (times_table.T, table, (), y),
+    )
+    matrix = np.zeros((50, 90))
+    np.add.at(matrix, (row, column), share)
+    np.testing.assert_allclose(product, matrix @ np.asarray(x), rtol=1e-5)
+    np.testing.assert_allclose(transposed, matrix.T @ np.asarray(y), rtol=1e-5)
+    dark = ((np.asarray(start) < 0) | (np.asarray(start) + 20 > np.subtract(windows.shape, 16))).any(1)
+    assert 0 < dark.sum() < lenses and not np.asarray(read)[..., dark].any() and np.asarray(read)[..., ~dark].all()
 
 
 @pytest.mark.parametrize(
@@ -181,7 +209,7 @@ def test_a_numba_that_cannot_compile_the_kernels_gives_one_warning(monkeypatch, 
 
     monkeypatch.setattr(dispatch, "load", fail)
     with pytest.warns(RuntimeWarning, match="XLA is used instead") as warned:
-        assert [linear_map.cpu_kernel(name) for name in dispatch.KERNELS] == [None] * 5
+        assert [linear_map.cpu_kernel(name) for name in dispatch.KERNELS] == [None] * len(dispatch.KERNELS)
     assert len(warned) == 1 and str(warned[0].message).endswith("NumbaError: No implementation of function")
 
 

@@ -57,8 +57,8 @@ def stray_light_image(
 
         def add_depth(spots, plane):
             nodes, table = plane
-            objects = _windows(Windows(nodes.shape, inner), places, nodes)
-            polar = _times_table(to_polar, (), objects.reshape(-1, len(centers)))
+            objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes)
+            polar = times_table(to_polar, (), objects.reshape(-1, len(centers)))
             spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
             parts = jnp.concatenate([spectrum.real, spectrum.imag], -1)
             return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)[None, None]], 1), None
@@ -68,9 +68,9 @@ def stray_light_image(
         # The image lies opposite to the object: half a turn.
         spots = lax.complex(*jnp.split(jnp.where(half_turn, -spots, spots), 2, -1))
         polar = jnp.fft.irfft(spots, polar_grid.angles, axis=0).reshape(-1, len(centers))
-        spots = _times_table(to_pixels, (), polar).reshape(outer, outer, -1)
+        spots = times_table(to_pixels, (), polar).reshape(outer, outer, -1)
         places = _window_places(centers, jnp.asarray(imager.sensor.origin, dtype), pixel, image.shape, outer)
-        return image + _windows.T(Windows(image.shape, outer), places, spots), None
+        return image + interpolate_windows.T(Windows(image.shape, outer), places, spots), None
 
     # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.
     image = jnp.zeros([n + 2 * outer + 2 + _SPARE for n in coarse], dtype)
@@ -121,7 +121,7 @@ def _window_places(centers, origin, step, shape, side):
     return whole.astype(jnp.int32) - side // 2, place - whole
 
 
-def _interpolate_windows(windows, places, image):
+def _window_values(windows, places, image):
     """Windows `(row, column, lens)` of an image, centred on the lenses; zero if they are not within it."""
     start, fraction = places
     read = _read_windows(windows, start, image)
@@ -131,7 +131,7 @@ def _interpolate_windows(windows, places, image):
 
 
 def _spread_windows(windows, places, spots):
-    """The adjoint of `_interpolate_windows`."""
+    """The adjoint of `_window_values`."""
     start, fraction = places
     down, right = fraction[:, 0, None, None], fraction[:, 1, None, None]
     spots = jnp.moveaxis(spots, -1, 0)
@@ -140,7 +140,7 @@ def _spread_windows(windows, places, spots):
     return _read_windows.T(windows, start, spots)
 
 
-_windows = LinearMap(_interpolate_windows, _spread_windows, kernels=("read_windows", "add_windows"))
+interpolate_windows = LinearMap(_window_values, _spread_windows, kernels=("read_windows", "add_windows"))
 
 
 def _gather_windows(windows, start, image):
@@ -232,7 +232,7 @@ def _times_part(index, weight, columns):
     return total
 
 
-_times_table = LinearMap(
+times_table = LinearMap(
     lambda table, _, x: _times_entries(table.rows, x),
     lambda table, _, x: _times_entries(table.columns, x),
     kernels=("times_rows", "times_columns"),
@@ -246,7 +246,7 @@ def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
     node, polar, share = polar_weights(polar_grid, polar_grid.fields, *_square(reach))
     polar = _angle_first(polar_grid, polar_grid.fields, polar)
     side, polars = 2 * reach + 1, polar_grid.fields * polar_grid.angles
-    return SparseTable(side, _by_row(polar, node, share, polars), _by_row(node, polar, share, side**2))
+    return SparseTable(side, by_row(polar, node, share, polars), by_row(node, polar, share, side**2))
 
 
 @cache
@@ -267,7 +267,7 @@ def _to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
     pixel, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
     node = _angle_first(polar_grid, polar_grid.radii, node)
     side, polars = 2 * reach + 1, polar_grid.radii * polar_grid.angles
-    return SparseTable(side, _by_row(pixel, node, share, side**2), _by_row(node, pixel, share, polars))
+    return SparseTable(side, by_row(pixel, node, share, side**2), by_row(node, pixel, share, polars))
 
 
 def _angle_first(polar_grid, radii, node):
@@ -295,7 +295,7 @@ def _square(reach: int):
     return x.ravel(), y.ravel()
 
 
-def _by_row(row, place, share, rows) -> Entries:
+def by_row(row, place, share, rows) -> Entries:
     """Entries sorted by row."""
     sorting = np.argsort(row, kind="stable")
     start = np.searchsorted(row[sorting], np.arange(rows + 1)).astype(np.int32)

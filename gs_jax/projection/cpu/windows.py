@@ -17,8 +17,8 @@ _TILE = _STEP * WIDTH
 
 @inline
 def _within(row, column, side, tall, wide):
-    """Whether a window, and the lines between whose pixels it lies, end before the image's spare columns."""
-    return row >= 0 and column >= 0 and row + side < tall and column + side + WIDTH < wide
+    """Whether a window, and the lines between whose pixels it lies, end before the image's spare lines."""
+    return row >= 0 and column >= 0 and row + side + WIDTH < tall and column + side + WIDTH < wide
 
 
 def read_windows(job_address, part, _):
