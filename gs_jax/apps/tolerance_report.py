@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from ..design.datasheets import text_table
 from .device_model import ERROR_FIELDS
 from .tolerance_analysis import LEAST_STREHL, Measures, Outcome, combine_changes
 
@@ -77,20 +78,18 @@ def sentences(outcome: Outcome) -> list[str]:
 def tables(outcome: Outcome) -> list[Table]:
     """The effect of each tolerance, and the devices depth by depth. Both fit 80 columns."""
     cell = lambda value: "-" if value is None else "0" if value < 5e-4 else f"{value:.3g}"
-    by_tolerance = _table(
-        "Effect of each tolerance alone, by gradient: RMS over depths and points",
-        ("tolerance", "", "width\n%", "Strehl\n%", "depth\num", "calibrated\num", "yield %\nwithout"),
-    )
     changes, whole = summarise_changes(outcome), f"{100 * outcome.all_met.mean():.3g}"
     without = {name: f"{100 * value:.3g}" for name, value in outcome.yields_without.items()} | {"all, drawn": whole}
     amounts = {name: _amount(outcome, name) for name in ERROR_FIELDS} | {
         "all, drawn": f"{len(outcome.all_met)} devices"
     }
-    for name in (*rank_tolerances(outcome), "all, by gradient", "all, drawn"):
-        by_tolerance.add_row(name, amounts.get(name, ""), *map(cell, changes[name].values()), without.get(name, ""))
-    by_depth = _table(
-        "By depth: as designed, and of the devices",
-        ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num"),
+    by_tolerance = text_table(
+        "Effect of each tolerance alone, by gradient: RMS over depths and points",
+        ("tolerance", "", "width\n%", "Strehl\n%", "depth\num", "calibrated\num", "yield %\nwithout"),
+        (
+            (name, amounts.get(name, ""), *map(cell, changes[name].values()), without.get(name, ""))
+            for name in (*rank_tolerances(outcome), "all, by gradient", "all, drawn")
+        ),
     )
     (width, strehl), (widths, strehls) = _linear(outcome.nominal), _linear(outcome.devices)
     columns = (
@@ -99,16 +98,12 @@ def tables(outcome: Outcome) -> list[Table]:
         *(np.where(ratio >= 1e-3, ratio, 0.0) for ratio in (strehl, *np.percentile(strehls, (50, _LOW), axis=0))),
         *1000 * np.array(_rms_by_depth(outcome)),
     )
-    for row in zip(*columns, strict=True):
-        by_depth.add_row(*(f"{x:.0f}" if x >= 100 else f"{x:.3g}" for x in row))
+    by_depth = text_table(
+        "By depth: as designed, and of the devices",
+        ("depth\nmm", "width\num", "\nmedian", "\n95 %", "Strehl\n", "\nmedian", "\n5 %", "depth\num", "calib.\num"),
+        ([f"{x:.0f}" if x >= 100 else f"{x:.3g}" for x in row] for row in zip(*columns, strict=True)),
+    )
     return [by_tolerance, by_depth]
-
-
-def _table(title: str, heads: tuple[str, ...]) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for head in heads:
-        table.add_column(head, justify="left" if head in ("tolerance", "") else "right")
-    return table
 
 
 def _amount(outcome: Outcome, name: str) -> str:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -208,7 +208,8 @@ _spot_sizes = eqx.filter_jit(
 
 def tables(sheet: dict[str, Any]) -> list[Table]:
     """A datasheet to read: an image in focus, how far out of focus it is, and what to expect. All fit 80 columns."""
-    made = [_table(title, columns, sheet) for title, columns in _TABLES.items()]
+    cells = lambda columns: zip(*([_cell(key, value) for value in sheet[key]] for key in columns), strict=True)
+    made = [text_table(title, columns.values(), cells(columns)) for title, columns in _TABLES.items()]
     return made + ([_table_of_types(sheet)] if len(sheet.get("kinds", ())) in range(2, _COLUMNS + 1) else [])
 
 
@@ -261,24 +262,21 @@ _COLUMNS = 6
 _LEAST_STREHL = 0.01
 
 
-def _table(title: str, columns: dict[str, str], sheet: dict[str, Any]) -> Table:
+def text_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
+    """A table for the terminal, flush right but for the column "tolerance" and the one without a head."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for header in columns.values():
-        table.add_column(header, justify="right")
-    for row in zip(*(sheet[key] for key in columns), strict=True):
-        table.add_row(*(_cell(key, value) for key, value in zip(columns, row, strict=True)))
+    for head in heads:
+        table.add_column(head, justify="left" if head in ("tolerance", "") else "right")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
 def _table_of_types(sheet: dict[str, Any]) -> Table:
+    heads = [f"{one['lenses']} of f =\n{_plain(one['focal_length_mm'])} mm" for one in sheet["kinds"]]
+    columns = [map(_plain, sheet["depth_mm"]), *(map(_plain, one["spot_width_um"]) for one in sheet["kinds"])]
     title = "Width at half height by each type of lens: in the object, um"
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    table.add_column("depth\nmm", justify="right")
-    for one in sheet["kinds"]:
-        table.add_column(f"{one['lenses']} of f =\n{_plain(one['focal_length_mm'])} mm", justify="right")
-    for i, depth in enumerate(sheet["depth_mm"]):
-        table.add_row(_plain(depth), *(_plain(one["spot_width_um"][i]) for one in sheet["kinds"]))
-    return table
+    return text_table(title, ["depth\nmm", *heads], zip(*columns, strict=True))
 
 
 def _cell(key: str, value: float | None) -> str:
