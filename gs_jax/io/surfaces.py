@@ -98,10 +98,7 @@ def write_surface(
 def read_surface(path: PathLike) -> SurfaceMaps:
     """Read an OME-TIFF of `write_surface`; depths are from the array, whatever those of the file count from.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, or holds no sheets.
+    Raises `InputError` if it cannot be read, or holds no sheets.
     """
     check_suffix(path, SURFACE_SUFFIXES[:2])
     path = check_input(path)

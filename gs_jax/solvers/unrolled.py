@@ -221,10 +221,7 @@ def write_unrolled(path: PathLike, networks: Unrolled, provenance: Provenance | 
 def read_unrolled(path: PathLike) -> Unrolled:
     """Read networks written by `write_unrolled`, in float32, without executing anything from the file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or does not hold finite arrays of such networks.
+    Raises `InputError` if the file cannot be read, or does not hold finite arrays of such networks.
     """
     return weights.read_weights(path, _skeleton)
 

@@ -48,10 +48,7 @@ def prepare_layers(
 ) -> Callable[[str, Path | np.ndarray], Result]:
     """Returns the function that reconstructs a file, or the pixels of a layer, as `gs-jax reconstruct` does.
 
-    Raises
-    ------
-    InputError
-        As the command.
+    Raises `InputError` as the command.
     """
     from ..design.design import read_design
     from ..reconstruction.plan import Plan
@@ -92,10 +89,7 @@ def prepare_layers(
 def newest_captures(folder: Path, make: Callable[[str, Path], Result], progress: CancellableProgress) -> Iterator:
     """Yields the `Result` of the newest capture of a folder again and again, or what is wrong with it in words.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be watched.
+    Raises `InputError` if the folder cannot be watched.
     """
     from ..io.recordings import WatchedFolder
     from ..reconstruction.recording import SETTLED

@@ -37,10 +37,7 @@ _POLL_INTERVAL = 100
 class Reconstruct(Container):
     """Dock widget: reconstructs a file or layer with a design, and adds the volume as a layer, to scale and in place.
 
-    Parameters
-    ----------
-    napari_viewer
-        The viewer with the layers.
+    `napari_viewer`: the viewer with the layers.
     """
 
     def __init__(self, napari_viewer):
