@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
@@ -73,7 +72,7 @@ def envelope(distance_squared, reduced_depth, field_radius):
 def falloff(distance_squared, field_radius):
     """Falloff from 1 to 0 across the field radius, where it is 1/2; 0 from `field_limit` on."""
     outer = field_limit(field_radius) ** 2
-    t = jnp.clip((outer - distance_squared) / (2 * FALLOFF * field_radius**2), 0, 1)
+    t = array_namespace(distance_squared).clip((outer - distance_squared) / (2 * FALLOFF * field_radius**2), 0, 1)
     return t * t * (3 - 2 * t)
 
 

@@ -226,7 +226,7 @@ def stray_light_table(
     if aperture.by_area.any():
         table[1] = binned(rays.landing, rays.light_per_area)
     for (inner, outer), distortion, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
-        amount = np.asarray(ring_light(fields**2, light, inner, outer), np.float64)
+        amount = ring_light(fields**2, light, inner, outer)
         core = imager.sensor.pixel_pitch * sample_profile(profile, _CORE_SAMPLES)
         for number in np.flatnonzero(amount):
             landing = core - [chief * distortion * fields[number], 0]

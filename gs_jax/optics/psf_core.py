@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Float64
 
+from ..base.arrays import array_namespace
 from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager, falloff
@@ -47,8 +48,9 @@ class PsfCores(NamedTuple):
 def ring_window(distance_squared, inner, outer):
     """1 within a ring of the field, with the envelope's smooth falloff at both ends; all rings add up to a disc."""
     # The ends may be traced; a disc has no falloff inside.
-    hole = falloff(distance_squared, jnp.where(inner > 0, inner, 1.0))
-    return falloff(distance_squared, outer) - jnp.where(inner > 0, hole, 0)
+    xp = array_namespace(distance_squared)
+    hole = falloff(distance_squared, xp.where(inner > 0, inner, 1.0))
+    return falloff(distance_squared, outer) - xp.where(inner > 0, hole, 0)
 
 
 def ring_light(distance_squared, coefficients, inner, outer):
@@ -57,7 +59,7 @@ def ring_light(distance_squared, coefficients, inner, outer):
     `coefficients` `(..., coefficient)` broadcast, but for the last axis, against `distance_squared`.
     """
     # Beyond the ring, where it does not count, a polynomial would overflow.
-    t = jnp.minimum(distance_squared / outer**2, 2)
+    t = array_namespace(distance_squared).minimum(distance_squared / outer**2, 2)
     value = coefficients[..., -1]
     for power in range(coefficients.shape[-1] - 2, -1, -1):
         value = value * t + coefficients[..., power]
@@ -102,7 +104,7 @@ def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, rea
 
 def _ring_core(rays, fields, chief, pitch, edges, inner, outer):
     """Distortion, light coefficients and radial profile of one ring."""
-    share = np.asarray(ring_window(jnp.asarray(fields**2), inner, outer), np.float64)
+    share = ring_window(fields**2, inner, outer)
     used = share > 1e-6
     mine = PupilSamples(*(part[used] for part in rays))
     # Lenses are spread evenly: their number at a field is proportional to the circle's length.
