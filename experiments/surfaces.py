@@ -195,14 +195,16 @@ def picture(results: list[dict]) -> Figure:
     figure = Figure(figsize=(9, 2.9 * len(sheets)), layout="constrained")
     half = PIXELS * PITCH / 2
     for row, each in enumerate(sheets):
-        for column, title in enumerate(("brightness", "depth, mm", "true depth, mm")):
+        for column, title in enumerate(("brightness", "depth, mm", "truth, mm")):
             axes = figure.add_subplot(len(sheets), 3, 3 * row + column + 1)
             colours = "gray" if column == 0 else "viridis"
             shown = axes.imshow(each["maps"][column], cmap=colours, extent=(-half, half, half, -half))
             if column:
                 shown.set_clim(*DEPTHS)
-            axes.set(title=f"{each['scene']}: {title}", xlabel="x, mm", ylabel="y, mm")
-            figure.colorbar(shown, ax=axes, shrink=0.8)
+            axes.set(xlabel="x, mm", ylabel="y, mm")
+            axes.set_title(f"{each['scene']}: {title}", fontsize="medium")
+            if column:
+                figure.colorbar(shown, ax=axes, shrink=0.8)
     return figure
 
 
