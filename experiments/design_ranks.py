@@ -1,0 +1,231 @@
+"""Whether objectives rank designs as reconstructed scenes do: Spearman's correlations with a judge of reduced cost.
+
+Designs are the shipped ones and random ones between bounds of R, D, conic constant, pitch, side and layout, with v from
+0.8 to 1.2 of the paraxial focus. The judge is that of `experiments/design_judge.py` on a field of 1.2 mm, at 3,000
+electrons: letters, beads and texture at 18.4, 20.5 and 22.6 mm, traced by rays, with noise of one exposure time. Its
+solver is Richardson-Lucy with a system matrix of rays of its own, which takes seconds where the full model takes
+minutes; a scene counts with its best number of steps. The mean of the PSNR is compared with each term of studies, and
+with the judge's own repeat, of other scenes and noise: for all designs, and for the better half, in which focus is no
+longer what tells them apart. Intervals are 95 %, by a bootstrap over designs.
+
+    python -m experiments.design_ranks [--records FILE] [--out DIR]
+
+Writes the records after each design, from which the next run goes on, and then `design_ranks.md`; about a quarter of
+an hour of a core.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import scipy.sparse as sp
+from scipy.stats import rankdata
+
+from experiments.common import Report, main, table
+from experiments.design_judge import DESIGNS, FOLDER, READ_NOISE, VOXEL, Settings, device, image_of, scene
+from experiments.ray_tracer import bundles
+from gs_jax import Imager, quality, random_layout, rasterize, read_design
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.base.progress import Progress
+from gs_jax.codesign.terms import TERMS
+from gs_jax.design.design import Design
+from gs_jax.design.start import geomscope
+from gs_jax.io.files import make_folder, write_json
+from gs_jax.layouts import hexagonal_layout
+from gs_jax.objectives import Conditions
+
+RANDOM = 20
+SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
+STEPS = (4, 12)
+# Rays of a voxel to each lens, and voxels along a side that share them.
+RAYS, SHARED = 120, 3
+# Terms, and whether more is better. What depends on the layout alone, or is a limit, is left out.
+BETTER = {
+    "psf_width_um": -1,
+    "encircled_radius_um": -1,
+    "blur_um": -1,
+    "light_percent": 1,
+    "lateral_resolution_um": -1,
+    "axial_resolution_um": -1,
+    "lenses_per_point": 1,
+    "occupancy": -1,
+    "volume_error": -1,
+    "crowded_precision_um": -1,
+    "scene_error": -1,
+}
+
+
+def random_design(seed: int) -> Design:
+    """A device that could be made, in focus or nearly."""
+    rng = np.random.default_rng(seed)
+    data = geomscope().model_dump()
+    side, pitch = rng.choice(["plano", "curved"]), rng.uniform(1.0, 1.5)
+    conic = rng.uniform(-1.2, 0.3) * rng.integers(0, 2)
+    radius, thickness = rng.uniform(1.0, 2.2), 1 / 1.43
+    focal = radius / 0.43
+    # The paraxial image of 20.5 mm, and where the plate is.
+    far, behind = (20.5, thickness) if side == "curved" else (20.5 + thickness, 0.0)
+    distance = rng.uniform(0.8, 1.2) * focal * far / (far - focal) - behind
+    diameter = min(np.exp(rng.uniform(np.log(0.3), np.log(1.9))), 1.5 * radius)
+    width = 20.0 * pitch / 1.23
+    if rng.integers(0, 4):
+        centers = random_layout(
+            200, (width, width), pitch=pitch, pitch_sd=rng.uniform(0.05, 0.1) * pitch, diameter=None, seed=seed
+        )
+    else:
+        centers = hexagonal_layout((width, width), pitch=pitch)
+    data["lens"] |= {"orientation": str(side), "conic_constant": float(conic)}
+    data["lens"] |= {"radius_of_curvature_mm": radius, "aperture_diameter_mm": float(diameter)}
+    data["array"] |= {"centers_mm": tuple(map(tuple, np.asarray(centers).tolist())), "size_mm": (width, width)}
+    data["imaging"] |= {"sensor_distance_mm": float(min(distance, 6.0))}
+    return Design.model_validate(data | {"name": f"random {seed}", "provenance": {}})
+
+
+def binning_of(imager: Imager) -> int:
+    """Pixels along a side that are summed: as wide as a voxel, as the package's solvers do."""
+    width = float(imager.magnification(SETTINGS.depths).mean()) * VOXEL / float(imager.sensor.pixel_pitch)
+    return max(1, int(width + 0.02))
+
+
+def system(imager: Imager) -> sp.csr_matrix:
+    """Adjoint of the imaging of voxels, `(voxel, pixel)`; a voxel is a pyramid two voxels wide, as in `rasterize`."""
+    grid, pixel = SETTINGS.grid, float(imager.sensor.pixel_pitch) * binning_of(imager)
+    side = imager.sensor.shape[0] // binning_of(imager)
+    x, y = np.asarray(grid.x, float), np.asarray(grid.y, float)
+    tiles = [range(first, min(first + SHARED, len(x))) for first in range(0, len(x), SHARED)]
+    rng, shape = np.random.default_rng(1), grid.volume_shape
+    places = [(x[list(b)].mean(), y[list(a)].mean(), z) for z in np.asarray(grid.depths) for a in tiles for b in tiles]
+    landed, magnification = bundles(np.array(places), imager, RAYS)
+    count = landed.shape[1] * RAYS
+    columns = np.zeros((np.prod(shape), count), np.int32)
+    values = np.zeros(columns.shape, np.float32)
+    numbers = iter(range(len(places)))
+    for depth in range(shape[0]):
+        for a in tiles:
+            for b in tiles:
+                number = next(numbers)
+                land = landed[number].reshape(-1, 3)
+                for row in a:
+                    for column in b:
+                        away = np.array([x[column], y[row]]) - places[number][:2]
+                        within = VOXEL * (rng.random((2, count, 2)).sum(0) - 1)
+                        at = land[:, :2] - magnification[number] * (away + within)
+                        pixels = np.floor(at / pixel + side / 2).astype(np.int32)
+                        inside = ((pixels >= 0) & (pixels < side)).all(1)
+                        voxel = np.ravel_multi_index((depth, row, column), shape)
+                        columns[voxel] = np.where(inside, pixels[:, 1] * side + pixels[:, 0], 0)
+                        values[voxel] = np.where(inside, land[:, 2], 0)
+    starts = np.arange(len(columns) + 1) * count
+    return sp.csr_matrix((values.ravel(), columns.ravel(), starts), (len(columns), side * side))
+
+
+def richardson_lucy(adjoint: sp.csr_matrix, images: np.ndarray, noise: float) -> dict[int, np.ndarray]:
+    """Volumes `(voxel, image)` after each number of steps; Gaussian noise counts as light that is known."""
+    seen = adjoint @ np.ones((len(images), 1), np.float32)
+    seen = np.maximum(seen, 0.1 * seen.mean())
+    x = np.ones((len(seen), images.shape[1]), np.float32) * images.sum(0) / seen.sum()
+    found = {}
+    for number in range(1, max(STEPS) + 1):
+        ratio = np.maximum(images + noise, 0) / (adjoint.T @ x + noise)
+        x = x * (adjoint @ ratio.astype(np.float32)) / seen
+        if number in STEPS:
+            found[number] = x
+    return found
+
+
+def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1)) -> dict[str, list[float]]:
+    """PSNR of each kind of scene, one for each draw, with the best number of steps."""
+    small, grid, side = device(imager, SETTINGS), SETTINGS.grid, binning_of(imager)
+    adjoint, cases, images, truths = system(small), [], [], []
+    for draw in draws:
+        for kind in SETTINGS.kinds:
+            one = scene(kind, draw, SETTINGS)
+            clean = image_of(one, small, SETTINGS) * (SETTINGS.exposures[0] / brightest(kind, draw))
+            rng = np.random.default_rng(draw)
+            image = rng.poisson(clean) + rng.normal(0, READ_NOISE, clean.shape)
+            rows = image.shape[0] // side
+            image = image[: rows * side, : rows * side].reshape(rows, side, rows, side).sum((1, 3))
+            cases.append(kind)
+            images.append(image.ravel().astype(np.float32))
+            truths.append(np.asarray(rasterize(one.emitters, grid), np.float32))
+    found = richardson_lucy(adjoint, np.stack(images, 1), (side * READ_NOISE) ** 2)
+    records: dict[str, list[float]] = {kind: [] for kind in SETTINGS.kinds}
+    for number, (kind, truth) in enumerate(zip(cases, truths, strict=True)):
+        volumes = (x[:, number].reshape(grid.volume_shape) for x in found.values())
+        records[kind].append(max(quality(volume, truth).psnr_db for volume in volumes))
+    return records
+
+
+def term_of(name: str, imager: Imager) -> float:
+    """A term's worst value over its entries."""
+    at, term = Conditions(np.linspace(*SETTINGS.span, 3), largest_magnification=0.5), TERMS[name]
+    values = np.ravel(_value(term.function, imager, at, *([jax.random.key(0)] if term.random else [])))
+    return float(values.min() if BETTER[name] > 0 else values.max())
+
+
+@eqx.filter_jit
+def _value(function, *arguments):
+    return function(*arguments)
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float]:
+    """Spearman's correlation, and its 95 % interval by a bootstrap over designs."""
+    rng = np.random.default_rng(0)
+    drawn = [spearman(a[i], b[i]) for i in rng.integers(0, len(a), (2000, len(a)))]
+    low, high = np.nanquantile(drawn, (0.025, 0.975))
+    return spearman(a, b), float(low), float(high)
+
+
+def spearman(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlation of ranks."""
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+
+
+def report(records: Path, progress: Progress) -> Report:
+    jax.config.update("jax_enable_x64", True)
+    make_folder(records.parent)
+    kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else {"bright": {}, "found": {}}
+    reference = device(read_design(FOLDER / f"{DESIGNS[0]}.toml").imager(), SETTINGS)
+
+    def brightest(kind: str, draw: int) -> float:
+        if (key := f"{kind} {draw}") not in kept["bright"]:
+            kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
+        return kept["bright"][key]
+
+    designs = [read_design(FOLDER / f"{name}.toml") for name in DESIGNS] + [random_design(k) for k in range(RANDOM)]
+    for design in progress.track(designs, "Designs"):
+        record = kept["found"].setdefault(str(design.name), {})
+        if "psnr_db" not in record:
+            record["psnr_db"] = judged(design.imager(), brightest)
+            write_json(records, kept)
+    cases = [(name, design) for name in BETTER for design in designs]
+    for name, design in progress.track(cases, "Terms"):
+        values = kept["found"][str(design.name)].setdefault("terms", {})
+        if name not in values:
+            values[name] = term_of(name, design.imager())
+            write_json(records, kept)
+    return shown(kept["found"])
+
+
+def shown(found: dict[str, Any]) -> Report:
+    """Table of correlations with the judge."""
+    means = np.array([[np.mean([v[k] for v in r["psnr_db"].values()]) for k in (0, 1)] for r in found.values()])
+    judge = means.mean(1)
+    better = np.argsort(-judge)[: len(judge) // 2]
+    cell = lambda a, b: "{:.2f} ({:.2f} to {:.2f})".format(*correlation(a, b))
+    both = lambda a, b: (cell(a, b), cell(a[better], b[better]))
+    values = {name: sign * np.array([r["terms"][name] for r in found.values()]) for name, sign in BETTER.items()}
+    names = sorted(BETTER, key=lambda name: -spearman(judge, values[name]))
+    rows = [["the judge's repeat", *both(means[:, 0], means[:, 1])]]
+    rows += [[f"`{name}`", *both(judge, values[name])] for name in names]
+    columns = ("objective", f"all {len(judge)} designs", "the better half")
+    files = {"design_ranks.md": markdown_table(columns, rows), "design_ranks.json": found}
+    return Report(files, [table(columns, rows)])
+
+
+if __name__ == "__main__":
+    main(report, {"--records": {"type": Path, "default": Path("out/design_ranks/records.json")}})
