@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..optics.apertures import clear_area
 from ..optics.field_varying import PolarGrid, StrayLight, polar_weights
@@ -173,9 +174,14 @@ def _upsampling_matrix(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fi
     """Along one axis, from the coarse pixels, sharpened, to the sensor's: Keys' cubic interpolation."""
     place = (jnp.arange(fine, dtype=dtype) - (fine - 1) / 2) * ratio + (coarse - 1) / 2
     x = jnp.abs(place[:, None] - jnp.arange(coarse, dtype=dtype)[None])
+    return cubic(x) @ jnp.asarray(_wiener_matrix(coarse), dtype)
+
+
+def cubic(distance):
+    """Keys' cubic interpolation: the weight at a distance, in steps, not negative."""
+    xp, x = array_namespace(distance), distance
     near, far = (1.5 * x - 2.5) * x**2 + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
-    cubic = jnp.where(x <= 1, near, jnp.where(x < 2, far, 0))
-    return cubic @ jnp.asarray(_wiener_matrix(coarse), dtype)
+    return xp.where(x <= 1, near, xp.where(x < 2, far, 0))
 
 
 @cache
