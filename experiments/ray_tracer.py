@@ -4,6 +4,7 @@ Rays from an isotropic emitter pass the plano face, then a conic, to the sensor,
 of refraction and with Fresnel losses; no diffraction. From `gs_jax` it takes only the parameters of an imager.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -23,14 +24,15 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
     """Image emitters `(x, y, z, intensity)`; a pixel gets its share of each intensity.
 
     `rays` go from each emitter toward each lens, random but reproducible. Apertures end at their disc and where a
-    neighbour's surface is higher, which is half-way for identical lenses.
+    neighbour's surface is higher, which is half-way for identical lenses. A tilted array is traced in its own frame, in
+    which emitters and the sensor are turned about the point `v` above the sensor's centre.
 
     With a `tile`, mm, emitters within a square of that width and a hundredth of a millimetre in depth share the rays of
     their mean place, displaced by the magnification: many times the rays for the same time. Spots must hardly change
     within a tile.
     """
     images = np.zeros((PARTS, *imager.sensor.shape))
-    emitters = np.asarray(emitters, np.float64)
+    emitters = _before(np.asarray(emitters, np.float64), imager)
     first = np.arange(len(emitters) + 1)
     if tile:
         place = np.floor(emitters[:, :3] / (tile, tile, DEEP)).astype(int)
@@ -48,13 +50,29 @@ def bundles(places: np.ndarray, imager: Imager, rays: int) -> tuple[np.ndarray, 
     """
     lenses = _lenses(imager)
     landed, magnification = np.zeros((len(places), len(lenses[0]), rays, 3)), np.zeros(len(places))
-    _bundles(np.asarray(places, np.float64), *lenses, landed, magnification)
+    _bundles(_before(np.asarray(places, np.float64), imager), *lenses, landed, magnification)
     return landed, magnification
+
+
+def _turn(imager: Imager) -> np.ndarray:
+    """The least rotation from the sensor's frame to the array's, `(3, 3)`."""
+    slopes = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt, np.float64)
+    cosine = 1 / np.sqrt(1 + slopes @ slopes)
+    turn = np.eye(3)
+    turn[:2, :2] -= np.outer(slopes, slopes) * cosine**2 / (1 + cosine)
+    turn[:2, 2], turn[2, :2], turn[2, 2] = slopes * cosine, -slopes * cosine, cosine
+    return turn
+
+
+def _before(emitters: np.ndarray, imager: Imager) -> np.ndarray:
+    """Emitters in the array's frame."""
+    lift = np.array([0.0, 0.0, float(imager.array.substrate_thickness)])
+    return np.column_stack([(emitters[:, :3] + lift) @ _turn(imager).T - lift, emitters[:, 3:]])
 
 
 def _lenses(imager: Imager):
     """Lenses, the numbers of their nearest neighbours, what all share, and whether the curved side is in front."""
-    centers = np.asarray(imager.centers, np.float64)
+    centers = np.asarray(dataclasses.replace(imager, tilt=None).centers, np.float64)
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
     a = imager.array
     touching = (apart < float(np.max(a.aperture_diameter))).sum(1).max()
@@ -63,7 +81,7 @@ def _lenses(imager: Imager):
     lenses = np.column_stack([centers, *(np.broadcast_to(np.asarray(x, np.float64), len(centers)) for x in each)])
     curve_first = a.orientation == "curved"
     shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
-    numbers = tuple(float(x) for x in shared)
+    numbers = (*(float(x) for x in shared), _turn(imager))
     return lenses, near, numbers, curve_first
 
 
@@ -108,7 +126,7 @@ def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
 @njit(fastmath=True, error_model="numpy")
 def _land(landed, place, lens, others, numbers, curve_first):
     """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
-    n, t, v, _ = numbers
+    n, t, v, _, turned = numbers
     radius, conic, aperture = lens[2:]
     x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]
     sag = _sag(aperture**2, radius, conic)
@@ -144,9 +162,13 @@ def _land(landed, place, lens, others, numbers, curve_first):
             last, to_sensor = (cap[0], cap[1]), v + cap[2]
         if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
-        way = to_sensor / ray[2]
-        landed[i, 0] = lens[0] + last[0] + way * ray[0]
-        landed[i, 1] = lens[1] + last[1] + way * ray[1]
+        # Heights in the array's frame are minus the way toward the sensor, whose height is 0 in its own frame.
+        at = lens[0] + last[0], lens[1] + last[1], to_sensor - v
+        height = v + turned[0, 2] * at[0] + turned[1, 2] * at[1] + turned[2, 2] * at[2]
+        way = height / (turned[2, 2] * ray[2] - turned[0, 2] * ray[0] - turned[1, 2] * ray[1])
+        hit = at[0] + way * ray[0], at[1] + way * ray[1], at[2] - way * ray[2]
+        landed[i, 0] = turned[0, 0] * hit[0] + turned[1, 0] * hit[1] + turned[2, 0] * hit[2]
+        landed[i, 1] = turned[0, 1] * hit[0] + turned[1, 1] * hit[1] + turned[2, 1] * hit[2]
         landed[i, 2] = light * passed * again * z / length**3
     return (v + t / n) / z if curve_first else v / (z + t / n)
 

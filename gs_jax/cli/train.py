@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -9,30 +10,71 @@ from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
-from .options import worker_options
-from .outputs import RESUMABLE, check_may_write, partial_outputs, provenance_of
+from .options import DESIGN, UM, CaptureOptions, Depths, capture_options, worker_options
+from .outputs import PARTIAL, RESUMABLE, check_may_write, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
+# At most, to fine-tune by captures.
+FINE_STEPS = 60
 _EVERY = 50
 _STACKS, _CASES = 96, 112
 _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
 @click.command("train", epilog="Example: gs-jax train --network unrolled -o weights.npz")
-@click.option("--network", type=click.Choice(list(STEPS)), default="multislice")
-@click.option("--steps", type=click.IntRange(1, 10**7), help=f"Number of steps.  [default: {_DEFAULTS}]")
+@click.option("--network", type=click.Choice(list(STEPS)), help="[default: multislice]")
+@click.option(
+    "--steps",
+    type=click.IntRange(1, 10**7),
+    help=f"Number of steps.  [default: {_DEFAULTS}; at most {FINE_STEPS} with --from-captures]",
+)
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0)
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint beside WEIGHTS; same steps and seed.")
 @click.option("-o", "--output", type=Path, required=True, help="WEIGHTS.npz.")
+@click.option(
+    "--from-captures",
+    type=Path,
+    help="Folder of 3 or more captures: train the unrolled networks on, by lenses predicted from the others, without "
+    "ground truth. Needs --design and --depths.",
+)
+@click.option("--design", type=DESIGN, help="The microscope of the captures.")
+@click.option("--depths", type=Depths(), help="START:STOP:STEP in mm of the volumes, as in `gs-jax reconstruct`.")
+@click.option("--voxel-um", type=UM, help="Lateral voxel pitch.  [default: 4 pixels as seen at the middle depth]")
+@click.option("--weights", type=Path, help="WEIGHTS.npz to begin with.  [default: ours]")
 @worker_options
-def train_command(network: str, steps: int | None, seed: int, resume: bool, output: Path, workers: Workers):
+@capture_options
+def train_command(
+    network: str | None,
+    steps: int | None,
+    seed: int,
+    resume: bool,
+    output: Path,
+    workers: Workers,
+    camera: CaptureOptions,
+    from_captures: Path | None,
+    **mine: Any,
+):
     """Train a network: for background suppression the paper's, or ours of seven slices; or for the unrolled inversion.
 
     Workers simulate the captures for training. Beside WEIGHTS.npz are written WEIGHTS.json, the losses,
     WEIGHTS.checkpoint, which remains after an interrupt, and for multislice the folder WEIGHTS-stacks of simulated
     captures (0.4 GB), which may be deleted.
+
+    \b
+    Fine-tune the unrolled inversion by your own captures, of several scenes of one kind:
+    gs-jax train --from-captures run7 --design my.toml --depths 18:22:0.5 -o mine.npz
     """
+    check_output(output, [".npz"])
+    if from_captures:
+        given = {"--resume": resume, "--workers or --scheduler": workers.remote, "--network": network != "unrolled"}
+        given["--network"] &= network is not None
+        if option := next((name for name, value in given.items() if value), None):
+            raise InputError(f"--from-captures trains the unrolled networks in this process, got {option}.")
+        return _from_captures(from_captures, output, steps or FINE_STEPS, seed, camera, **mine)
+    if option := next((name for name, value in mine.items() if value is not None), None):
+        raise InputError(f"--{option.replace('_', '-')} must be used with --from-captures.")
+    network = network or "multislice"
     import numpy as np
 
     from ..apps.training.training_loop import (
@@ -50,7 +92,6 @@ def train_command(network: str, steps: int | None, seed: int, resume: bool, outp
     from ..detection.unet import write_weights
     from ..solvers.unrolled import write_unrolled
 
-    check_output(output, [".npz"])
     steps = steps or STEPS[network]
     checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
     check_output(history, [".json"])
@@ -85,3 +126,52 @@ def train_command(network: str, steps: int | None, seed: int, resume: bool, outp
     else:
         write_weights(output, state.network, provenance_of())
     click.echo(f"{output}: {network}, {steps} steps, loss {np.mean(state.losses[-_EVERY:]):.4f}")
+
+
+def _from_captures(
+    folder: Path,
+    output: Path,
+    steps: int,
+    seed: int,
+    camera: CaptureOptions,
+    *,
+    design: Path | None,
+    depths: list[float] | None,
+    voxel_um: float | None,
+    weights: Path | None,
+) -> None:
+    from ..apps.training.from_captures import fine_tune
+    from ..design.design import design_text, read_design
+    from ..io.recordings import capture_files
+    from ..reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+    from ..solvers.unrolled import Unrolled, read_unrolled, write_unrolled
+
+    if design is None or depths is None:
+        raise InputError("--from-captures must be used with --design and --depths.")
+    files = capture_files(folder)
+    if files is None:
+        raise InputError(f"--from-captures must be a folder of captures, got {folder}.")
+    history = output.with_suffix(".json")
+    check_may_write(output, history, inputs=(*files, design, weights, *camera.files))
+    microscope = read_design(design)
+    imager = camera.imager(microscope.imager())
+    grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=PIXELS_PER_VOXEL)
+    provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
+
+    def on_better(networks):
+        write_unrolled(output, networks, provenance)
+        partial_outputs[output] = PARTIAL
+
+    with Progress() as progress:
+        images = [camera.read(file) for file in files]
+        start = read_unrolled(weights) if weights else Unrolled.pretrained()
+        how = {"steps": steps, "seed": seed, "on_better": on_better, "progress": progress}
+        found = fine_tune(images, imager, grid, start, **how)
+        write_unrolled(output, found.networks, provenance)
+        held_out = [{"step": step, "loss": loss} for step, loss in found.held_out]
+        numbers = {"loss": found.losses, "held_out": held_out, "before": found.before, "after": found.after}
+        write_json(history, {"seed": seed} | numbers)
+    camera.print_corrections()
+    error = f"{found.before**0.5:.1%} before, {found.after**0.5:.1%} after (RMS)"
+    words = f"{len(files)} captures, {len(found.losses)} steps"
+    click.echo(f"{output}: {words}; of captures held out, lenses left out are predicted with an error of {error}")

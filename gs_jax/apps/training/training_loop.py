@@ -19,6 +19,7 @@ from ...base.progress import Progress
 from ...detection.unet import UNet, multislice_network, paper_network
 from ...io.files import atomic_write, check_input, decoding
 from ...reconstruction.inverse_problem import InverseProblem, lens_type_geometries, subtract_offset
+from ...solvers.base import Operator
 from ...solvers.unrolled import State as UnrolledState, Unrolled, initialize_unrolled
 from ...typing import PathLike, Volume
 from .simulated_captures import SCENES, CaptureSpec, simulate_example, trace_optics
@@ -58,8 +59,8 @@ def init(recipe: Recipe, *, steps: int, seed: int) -> State:
     return State(network, memory, np.full(steps, np.nan, np.float32), np.array(seed), np.array(0))
 
 
-def train(recipe: Recipe, state: State, *, callback: Callable[[State], None] = lambda state: None) -> State:
-    """Train to the last step, and call `callback` with the state after every step.
+def train(recipe: Recipe, state: State, *, callback: Callable[[State], bool | None] = lambda state: None) -> State:
+    """Train to the last step, and call `callback` with the state after every step; where it returns true, end there.
 
     A batch depends on the seed and the step only, so that a training that goes on from a checkpoint ends with the same
     weights as one without interruption.
@@ -71,7 +72,8 @@ def train(recipe: Recipe, state: State, *, callback: Callable[[State], None] = l
         losses = state.losses.copy()
         losses[number] = value
         state = State(network, memory, losses, state.seed, np.array(number + 1))
-        callback(state)
+        if callback(state):
+            break
     return state
 
 
@@ -146,16 +148,23 @@ class UnrolledExample(NamedTuple):
 
 def unrolled_loss(network: Unrolled, example: UnrolledExample) -> Float[Array, ""]:
     """Squared error of the volume, relative to the truth's mean square and a share of the start's."""
-    truth, light, operator = jnp.asarray(example.truth), jnp.asarray(example.light), example.system.operator
+    truth = jnp.asarray(example.truth)
+    volume = unroll(network, example.system.operator, jnp.asarray(example.light), example.start)
+    start = network.estimate(example.start)
+    return jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
+
+
+def unroll(
+    network: Unrolled, operator: Operator, light: Float[Array, "row column"], start: UnrolledState
+) -> Float[Array, "depth y x"]:
+    """Volume after the steps with networks."""
 
     # Not `step`, whose other branches would keep residuals for the gradient, too.
     def network_step(state, _):
         lucy, cost, _ = network.network_step(operator, light, state)
         return state._replace(lucy=lucy, number=state.number + 1), cost
 
-    volume = network.estimate(lax.scan(network_step, example.start, length=network.power.size)[0])
-    start = network.estimate(example.start)
-    return jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
+    return network.estimate(lax.scan(network_step, start, length=network.power.size)[0])
 
 
 def with_fixed_steps(network: Unrolled) -> Unrolled:
@@ -196,7 +205,7 @@ def _simulator(seed: int, spec: CaptureSpec):
             light = subtract_offset(image)
             unit = np.float32(max(float(np.abs(light).mean()), 1e-30))
             system = InverseProblem(imager, grid, optics, lens_type_geometries(imager, grid))
-            start = _run_fixed_steps(networks, system, light / unit)
+            start = run_fixed_steps(networks, system, light / unit)
             examples.append(UnrolledExample(light / unit, system, truth / unit, start))
         return examples
 
@@ -204,7 +213,9 @@ def _simulator(seed: int, spec: CaptureSpec):
 
 
 @eqx.filter_jit
-def _run_fixed_steps(networks, system, light):
+def run_fixed_steps(
+    networks: Unrolled, system: InverseProblem, light: Float[Array | np.ndarray, "row column"]
+) -> UnrolledState:
     """The state after the steps without networks, which training does not change."""
     step = lambda state, _: networks.step(system.operator, light, state)[:2]
     return lax.scan(step, networks.init(system.operator, light), length=networks.first)[0]

@@ -1,0 +1,194 @@
+"""Fine-tuning of the unrolled networks by one's own captures, without a truth: lenses are predicted from the others.
+
+A network is as good as its volumes predict the light of lenses that the reconstruction did not use (measurement
+splitting; Moran et al., "Noisier2Noise", arXiv:1910.11908, and Yaman et al., Magn. Reson. Med. 84, 3172, 2020, for
+other instruments). The noise of a pixel is independent of its prediction, whatever its distribution: in the mean it
+adds a constant, so that the best network is the best for captures without noise, too.
+"""
+
+import dataclasses
+from collections.abc import Callable, Hashable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Float32
+
+from ...base.arrays import divide
+from ...base.errors import InputError
+from ...base.progress import Progress
+from ...geometry import Imager
+from ...grid import Grid
+from ...projection.forward_model import PsfModel
+from ...projection.operators import ImagingOperator
+from ...reconstruction.cross_validation import kept_pixels_of_folds
+from ...reconstruction.inverse_problem import (
+    InverseProblem,
+    lens_type_geometries,
+    num_detrend_modes,
+    prepare_data,
+    prepare_model,
+)
+from ...reconstruction.pipeline import run_solver
+from ...solvers.unrolled import State as UnrolledState, Unrolled
+from ...typing import Image
+from .training_loop import Recipe, State, init, run_fixed_steps, train, unroll
+
+# Captures at the least, and the share of them that is held out.
+_LEAST, _HELD_OUT = 3, 4
+_FOLDS = 4
+# Steps between two looks at the captures held out, and looks without improvement after which the training ends.
+_EVERY, _PATIENCE = 10, 3
+# Rates of the networks' weights, and of the powers, of which each step has one.
+_RATE, _POWER_RATE = 1e-3, 1e-2
+
+
+class SplitCapture(NamedTuple):
+    """A capture above its offset, with the mean 1, its inverse problem without a fold, and the state to begin with."""
+
+    light: Float32[np.ndarray, "row column"]
+    system: InverseProblem
+    start: UnrolledState
+
+
+class FineTuned(NamedTuple):
+    """Networks, and squared errors of prediction, relative to the light.
+
+    `losses` are those of each step, `held_out` those of the captures held out, `(step, loss)`, from before the first
+    step on, both after the steps with networks. `before` and `after` are those of the captures held out after all
+    steps, by the networks that it began with and by those that it returns.
+    """
+
+    networks: Unrolled
+    losses: list[float]
+    held_out: list[tuple[int, float]]
+    before: float
+    after: float
+
+
+def fine_tune(
+    images: Sequence[Image],
+    imager: Imager,
+    grid: Grid,
+    networks: Unrolled,
+    *,
+    optics: PsfModel | str = "full",
+    steps: int = 60,
+    seed: int = 0,
+    on_better: Callable[[Unrolled], None] = lambda networks: None,
+    progress: Progress | None = None,
+) -> FineTuned:
+    """Train networks on, by captures of one microscope; every fourth of them decides when to stop.
+
+    These also decide whether the conjugate gradients after the networks are left out, and whether the result is better
+    at all: if not, the networks that it began with are returned.
+
+    Parameters
+    ----------
+    images
+        3 captures or more, of different scenes of one kind.
+    imager, grid
+        The microscope as it is known, and the voxels that are wanted.
+    networks
+        Those to begin with.
+    optics
+        As for `reconstruct`.
+    steps, seed
+        Most steps, and seed of their order.
+    on_better
+        Is called with networks that are better for the captures held out, after the steps with networks.
+    progress
+        Shows progress.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than 3 captures, or fewer than 4 lenses.
+    """
+    if len(images) < _LEAST:
+        raise InputError(f"there must be {_LEAST} captures or more, of different scenes, got {len(images)}.")
+    progress = progress or Progress()
+    trained, held_out = _split(images, imager, grid, networks, optics, seed, progress)
+    loss = eqx.filter_jit(prediction_loss)
+    mean_loss = lambda networks: float(np.mean([loss(networks, each) for each in held_out]))
+    recipe = Recipe(lambda key: networks, _optimizer, lambda rng: trained[rng.integers(len(trained))], prediction_loss)
+    history, best = [(0, mean_loss(networks))], networks
+    with progress.counter("Training", steps) as advance:
+
+        def callback(state: State) -> bool:
+            nonlocal best
+            advance()
+            if int(state.step) % _EVERY and int(state.step) < steps:
+                return False
+            found = mean_loss(state.network)
+            if found < min(each for _, each in history):
+                best = state.network
+                on_better(best)
+            history.append((int(state.step), found))
+            return int(np.argmin([each for _, each in history])) < len(history) - _PATIENCE
+
+        state = train(recipe, init(recipe, steps=steps, seed=seed), callback=callback)
+    whole = lambda networks: np.mean([_error_of_all_steps(networks, each, progress) for each in held_out])
+    without = dataclasses.replace(best, last=0, steps=best.first + best.power.size)
+    errors = [(float(whole(each)), each) for each in (networks, best, without)]
+    after, chosen = min(errors, key=lambda each: each[0])
+    losses = [float(each) for each in state.losses[: int(state.step)]]
+    return FineTuned(chosen, losses, history, errors[0][0], after)
+
+
+def prediction_loss(networks: Unrolled, capture: SplitCapture) -> Float[Array, ""]:
+    """Squared error of the pixels predicted after the steps with networks."""
+    light = jnp.asarray(capture.system.kept) * jnp.asarray(capture.light)
+    return _squared_error(unroll(networks, capture.system.operator, light, capture.start), capture)
+
+
+def _error_of_all_steps(networks: Unrolled, capture: SplitCapture, progress: Progress) -> float:
+    volume = run_solver(networks, capture.system.kept * capture.light, capture.system, progress)
+    return float(_squared_error(volume, capture))
+
+
+@eqx.filter_jit
+def _squared_error(volume, capture):
+    """Squared error of the predicted pixels, relative to their light; the gain is that of the pixels used."""
+    system, kept, light = capture.system, jnp.asarray(capture.system.kept), jnp.asarray(capture.light)
+    whole: InverseProblem = dataclasses.replace(system, kept=None)
+    A = ImagingOperator(whole.imager, whole.grid, whole.optics)
+    shown = whole.detrend(A.mv(jnp.asarray(volume, light.dtype)))
+    light = whole.detrend(light)
+    gain = divide(jnp.vdot(kept * shown, light), jnp.vdot(kept * shown, shown))
+    left_out = 1 - kept
+    return jnp.sum(left_out * (light - gain * shown) ** 2) / jnp.sum(left_out * light**2)
+
+
+def _optimizer(steps: int) -> optax.GradientTransformation:
+    rate = lambda first: optax.adam(optax.cosine_decay_schedule(first, steps))
+    adam: dict[Hashable, optax.GradientTransformation] = {"power": rate(_POWER_RATE), "layers": rate(_RATE)}
+
+    def kinds(networks):
+        names = jax.tree.map(lambda _: "layers", networks)
+        return eqx.tree_at(lambda n: n.power, names, "power")
+
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.multi_transform(adam, kinds))
+
+
+def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list[SplitCapture], list[SplitCapture]]:
+    """Captures without each of the folds, to train with, and those held out without one of them."""
+    model = prepare_model(imager, grid, optics, progress)
+    modes = num_detrend_modes(model.imager, model.optics) if isinstance(optics, str) else 0
+    views = lens_type_geometries(imager, grid)
+    folds = kept_pixels_of_folds(model.imager, _FOLDS)
+    order = np.random.default_rng(seed).permutation(len(images))
+    trained, held_out = [], []
+    for place, number in enumerate(progress.track(order, "First steps")):
+        light, background = prepare_data(images[number], model)
+        light = light - background
+        light = light / np.float32(max(float(np.abs(light).mean()), 1e-30))
+        is_held_out = place % _HELD_OUT == 0
+        for kept in [folds[place // _HELD_OUT % _FOLDS]] if is_held_out else folds:
+            system = InverseProblem(model.imager, grid, model.optics, views, modes, kept)
+            start = run_fixed_steps(networks, system, kept * light)
+            (held_out if is_held_out else trained).append(SplitCapture(light, system, start))
+    return trained, held_out

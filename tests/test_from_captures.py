@@ -1,0 +1,66 @@
+"""Fine-tuning by captures alone: it predicts lenses better that it did not use, and is refused in words."""
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import gs_jax as gs
+from gs_jax.apps.training.from_captures import fine_tune
+from gs_jax.cli.train import train_command
+from gs_jax.io.captures import write_capture
+from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
+
+from .test_cli import DESIGN
+from .test_cross_validation import GRID, exposed, scope
+
+
+@pytest.mark.integration
+def test_lenses_that_were_left_out_are_predicted_better():
+    psf, rng, images = gs.make_psf_model(scope(), GRID.depths, "near"), np.random.default_rng(0), []
+    for _ in range(3):
+        truth = np.where(rng.random(GRID.volume_shape) < 0.01, 1.0, 0.0)
+        images.append(exposed(np.asarray(gs.forward(truth, scope(), GRID, psf)), 500))
+    better = []
+    # Small and untrained, so that it is quick and has much to learn.
+    start = initialize_unrolled(2, 1, 1, 4, key=jax.random.key(0))
+    found = fine_tune(images, scope(), GRID, start, optics=psf, steps=10, on_better=better.append)
+    losses = dict(found.held_out)
+    assert len(found.losses) == 10 and np.isfinite(found.losses).all()
+    assert min(losses.values()) < losses[0] and better
+    assert found.after < found.before and not np.array_equal(found.networks.power, start.power)
+
+
+def test_two_captures_are_too_few():
+    with pytest.raises(gs.InputError, match="3 captures or more"):
+        fine_tune([np.zeros((125, 125))] * 2, scope(), GRID, gs.Unrolled.pretrained())
+
+
+@pytest.mark.integration
+def test_the_command(tmp_path):
+    (tmp_path / "design.toml").write_text(DESIGN)
+    (tmp_path / "run").mkdir()
+    for number in range(3):
+        image = np.random.default_rng(number).poisson(20, (96, 80)) + 7
+        write_capture(tmp_path / "run" / f"{number}.tif", image.astype(np.uint16))
+    where = ["--design", str(tmp_path / "design.toml"), "--depths", "19:21:1", "-o", str(tmp_path / "mine.npz")]
+    write_unrolled(tmp_path / "w.npz", initialize_unrolled(2, 1, 1, 4, key=jax.random.key(0)))
+    words = ["--from-captures", str(tmp_path / "run"), *where, "--steps", "1", "--weights", str(tmp_path / "w.npz")]
+    done = CliRunner().invoke(train_command, words, catch_exceptions=False)
+    assert done.exit_code == 0 and "3 captures, 1 steps" in done.output
+    assert read_unrolled(tmp_path / "mine.npz").first == 2
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--depths", "18:22:1"], "--depths must be used with --from-captures"),
+        (["--from-captures", "run"], "must be used with --design and --depths"),
+        (["--from-captures", "run", "--network", "paper"], "got --network"),
+        (["--from-captures", "run", "--design", "geomscope", "--depths", "20"], "must be a folder of captures"),
+    ],
+)
+def test_wrong_input(words, said, tmp_path):
+    done = CliRunner().invoke(train_command, [*words, "-o", str(tmp_path / "w.npz")])
+    assert isinstance(done.exception, gs.InputError) and said in str(done.exception)
+    assert not list(tmp_path.iterdir())
