@@ -80,7 +80,8 @@ def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
         np.save(folder / "image.npy", np.kron(np.asarray(image), np.ones((model.binning, model.binning), np.float32)))
         return parts
     image = np.load(folder / "image.npy")
-    image = np.random.default_rng(0).poisson(image * (2000 / image.max())).astype(np.float32)
+    light = np.maximum(image, 0) * (2000 / image.max())
+    image = np.random.default_rng(0).poisson(light).astype(np.float32)
     image = np.pad(image, [(0, n - m) for n, m in zip(scope.sensor.shape, image.shape, strict=True)])
     began = time.perf_counter()
     invert = reconstructor(scope, grid, BY_NAME[name](20), progress=Progress())
