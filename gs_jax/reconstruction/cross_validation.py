@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
@@ -162,6 +161,8 @@ def kept_pixels_of_folds(imager: Imager, count: int) -> list[Float[np.ndarray, "
     InputError
         Unless there are 2 or more folds, and at least as many lenses.
     """
+    from scipy.spatial import KDTree  # imported here: back-projection does without SciPy
+
     centers = np.asarray(imager.centers)
     if len(centers) < 2:
         raise InputError("a capture must be seen by 2 or more lenses to be predicted by others, got 1 lens.")
