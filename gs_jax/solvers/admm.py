@@ -15,14 +15,23 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num, PyTree
 
 from ..base.arrays import divide
 from ..typing import Real
-from .base import as_image, check_options, differences, differences_adjoint, lambda_max, norm, shrink, total_variation
+from .base import (
+    Operator,
+    as_image,
+    check_options,
+    differences,
+    differences_adjoint,
+    lambda_max,
+    norm,
+    shrink,
+    total_variation,
+)
 
 # The penalty changes by a factor where one residual is this many times the other (Boyd, section 3.4.1), and only so
 # many times: convergence is proven for a penalty that is constant from some step on.
@@ -152,7 +161,7 @@ class ADMM(eqx.Module):
     def __check_init__(self):
         check_options(self)
 
-    def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = as_image(A, image)
         back = A.T.mv(image)
         regularizer = Regularizer.of(self, back, wrap=False)
@@ -161,7 +170,7 @@ class ADMM(eqx.Module):
         return State(Splitting.start(start, regularizer.split(x), _mean_gain(A)), regularizer, back)
 
     def step(
-        self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
+        self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         image = as_image(A, image)
         splitting, regularizer, back = state

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import divide
 from ..typing import Real
-from .base import as_image, check_options, lambda_max, norm
+from .base import Operator, as_image, check_options, lambda_max, norm
 
 # Without negative entries the largest eigenvalue is isolated, and this many steps find it to about a percent; the
 # margin covers the rest.
@@ -74,7 +73,7 @@ class FISTA(eqx.Module):
     def __check_init__(self):
         check_options(self)
 
-    def init(self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."]) -> State:
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = as_image(A, image)
         back = A.T.mv(image)
         weight = jnp.asarray(self.sparsity, image.dtype) * lambda_max(back)
@@ -82,7 +81,7 @@ class FISTA(eqx.Module):
         return State(zeros, zeros, one, divide(one, _MARGIN * largest_eigenvalue(A)), weight)
 
     def step(
-        self, A: lx.AbstractLinearOperator, image: Num[Array | np.ndarray, "..."], state: State
+        self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
     ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         x, point, t, rate, weight = state
         residual = A.mv(point) - as_image(A, image)
@@ -99,7 +98,7 @@ class FISTA(eqx.Module):
         return state.x
 
 
-def largest_eigenvalue(A: lx.AbstractLinearOperator) -> Float[Array, ""]:
+def largest_eigenvalue(A: Operator) -> Float[Array, ""]:
     """Largest eigenvalue of `A' A`, approached from below by the power method."""
 
     def power(x, _):
