@@ -133,7 +133,7 @@ def cross_validated(
 
 def comparison(
     image: Image, model: ImageModel, grid: Grid, *, is_named: bool
-) -> tuple[Float[np.ndarray, "row column"], Callable[[Volume, np.ndarray], np.ndarray]]:
+) -> tuple[Float[np.ndarray, "y x"], Callable[[Volume, np.ndarray], np.ndarray]]:
     """Return the light of a capture without background, and what a volume leaves of it.
 
     The function takes a volume and the pixels (1, and 0 for others) to which its gain is fitted.
