@@ -37,6 +37,7 @@ from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.layouts import hexagonal_layout
 from gs_jax.objectives import Conditions
+from gs_jax.reconstruction.inverse_problem import sum_pixels
 
 RANDOM = 20
 SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
@@ -147,10 +148,8 @@ def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1))
             clean = image_of(one, small, SETTINGS) * (SETTINGS.exposures[0] / brightest(kind, draw))
             rng = np.random.default_rng(draw)
             image = rng.poisson(clean) + rng.normal(0, READ_NOISE, clean.shape)
-            rows = image.shape[0] // side
-            image = image[: rows * side, : rows * side].reshape(rows, side, rows, side).sum((1, 3))
             cases.append(kind)
-            images.append(image.ravel().astype(np.float32))
+            images.append(sum_pixels(image, side).ravel().astype(np.float32))
             truths.append(np.asarray(rasterize(one.emitters, grid), np.float32))
     found = richardson_lucy(adjoint, np.stack(images, 1), (side * READ_NOISE) ** 2)
     records: dict[str, list[float]] = {kind: [] for kind in SETTINGS.kinds}

@@ -55,6 +55,8 @@ def test_the_command(tmp_path):
     "words, said",
     [
         (["--depths", "18:22:1"], "--depths must be used with --from-captures"),
+        (["--dark", "d.tif"], "--dark must be used with --from-captures"),
+        (["--from-captures", "run", "--resume"], "got --resume"),
         (["--from-captures", "run"], "must be used with --design and --depths"),
         (["--from-captures", "run", "--network", "paper"], "got --network"),
         (["--from-captures", "run", "--design", "geomscope", "--depths", "20"], "must be a folder of captures"),

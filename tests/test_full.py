@@ -38,6 +38,7 @@ from gs_jax.optics.psf_core import (
 )
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
+from gs_jax.projection.field_varying_model import wider_voxels
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
@@ -285,3 +286,21 @@ def test_intensities_are_what_points_send_out():
     np.testing.assert_allclose(found[:, 3], truth[:, 3], rtol=0.1)
     # A pixel is 0.43 mm axially here.
     np.testing.assert_allclose(found[:, 2], truth[:, 2], atol=0.15)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("shape", [(20, 31), (9, 8)])
+def test_wider_voxels_keep_light_place_and_width(shape, factor):
+    """Keys' cubic keeps moments up to the second: outer rings are as wide as with the volume's own voxels."""
+    grid = Grid([20.0], shape, 0.1, (0.4, -0.3))
+    volume = np.random.default_rng(0).random(grid.volume_shape)
+    wider, light = wider_voxels(grid, jnp.asarray(volume), factor)
+    assert wider.pitch == pytest.approx(factor * grid.pitch) and wider.volume_shape == light.shape
+    for axis, place in ((2, "x"), (1, "y")):
+        sums = [np.asarray(some).sum((0, 3 - axis)) for some in (volume, light)]
+        for power in range(3):
+            fine, coarse = (
+                np.vdot(part, (np.asarray(getattr(each, place), float) - np.asarray(grid.origin)[2 - axis]) ** power)
+                for part, each in zip(sums, (grid, wider), strict=True)
+            )
+            assert coarse == pytest.approx(fine, rel=1e-6, abs=1e-6)

@@ -6,10 +6,12 @@ repeated here.
 
 import functools
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from ..base.machine import Workers
 
@@ -25,6 +27,9 @@ SIMULATED = ("full", "near")
 PSFS = ("diffraction", "geometric", "gaussian")
 CHANNELS = ("red", "green", "blue")
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+# Names of the options that read a picture, and of those of a capture.
+_PICTURE = ("page", "channel", "bayer", "dark", "flat", "bad_pixels", "offset")
+CAPTURE_OPTIONS = (*_PICTURE, "roi", "binning")
 
 
 class Number(click.ParamType):
@@ -273,18 +278,23 @@ class CaptureOptions:
 
 def capture_options(command):
     """Add the options of captures; the command receives them as `camera`, a `CaptureOptions`."""
-    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS), ("roi", "binning"))
+    return _with_camera(command, (*_FORMAT_OPTIONS, *_REGION_OPTIONS, *_CORRECTION_OPTIONS), CAPTURE_OPTIONS)
 
 
 def picture_options(command):
     """As `capture_options`, without those that place the capture on a sensor."""
-    return _with_camera(command, (*_FORMAT_OPTIONS, *_CORRECTION_OPTIONS))
+    return _with_camera(command, (*_FORMAT_OPTIONS, *_CORRECTION_OPTIONS), _PICTURE)
 
 
-def _with_camera(command, options, region=()):
+def given_options(names: Iterable[str]) -> list[str]:
+    """Those of some options of the running command that its user gave, as `--name`."""
+    source = click.get_current_context().get_parameter_source
+    return [f"--{name.replace('_', '-')}" for name in names if source(name) is ParameterSource.COMMANDLINE]
+
+
+def _with_camera(command, options, names):
     @functools.wraps(command)
     def wrapper(*args, **kwargs):
-        names = ("page", "channel", "bayer", *region, "dark", "flat", "bad_pixels", "offset")
         camera = CaptureOptions(**{name: kwargs.pop(name) for name in names})
         return command(*args, camera=camera, **kwargs)
 

@@ -26,13 +26,7 @@ from .options import (
     worker_options,
 )
 from .outputs import check_may_write, force_option, provenance_of
-from .recording_command import (
-    check_recording,
-    reconstruct_recording,
-    recording_options,
-    residual_in_words,
-    score_in_words,
-)
+from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
 from .watch_command import check_watched, watch_folder
 
 
@@ -212,7 +206,7 @@ def reconstruct_command(
         with xla_only() if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
-        predicted = score_in_words(plan.score(image, progress)) if score else None
+        predicted = _score_in_words(plan.score(image, progress)) if score else None
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, weights, *camera.files, design=text))
             provenance |= frame.note if imager.sample is not None else {}
@@ -239,3 +233,8 @@ def reconstruct_command(
         click.echo(f"{points or output}: {count} point{'s' * (count != 1)}")
     if result.warning:
         click.echo(f"gs-jax: warning: {result.warning}", err=True)
+
+
+def _score_in_words(found) -> str:
+    noise = f"; its noise allows {found.best_db:.1f} dB" if found.noise else ""
+    return f"it predicts lenses that were left out {found.score_db:.1f} dB better than an empty volume does{noise}"

@@ -208,12 +208,6 @@ def residual_in_words(residual) -> str:
     return f"{error}, {residual.regions.max():.0%} where it is farthest"
 
 
-def score_in_words(found) -> str:
-    """A `CrossValidation` in words."""
-    noise = f"; noise allows {found.best_db:.1f} dB" if found.noise else ""
-    return f"lenses that were left out are predicted {found.score_db:.1f} dB better than by nothing{noise}"
-
-
 def request_of(provenance: dict[str, str], names: list[str] | None = None) -> dict[str, str]:
     """What the volumes depend on: options, the design, and the contents of the files beside the recording."""
     options = click.get_current_context().params

@@ -10,7 +10,16 @@ from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
-from .options import DESIGN, UM, CaptureOptions, Depths, capture_options, worker_options
+from .options import (
+    CAPTURE_OPTIONS,
+    DESIGN,
+    UM,
+    CaptureOptions,
+    Depths,
+    capture_options,
+    given_options,
+    worker_options,
+)
 from .outputs import PARTIAL, RESUMABLE, check_may_write, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
@@ -67,13 +76,12 @@ def train_command(
     """
     check_output(output, [".npz"])
     if from_captures:
-        given = {"--resume": resume, "--workers or --scheduler": workers.remote, "--network": network != "unrolled"}
-        given["--network"] &= network is not None
-        if option := next((name for name, value in given.items() if value), None):
-            raise InputError(f"--from-captures trains the unrolled networks in this process, got {option}.")
+        alone = () if network == "unrolled" else ("network",)
+        if given := given_options((*alone, "resume", "workers", "scheduler")):
+            raise InputError(f"--from-captures trains the unrolled networks in this process, got {given[0]}.")
         return _from_captures(from_captures, output, steps or FINE_STEPS, seed, camera, **mine)
-    if option := next((name for name, value in mine.items() if value is not None), None):
-        raise InputError(f"--{option.replace('_', '-')} must be used with --from-captures.")
+    if given := given_options((*mine, *CAPTURE_OPTIONS)):
+        raise InputError(f"{given[0]} must be used with --from-captures.")
     network = network or "multislice"
     import numpy as np
 

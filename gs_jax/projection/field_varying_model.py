@@ -46,7 +46,7 @@ def _cores_image(volume, imager, grid, optics):
     wide, wide_half = with_margin(imager, optics.kernel.shape[-1]), with_margin(_half_resolution(imager), size)
     dtype, nodes = volume.dtype, optics.stray_light.grid
     voxels_per_pixel = 2 * sensor.pixel_pitch / (grid.pitch * nodes.pixel / nodes.step)
-    outer_grid, outer_volume = _wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
+    outer_grid, outer_volume = wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
 
     def sharp(imager, plane, number):
         depth, inner, outer, distortion, light, _, _ = plane
@@ -81,7 +81,7 @@ def _cores_image(volume, imager, grid, optics):
     return fine + upsample_by_two(coarse, size, sensor.shape)
 
 
-def _wider_voxels(grid, volume, factor):
+def wider_voxels(grid, volume, factor):
     """A grid of voxels that are wider by a whole factor, and the volume's light, shared by these."""
     if factor == 1:
         return grid, volume
@@ -90,7 +90,7 @@ def _wider_voxels(grid, volume, factor):
 
 
 def _share_lines(volume, factor, axis):
-    """By Keys' cubic, which blurs nothing: linear shares would make an image of letters 6 % less right."""
+    """Share lines along an axis by Keys' cubic, which keeps a spot's width: linear shares would blur."""
     size = volume.shape[axis]
     count = 2 * math.ceil(size / factor / 2) + 3
     # Place of the first new line, and the first line that shares its light with it.

@@ -178,7 +178,7 @@ def _upsampling_matrix(fine: int, coarse: int, ratio, dtype) -> Float[Array, "fi
 
 
 def cubic(distance):
-    """Keys' cubic interpolation: the weight at a distance, in steps, not negative."""
+    """Weight of Keys' cubic interpolation at an absolute distance, in steps."""
     xp, x = array_namespace(distance), distance
     near, far = (1.5 * x - 2.5) * x**2 + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
     return xp.where(x <= 1, near, xp.where(x < 2, far, 0))

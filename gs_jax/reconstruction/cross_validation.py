@@ -44,13 +44,13 @@ class CrossValidation(NamedTuple):
 
     @property
     def score_db(self) -> float:
-        """The error in dB better than an empty volume, `-20 log10(error)`: larger is better."""
-        return -20 * math.log10(max(self.error, 1e-12))
+        """How much smaller the error is than that of an empty volume, `20 log10(1 / error)`, dB."""
+        return 20 * math.log10(1 / max(self.error, 1e-12))
 
     @property
     def best_db(self) -> float:
         """The score of a perfect volume: noise cannot be predicted."""
-        return -20 * math.log10(max(self.noise, 1e-12))
+        return 20 * math.log10(1 / max(self.noise, 1e-12))
 
 
 def cross_validated(

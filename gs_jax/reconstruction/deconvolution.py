@@ -17,7 +17,7 @@ from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..typing import Image
-from .inverse_problem import subtract_offset, sum_squares
+from .inverse_problem import subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR, run_solver
 from .residual import discrepancy_target
 
@@ -136,7 +136,7 @@ def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarra
     rows, columns = (n // side for n in image.shape)
     if min(rows, columns) < 2:
         raise input_error("--binning", "such that 2 x 2 pixels or more are left", f"{rows} x {columns}")
-    return sum_squares(np.asarray(image, np.float32), side)
+    return sum_pixels(np.asarray(image, np.float32), side)
 
 
 def _stack_operator(psf, image_shape) -> ConvolutionOperator:

@@ -66,12 +66,12 @@ def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y 
     Raises `InputError` if a pixel is not finite.
     """
     check_finite("image", image)
-    light = sum_squares(subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype)), model.binning)
+    light = sum_pixels(subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype)), model.binning)
     return light, np.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0) if model.is_partial else 0.0
 
 
-def sum_squares(image: Float[np.ndarray, "row column"], side: int) -> Float[np.ndarray, "y x"]:
-    """Sum squares of pixels; what fills no square is left out."""
+def sum_pixels(image: Float[np.ndarray, "row column"], side: int) -> Float[np.ndarray, "y x"]:
+    """Sum the pixels of each square of `side` x `side`; those that fill no square are left out."""
     rows, columns = (n // side for n in image.shape)
     return image[: rows * side, : columns * side].reshape(rows, side, columns, side).sum((1, 3))
 

@@ -132,9 +132,7 @@ class Plan:
         return forward_residual(volume, image, self.imager, self.grid, optics=self.optics, progress=progress)
 
     def score(self, image: Image, progress: Progress) -> CrossValidation:
-        """How well lenses are predicted from the others; `InputError` with suppression, and with sheets."""
-        if self.suppress != "none":
-            raise InputError(f"--score must be used with --suppress none, got {self.suppress}.")
+        """How well lenses are predicted from the others, without suppression; `InputError` with sheets."""
         options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
         return cross_validated(image, self.imager, self.grid, self.method, **options, progress=progress)
 

@@ -111,7 +111,7 @@ def scatter(job_address, part, _):
     """Volume to image; a part is a band of rows of pixels."""
     job = rows.job_at(job_address)
     tables = rows.read_tables(job)
-    limit2, hole2 = tables.numbers[1], rows.hole_limit2(tables)
+    limit2 = tables.numbers[1]
     lenses, depths, ny = tables.y_pixel.shape
     nx = tables.x_pixel.shape[2]
     height, width = rows.size(job, FIRST, 1), rows.size(job, FIRST, 2)
@@ -143,7 +143,7 @@ def scatter(job_address, part, _):
             if begin == end:
                 continue
             start, most = fill_taps(taps, here, begin, end, wide)
-            many, hole, beyond = lines_needed(here, begin, end), 0, 0
+            many = lines_needed(here, begin, end)
             for k in range(first, last):
                 y2 = tables.y_distance2[lens, d, k]
                 if y2 >= limit2:
@@ -152,22 +152,12 @@ def scatter(job_address, part, _):
                 if begin == end:
                     begin, end = shift, shift + nx
                     continue
-                # The hole's whole blocks, and the pixels that no other voxels reach, or none.
-                hole, beyond = rows.hole(x2[: shift + nx], y2, hole2, begin, end, hole, beyond)
-                skip, resume = (hole + WIDTH - 1) // WIDTH * WIDTH, beyond // WIDTH * WIDTH
-                dark, lit = wide, wide
-                if begin < skip and skip < resume and resume < end:
-                    dark, lit = np.int64(low[resume]) + 2, np.int64(low[skip - 1])
-                else:
-                    skip, resume = end, end
                 i, down = rows.pixel_row(tables, lens, d, k, tall)
                 at_upper = rows.address(job, FIRST + 1) + 4 * i * wide
                 at_lower = at_upper + 4 * wide if i + 1 < bottom else at_spare
                 at_upper = at_upper if i >= top else at_spare
                 at_row = rows.address(job, FIRST) + 4 * ((d * height + y_start + k) * width + x_start - shift)
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
-                    if c >= skip and c < resume:
-                        continue
                     simd.prefetch(at_row + 4 * (AHEAD * width + c))
                     voxels = rows.load_voxels(at_row, c, width - x_start + shift - c, at_edge)
                     value = voxels * rows.weight(tables, d, y2 + simd.load(here.distance2 + 4 * c))
@@ -180,8 +170,6 @@ def scatter(job_address, part, _):
                 if most > 0:
                     for block in range((left - start) // WIDTH, (right - start) // WIDTH + 1):
                         j = 4 * (start + WIDTH * block)
-                        if start + WIDTH * block >= dark and start + WIDTH * block + WIDTH <= lit:
-                            continue
                         spread = sum_taps(taps, at_values, block, most)
                         simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)
                         simd.store(at_lower + j, simd.load(at_lower + j) + down * spread)
@@ -189,13 +177,9 @@ def scatter(job_address, part, _):
                         simd.store(at_values + 4 * c, simd.zeros())
                     continue
                 for c in range(begin, end):
-                    if c >= skip and c < resume:
-                        continue
                     simd.add_two(at_pairs + 8 * c, at_lines + 4 * ((c & (many - 1)) * length + np.int64(low[c])))
                 for block in range(left // WIDTH, right // WIDTH + 1):
                     j = 4 * min(WIDTH * block, wide - WIDTH)
-                    if j >= 4 * dark and j + 4 * WIDTH <= 4 * lit:
-                        continue
                     spread = take_sum(at_lines + j, many, 4 * length)
                     simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)
                     simd.store(at_lower + j, simd.load(at_lower + j) + down * spread)
