@@ -103,7 +103,8 @@ def read_surface(path: PathLike) -> SurfaceMaps:
     check_suffix(path, SURFACE_SUFFIXES[:2])
     path = check_input(path)
     with decoding(path, "OME-TIFF"), tifffile.TiffFile(path, is_ome=False) as tiff:
-        pixels = ElementTree.fromstring(tiff.pages.first.description).find("{*}Image/{*}Pixels")
+        words = tiff.pages.first.description
+        pixels = ElementTree.fromstring(words).find("{*}Image/{*}Pixels") if words.startswith("<?xml") else None
         names = [] if pixels is None else [each.get("Name", "") for each in pixels.findall("{*}Channel")]
         maps = np.stack([page.asarray() for page in tiff.pages])
     count = len(maps) // len(_CHANNELS)
