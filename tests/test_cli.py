@@ -136,7 +136,7 @@ def test_a_score_is_told_and_kept(folder, monkeypatch, capsys):
     tifffile.imwrite(folder / "capture.tif", image)
     options = "20 --voxel-um 50 --score -o v.tif -q".split()
     status, out, _ = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options)
-    assert status == 0 and "v.tif: lenses that were left out are predicted" in out
+    assert status == 0 and "v.tif: it predicts lenses that were left out" in out
     assert read_provenance(folder / "v.tif")[SCORE] in out
     status, _, err = run(monkeypatch, capsys, *RECONSTRUCT[:4], *options, "--suppress", "clusters")
     assert status == 2 and "--score must be used with --suppress none" in err
