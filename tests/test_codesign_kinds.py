@@ -78,10 +78,9 @@ def test_kinds_that_cannot_be():
     thin = conics().model_copy(update={"lens": conics().lens.model_copy(update={"focal_length_mm": 4.65})})
     with pytest.raises(InputError, match="`kinds` needs a design without"):
         initial_design(thin, study(kinds=2))
-    with pytest.raises(InputError, match="up to 8 lens types, got 12"):
-        problem_of(conics(radii=np.linspace(1.3, 1.4, 12).tolist()), study())
-    with pytest.raises(ValueError, match="less than or equal to 8"):
-        study(kinds=9)
+    twelve = conics(radii=np.linspace(1.3, 1.4, 12).tolist())
+    with pytest.raises(InputError, match="scene_error takes up to 8 lens types, got 12"):
+        problem_of(twelve, study(terms=({"name": "scene_error", "minimise": 0.1},)))
 
 
 @pytest.mark.integration
@@ -133,6 +132,18 @@ def test_terms_of_kinds_that_are_alike_are_those_of_one():
     for name in _OURS:
         expected = np.broadcast_to(single[name], several[name].shape)
         np.testing.assert_allclose(several[name], expected, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.integration
+def test_every_lens_may_be_a_kind_of_its_own():
+    """The best of all is the best of what each has alone, and a search takes them."""
+    twelve = study(kinds=12, terms=[{"name": "psf_width_um", "minimise": 100.0}], depth_count=2)
+    design, depths = initial_design(conics(), twelve), np.array([15.0, 30.0])
+    alone = [objectives.spot_width(*part) for part in per_type(design.imager(), depths)]
+    np.testing.assert_allclose(objectives.spot_width(design.imager(), depths), np.min(alone, 0), rtol=1e-9)
+    found = run_study(design, twelve)
+    assert found.after[0].high < found.before[0].high
+    assert len(np.unique(found.design.lens.radius_of_curvature_mm)) == 12
 
 
 @pytest.mark.integration

@@ -81,11 +81,11 @@ def test_a_lens_and_a_plane_are_wieners_filter():
     spectrum = linear_error._spectrum(nodes)
     power = transfer_power(*c, jnp.array(nodes / float(c.imager.magnification(c.at.depths)[0])))[0]
     signal = (
-        spectrum * power * (lit_density(*c)[0] * c.imager.magnification(c.at.depths)[0]) ** 2 / noise_density(*c, [c])
+        spectrum * power * (lit_density(*c)[0] * c.imager.magnification(c.at.depths)[0]) ** 2 / noise_density(*c)[0]
     )
     expected = np.sum(nodes * spectrum / (1 + signal)) / np.sum(nodes * spectrum)
     # The lens is above the object, so that the envelope is 1; 16 nodes against 4000 are good to 2e-3.
-    np.testing.assert_allclose(jax.jit(lost_power)([c], jnp.zeros((1, 2)))[0], expected, rtol=3e-3)
+    np.testing.assert_allclose(jax.jit(lost_power)(*c, jnp.zeros((1, 2)))[0], expected, rtol=3e-3)
 
 
 @pytest.mark.integration
@@ -96,7 +96,7 @@ def test_planes_that_no_parallax_tells_apart():
     losses = []
     for centers in ([(0.0, 0.0)], rng.uniform(-2, 2, (40, 2)).tolist()):
         c = case({"aperture_diameter_mm": jnp.array(0.3)}, centers=tuple(map(tuple, centers)), exposure=1e9)
-        losses.append(np.asarray(jax.jit(lost_power)([c], jnp.zeros((1, 2)))))
+        losses.append(np.asarray(jax.jit(lost_power)(*c, jnp.zeros((1, 2)))))
     assert losses[0].mean() == pytest.approx(0.5, abs=0.02)
     assert losses[1].max() < 0.1
 
@@ -123,12 +123,12 @@ def test_the_bound_is_that_of_the_pixels():
     then, and differ by what is beyond the pixels' highest frequency and by the mean over the field."""
     c = case({"aperture_diameter_mm": jnp.array(0.3)}, exposure=3e3)
     c = c._replace(at=dataclasses.replace(c.at, depths=jnp.array([20.0])))
-    background = float(noise_density(*c, [c]) * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
+    background = float(noise_density(*c)[0] * c.imager.sensor.pixel_pitch**2 - linear_error.READ_NOISE**2)
     psf = diffraction_psf(c.imager, 20.0, size=65, radius=clear_diameter(*c) / 2, field=(1.5, 0.0), samples=6)
     points = jnp.array([[0.1, -0.2, 20.0]])
     light = {"photons": lens_electrons(*c)[0], "background": background, "read_noise": linear_error.READ_NOISE}
     pixels = localization_bound(c.imager, points, spot=psf, size=65, **light)
-    np.testing.assert_allclose(jax.jit(crowded_bound)([c], PLACES)[0], pixels, rtol=0.15)
+    np.testing.assert_allclose(jax.jit(crowded_bound)(*c, PLACES)[0], pixels, rtol=0.15)
 
 
 @pytest.mark.integration

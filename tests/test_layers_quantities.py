@@ -98,7 +98,7 @@ def test_the_bound_of_points_in_a_medium():
     reduced = scope.reduced_depth(at.depths) - scope.array.reduced_thickness_front
     air = Conditions(reduced, exposure=1e4 / INDEX**2)
     places = jnp.array([[0.3, -0.2]])
-    wet, dry = crowded_bound([(scope, at)], places), crowded_bound([(gs.geomscope().imager(), air)], places)
+    wet, dry = crowded_bound(scope, at, places), crowded_bound(gs.geomscope().imager(), air, places)
     np.testing.assert_allclose(wet, np.asarray(dry) * (1.0, 1.0, INDEX), rtol=0.02)
 
 

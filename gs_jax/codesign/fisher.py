@@ -21,7 +21,6 @@ variance would not distinguish a sharp core in stray light from no core. The noi
 (`linear_error.noise_density`) plus the point's own.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -32,7 +31,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..geometry import Imager, envelope
-from ..objectives.conditions import Conditions, field_radius
+from ..objectives.conditions import Conditions, field_radius, of_lenses
 from ..typing import Real
 from .linear_error import lens_electrons, noise_density, transfer_power
 
@@ -198,43 +197,40 @@ def _shifted(psf, shift):
 _NODES = 24
 
 
-def crowded_bound(
-    parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, "place 2"]
-) -> Float[Array, "depth 3"]:
+def crowded_bound(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) -> Float[Array, "depth 3"]:
     """Cramer-Rao bound of x, y, z in a crowded scene, for points as bright as an emitter of 40 um x 40 um, mm.
 
-    `parts`: the lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are
-    those of the points. `places`: `(x, y)` of points, mm. The result is the root mean square over them.
+    `at`: conditions, whose depths are those of the points. `places`: `(x, y)` of points, mm. The result is the root
+    mean square over them.
     """
-    spots = [_spot(*part, parts) for part in parts]
-    prior = jnp.asarray(PRIOR[:3], parts[0][1].depths.dtype)
+    spot, prior = _spot(imager, at), jnp.asarray(PRIOR[:3], at.depths.dtype)
 
-    def at(place):
-        information = sum(_information(*part, spot, place) for part, spot in zip(parts, spots, strict=True))
+    def variance(place):
+        information = _information(imager, at, spot, place)
         return jnp.diagonal(jnp.linalg.inv(information + jnp.diag(prior**-2)[None]), axis1=1, axis2=2)
 
-    return jnp.sqrt(jnp.mean(jax.lax.map(at, places), 0))
+    return jnp.sqrt(jnp.mean(jax.lax.map(variance, places), 0))
 
 
-def _spot(imager, at, parts):
-    """Integrals at each depth of a spot's square and of its squared derivative, 1/mm^2, and the noise density."""
+def _spot(imager, at):
+    """Integrals of a spot's square and of its squared derivative, 1/mm^2, `(depth, lens)`, and the noise density."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     dtype, highest = at.depths.dtype, 1 / (2 * imager.sensor.pixel_pitch)
     frequency = highest * jnp.asarray((nodes + 1) / 2, dtype)
     ring = jnp.asarray(np.pi * weights, dtype) * highest * frequency
-    power = transfer_power(imager, at, frequency)
-    energy = jnp.sum(ring[None] * power, 1)
-    slope = jnp.sum(ring[None] * power * (2 * jnp.pi * frequency[None]) ** 2, 1) / 2
-    return energy, slope, noise_density(imager, at, parts)
+    power = of_lenses(imager, transfer_power(imager, at, frequency))
+    energy = power @ ring
+    slope = power @ (ring * (2 * jnp.pi * frequency) ** 2) / 2
+    return energy.T, slope.T, noise_density(imager, at)[None]
 
 
 def _information(imager, at, spot, place) -> Float[Array, "depth 3 3"]:
-    """Fisher information about `x, y, z` of a point by lenses of one type."""
+    """Fisher information about `x, y, z` of a point by all lenses."""
     energy, slope, noise = spot
     beside = imager.array.centers - place[None]
     weight = envelope(jnp.sum(beside**2, 1)[None], imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
-    light = lens_electrons(imager, at)[:, None] * weight
-    per_shift = light**2 * slope[:, None] / (noise + light * energy[:, None])
+    light = of_lenses(imager, lens_electrons(imager, at)).T * weight
+    per_shift = light**2 * slope / (noise + light * energy)
     along = imager.depth_in_medium(at.depths)
     # Derivative of image positions by x, y, z, divided by the magnification.
     shift = jnp.concatenate(

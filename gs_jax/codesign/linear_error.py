@@ -24,8 +24,6 @@ distance of 20 mm in air collects from an emitter of 40 um x 40 um. So a smaller
 light, and a magnification for its detail.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +31,7 @@ from jaxtyping import Array, Float
 
 from ..base.arrays import safe_sqrt
 from ..geometry import Imager, envelope
-from ..objectives.conditions import Conditions, clear_diameter, field_heights, field_radius
+from ..objectives.conditions import Conditions, by_type, clear_diameter, field_heights, field_radius, of_lenses
 from ..objectives.quantities import occupancy
 from ..optics import theory
 from ..optics.pupil import pupil_quadrature
@@ -47,56 +45,52 @@ READ_NOISE = 2.0
 _NODES = 16
 
 
-def lost_power(parts: Sequence[tuple[Imager, Conditions]], places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
+def lost_power(imager: Imager, at: Conditions, places: Float[Array, "place 2"]) -> Float[Array, " depth"]:
     """Mean squared error of the best linear estimate over the scene's variance, at each depth: 0 to 1.
 
     Parameters
     ----------
-    parts
-        The lenses of each type and their conditions, as of `gs_jax.objectives.conditions.per_type`. The depths are the
-        scene's planes.
+    imager, at
+        Lenses of any number of types, and conditions whose depths are the scene's planes.
     places
         `(x, y)` of objects, mm; the result is the mean over them. The lenses around each give its parallax.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    imager, at = parts[0]
     dtype, finest = at.depths.dtype, 1 / (2 * PLACE)
     # Frequencies in the object, 1/mm; on the sensor they are those of the mean magnification.
     object_frequency = jnp.asarray(finest * (nodes + 1) / 2, dtype)
     ring = jnp.asarray(weights, dtype) * object_frequency
     frequency = object_frequency / jnp.mean(imager.magnification(at.depths))
     spectrum = _spectrum(imager.magnification(at.depths)[:, None] * frequency[None])
-    amplitudes = [_amplitude(*part, parts, frequency, spectrum) for part in parts]
+    amplitude = _amplitude(imager, at, frequency, spectrum)
     ways, planes = directions(dtype), jnp.eye(at.depths.size, dtype=dtype)
 
     def at_place(place):
-        views = [_view(*part, place, ways) for part in parts]
+        weight, turns = _view(imager, at, place, ways)
 
-        def at_frequency(frequency, amplitudes):
-            real, imaginary = planes[None], 0.0
-            for (weight, turns), amplitude in zip(views, amplitudes, strict=True):
-                cos, sin = (weight[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
-                same = jnp.einsum("wlj,wlk->wjk", cos, cos) + jnp.einsum("wlj,wlk->wjk", sin, sin)
-                other = jnp.einsum("wlj,wlk->wjk", cos, sin)
-                both = amplitude[None, :, None] * amplitude[None, None]
-                real = real + both * same
-                imaginary = imaginary + both * (other - jnp.swapaxes(other, 1, 2))
+        def at_frequency(frequency, amplitude):
+            cos, sin = ((amplitude * weight)[None] * wave(frequency * turns) for wave in (jnp.cos, jnp.sin))
+            same = jnp.einsum("wlj,wlk->wjk", cos, cos) + jnp.einsum("wlj,wlk->wjk", sin, sin)
+            other = jnp.einsum("wlj,wlk->wjk", cos, sin)
+            real, imaginary = planes[None] + same, other - jnp.swapaxes(other, 1, 2)
             # A complex matrix as a real one of twice the size.
             normal = jnp.block([[real, -imaginary], [imaginary, real]])
             left = jnp.diagonal(jnp.linalg.inv(normal), axis1=1, axis2=2)
             return jnp.mean(left[:, : len(planes)], 0)
 
-        return jax.vmap(at_frequency, (0, 1), 1)(frequency, amplitudes)
+        return jax.vmap(at_frequency, (0, 2), 1)(frequency, amplitude)
 
     left = jnp.mean(jax.lax.map(at_place, places), 0)
     share = ring[None] * spectrum
     return jnp.sum(left * share, 1) / jnp.sum(share, 1)
 
 
-def _amplitude(imager, at, parts, frequency, spectrum) -> Float[Array, "depth frequency"]:
-    """Amplitude with which a lens images each plane, relative to the noise."""
-    amplitude = lit_density(imager, at) * imager.magnification(at.depths) / jnp.sqrt(noise_density(imager, at, parts))
-    return amplitude[:, None] * safe_sqrt(transfer_power(imager, at, frequency) * spectrum)
+def _amplitude(imager, at, frequency, spectrum) -> Float[Array, "lens depth frequency"]:
+    """Amplitude with which each lens images each plane, relative to the noise."""
+    noise = jnp.sqrt(noise_density(imager, at))
+    amplitude = of_lenses(imager, lit_density(imager, at)) * imager.magnification(at.depths)[None] / noise[:, None]
+    power = of_lenses(imager, transfer_power(imager, at, frequency))
+    return amplitude[..., None] * safe_sqrt(power * spectrum[None])
 
 
 def _view(imager, at, place, ways):
@@ -107,14 +101,15 @@ def _view(imager, at, place, ways):
     return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * imager.magnification(at.depths)[None, None]
 
 
-def noise_density(imager: Imager, at: Conditions, parts: Sequence[tuple[Imager, Conditions]]) -> Float[Array, ""]:
-    """Noise density of a sub-image, electrons^2 per mm^2: shot noise of planes and overlapping sub-images, read noise.
+def noise_density(imager: Imager, at: Conditions) -> Float[Array, " lens"]:
+    """Noise density of each lens's sub-image, electrons^2 per mm^2, on its sensor.
 
-    `imager` has the lens type of the sub-image, `parts` are all types, whose light follows from their apertures.
+    It is the shot noise of planes and of overlapping sub-images, whose light follows from the apertures, and read
+    noise.
     """
-    over = sum(occupancy(*part) * lit_density(*part) for part in parts)
-    shot = FILL * jnp.sum(lit_density(imager, at) + over)
-    return shot + (READ_NOISE / imager.sensor.pixel_pitch) ** 2
+    own = of_lenses(imager, lit_density(imager, at))
+    over = occupancy(imager, at) * jnp.mean(own, 0)
+    return FILL * jnp.sum(own + over[None], 1) + (READ_NOISE / imager.sensor.pixel_pitch) ** 2
 
 
 def _spectrum(frequency):
@@ -138,6 +133,7 @@ def directions(dtype) -> Float[Array, "2 direction"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
+@by_type
 def transfer_power(
     imager: Imager, at: Conditions, frequencies: Float[Array, " frequency"]
 ) -> Float[Array, "depth frequency"]:
@@ -149,10 +145,8 @@ def transfer_power(
 
     Parameters
     ----------
-    imager
-        With lenses that are alike.
-    at
-        Depths, and the exposure.
+    imager, at
+        Lenses, and the depths.
     frequencies
         On the sensor, 1/mm.
     """
@@ -176,6 +170,7 @@ def transfer_power(
     return mean * (others**2)[None]
 
 
+@by_type
 def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size size"]:
     """Symmetric spots with the modulus of the transfer function, on the sensor's pixels, of sum 1: PSFs for `forward`.
 
@@ -194,6 +189,7 @@ def spots(imager: Imager, at: Conditions, size: int) -> Float[Array, "depth size
     return light / jnp.sum(light, (1, 2), keepdims=True)
 
 
+@by_type
 def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
@@ -201,6 +197,7 @@ def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     return at.exposure * area * (AWAY / imager.depth_in_medium(at.depths)) ** 2
 
 
+@by_type
 def lit_density(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons per mm^2 of the sensor in the image of a lit plane."""
     return lens_electrons(imager, at) / (PLACE * imager.magnification(at.depths)) ** 2

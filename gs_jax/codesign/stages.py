@@ -24,9 +24,12 @@ from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
 from .parameters import Values, candidate, evaluated, start_values
 from .solve import NOT_FINITE, Bounds, Box, Log, State, Stepper, restore_state, run, solver_of, stepper
-from .study import MOST_TYPES, StageTable, Study, TermTable, labels
+from .study import StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_entry
 from .terms import with_terms
+
+# Most lens types of the term that images scenes by each in turn.
+_SCENE_TYPES = 8
 
 
 class Problem(NamedTuple):
@@ -66,8 +69,9 @@ def problem_of(design: Design, study: Study) -> Problem:
 
 
 def _check_free(design: Design, study: Study) -> None:
-    if (count := len(lenses_by_type(design.imager().array))) > MOST_TYPES:
-        raise InputError(f"`lens`: a search takes up to {MOST_TYPES} lens types, got {count}.")
+    count = len(lenses_by_type(design.imager().array))
+    if count > _SCENE_TYPES and any(term.name == "scene_error" for term in study.terms):
+        raise InputError(f"`terms`: scene_error takes up to {_SCENE_TYPES} lens types, got {count}.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:
         raise InputError("`free.pitch_mm` needs a design of two lenses or more, got one lens.")
     _check_room(design, study)

@@ -33,8 +33,6 @@ from .parameters import NAMES
 from .terms import check_term
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
-# Each lens type is traced separately.
-MOST_TYPES = 8
 KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
 
 # Lower limits of free parameters that are not lengths.
@@ -145,7 +143,7 @@ class Study(Table):
     name: str = Field(default="optimized", description="a string")
     orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
     sample: str | None = Field(default=None, description='the name of one of the design\'s `[samples]`, or "air"')
-    kinds: int | None = Field(default=None, ge=1, le=MOST_TYPES, description=f"a whole number from 1 to {MOST_TYPES}")
+    kinds: int | None = Field(default=None, ge=1, description="a positive whole number")
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")
     confusion_um: Positive | None = Field(default=None, description="a positive number of micrometres")

@@ -163,12 +163,12 @@ def _points(imager: Imager, at: Conditions, key: PRNGKeyArray, count: int) -> Fl
 
 def volume_error(imager: Imager, at: Conditions) -> Float[Array, ""]:
     """Relative error of volumes by the best linear estimate: the root of the mean of `lost_power` over the depths."""
-    return jnp.sqrt(jnp.mean(lost_power(per_type(imager, at), places_of(imager))))
+    return jnp.sqrt(jnp.mean(lost_power(imager, at, places_of(imager))))
 
 
 def crowded_precision(imager: Imager, at: Conditions) -> Float[Array, "depth 3"]:
     """`crowded_bound` of x, y, z at each depth, um."""
-    return 1000 * crowded_bound(per_type(imager, at), places_of(imager))
+    return 1000 * crowded_bound(imager, at, places_of(imager))
 
 
 def places_of(imager: Imager) -> Float[Array, "place 2"]:

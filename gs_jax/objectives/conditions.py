@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields
 from ..geometry import Imager
-from ..lenses import lenses_by_type
+from ..lenses import lenses_by_type, type_of_lens
 from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
 from ..optics.lens_types import split_by_type
 
@@ -100,7 +100,7 @@ def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
     ]
 
 
-# The arguments of a quantity: an imager, and depths or `Conditions`.
+# The arguments of a quantity: an imager, depths or `Conditions`, and what is the same for all types.
 P = ParamSpec("P")
 
 
@@ -109,8 +109,7 @@ def by_type(function: Callable[P, Array]) -> Callable[P, Array]:
 
     @wraps(function)
     def of_all(*args: P.args, **options: P.kwargs) -> Array:
-        values = _values(function, args, options)
-        return values[0] if len(values) == 1 else jnp.stack(values)
+        return _of_types(function, args, options)[0]
 
     return of_all
 
@@ -120,20 +119,31 @@ def best_type(function: Callable[P, Array], *, best: Callable[..., Array] = jnp.
 
     @wraps(function)
     def of_best(*args: P.args, **options: P.kwargs) -> Array:
-        values = _values(function, args, options)
-        if len(values) == 1:
-            return values[0]
-        stacked = jnp.stack(values)
-        return jnp.take_along_axis(stacked, best(stacked, axis=0, keepdims=True), 0)[0]
+        values, several = _of_types(function, args, options)
+        return jnp.take_along_axis(values, best(values, axis=0, keepdims=True), 0)[0] if several else values
 
     return of_best
 
 
-def _values(function, args, options) -> list[Array]:
+def _of_types(function, args, options) -> tuple[Array, bool]:
+    """The value, and False; or a row for each of several types, and True."""
     # The wrapped function has the names and the defaults of the arguments.
     bound = inspect.signature(function).bind(*args, **options)
     bound.apply_defaults()
-    return [function(*part) for part in per_type(*bound.args)]
+    imager, depths, *others = bound.args
+    parts = per_type(imager, depths)
+    if len(parts) == 1:
+        return function(*parts[0], *others), False
+    # What is asked of a type does not depend on its lenses' places: one program serves any number of types.
+    alone = [(eqx.tree_at(lambda i: i.array, one, one.array.lens(0)), at) for one, at in parts]
+    stacked = jax.tree.map(lambda *each: jnp.stack(each), *alone)
+    return jax.vmap(lambda one, at: function(one, at, *others))(*stacked), True
+
+
+def of_lenses(imager: Imager, values: Float[Array, "..."]) -> Float[Array, "lens ..."]:
+    """A row for each lens of what `by_type` functions return."""
+    types = type_of_lens(imager.array)
+    return values[types] if types.any() else jnp.broadcast_to(values, (types.size, *values.shape))
 
 
 def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
