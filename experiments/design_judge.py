@@ -325,6 +325,8 @@ def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
             axis.imshow(shown.max(0), cmap="gray", vmin=0, vmax=truth.max(), extent=(-half, half, half, -half))
             axis.set_title(f"{list(names)[column - 1] if column else 'truth'}: {kind}", fontsize=8)
             axis.tick_params(labelsize=7)
+    figure.supxlabel("x, mm", fontsize=8)
+    figure.supylabel("y, mm", fontsize=8)
     return figure
 
 

@@ -32,6 +32,7 @@ __all__ = ["folder"]
 
 FRAMES = np.random.default_rng(0).integers(100, 3000, (5, 96, 80)).astype(np.uint16)
 OPTIONS = ("--depths", "18:22:1", "--voxel-um", "50")
+WARM = ("--warm-start", "--method")
 
 
 def save(name, frames=FRAMES):
@@ -283,6 +284,9 @@ def test_it_is_compiled_once(folder, monkeypatch, capsys):
         ("no*.tif", (), "no*.tif: no captures"),
         ("capture.tif", ("--resume",), "--resume must be used with a recording, got a single capture capture.tif"),
         ("capture.tif", ("--frame-interval", "1"), "--frame-interval must be used with a recording"),
+        ("capture.tif", (*WARM, "list-rl"), "--warm-start must be used with a recording"),
+        ("rec.tif", (*WARM, "fista"), "--warm-start must be used with list-rl or richardson-lucy, got --method fista"),
+        ("rec.tif", (*WARM, "list-rl", "--workers", "2"), "--warm-start must be used without --workers"),
         ("flat.zarr", (), "array must be (t, y, x), with axes of 1 alone between t and y, got 96 x 80"),
         ("deep.zarr", (), "got 5 x 3 x 96 x 80"),
         ("double.zarr", (), "got float64"),

@@ -114,6 +114,7 @@ def reconstruct_command(
     force: bool,
     frame_interval: float | None,
     track: float | None,
+    warm_start: bool | None,
     resume: bool,
     watch: bool,
     light: Light,
@@ -176,7 +177,9 @@ def reconstruct_command(
     text, imager = design_text(microscope), camera.imager(light.imager(microscope))
     frame, shown = DepthFrame(light.origin(imager)), depths
     depths = light.from_array(depths, imager)
-    method_options |= {"points": points is not None, "weights": weights}
+    if warm_start and workers.remote:
+        raise InputError("--warm-start must be used without --workers and --scheduler: their frames do not follow on.")
+    method_options |= {"points": points is not None, "weights": weights, "warm_start": bool(warm_start)}
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     how = {"track": track, "interval": frame_interval, "resume": resume}
     if watch:
@@ -187,7 +190,7 @@ def reconstruct_command(
             files = {"design_text": text, "camera": camera, "points": points, "frame": frame}
             return watch_folder(capture, plan, output, **files, **how, progress=progress)
     with open_recording(capture, page=camera.page) as recording, Progress() as progress:
-        given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track}
+        given = {"--resume": resume, "--frame-interval": frame_interval, "--track": track, "--warm-start": warm_start}
         given["--workers or --scheduler"] = workers.remote
         check_recording(capture, recording, output, resume=resume, given=given, force=force)
         if recording and (surface or score):

@@ -47,7 +47,14 @@ def recording_options(command):
         help="CAPTURE is a folder into which a camera writes: reconstruct each capture as it comes, the newest first, "
         "to VOLUME.zarr, until Ctrl-C. Needs pip install 'gs-jax[live]'.",
     )
-    return watch(interval(track(resume(command))))
+    warm = click.option(
+        "--warm-start",
+        is_flag=True,
+        default=None,
+        help="Recordings by list-rl or richardson-lucy: start each frame from the volume of the one before, and "
+        "take only the steps that it needs.",
+    )
+    return watch(interval(track(warm(resume(command)))))
 
 
 def check_recording(capture: Path, recording, output: Path, *, resume: bool, given: dict[str, Any], force: bool):

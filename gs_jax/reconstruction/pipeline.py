@@ -1,6 +1,7 @@
 """Reconstruction of a volume from a capture, by any method."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -155,18 +156,19 @@ def reconstructor(
     optics: PsfModel | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
-    read: Callable[[Any, Any], Any] | None = None,
+    read: Callable[[Any, Any, float], Any] | None = None,
 ) -> Callable[..., Any]:
     """Prepare `reconstruct` for many images of one type; parameters and errors as there.
 
-    `read` takes a solver and its last state, and returns what is returned instead of the volume.
+    `read` takes a solver, its last state and the cost before the last step, and returns what is returned instead of the
+    volume.
 
     Returns
     -------
     Callable
-        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of a `Surface`, its state to
-        start from, and pixels to keep (`kept`: 1, and 0 for those that are left out, in the pixels of `prepare_model`),
-        to the volume.
+        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of the method, its state to
+        start from, pixels to keep (`kept`: 1, and 0 for those that are left out, in the pixels of `prepare_model`), and
+        the cost at which the steps may end (`enough`), to the volume.
 
     Warns
     -----
@@ -194,12 +196,13 @@ def reconstructor(
     modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
     problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
-    def volume_of(image, progress, method=method, start=None, kept=None):
+    def volume_of(image, progress, method=method, start=None, kept=None, enough=0.0):
         light, background = prepare_data(image, model)
-        target = 0.0
+        target = enough
         # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
         if stop_at_discrepancy and not isinstance(method, Unrolled | Surface):
-            target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=is_poisson)
+            noise = discrepancy_target(np.asarray(image), light, counts=is_poisson)
+            target = max(enough, DISCREPANCY_FACTOR * noise)
         solver = method
         if isinstance(method, PinholeRichardsonLucy):
             solver = method.solver(background)
@@ -295,12 +298,13 @@ def _wider_voxels(grid):
 def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, start=None):
     """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target.
 
-    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or `read(solver, state)`.
+    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or what `read` returns.
     """
     # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
     state = _start(compiled, light, problem) if start is None else start
     quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else "twice the --binning"
+    cost = math.nan
     with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):
             state, cost, residual = _step(state, compiled, light, problem)
@@ -309,7 +313,7 @@ def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, sta
                 break
             advance()
     if read:
-        return read(solver, state)
+        return read(solver, state, float(cost))
     return np.asarray(solver.estimate(state), np.float32)
 
 

@@ -21,6 +21,7 @@ from .methods import METHODS, Method
 from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
 from .surface_fit import SurfaceFit, surface_fitter
+from .warm_start import Followed, following_reconstructor
 
 
 class Result(NamedTuple):
@@ -45,6 +46,7 @@ class Plan:
     suppress: str
     points: bool
     weights: Path | None
+    warm_start: bool = False
 
     @classmethod
     def of(
@@ -60,6 +62,7 @@ class Plan:
         suppress: str = "none",
         points: bool = False,
         weights: Path | None = None,
+        warm_start: bool = False,
         **method_options: float | None,
     ) -> "Plan":
         """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
@@ -80,13 +83,16 @@ class Plan:
                 f"--stop-at-noise must be used with list-rl, richardson-lucy, fista or admm, got --method {method}."
             )
         solver = _method(method, steps, weights, method_options)
+        if warm_start and not isinstance(solver, Followed):
+            raise InputError(f"--warm-start must be used with list-rl or richardson-lucy, got --method {method}.")
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
-        return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights)
+        return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
     def prepare(self, progress: Progress, *, in_time: bool = False) -> Callable[[Image, Progress], Result]:
         """Compute what all images share; return the function that reconstructs one.
 
-        `in_time`: the images follow each other, so that a surface is fitted from the last one on.
+        `in_time`: the images follow each other, so that a surface, and with `warm_start` a volume, starts from the last
+        one.
         """
         clean = volume_of = fit = None
         if self.suppress == "unet":
@@ -98,7 +104,10 @@ class Plan:
             fit = surface_fitter(self.imager, self.grid, self.method, **how)
         elif self.suppress != "points":
             options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
-            volume_of = reconstructor(self.imager, self.grid, self.method, **options, progress=progress)
+            prepare = partial(reconstructor, method=self.method)
+            if self.warm_start and in_time and isinstance(self.method, Followed):
+                prepare = partial(following_reconstructor, method=self.method)
+            volume_of = prepare(self.imager, self.grid, **options, progress=progress)
         # Computed once, and only if points are asked for.
         sharp = cache(partial(sharpness, self.imager, self.grid))
 

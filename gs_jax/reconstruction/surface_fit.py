@@ -119,7 +119,7 @@ def surface_fitter(
     depths = np.asarray(grid.depths, np.float64)
     step = float(np.abs(np.gradient(depths)).mean()) if depths.size > 1 else 0.0
 
-    def read(solver, state):
+    def read(solver, state, _):
         planes, sd = (np.asarray(part, np.float64) for part in depth_of_sheets(state))
         brightness = np.asarray(state.sheets.root, np.float32) ** 2
         dark = ~(brightness > _DARK * np.percentile(brightness, 99))

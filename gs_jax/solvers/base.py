@@ -18,6 +18,9 @@ from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
 
+# Weights with a standard deviation of one voxel.
+_BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+
 
 class UnmatchedAdjointOperator(eqx.Module):
     """Operator with a back-projection that is not its adjoint: `A.mv` is `forward.mv`, `A.T.mv` is `back.mv`.
@@ -188,6 +191,16 @@ def lambda_max(back: Float[Array, "*shape"]) -> Float[Array, ""]:
     on.
     """
     return jnp.maximum(jnp.max(back), 0)
+
+
+def blurred(x: Float[Array, "depth y x"]) -> Float[Array, "depth y x"]:
+    """A volume blurred laterally, with a standard deviation of one voxel; zeros are beyond it."""
+    reach = len(_BINOMIAL) // 2
+    for axis in (1, 2):
+        padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(3)])
+        shifted = [lax.slice_in_dim(padded, i, i + x.shape[axis], axis=axis) for i in range(len(_BINOMIAL))]
+        x = sum((w * part for w, part in zip(_BINOMIAL, shifted, strict=True)), jnp.zeros_like(x))
+    return x
 
 
 def norm(x: PyTree) -> Float[Array, ""]:

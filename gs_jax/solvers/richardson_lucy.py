@@ -15,7 +15,17 @@ from jaxtyping import Array, Float, Num
 from ..base.arrays import divide
 from ..base.errors import InputError
 from ..typing import Real
-from .base import Operator, as_image, check_options, differences, differences_adjoint, kept_pixels, magnitude, norm
+from .base import (
+    Operator,
+    as_image,
+    blurred,
+    check_options,
+    differences,
+    differences_adjoint,
+    kept_pixels,
+    magnitude,
+    norm,
+)
 
 # Default number of background knots along each side: their spacing is wider than the stray light of a spot.
 BACKGROUND_KNOTS = 8
@@ -23,6 +33,8 @@ BACKGROUND_KNOTS = 8
 _MIN_DENOMINATOR = 0.1
 # Rounding errors of an FFT, in units of the type's precision times the largest sensitivity.
 _ROUNDING = 100
+# Share of a uniform volume in that from which the next image of a recording starts.
+_UNIFORM = 0.1
 # Initial level of the background relative to the mean pixel: the voxels explain the light first.
 _INITIAL_BACKGROUND = 0.02
 
@@ -137,6 +149,18 @@ class RichardsonLucy(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.x
+
+
+def restarted(state: State) -> State:
+    """State from which the next image of a recording starts: the estimate, blurred by a voxel for what has moved.
+
+    A tenth of the light is uniform, as steps do not light dark voxels.
+    """
+    seen = state.sensitivity > 0
+    uniform = jnp.where(seen, jnp.mean(state.x, where=seen), 0)
+    x = (1 - _UNIFORM) * blurred(state.x) + _UNIFORM * uniform
+    momentum = (x, jnp.zeros_like(x), jnp.zeros((), x.dtype)) if state.momentum else None
+    return state._replace(x=x, momentum=momentum)
 
 
 def bilinear_background(knots: Float[Array, "knot knot"] | None, image: Float[Array, "..."]) -> Float[Array, "..."]:

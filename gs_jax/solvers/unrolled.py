@@ -21,7 +21,7 @@ from ..base.errors import InputError
 from ..io import weights
 from ..io.provenance import Provenance
 from ..typing import PathLike
-from .base import Operator, UnmatchedAdjointOperator, as_image, check_options, kept_pixels, norm
+from .base import Operator, UnmatchedAdjointOperator, as_image, blurred, check_options, kept_pixels, norm
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
     RichardsonLucy,
@@ -42,8 +42,6 @@ _DARK, _FAINT = 1e-2, 1e-3
 _MAX_FACTOR = 20.0
 # Rows of voxels that a network processes at once, which bounds the memory.
 _ROWS = 128
-# Binomial weights with a standard deviation of one voxel: where light is likely, it is likely in neighbours, too.
-_BLUR = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 _MAX_STEPS, _MAX_WIDTH = 64, 1024
 _LUCY = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS)
 
@@ -261,7 +259,8 @@ def initialize_unrolled(
 def _start_gradients(A, image, lucy: LucyState) -> ConjugateGradients:
     x, forward = lucy.x, A.forward if isinstance(A, UnmatchedAdjointOperator) else A
     residual_image = image - forward.mv(x) - bilinear_background(lucy.knots, image)
-    variance = _blur(_blur(x, 1), 2) * divide(jnp.vdot(x, x), jnp.sum(x))
+    # Where light is likely, it is likely in neighbours, too.
+    variance = blurred(x) * divide(jnp.vdot(x, x), jnp.sum(x))
     residual = _least_squares_operator(A).T.mv(image)
     product = jnp.vdot(residual, variance * residual)
     noise, cost = jnp.mean(residual_image**2, where=_where_kept(A)), jnp.vdot(image, image) / 2
@@ -289,12 +288,6 @@ def _where_kept(A: Operator) -> Array | None:
 
 def _least_squares_operator(A: Operator) -> lx.AbstractLinearOperator:
     return (A.least_squares or A.forward) if isinstance(A, UnmatchedAdjointOperator) else A
-
-
-def _blur(x, axis):
-    reach, size = len(_BLUR) // 2, x.shape[axis]
-    padded = jnp.pad(x, [(reach, reach) if along == axis else (0, 0) for along in range(x.ndim)])
-    return sum(w * lax.slice_in_dim(padded, i, i + size, axis=axis) for i, w in enumerate(_BLUR))
 
 
 def _rms(x):
