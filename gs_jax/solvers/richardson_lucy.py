@@ -33,7 +33,7 @@ BACKGROUND_KNOTS = 8
 _MIN_DENOMINATOR = 0.1
 # Rounding errors of an FFT, in units of the type's precision times the largest sensitivity.
 _ROUNDING = 100
-# Share of a uniform volume in that from which the next image of a recording starts.
+# Uniform share of the volume from which the next image of a recording starts.
 _UNIFORM = 0.1
 # Initial level of the background relative to the mean pixel: the voxels explain the light first.
 _INITIAL_BACKGROUND = 0.02
@@ -154,7 +154,7 @@ class RichardsonLucy(eqx.Module):
 def restarted(state: State) -> State:
     """State from which the next image of a recording starts: the estimate, blurred by a voxel for what has moved.
 
-    A tenth of the light is uniform, as steps do not light dark voxels.
+    A tenth is uniform, because steps multiply: they never light a voxel that is dark.
     """
     seen = state.sensitivity > 0
     uniform = jnp.where(seen, jnp.mean(state.x, where=seen), 0)
