@@ -346,7 +346,7 @@ def test_shrinking_is_the_proximal_map(isotropic):
 @pytest.mark.integration
 @pytest.mark.parametrize("tv", [0.0, 0.01])
 def test_few_applications_of_the_operator_reach_the_minimum(tv):
-    """Fewer equations than unknowns, as of a volume. FISTA's power method is not counted."""
+    """Fewer equations than unknowns, as of a volume. FISTA's search of the largest eigenvalue is not counted."""
     A = lx.MatrixLinearOperator(jax.random.uniform(jax.random.key(0), (60, 120)))
     scene = jnp.zeros(120).at[jnp.array([3, 20, 21, 50])].set(1.0)
     image = A.mv(scene) + 0.05 * jax.random.normal(jax.random.key(1), (60,))
