@@ -26,6 +26,7 @@ from gs_jax import (
 from gs_jax.design.design import read_design
 from gs_jax.detection.point_finder import find_points
 from gs_jax.geometry import falloff
+from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
 from gs_jax.optics.psf_core import (
@@ -207,7 +208,8 @@ def test_zones_are_the_lenses_apertures():
 
 
 @pytest.mark.integration
-def test_tables_are_kept_for_the_same_microscope():
+def test_tables_are_kept_for_the_same_microscope(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scope = imager(pixels=(24, 24), pitch=0.2)
     first = field_varying_psf(scope, [20.0])
     assert field_varying_psf(imager(pixels=(24, 24), pitch=0.2), [20.0]) is first
@@ -218,6 +220,11 @@ def test_tables_are_kept_for_the_same_microscope():
         field_varying_psf(scope, [20.0], extent=2.0),
     ):
         assert other is not first
+    # And for the next process: four files.
+    field_varying._cached_tables.cache_clear()
+    monkeypatch.setattr(field_varying, "_trace_tables", lambda request: pytest.fail("traced again"))
+    assert eqx.tree_equal(field_varying_psf(scope, [20.0]), first)
+    assert len(list(tmp_path.rglob("*.npz"))) == 4
 
 
 def test_rings_add_up_to_the_falloff():

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int, Num
 
+from ..base.disk_cache import cached_on_disk
 from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -104,7 +105,7 @@ def field_varying_psf(
     rings: Sequence[float] = RINGS,
     progress: Progress | None = None,
 ) -> FieldVaryingPsf:
-    """Trace the tables of a microscope at some depths: a second each; the last ones are cached.
+    """Trace the tables of a microscope at some depths: a second each. They are kept in the user's cache folder.
 
     They are constants to JAX: derivatives by the lens centres and the sensor's distance move the spots and leave their
     shapes. For another lens, make new tables.
@@ -151,6 +152,17 @@ class _Request:
 # Captures of a microscope share tables, one for each type of lens; 80 MiB each at full scale.
 @lru_cache(maxsize=4)
 def _cached_tables(request: _Request) -> FieldVaryingPsf:
+    structure, *leaves = request.key
+    key = (repr((structure, request.grid, request.rings)).encode(), *leaves)
+    tables = cached_on_disk(key, lambda: _trace_tables(request))
+    to_jax = lambda name: jnp.asarray(tables[name], request.imager.sensor_distance.dtype)
+    stray_light = StrayLight(*map(to_jax, ("table", "area", "sensor_distance")), request.grid)
+    cores = map(to_jax, ("distortion", "light", "kernel", "wide_kernels"))
+    return FieldVaryingPsf(*cores, stray_light, request.rings)
+
+
+def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
+    """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name."""
     imager, depths, grid, progress = request.imager, request.depths, request.grid, request.progress
     cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, request.rings, progress)
     stray_light = trace_stray_light(imager, depths, grid, cores, request.rings, progress)
@@ -158,9 +170,8 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     kernel = np.stack([render_kernel(profile, size) for profile in cores.profile[:, 0]])
     outer = cores.profile[:, 1:]
     wide = np.stack([[render_kernel(profile, size // 4 * 2 + 1, 0.5) for profile in profiles] for profiles in outer])
-    tables = (jnp.asarray(part, imager.sensor_distance.dtype) for part in (cores.distortion, cores.light, kernel, wide))
-    distortion, light, kernel, wide = tables
-    return FieldVaryingPsf(distortion, light, kernel, wide, stray_light, request.rings)
+    arrays = {"distortion": cores.distortion, "light": cores.light, "kernel": kernel, "wide_kernels": wide}
+    return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
 
 
 def kernel_size(imager: Imager, grid: PolarGrid) -> int:

@@ -1,0 +1,87 @@
+"""Arrays that take seconds to compute, kept in the user's cache folder for the next process."""
+
+import contextlib
+import hashlib
+import os
+import sys
+import uuid
+import zipfile
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+# Of all files together; those that were not read for the longest time are removed.
+_MOST_BYTES = 2**29
+_NO_CACHE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+
+
+def cached_on_disk(key: Iterable[bytes], compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Read arrays of an earlier process from the cache, or compute and keep them.
+
+    A folder that cannot be written, a full disk and a damaged file mean that the arrays are computed. Another version
+    of the package's source computes them anew.
+
+    Parameters
+    ----------
+    key
+        All that the arrays depend on.
+    compute
+        Returns the arrays by name.
+    """
+    try:
+        path = cache_folder() / f"{_digest(key)}.npz"
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        os.utime(path)
+        return arrays
+    except RuntimeError:  # no home folder
+        return compute()
+    except _NO_CACHE:
+        arrays = compute()
+    with contextlib.suppress(*_NO_CACHE):
+        _write(path, arrays)
+    return arrays
+
+
+def cache_folder() -> Path:
+    """The folder of this package in the user's cache: `$XDG_CACHE_HOME/gs_jax`, or the platform's.
+
+    Raises `RuntimeError` if the user has no home folder.
+    """
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder) / "gs_jax"
+    if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
+        return Path(folder) / "gs_jax" / "Cache"
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "gs_jax"
+
+
+def _digest(key: Iterable[bytes]) -> str:
+    digest = hashlib.sha256(_source())
+    for part in key:
+        digest.update(hashlib.sha256(part).digest())
+    return digest.hexdigest()
+
+
+@cache
+def _source() -> bytes:
+    """A hash of the package's source: any change of it may change the arrays."""
+    package = Path(__file__).parents[1]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))).digest()
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Whole or not at all: another process may read it.
+    temporary = path.with_name(f"{uuid.uuid4().hex}.npz")
+    try:
+        np.savez(temporary, allow_pickle=False, **arrays)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    used = 0
+    for file in sorted(path.parent.glob("*.npz"), key=lambda file: -file.stat().st_mtime):
+        used += file.stat().st_size
+        if used > _MOST_BYTES:
+            file.unlink(missing_ok=True)

@@ -1,0 +1,75 @@
+"""Arrays that are kept for the next process."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs_jax.base import disk_cache
+from gs_jax.base.disk_cache import cached_on_disk
+
+
+class Counted:
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self):
+        self.calls += 1
+        return {"a": np.arange(6.0).reshape(2, 3), "b": np.float32(0.1)}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "gs_jax"
+
+
+def test_arrays_are_computed_once(folder):
+    compute = Counted()
+    first, second = (cached_on_disk([b"x", b"y"], compute) for _ in range(2))
+    assert compute.calls == 1 and len(list(folder.iterdir())) == 1
+    for name in ("a", "b"):
+        assert first[name].dtype == second[name].dtype
+        np.testing.assert_array_equal(first[name], second[name])
+    cached_on_disk([b"xy"], compute)
+    assert compute.calls == 2
+
+
+def test_a_damaged_file_is_replaced(folder):
+    compute = Counted()
+    cached_on_disk([b"x"], compute)
+    (file,) = folder.iterdir()
+    for content in (b"", b"nonsense", file.read_bytes()[:300]):
+        file.write_bytes(content)
+        cached_on_disk([b"x"], compute)
+    cached_on_disk([b"x"], compute)
+    assert compute.calls == 4
+
+
+def test_nothing_is_kept_where_nothing_can_be_written(tmp_path, monkeypatch):
+    compute = Counted()
+    (tmp_path / "gs_jax").write_text("a file in place of the folder")
+    assert cached_on_disk([b"x"], compute)["a"].shape == (2, 3)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+
+    def no_home():
+        raise RuntimeError("no home")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    assert cached_on_disk([b"x"], compute)["a"].shape == (2, 3) and compute.calls == 2
+
+
+def test_files_that_were_not_read_for_longest_are_removed(folder, monkeypatch):
+    compute = Counted()
+    cached_on_disk([b"x"], compute)
+    size = next(folder.iterdir()).stat().st_size
+    monkeypatch.setattr(disk_cache, "_MOST_BYTES", 2.5 * size)
+    cached_on_disk([b"y"], compute)
+    for age, file in enumerate(folder.iterdir()):
+        os.utime(file, (1e9 - age, 1e9 - age))
+    cached_on_disk([b"x"], compute)
+    cached_on_disk([b"z"], compute)
+    assert len(list(folder.iterdir())) == 2 and compute.calls == 3
+    cached_on_disk([b"x"], compute)
+    assert compute.calls == 3
