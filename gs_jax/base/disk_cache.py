@@ -32,12 +32,13 @@ def cached_on_disk(key: Iterable[bytes], compute: Callable[[], dict[str, np.ndar
     """
     try:
         path = cache_folder() / f"{_digest(key)}.npz"
+    except RuntimeError:  # no home folder
+        return compute()
+    try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         os.utime(path)
         return arrays
-    except RuntimeError:  # no home folder
-        return compute()
     except _NO_CACHE:
         arrays = compute()
     with contextlib.suppress(*_NO_CACHE):

@@ -154,11 +154,13 @@ class _Request:
 def _cached_tables(request: _Request) -> FieldVaryingPsf:
     structure, *leaves = request.key
     key = (repr((structure, request.grid, request.rings)).encode(), *leaves)
-    tables = cached_on_disk(key, lambda: _trace_tables(request))
-    to_jax = lambda name: jnp.asarray(tables[name], request.imager.sensor_distance.dtype)
-    stray_light = StrayLight(*map(to_jax, ("table", "area", "sensor_distance")), request.grid)
-    cores = map(to_jax, ("distortion", "light", "kernel", "wide_kernels"))
-    return FieldVaryingPsf(*cores, stray_light, request.rings)
+    arrays = cached_on_disk(key, lambda: _trace_tables(request))
+    tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
+    stray_light = StrayLight(tables["table"], tables["area"], tables["sensor_distance"], request.grid)
+    kernels = {"kernel": tables["kernel"], "wide_kernels": tables["wide_kernels"]}
+    return FieldVaryingPsf(
+        tables["distortion"], tables["light"], **kernels, stray_light=stray_light, rings=request.rings
+    )
 
 
 def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
