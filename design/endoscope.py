@@ -1,11 +1,14 @@
-"""Write `endoscope-start.toml`, the initial design of the endoscope's study: `python design/endoscope.py`."""
+"""Write `endoscope-start.toml`, the initial design of the endoscope's study: `python design/endoscope.py`.
+
+The file is in `experiments/designs`.
+"""
 
 from pathlib import Path
 
 from gs_jax.design.design import ArrayTable, Design, ImagingTable, LensTable, SensorTable, write_design
 from gs_jax.layouts import random_layout
 
-HERE = Path(__file__).parent
+STARTS = Path(__file__).parents[1] / "experiments" / "designs"
 SIZE = (4.4, 4.4)
 
 
@@ -20,9 +23,9 @@ def main() -> None:
         imaging=ImagingTable(
             sensor_distance_mm=1.4, working_distance_mm=(5.0, 6.5), wavelength_nm=520.0, field_radius_mm=0.9
         ),
-        provenance={"note": "a guess, to be optimised with studies/endoscope.toml"},
+        provenance={"note": "a guess, to be optimised with design/studies/endoscope.toml"},
     )
-    write_design(HERE / "endoscope-start.toml", design)
+    write_design(STARTS / "endoscope-start.toml", design)
 
 
 if __name__ == "__main__":

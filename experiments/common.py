@@ -26,6 +26,8 @@ from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
 from gs_jax.pictures import PALETTE
 
+# Designs that only experiments use.
+DESIGNS = Path(__file__).parent / "designs"
 OPTIONAL_PATH = {"type": Path, "nargs": "?"}
 # Resolution of all pictures of experiments.
 matplotlib.rcParams.update({"axes.prop_cycle": cycler(color=PALETTE), "font.size": 9.5, "legend.frameon": False})
@@ -91,6 +93,12 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]], title: str | No
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def design_file(name: str) -> Path:
+    """File of a design that comes with the package, or of one in `DESIGNS`."""
+    shipped = DESIGNS.parents[1] / "design" / f"{name}.toml"
+    return shipped if shipped.exists() else DESIGNS / shipped.name
 
 
 def design_of(data: Path | None) -> Design:

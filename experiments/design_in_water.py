@@ -9,11 +9,9 @@ of the same study, which starts from `geomscope` with the layers. Depths are 18,
 Writes `water.json` and `water.md`; about two minutes of processor time.
 """
 
-from pathlib import Path
-
 import numpy as np
 
-from experiments.common import Report, main, table
+from experiments.common import DESIGNS, Report, design_file, main, table
 from gs_jax import Design, objectives, read_design, read_study, run_study
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
@@ -21,7 +19,7 @@ from gs_jax.codesign.terms import TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.objectives import Conditions
 
-DESIGNS, DEPTHS = Path(__file__).parents[1] / "design", (18.0, 20.5, 23.0)
+DEPTHS = (18.0, 20.5, 23.0)
 LAYERS = {
     "object": [{"name": "filter", "thickness_mm": 2.0, "refractive_index": 1.52}],
     "sensor": [{"thickness_mm": 0.6}, {"name": "window", "thickness_mm": 0.55, "refractive_index": 1.51}],
@@ -35,8 +33,8 @@ WATER = {
 
 def run(progress: Progress) -> dict[str, dict]:
     """The numbers of each design."""
-    air = read_design(DESIGNS / "geomscope-exposure.toml")
-    start = read_design(DESIGNS / "geomscope.toml").replace(name="geomscope-water", layers=LAYERS, sample=WATER)
+    air = read_design(design_file("geomscope-exposure"))
+    start = read_design(design_file("geomscope")).replace(name="geomscope-water", layers=LAYERS, sample=WATER)
     study = read_study(DESIGNS / "studies" / "geomscope-exposure.toml")
     found = run_study(start, study.model_copy(update={"name": "geomscope-exposure-water"}), progress=progress).design
     designs = {

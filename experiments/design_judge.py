@@ -26,7 +26,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.common import Report, main, table
+from experiments.common import Report, design_file, main, table
 from experiments.lens_scenes import cropped
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
@@ -46,7 +46,6 @@ from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import run_solver
 from gs_jax.simulation.phantoms import letters
 
-FOLDER = Path(__file__).parents[1] / "design"
 # Those for 18 to 23 mm; the first defines the exposures.
 DESIGNS = ("geomscope", "geomscope-exposure", "geomscope-optimized", "geomscope-asphere", "geomscope-table1")
 DESIGNS += ("geomscope-targets",)
@@ -332,8 +331,8 @@ def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
 
 def report(designs: list[Path], span: list[float], draws: int, rays: int, records: Path, progress: Progress) -> Report:
     settings = Settings(span=(span[0], span[1]), rays=rays)
-    files = designs or [FOLDER / f"{name}.toml" for name in DESIGNS]
-    reference = read_design(FOLDER / f"{DESIGNS[0]}.toml").imager()
+    files = designs or [design_file(name) for name in DESIGNS]
+    reference = read_design(design_file(DESIGNS[0])).imager()
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
     imagers = {read_design(file).name or file.stem: read_design(file).imager() for file in files}

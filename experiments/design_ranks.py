@@ -25,8 +25,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.stats import rankdata
 
-from experiments.common import Report, main, table
-from experiments.design_judge import DESIGNS, FOLDER, READ_NOISE, VOXEL, Settings, device, image_of, scene
+from experiments.common import Report, design_file, main, table
+from experiments.design_judge import DESIGNS, READ_NOISE, VOXEL, Settings, device, image_of, scene
 from experiments.ray_tracer import bundles
 from gs_jax import Imager, quality, random_layout, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
@@ -188,14 +188,14 @@ def report(records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
     make_folder(records.parent)
     kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else {"bright": {}, "found": {}}
-    reference = device(read_design(FOLDER / f"{DESIGNS[0]}.toml").imager(), SETTINGS)
+    reference = device(read_design(design_file(DESIGNS[0])).imager(), SETTINGS)
 
     def brightest(kind: str, draw: int) -> float:
         if (key := f"{kind} {draw}") not in kept["bright"]:
             kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
         return kept["bright"][key]
 
-    designs = [read_design(FOLDER / f"{name}.toml") for name in DESIGNS] + [random_design(k) for k in range(RANDOM)]
+    designs = [read_design(design_file(name)) for name in DESIGNS] + [random_design(k) for k in range(RANDOM)]
     for design in progress.track(designs, "Designs"):
         record = kept["found"].setdefault(str(design.name), {})
         if "psnr_db" not in record:

@@ -1,7 +1,7 @@
 """Error of volumes against light and span of depths, for spheres and conics with either side facing the object.
 
 For each span of depths, share of a point's light and lens type (with one to three foci), the search of
-`geomscope-exposure` (in `design/studies`) minimises `volume_error`: the error of the best linear estimate of a volume
+`geomscope-exposure` (`designs/studies`) minimises `volume_error`: the error of the best linear estimate of a volume
 at equal exposure, in which a lens out of focus contributes blur and its light contributes noise, so that it is fair to
 lenses of one focus and of several. The search uses four planes over the span; the results are means over these and the
 three halfway between them, which are resolved separately, so that foci on the searched planes only do not pay. Light is
@@ -14,7 +14,6 @@ the result with less light.
 Writes `lens_front.json`, `lens_front.md` and `lens_front.png`; about half an hour on a core.
 """
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
-from experiments.common import Report, main, table
+from experiments.common import DESIGNS, Report, design_file, main, table
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
@@ -35,7 +34,6 @@ from gs_jax.design.conversion import reduced_depth
 from gs_jax.design.design import Design, read_design
 from gs_jax.pictures import PALETTE
 
-FOLDER = Path(__file__).parents[1] / "design"
 SPANS = ((18.0, 23.0), (17.0, 25.0), (15.0, 30.0))
 # Shares of the light of a point 20.5 mm away, %, and their tolerance.
 LIGHTS, MIDDLE, MORE = (0.05, 0.1, 0.2, 0.4), 20.5, 1.02
@@ -63,7 +61,7 @@ KINDS = {
 
 def study_of(kind: Kind, span: tuple[float, float], steps: int) -> Study:
     """Study of a lens type over a span, without a mask, and with lower and upper limits of the light."""
-    data = read_study(FOLDER / "studies" / "geomscope-exposure.toml").model_dump()
+    data = read_study(DESIGNS / "studies" / "geomscope-exposure.toml").model_dump()
     kept = [term for term in data["terms"] if term["name"] in (*_TARGETS, "volume_error")]
     sides = ("at_least", "at_most")
     kept += [{"name": "light_percent", side: 1.0, "weight": 30.0} for side in sides]
@@ -109,7 +107,7 @@ def front(kind: Kind, span: tuple[float, float], lights, followed: list[dict] | 
 
 def posed(kind: Kind, span: tuple[float, float], steps: int) -> tuple[Design, Study]:
     """Initial design of a lens type, and its study."""
-    design, study = read_design(FOLDER / f"{kind.design}.toml"), study_of(kind, span, steps)
+    design, study = read_design(design_file(kind.design)), study_of(kind, span, steps)
     lens = design.lens if kind.conic else design.lens.model_copy(update={"conic_constant": 0.0})
     return initial_design(design.model_copy(update={"lens": lens}), study), study
 

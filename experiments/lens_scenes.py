@@ -12,7 +12,6 @@ Writes `lens_scenes.json`, `lens_scenes.md` and `lens_scenes.png`; about twenty 
 """
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from experiments.common import Report, main, table
+from experiments.common import Report, design_file, main, table
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, RichardsonLucy, Sensor, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
@@ -30,7 +29,6 @@ from gs_jax.lenses import EACH
 from gs_jax.metrics import quality
 from gs_jax.simulation.phantoms import letters, random_points, rasterize, snowflake
 
-FOLDER = Path(__file__).parents[1] / "design"
 DESIGNS = ("geomscope", "geomscope-optimized", "geomscope-asphere")
 DEPTHS = (18.5, 20.5, 22.5)
 # Position and size of each depth's part of a scene, mm.
@@ -89,7 +87,7 @@ def run(names=DESIGNS, *, samples: int = SAMPLES, rays: int = RAYS, progress: Pr
     """Return for each scene the truth, and for each design and exposure scores and the volume."""
     count = round(FIELD / VOXEL) | 1
     grid = Grid(DEPTHS, (count, count), VOXEL)
-    imagers = {name: cropped(read_design(FOLDER / f"{name}.toml").imager(), **sizes) for name in names}
+    imagers = {name: cropped(read_design(design_file(name)).imager(), **sizes) for name in names}
     results: dict[str, Any] = {}
     for scene, emitters in scenes().items():
         truth = np.asarray(rasterize(emitters, grid), np.float32)

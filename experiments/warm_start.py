@@ -16,8 +16,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from experiments.common import Report, main, table
-from experiments.design_judge import FOLDER, READ_NOISE, Settings, device, image_of, scene
+from experiments.common import Report, design_file, main, table
+from experiments.design_judge import READ_NOISE, Settings, device, image_of, scene
 from gs_jax import Imager, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
@@ -74,7 +74,7 @@ def measured(reconstruct: Callable, frames: list[tuple[np.ndarray, np.ndarray]])
 
 def report(design: str, progress: Progress) -> Report:
     settings = Settings()
-    imager = device(read_design(FOLDER / f"{design}.toml").imager(), settings)
+    imager = device(read_design(design_file(design)).imager(), settings)
     afresh = {
         name: reconstructor(imager, settings.grid, METHODS[name](20), progress=Progress())
         for name in ("backproject", *FOLLOWED, "unrolled")

@@ -29,11 +29,12 @@ LISTS = (
     "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um spot_width_um spot_radius_um"
 ).split()
 SCALARS = "f_number numerical_aperture focal_length_mm pitch_mm pitch_sd_mm field_radius_mm coverage".split()
+TABLE1 = Path(__file__).parents[1] / "experiments" / "designs" / "geomscope-table1.toml"
 
 
 @pytest.fixture(scope="module")
 def table1():
-    return read_design(Path(__file__).parents[1] / "design" / "geomscope-table1.toml")
+    return read_design(TABLE1)
 
 
 def changed(design, table, **values):
@@ -255,10 +256,9 @@ def test_the_built_in_design_matches_its_file():
 
 @pytest.mark.integration
 def test_the_command(tmp_path, monkeypatch, capsys, table1):
-    design = Path(__file__).parents[1] / "design" / "geomscope-table1.toml"
     output = tmp_path / "sheet.json"
     options = ("--depths", "20:22:1", "--confusion-um", "18", "--json", output)
-    status, out, err = run(monkeypatch, capsys, "metrics", design, *options)
+    status, out, err = run(monkeypatch, capsys, "metrics", TABLE1, *options)
     assert (status, err) == (0, "")
     assert json.loads(output.read_text()) == datasheet(table1, [20.0, 21.0, 22.0], circle_of_confusion=0.018)
     assert "- At 20 mm the image forms 2 mm behind the sensor" in out and "the circle of confusion, 18 um" in out

@@ -24,7 +24,8 @@ from gs_jax.design.design import Design, read_design, write_design
 
 from .helpers import examples, needs
 
-SHIPPED = sorted((Path(__file__).parents[1] / "design").glob("*.toml"))
+ROOT = Path(__file__).parents[1]
+DESIGNS = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder).glob("*.toml"))
 
 BASE = {
     "name": "small",
@@ -448,7 +449,7 @@ def test_the_shape_of_a_lens_goes_to_the_imager_and_back(tmp_path):
 
 
 @pytest.mark.parametrize("x64", [False, True])
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", DESIGNS, ids=lambda path: path.stem)
 def test_a_design_is_its_imagers(path, x64):
     with jax.enable_x64(x64):
         design = read_design(path).model_copy(update={"provenance": {}})

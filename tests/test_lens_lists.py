@@ -96,7 +96,7 @@ def test_editors_know_lists_and_columns():
 
 def test_searches_keep_which_lens_is_of_which_kind(tmp_path):
     design = read_design(written(tmp_path, LISTS))
-    study = read_study("design/studies/geomscope-targets.toml")
+    study = read_study("experiments/designs/studies/geomscope-targets.toml")
     assert lenses_by_type(problem_of(design, study).imager.array) == ((0, 2), (1,))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import gs_jax as gs
+from experiments.common import design_file
 from gs_jax import Design, Grid, InputError
 from gs_jax.apps.report.page import write_report
 from gs_jax.apps.tolerance_analysis import tolerance
@@ -41,8 +42,8 @@ PIXEL_PITCH, PLATE = 13e-3 / 3, 9.2 / 3
 
 
 def cropped(name: str, *, lenses: int = LENSES, shape=(PIXELS, PIXELS), **tables) -> Design:
-    """The lenses of a shipped design nearest to the axis, at most these, and as much of its sensor as they cover."""
-    design = gs.read_design(Path(__file__).parents[1] / "design" / f"{name}.toml")
+    """The lenses of a design nearest to the axis, at most these, and as much of its sensor as they cover."""
+    design = gs.read_design(design_file(name))
     centers = np.array(design.array.centers_mm)
     data, field = design.model_dump(), design.imaging.field_radius_mm
     away = np.abs(centers).max(1)
@@ -106,6 +107,8 @@ def mirrored() -> Design:
 
 DEVICES: dict[str, Callable[[], Design]] = {
     **{name: lambda name=name: cropped(name, lenses=18 if "endoscope" in name else LENSES) for name in SHIPPED},
+    "out of focus": lambda: cropped("geomscope-table1"),
+    "steep": lambda: cropped("geomscope-targets"),
     "curved side": turned_round,
     "conic": lambda: cropped("geomscope", lens={"conic_constant": -0.6}),
     "aspheric": lambda: cropped("geomscope", lens={"conic_constant": -0.5, "aspheric_terms": [-1e-3, 2e-4]}),
@@ -338,10 +341,10 @@ REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
-    ("geomscope-table1", "calibrate"): "of 20 bright spots on lenses",
+    ("out of focus", "calibrate"): "of 20 bright spots on lenses",
 }
-# Out of focus as printed: whatever reads the cores of spots warns of it.
-WARNED = {("geomscope-table1", task) for task in ("points", "list-rl", "unrolled")}
+# Whatever reads the cores of spots warns.
+WARNED = {("out of focus", task) for task in ("points", "list-rl", "unrolled")}
 
 # `make test` runs one task of each kind for every device, these in turn and these always; `make integration` the rest.
 IN_TURN = (tuple(METHODS), ("points", "calibrate", "pattern"))
@@ -349,7 +352,6 @@ ALWAYS = ("design", "map", "metrics", "mold", "optimise")
 # What people are told to use first; a report takes long, so once.
 ALSO = (
     ("geomscope-asphere", "points"),
-    ("geomscope-exposure", "points"),
     ("geomscope-optimized", "report"),
 )
 
@@ -369,8 +371,8 @@ def pairs():
             yield pytest.param(device, task, "near", marks=marks, id=f"{device}-{task}")
     for task in ("points", "backproject", "list-rl", "richardson-lucy", "map"):
         yield pytest.param(LARGE, task, "near", marks=pytest.mark.integration, id=f"{LARGE}-{task}")
-    # The designs that are recommended most, with all of the light.
-    for device in ("geomscope-asphere", "geomscope-exposure"):
+    # The designs with sharp spots, with all of the light.
+    for device in ("geomscope-asphere", "geomscope-optimized"):
         for task in ("points", *METHODS):
             yield pytest.param(device, task, "full", marks=pytest.mark.integration, id=f"{device}-{task}-full")
 

@@ -278,7 +278,7 @@ def test_the_contrast_of_a_perfect_lens():
 
 def test_a_wide_spot_has_the_light_that_rays_bring():
     """The spot of an f/1.5 sphere is far wider than its window, into which diffraction folded light from beside it."""
-    imager = read_design(Path(__file__).parents[1] / "design" / "geomscope-targets.toml").imager()
+    imager = read_design(Path(__file__).parents[1] / "experiments" / "designs" / "geomscope-targets.toml").imager()
     psfs = drawings.simulate_psfs(imager, np.array([20.0]), 1.76, 0.64)
     aperture = 0.88 * np.sqrt(np.random.default_rng(0).random((4000, 1)))
     angle = 2 * np.pi * np.random.default_rng(1).random((4000, 1))

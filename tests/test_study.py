@@ -11,7 +11,8 @@ from gs_jax.codesign.study import KINDS, Solver, Study, TermTable, parent_path, 
 from gs_jax.codesign.terms import TERMS, Term
 from gs_jax.objectives import spot_width
 
-STUDIES = sorted((Path(__file__).parents[1] / "design" / "studies").glob("*.toml"))
+ROOT = Path(__file__).parents[1]
+STUDIES = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder / "studies").glob("*.toml"))
 
 STUDY = """
 depths_mm = [18.0, 23.0]
@@ -35,7 +36,7 @@ def read(tmp_path):
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
-def test_the_studies_that_come_with_the_designs(path):
+def test_the_studies_of_the_repository_start_from_designs(path):
     study = read_study(path)
     assert parent_path(path, study).exists()
 

@@ -12,9 +12,7 @@ from .options import DESIGN, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 
-@click.command(
-    "optimize", epilog="Example: gs-jax optimize design/geomscope-table1.toml --study study.toml -o new.toml"
-)
+@click.command("optimize", epilog="Example: gs-jax optimize design/geomscope.toml --study study.toml -o new.toml")
 @click.argument("design", type=DESIGN)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: free parameters, goals and solvers.")
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint of an interrupted run beside NEW.toml.")

@@ -1,6 +1,6 @@
 """Study files: what is free, what is wanted, and how it is searched for, as TOML.
 
-design = "../geomscope-table1.toml"     # to start from; `gs-jax optimize` takes its own
+design = "../geomscope.toml"            # to start from; `gs-jax optimize` takes its own
 name = "geomscope-optimized"
 depths_mm = [18.0, 23.0]
 confusion_um = 36.0
