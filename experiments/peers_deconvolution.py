@@ -58,14 +58,14 @@ def _averaged(a: np.ndarray, factor: int) -> np.ndarray:
 
 
 def run(problem: dict, pythons: dict[str, str], steps: dict[str, int], progress: Progress) -> dict[str, dict]:
-    """Run each code on a problem; results by code, as the runs write them."""
+    """Run each code, or a method of it, on a problem; results by the names in `steps`, as the runs write them."""
     script = str(Path(__file__).with_name("peers_deconvolution_runs.py"))
     results = {}
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(given, **problem)
-        for code in [code for code in steps if code in pythons]:
-            python = pythons[code]
+        for code in [code for code in steps if code.split()[0] in pythons]:
+            python = pythons[code.split()[0]]
             with progress.step(code):
                 command = [python, script, code, str(given), str(found), str(steps[code])]
                 done = subprocess.run(command, capture_output=True, text=True)

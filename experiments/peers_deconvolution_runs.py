@@ -1,9 +1,10 @@
-"""Run one solver of `peers_deconvolution.py` in the environment that has it, step by step.
+"""Run one solver of `peers_deconvolution.py` or `peers_steps.py` in the environment that has it, step by step.
 
     PYTHON experiments/peers_deconvolution_runs.py CODE INPUT.npz OUTPUT.npz STEPS
 
-CODE is gs_jax, scico or LenslessPiCam (`pip install scico`, `pip install lensless`, each in an environment of its own).
-After each step the objective of its scene is computed here, in NumPy and SciPy, the same for all; this is not timed.
+CODE is gs_jax, scico or LenslessPiCam (`pip install scico`, `pip install lensless`, each in an environment of its own),
+for its ADMM, or one with a method, such as "scico FISTA". After each step the objective of its scene is computed here,
+in NumPy and SciPy, the same for all; this is not timed.
 """
 
 import math
@@ -11,8 +12,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.metadata import version
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -20,6 +23,8 @@ import scipy.fft
 WARM_UP = 2
 # Penalties and relaxation of scico's example of this problem.
 PENALTIES, RELAXATION = (1.0, 5.0, 10.0), 1.8
+# What the steps of Richardson-Lucy that are written here divide an image by, at least; its norm is 1.
+SMALLEST = 1e-8
 
 
 class Problem:
@@ -66,19 +71,40 @@ def gs_jax(problem: Problem) -> Callable[[], Run]:
     A = ConvolutionOperator(problem.stack, problem.image.shape)
     unit = float(jax.jit(lambda A, y: A.T.mv(y).max())(A, problem.image))
     weights = {"tv": problem.tv / unit, "sparsity": problem.l1 / unit, "tv_z": 0.0}
-    solver = ConvolutionADMM(1, isotropic=problem.isotropic, nonnegative=not problem.signed, **weights)
+    return _ours(problem, ConvolutionADMM(1, isotropic=problem.isotropic, nonnegative=not problem.signed, **weights))
+
+
+def gs_jax_fista(problem: Problem) -> Callable[[], Run]:
+    from gs_jax import FISTA
+
+    return _ours(problem, FISTA(1, sparsity=0.0))
+
+
+def gs_jax_richardson_lucy(problem: Problem) -> Callable[[], Run]:
+    from gs_jax import RichardsonLucy
+
+    return _ours(problem, RichardsonLucy(1))
+
+
+def _ours(problem: Problem, solver: Any) -> Callable[[], Run]:
+    import jax
+
+    from gs_jax import ConvolutionOperator
+
+    A = ConvolutionOperator(problem.stack, problem.image.shape)
     init, step = jax.jit(solver.init), jax.jit(solver.step, donate_argnums=2)
 
     def start() -> Run:
         state = jax.block_until_ready(init(A, problem.image))
         while True:
             state = jax.block_until_ready(step(A, problem.image, state)[0])
-            yield partial(np.asarray, state.best), float(state.cost)
+            yield partial(np.asarray, solver.estimate(state)), float(getattr(state, "cost", math.nan))
 
     return start
 
 
-def scico(problem: Problem) -> Callable[[], Run]:
+def scico(problem: Problem, prints: bool = True) -> Callable[[], Run]:
+    """With `prints` a step includes the objective that scico prints after it."""
     import jax
     from scico.functional import (  # pyright: ignore[reportMissingImports]
         L1Norm,
@@ -86,22 +112,11 @@ def scico(problem: Problem) -> Callable[[], Run]:
         NonNegativeIndicator,
         ZeroFunctional,
     )
-    from scico.linop import (  # pyright: ignore[reportMissingImports]
-        CircularConvolve,
-        Crop,
-        FiniteDifference,
-        Identity,
-        Sum,
-    )
+    from scico.linop import FiniteDifference, Identity  # pyright: ignore[reportMissingImports]
     from scico.loss import SquaredL2Loss  # pyright: ignore[reportMissingImports]
     from scico.optimize.admm import ADMM, G0BlockCircularConvolveSolver  # pyright: ignore[reportMissingImports]
 
-    shape = (len(problem.stack), *problem.size)
-    options = {"input_shape": shape, "input_dtype": np.float32}
-    middle = np.array(problem.stack.shape[1:]) // 2
-    pads = [(rows.start, n - rows.stop) for rows, n in zip(problem.window(problem.size), problem.size, strict=True)]
-    crop = Crop(tuple(pads), input_shape=problem.size, input_dtype=np.float32)
-    convolve = CircularConvolve(jax.device_put(problem.stack), h_center=middle, ndims=2, **options)
+    crop, blur, options = _scico_operators(problem)
     differences = FiniteDifference(axes=(-2, -1), circular=True, **options)
     last = problem.l1 * L1Norm() if problem.signed else NonNegativeIndicator()
 
@@ -113,7 +128,7 @@ def scico(problem: Problem) -> Callable[[], Run]:
                 problem.tv * (L21Norm() if problem.isotropic else L1Norm()),
                 last,
             ],
-            C_list=[Sum(axis=0, **options) @ convolve, differences, Identity(**options)],
+            C_list=[blur, differences, Identity(**options)],
             rho_list=list(PENALTIES),
             alpha=RELAXATION,
             subproblem_solver=G0BlockCircularConvolveSolver(ndims=2),
@@ -122,9 +137,62 @@ def scico(problem: Problem) -> Callable[[], Run]:
         while True:
             solver.step()
             jax.block_until_ready([solver.x, *solver.z_list, *solver.u_list])
-            yield partial(_of_sign, solver.x, problem.signed), float(solver.objective())
+            yield partial(_of_sign, solver.x, problem.signed), float(solver.objective()) if prints else math.nan
 
     return start
+
+
+def scico_fista(problem: Problem) -> Callable[[], Run]:
+    import jax
+    from scico.functional import NonNegativeIndicator  # pyright: ignore[reportMissingImports]
+    from scico.loss import SquaredL2Loss  # pyright: ignore[reportMissingImports]
+    from scico.optimize import AcceleratedPGM  # pyright: ignore[reportMissingImports]
+
+    crop, blur, options = _scico_operators(problem)
+    loss = SquaredL2Loss(y=jax.device_put(problem.image), A=crop @ blur)
+    largest = float(np.abs(np.fft.rfft2(problem.stack, problem.size)).max() ** 2)
+
+    def start() -> Run:
+        zeros = jax.device_put(np.zeros(options["input_shape"], np.float32))
+        solver = AcceleratedPGM(loss, NonNegativeIndicator(), largest, zeros, itstat_options={"display": False})
+        while True:
+            solver.step()
+            jax.block_until_ready([solver.x, solver.v])
+            yield partial(np.asarray, solver.x), math.nan
+
+    return start
+
+
+def scico_richardson_lucy(problem: Problem) -> Callable[[], Run]:
+    """Written here with scico's operators."""
+    import jax
+
+    crop, blur, options = _scico_operators(problem)
+    # Its crop cannot be compiled.
+    blur.jit()
+    A, image = crop @ blur, jax.device_put(np.maximum(problem.image, 0))
+    seen = jax.device_put(_where_seen(np.asarray(A.adj(jax.numpy.ones_like(image)))))
+
+    def start() -> Run:
+        x = jax.device_put(np.ones(options["input_shape"], np.float32))
+        while True:
+            x = jax.block_until_ready(x * A.adj(image / jax.numpy.maximum(A(x), SMALLEST)) / seen)
+            yield partial(np.asarray, x), math.nan
+
+    return start
+
+
+def _scico_operators(problem: Problem) -> tuple[Any, Any, dict]:
+    """Crop, sum of convolutions, and the shape and type of scenes."""
+    import jax
+    from scico.linop import CircularConvolve, Crop, Sum  # pyright: ignore[reportMissingImports]
+
+    options = {"input_shape": (len(problem.stack), *problem.size), "input_dtype": np.float32}
+    middle = np.array(problem.stack.shape[1:]) // 2
+    pads = [(rows.start, n - rows.stop) for rows, n in zip(problem.window(problem.size), problem.size, strict=True)]
+    crop = Crop(tuple(pads), input_shape=problem.size, input_dtype=np.float32)
+    convolve = CircularConvolve(jax.device_put(problem.stack), h_center=middle, ndims=2, **options)
+    return crop, Sum(axis=0, **options) @ convolve, options
 
 
 def _of_sign(scene, signed: bool) -> np.ndarray:
@@ -144,7 +212,65 @@ def LenslessPiCam(problem: Problem) -> Callable[[], Run]:
     return start
 
 
-CODES = {code.__name__: code for code in (gs_jax, scico, LenslessPiCam)}
+def LenslessPiCam_fista(problem: Problem) -> Callable[[], Run]:
+    """Of a scene that ends where the image does."""
+    from lensless import FISTA  # pyright: ignore[reportMissingImports]
+
+    def start() -> Run:
+        psf = problem.stack[..., None].astype(np.float32)
+        solver = FISTA(psf, norm="backward", initial_est=np.zeros_like(psf[None]))
+        solver.set_data(problem.image[None, None, :, :, None].astype(np.float32))
+        for number in count():
+            solver._update(number)
+            yield partial(_within, solver._xk, problem), math.nan
+
+    return start
+
+
+def LenslessPiCam_richardson_lucy(problem: Problem) -> Callable[[], Run]:
+    """Written here with its convolution, of a scene that ends where the image does."""
+    from lensless.recon.rfft_convolve import RealFFTConvolve2D  # pyright: ignore[reportMissingImports]
+
+    A = RealFFTConvolve2D(problem.stack[..., None], norm="backward")
+    image = np.maximum(problem.image, 0)[None, None, :, :, None]
+    seen = _where_seen(A.deconvolve(np.ones_like(image)))
+
+    def start() -> Run:
+        x = np.ones_like(image)
+        while True:
+            x = x * A.deconvolve(image / np.maximum(A.convolve(x), SMALLEST)) / seen
+            yield partial(_within, x, problem), math.nan
+
+    return start
+
+
+def _where_seen(sensitivity: np.ndarray) -> np.ndarray:
+    """Infinite where there is rounding alone, so that scenes are dark there."""
+    return np.where(sensitivity > 1e-4 * sensitivity.max(), sensitivity, np.inf).astype(np.float32)
+
+
+def _within(scene, problem: Problem) -> np.ndarray:
+    """The middle of a scene that is dark beside it."""
+    whole = np.zeros((1, *problem.size), np.float32)
+    whole[(0, *problem.window(problem.size))] = scene[0, 0, ..., 0]
+    return whole
+
+
+# Names begin with that of the code.
+CODES: dict[str, Callable[[Problem], Callable[[], Run]]] = {
+    **{code.__name__: code for code in (gs_jax, scico, LenslessPiCam)},
+    "gs_jax ADMM": gs_jax,
+    "gs_jax FISTA": gs_jax_fista,
+    "gs_jax Richardson-Lucy": gs_jax_richardson_lucy,
+    "scico ADMM": partial(scico, prints=False),
+    "scico FISTA": scico_fista,
+    "scico Richardson-Lucy": scico_richardson_lucy,
+    "LenslessPiCam ADMM": LenslessPiCam,
+    "LenslessPiCam FISTA": LenslessPiCam_fista,
+    "LenslessPiCam Richardson-Lucy": LenslessPiCam_richardson_lucy,
+}
+# Packages whose versions are written, by the code.
+PACKAGES = {"gs_jax": ("gs-jax", "jax"), "scico": ("scico", "jax"), "LenslessPiCam": ("lensless", "scipy")}
 
 
 def peak_mib() -> float:
@@ -174,6 +300,7 @@ def main() -> None:
     seen = scene[:, *problem.window(scene.shape[1:])]
     np.savez(
         results,
+        versions=", ".join(f"{package} {version(package)}" for package in PACKAGES[code.split()[0]]),
         objectives=objectives,
         printed=printed,
         peak_mib=memory,

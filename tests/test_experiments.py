@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from experiments import table1
+from experiments import peers_steps, table1
 from experiments.common import Report, main, table, write
 from gs_jax.base.progress import Progress
 
@@ -53,6 +53,20 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
     with pytest.raises(TypeError):
         write(tmp_path, Report({"a.json": {"a": object()}}))
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"] and (tmp_path / "a.json").read_text() == "old"
+
+
+def test_ratios_of_steps_are_of_the_same_round():
+    """The machine is twice as slow in the second round, and three times in the third."""
+    step = {"processor_seconds": [1.0], "peak_mib": 1.0, "objectives": [3.0, 2.0], "versions": "a 1"}
+    codes = {"gs_jax FISTA": 1.0, "peer FISTA": 0.5}
+    rounds = [
+        {name: step | {"seconds": np.cumsum(3 * [load * seconds])} for name, seconds in codes.items()}
+        for load in (1.0, 2.0, 3.0)
+    ]
+    ours, theirs = peers_steps.rows_of(rounds)
+    assert (ours["seconds_a_step"], ours["over_ours"]) == (2.0, 1.0)
+    assert (theirs["code"], theirs["method"], theirs["seconds_a_step"]) == ("peer", "FISTA", 1.0)
+    assert (theirs["over_ours"], theirs["objective"]) == (0.5, 2.0)
 
 
 @pytest.mark.slow
