@@ -8,7 +8,7 @@ of NumPy. scico and LenslessPiCam have no Richardson-Lucy: its step is written i
     python -m experiments.peers_steps DATA [--scico PYTHON] [--lensless PYTHON] [--rounds 3] [--out DIR]
 
 DATA holds the folder `diffusercam`; PYTHON are those of environments with the peers. Writes `peers_steps.json` and
-`peers_steps.md`; about ten minutes on two cores.
+`peers_steps.md`; about five minutes on two cores.
 """
 
 import sys
