@@ -86,21 +86,25 @@ def make_scenes(width: float) -> dict[str, Emitters]:
     behind = sheet(
         (np.abs(x - 0.1 * width) < 0.25 * width) & (np.abs(y) < 0.3 * width), far - 0.8 + 0.1 * x, texture(x, y, 3)
     )
-    rng = np.random.default_rng(0)
-    sizes = np.array([0.35 * width, 0.35 * width, half - 0.2])
-    blobs = rng.uniform(-sizes, sizes, (60, 3)) + [0, 0, middle]
-    blobs = (blobs[:, None] + rng.normal(0, 0.15, (60, 2000, 3))).reshape(-1, 3)
     named = {"tilted snowflake": flake, "curved leaf": leaf, "hemisphere": dome}
-    both = np.concatenate([front, behind])
-    return named | {"two sheets": both, "blobs": np.column_stack([blobs, np.ones(len(blobs))])}
+    return named | {"two sheets": np.concatenate([front, behind]), "blobs": blobs(width, 0)}
 
 
-def texture(x, y, seed: int) -> np.ndarray:
+def blobs(width: float, seed: int) -> Emitters:
+    """60 Gaussian blobs at random places, for a sensor of this width, mm."""
+    rng, middle = np.random.default_rng(seed), float(np.mean(DEPTHS))
+    sizes = np.array([0.35 * width, 0.35 * width, (DEPTHS[1] - DEPTHS[0]) / 2 - 0.2])
+    middles = rng.uniform(-sizes, sizes, (60, 3)) + [0, 0, middle]
+    points = (middles[:, None] + rng.normal(0, 0.15, (60, 2000, 3))).reshape(-1, 3)
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def texture(x, y, seed: int, z: float | np.ndarray = 0.0) -> np.ndarray:
     """Light that varies over about 0.1 mm, log-normal."""
     rng = np.random.default_rng(seed)
-    frequencies, phases = rng.normal(0, 1 / 0.12, (40, 2)), rng.uniform(0, 2 * np.pi, 40)
-    waves = sum(np.cos(x * a + y * b + p) for (a, b), p in zip(frequencies, phases, strict=True))
-    return np.exp(0.8 * waves / np.sqrt(20))
+    frequencies, phases, along = rng.normal(0, 1 / 0.12, (40, 2)), rng.uniform(0, 2 * np.pi, 40), rng.normal(size=40)
+    parts = zip(frequencies, phases, along / 0.12, strict=True)
+    return np.exp(0.8 * sum(np.cos(x * a + y * b + z * c + p) for (a, b), p, c in parts) / np.sqrt(20))
 
 
 def capture(emitters: Emitters, imager: Imager, count: int = EMITTERS) -> np.ndarray:
@@ -156,7 +160,7 @@ class Methods:
         self.unrolled = reconstructor(imager, self.grid, METHODS["unrolled"](20), progress=progress)
 
 
-def noisy(clean: np.ndarray, electrons: int) -> np.ndarray:
+def noisy(clean: np.ndarray, electrons: float) -> np.ndarray:
     """Shot noise of so many electrons in the brightest pixel, readout noise, and an offset."""
     rng = np.random.default_rng(1)
     image = rng.poisson(clean * electrons / clean.max()) + rng.normal(0, READ, clean.shape)
