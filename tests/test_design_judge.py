@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from experiments import design_changes
 from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, scene
 from experiments.ray_tracer import traced
-from gs_jax import Imager, MicrolensArray, Sensor, rasterize
+from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
 
 IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
@@ -56,3 +57,11 @@ def test_emitters_that_share_rays_make_the_same_image():
     assert shared.sum() == pytest.approx(own.sum(), rel=2e-3)
     error = squares(shared) - squares(own)
     assert np.linalg.norm(error) < 0.03 * np.linalg.norm(squares(own))
+
+
+def test_changes_of_the_microscope_are_designs():
+    start = geomscope()
+    for change in design_changes.CHANGES.values():
+        assert start.replace(**change).imager().array.centers.shape == (200, 2)
+    fewer = np.array(design_changes.fewer_lenses(start).array.centers_mm)
+    assert len(fewer) == pytest.approx(200 / design_changes.SPREAD**2, rel=0.1)
