@@ -146,7 +146,7 @@ def reconstruct_command(
     from ..io.recordings import open_recording
     from ..io.surfaces import SURFACE_SUFFIXES, write_surface
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
-    from ..projection.linear_map import xla_only
+    from ..projection.linear_map import compiled_for_cpu
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
@@ -206,7 +206,7 @@ def reconstruct_command(
         reconstruct = plan.prepare(progress)
         # Back-projection alone runs its kernels once; iterative methods and points run them many times.
         is_single_pass = method_options["method"] == "backproject" and plan.suppress != "points" and not points
-        with xla_only() if is_single_pass else nullcontext():
+        with compiled_for_cpu("xla") if is_single_pass else nullcontext():
             result = reconstruct(image, progress)
         residual = plan.check(result.volume, image, progress) if plan.is_learned else None
         predicted = _score_in_words(plan.score(image, progress)) if score else None

@@ -9,11 +9,13 @@ back-projection is dB/d(volume), the ray-optics image of a volume is dB/d(image)
 geometry, which JAX propagates to lens positions, distances and depths. Each is written out because JAX would transpose
 the gather to a scatter, which is twenty times slower on a CPU.
 
-Each scans the lenses, one patch of voxels at a time and all depths at once, so that the memory is image + volume + one
-patch. `lax.cond` skips lenses that see no voxel. It also stops XLA from fusing the loop body into one in-place update
-on one core: what a branch returns is computed separately, on all cores.
+The forms here are for CPUs without kernels; those for GPUs and TPUs are in `tiles`. Each scans the lenses, one patch of
+voxels at a time and all depths at once, so that the memory is image + volume + one patch. `lax.cond` skips lenses that
+see no voxel. It also stops XLA from fusing the loop body into one in-place update on one core: what a branch returns is
+computed separately, on all cores.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,20 +24,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from . import tiles
 from .linear_map import LinearMap
-from .rays import Axis, Envelope, Rays, RingLight
+from .rays import Axis, Pair, Rays, Shapes, interpolate, pairs
 
 # Side of the square of pixels that the adjoint writes at once: its buffers stay in the cache. The magnification, which
 # may be traced, changes the number of squares and not their size.
 _BLOCK = 160
-
-
-class Shapes(NamedTuple):
-    """What must be known before tracing."""
-
-    image: tuple[int, int]
-    volume: tuple[int, int, int]
-    weight: Envelope | RingLight
+# Lenses at once in the gradient by the rays on GPUs and TPUs, which bounds the memory.
+_LENSES = 16
 
 
 def _gather(shapes: Shapes, rays: Rays, image):
@@ -48,13 +45,13 @@ def _gather(shapes: Shapes, rays: Rays, image):
             weight = _weights(shapes, y, x, rays.parameters)
             if image is None:
                 return weight
-            return weight * _interpolate(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
+            return weight * _between(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
 
         new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
         return _update_patch(volume, new, y, x), None
 
     volume = jnp.zeros(shapes.volume, rays.parameters.dtype)
-    return lax.scan(add_lens, volume, (rays.y, rays.x, *_pairs(shapes, rays)))[0]
+    return lax.scan(add_lens, volume, (rays.y, rays.x, *pairs(shapes, rays)))[0]
 
 
 def _scatter(shapes: Shapes, rays: Rays, volume):
@@ -88,11 +85,11 @@ def _continuous(rays: Rays):
     return rays.y.fraction, rays.y.distance2, rays.x.fraction, rays.x.distance2, rays.parameters
 
 
-def _rays_vjp(shapes: Shapes, constants, volume):
+def _rays_vjp(shapes: Shapes, constants, volume, at_once=None):
     """dB/d(rays), of the `_continuous` ones: sums over one axis of the derivatives along the other."""
     rays, image = constants
 
-    def add_lens(total, lens):
+    def of_lens(lens):
         y, x, y_pair, x_pair = lens
         patch = _patch(volume, y, x)
         distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
@@ -101,14 +98,13 @@ def _rays_vjp(shapes: Shapes, constants, volume):
             sample, along_y, along_x = jnp.ones_like(patch), jnp.zeros_like(patch), jnp.zeros_like(patch)
         else:
             corners = _if_seen(shapes, y, x, lambda: _corners(image, y_pair, x_pair))
-            sample, along_y, along_x = _interpolate(corners, y_pair, x_pair)
+            sample, along_y, along_x = _between(corners, y_pair, x_pair)
         by_distance2, by_parameters = weight_vjp(patch * sample)
         by_y, by_x = patch * weight * along_y, patch * weight * along_x
-        return total + by_parameters[:, 0, 0], (by_y.sum(2), by_distance2.sum(2), by_x.sum(1), by_distance2.sum(1))
+        return by_y.sum(2), by_distance2.sum(2), by_x.sum(1), by_distance2.sum(1), by_parameters[:, 0, 0]
 
-    total = jnp.zeros_like(rays.parameters)
-    by_parameters, by_axes = lax.scan(add_lens, total, (rays.y, rays.x, *_pairs(shapes, rays)))
-    return *by_axes, by_parameters
+    *by_axes, by_parameters = lax.map(of_lens, (rays.y, rays.x, *pairs(shapes, rays)), batch_size=at_once)
+    return *by_axes, by_parameters.sum(0)
 
 
 def _rays_vjp_transpose(shapes: Shapes, constants, cotangents):
@@ -116,7 +112,12 @@ def _rays_vjp_transpose(shapes: Shapes, constants, cotangents):
     return jax.linear_transpose(lambda volume: _rays_vjp(shapes, constants, volume), volume)(cotangents)[0]
 
 
-_continuous_vjp = LinearMap(_rays_vjp, _rays_vjp_transpose, kernels=("rays_vjp", None))
+_continuous_vjp = LinearMap(
+    _rays_vjp,
+    _rays_vjp_transpose,
+    kernels=("rays_vjp", None),
+    accelerated=(partial(_rays_vjp, at_once=_LENSES), None),
+)
 
 
 def rays_vjp(shapes: Shapes, rays: Rays, image, volume) -> Rays:
@@ -126,23 +127,8 @@ def rays_vjp(shapes: Shapes, rays: Rays, image, volume) -> Rays:
 
 
 # `(shapes, rays, image)` to dB/d(volume), `(shapes, rays, volume)` to dB/d(image); both differentiable.
-image_to_volume = LinearMap(_gather, _scatter, rays_vjp, ("gather", "scatter"))
+image_to_volume = LinearMap(_gather, _scatter, rays_vjp, ("gather", "scatter"), (tiles.gather, tiles.scatter))
 volume_to_image = image_to_volume.T
-
-
-class _Pair(NamedTuple):
-    """The two pixels between which a ray is interpolated; always on the sensor, even if the ray is not."""
-
-    low: Int[Array, "... depth voxel"]
-    fraction: Float[Array, "... depth voxel"]
-
-
-def _pairs(shapes: Shapes, rays: Rays) -> tuple[_Pair, _Pair]:
-    def pair(axis, pixels):
-        low = jnp.clip(axis.pixel, 0, pixels - 2)
-        return _Pair(low, axis.fraction + (axis.pixel - low).astype(axis.fraction.dtype))
-
-    return pair(rays.y, shapes.image[0]), pair(rays.x, shapes.image[1])
 
 
 def _patch(volume, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
@@ -176,7 +162,7 @@ def _if_seen(shapes: Shapes, y: Axis, x: Axis, compute):
     return lax.cond(seen, compute, lambda: zeros)
 
 
-def _corners(image, y: _Pair, x: _Pair):
+def _corners(image, y: Pair, x: Pair):
     """The four pixels around each ray, `(depth, y, x)` each."""
     row, column = y.low[:, :, None], x.low[:, None, :]
     read = lambda down, right: (
@@ -185,14 +171,8 @@ def _corners(image, y: _Pair, x: _Pair):
     return read(0, 0), read(0, 1), read(1, 0), read(1, 1)
 
 
-def _interpolate(corners, y: _Pair, x: _Pair):
-    """The interpolated pixel and its derivatives by the row and column of the ray."""
-    upper_left, upper_right, lower_left, lower_right = corners
-    down, right = y.fraction[:, :, None], x.fraction[:, None, :]
-    upper = upper_left + right * (upper_right - upper_left)
-    lower = lower_left + right * (lower_right - lower_left)
-    along_x = (1 - down) * (upper_right - upper_left) + down * (lower_right - lower_left)
-    return upper + down * (lower - upper), lower - upper, along_x
+def _between(corners, y: Pair, x: Pair):
+    return interpolate(corners, y.fraction[:, :, None], x.fraction[:, None, :])
 
 
 class _Blocks(NamedTuple):

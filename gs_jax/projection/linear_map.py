@@ -1,4 +1,7 @@
-"""Linear maps with hand-written transposes and derivatives: a JAX primitive, which CPUs run by compiled kernels."""
+"""Linear maps with hand-written transposes and derivatives: a JAX primitive with a form for each platform.
+
+CPUs run compiled kernels where there are any, GPUs and TPUs a form without loops over lenses.
+"""
 
 import warnings
 from collections.abc import Callable, Hashable, Iterator
@@ -8,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 from threading import Lock
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -41,12 +44,15 @@ class LinearMap:
         the constants. Its leaves at integer constants are ignored. None: JAX derives it.
     kernels
         Names in `cpu.dispatch` of the functions that replace `function` and `transpose` on a CPU in float32.
+    accelerated
+        Functions that replace `function` and `transpose` on GPUs and TPUs. None: the same as on CPUs.
     """
 
     function: Callable
     transpose: Callable
     constants_vjp: Callable | None = None
     kernels: tuple[str | None, str | None] = (None, None)
+    accelerated: tuple[Callable | None, Callable | None] = (None, None)
 
     def __call__(self, static: Hashable, constants: PyTree, x: PyTree) -> PyTree:
         flat_constants, constants_tree = tree.flatten(constants)
@@ -61,7 +67,8 @@ class LinearMap:
         vjp = self.constants_vjp
         # A transpose of a transpose equals the map, whose compiled programs serve it.
         vjp = vjp.constants_vjp if isinstance(vjp, _Swapped) else vjp and _Swapped(vjp)
-        return LinearMap(self.transpose, self.function, vjp, (self.kernels[1], self.kernels[0]))
+        (kernel, of_transpose), (form, of_transposed) = self.kernels, self.accelerated
+        return LinearMap(self.transpose, self.function, vjp, (of_transpose, kernel), (of_transposed, form))
 
 
 @dataclass(frozen=True)
@@ -120,21 +127,25 @@ def _jvp(primals, tangents, *, call):
     moving = tuple(i for i, t in enumerate(constants_dot) if type(t) is not ad.Zero)
     if moving:
         dots = [constants_dot[i] for i in moving]
-        derivative = LinearMap(_by_constants, _by_constants_transpose) if call.map.constants_vjp else _by_constants
+        derivative = _derivative if call.map.constants_vjp else _by_constants
         terms.append(derivative((call, moving), primals, dots))
     return y, [sum(term[1:], term[0]) for term in zip(*terms, strict=True)]
 
 
-def _by_constants(static, primals, dots):
+def _by_constants(static, primals, dots, function=None):
     call, moving = static
 
     def move(values):
         arrays = list(primals)
         for i, value in zip(moving, values, strict=True):
             arrays[i] = value
-        return call(*arrays)
+        return call(*arrays, function=function)
 
     return jax.jvp(move, ([primals[i] for i in moving],), (list(dots),))[1]
+
+
+def _by_constants_accelerated(static, primals, dots):
+    return _by_constants(static, primals, dots, static[0].map.accelerated[0])
 
 
 def _by_constants_transpose(static, primals, y):
@@ -144,6 +155,9 @@ def _by_constants_transpose(static, primals, y):
         call.static, call.constants_tree.unflatten(constants), call.x_tree.unflatten(x), call.y_tree.unflatten(y)
     )
     return [tree.leaves(gradient)[i] for i in moving]
+
+
+_derivative = LinearMap(_by_constants, _by_constants_transpose, accelerated=(_by_constants_accelerated, None))
 
 
 def _transpose(y, *arrays, call):
@@ -164,9 +178,15 @@ def _batch(arrays, axes, *, call):
     return y, [0] * len(y)
 
 
+def _run_on_accelerator(*arrays, call):
+    return call(*arrays, function=call.map.accelerated[0])
+
+
 def _run_on_cpu(*arrays, call):
     """Uses a compiled kernel in float32; float64 is for comparisons."""
-    name = None if _xla_only.get() or jax.default_backend() != "cpu" else call.map.kernels[0]
+    if _form.get() == "accelerated":
+        return _run_on_accelerator(*arrays, call=call)
+    name = None if _form.get() == "xla" or jax.default_backend() != "cpu" else call.map.kernels[0]
     if name is None:
         return call(*arrays)
     _, x = call.split(arrays)
@@ -177,24 +197,28 @@ def _run_on_cpu(*arrays, call):
     return call(*arrays, function=cpu_kernel(name) if suitable else None)
 
 
-mlir.register_lowering(_linear, mlir.lower_fun(lambda *arrays, call: call(*arrays), multiple_results=True))
+mlir.register_lowering(_linear, mlir.lower_fun(_run_on_accelerator, multiple_results=True))
 mlir.register_lowering(_linear, mlir.lower_fun(_run_on_cpu, multiple_results=True), platform="cpu")
 ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batch
 
 _lock = Lock()
-_xla_only = ContextVar("xla_only", default=False)
+_form = ContextVar("form", default="kernels")
 
 
 @contextmanager
-def xla_only() -> Iterator[None]:
-    """Compile without kernels within this context. For a single call XLA is faster than to import numba."""
-    token = _xla_only.set(True)
+def compiled_for_cpu(form: Literal["xla", "accelerated"]) -> Iterator[None]:
+    """How CPUs run what is compiled within this context.
+
+    `"xla"`: without kernels; for a single call that is faster than to import numba. `"accelerated"`: as GPUs and TPUs
+    do, which is several times slower; for tests.
+    """
+    token = _form.set(form)
     try:
         yield
     finally:
-        _xla_only.reset(token)
+        _form.reset(token)
 
 
 def cpu_kernel(name: str) -> Callable | None:

@@ -18,7 +18,7 @@ from ..optics.psf_core import ring_light
 
 # Squared distance, mm^2, added for rays off the sensor: outside the field of every lens, where the envelope and all
 # its derivatives vanish.
-_OUTSIDE = 1e8
+OUTSIDE = 1e8
 # Neighbouring lenses read neighbouring pixels: an order in bands of this height, in field radii, suits the cache best.
 _BAND = 0.5
 
@@ -70,6 +70,14 @@ class RingLight(NamedTuple):
         return ring_light(distance2, parameters, self.inner, self.outer)
 
 
+class Shapes(NamedTuple):
+    """What must be known before tracing."""
+
+    image: tuple[int, int]
+    volume: tuple[int, int, int]
+    weight: Envelope | RingLight
+
+
 def trace(
     imager: Imager,
     grid: Grid,
@@ -107,7 +115,7 @@ def trace(
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
-        distance2 = jnp.where(on_sensor, (offset + axis_offset[None, :, None]) ** 2, _OUTSIDE)
+        distance2 = jnp.where(on_sensor, (offset + axis_offset[None, :, None]) ** 2, OUTSIDE)
         first_coordinate = jax.lax.stop_gradient(coordinate[..., 0])
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
@@ -153,6 +161,30 @@ def _snake(centers: Float[Array, "lens 2"], height: float) -> Int[Array, " lens"
     x, y = jax.lax.stop_gradient(centers).T
     band = jnp.floor(y / height)
     return jnp.lexsort((jnp.where(band % 2 == 0, x, -x), band))
+
+
+class Pair(NamedTuple):
+    """The two pixels between which a ray is interpolated; always on the sensor, even if the ray is not."""
+
+    low: Int[Array, "... depth voxel"]
+    fraction: Float[Array, "... depth voxel"]
+
+
+def pairs(shapes: Shapes, rays: Rays) -> tuple[Pair, Pair]:
+    def pair(axis, pixels):
+        low = jnp.clip(axis.pixel, 0, pixels - 2)
+        return Pair(low, axis.fraction + (axis.pixel - low).astype(axis.fraction.dtype))
+
+    return pair(rays.y, shapes.image[0]), pair(rays.x, shapes.image[1])
+
+
+def interpolate(corners, down, right):
+    """The pixels between four corners, and their derivatives by row and column, at fractions that broadcast."""
+    upper_left, upper_right, lower_left, lower_right = corners
+    upper = upper_left + right * (upper_right - upper_left)
+    lower = lower_left + right * (lower_right - lower_left)
+    along_x = (1 - down) * (upper_right - upper_left) + down * (lower_right - lower_left)
+    return upper + down * (lower - upper), lower - upper, along_x
 
 
 def crop_field(

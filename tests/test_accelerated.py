@@ -1,0 +1,176 @@
+"""The form for GPUs and TPUs, run on a CPU: the same numbers as the other form's, and programs without conditionals."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+from jax.test_util import check_grads
+
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward, make_psf_model
+from gs_jax.optics.field_varying import field_varying_psf
+from gs_jax.projection import tiles
+from gs_jax.projection.bilinear import image_to_volume, rays_vjp, volume_to_image
+from gs_jax.projection.linear_map import compiled_for_cpu
+from gs_jax.projection.rays import Envelope, RingLight, Shapes, trace
+from gs_jax.projection.stray_light import Windows, interpolate_windows
+
+from . import test_full
+from .helpers import scene
+from .test_matrix import cropped
+
+ENVELOPE, RING = Envelope(0.45), RingLight(0.3, 0.5)
+
+
+def lowered(form, function: Callable, *arguments):
+    """A new program: those that were made before are kept."""
+    with compiled_for_cpu(form):
+        return jax.jit(lambda *arguments: function(*arguments)).lower(*arguments)
+
+
+def same(function: Callable, *arguments, tolerance=1e-12) -> Any:
+    """The results, for which both forms must agree relative to the largest number of each array."""
+    programs = [lowered(form, function, *arguments) for form in ("accelerated", "xla")]
+    assert programs[0].as_text() != programs[1].as_text()
+    results, expected = (program.compile()(*arguments) for program in programs)
+    for a, b in zip(jax.tree.leaves(results), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * float(jnp.abs(b).max()))
+    return results
+
+
+def problem(weight, voxels, pitch, *, pixels=(96, 83), lenses=7, nearest=False, dtype=jnp.float64, tilt=None):
+    rng = np.random.default_rng(0)
+    # Some at the sensor's edge, one so far off that nothing is seen through it.
+    centers = np.concatenate([[[0.02, 0.01], [9.0, 9.0]], rng.uniform(-0.3, 0.3, (40, 2))])[:lenses]
+    imager = Imager(MicrolensArray(centers), Sensor(pixels, 0.0045), 5.8, 0.45, tilt=tilt)
+    imager, grid = jax.tree.map(lambda a: a.astype(dtype), (imager, Grid([18.0, 23.0], voxels, pitch)))
+    parameters = jnp.asarray(rng.normal(size=(2, 7)), dtype) if isinstance(weight, RingLight) else None
+    rays = trace(imager, grid, nearest=nearest, dtype=dtype, limit=weight.limit, parameters=parameters)
+    image, volume = (jnp.asarray(rng.random(shape), dtype) for shape in (pixels, grid.volume_shape))
+    return Shapes(pixels, grid.volume_shape, weight), rays, image, volume
+
+
+def both_ways(shapes, rays, image, volume):
+    return (
+        image_to_volume(shapes, rays, image),
+        image_to_volume(shapes, rays, (255 * image).astype(jnp.uint8)),
+        image_to_volume(shapes, rays, None),
+        volume_to_image(shapes, rays, volume),
+    )
+
+
+further = partial(pytest.param, marks=pytest.mark.integration)
+
+
+@pytest.mark.parametrize(
+    ("weight", "voxels", "pitch", "options"),
+    [
+        (ENVELOPE, (40, 66), 0.03, {"tilt": (0.05, -0.03)}),
+        (RingLight(0.0, 0.4), (40, 33), 0.006, {"lenses": 40}),  # two to three rays on a pixel
+        further(RING, (9, 8), 0.21, {}),  # 11 to 15 pixels apart
+        further(ENVELOPE, (40, 33), 0.001, {"nearest": True}),  # up to 18 on a pixel
+        further(ENVELOPE, (5, 3), 0.02, {"lenses": 1, "pixels": (13, 40)}),
+        further(ENVELOPE, (21, 17), 0.05, {"dtype": jnp.float32}),
+    ],
+    ids=str,
+)
+def test_both_forms_give_the_same(weight, voxels, pitch, options, monkeypatch):
+    monkeypatch.setattr(tiles, "_BAND", 2 * 3 * 32**2)  # several bands of the image
+    shapes, *arrays = problem(weight, voxels, pitch, **options)
+    single = options.get("dtype") == jnp.float32
+    volume, *_, image = same(partial(both_ways, shapes), *arrays, tolerance=2e-6 if single else 1e-12)
+    assert volume.any() and image.any()
+
+
+@pytest.mark.parametrize("weight", [ENVELOPE, further(RING)], ids=str)
+def test_both_forms_give_the_same_gradient(weight):
+    """Each lens by itself, more of them than are computed at once. The slope of `cos^4` loses three digits."""
+    shapes, *arrays = problem(weight, (21, 17), 0.05, lenses=20)
+    gradient = lambda *arrays: (rays_vjp(shapes, *arrays), rays_vjp(shapes, arrays[0], None, arrays[2]))
+    same(gradient, *arrays, tolerance=1e-11)
+
+
+def test_windows_are_added_alike():
+    windows, count = Windows((61, 75), 19), 30
+    rng = np.random.default_rng(0)
+    # Some end beyond the image.
+    places = jnp.asarray(rng.integers(-4, 30, (count, 2)), jnp.int32), jnp.asarray(rng.random((count, 2)))
+    spots = jnp.asarray(rng.random((windows.side, windows.side, count)))
+    assert same(partial(interpolate_windows.T, windows), places, spots).any()
+
+
+@pytest.mark.integration
+def test_adjoint_derivatives_and_batches():
+    imager, grid = scene(voxels=(6, 5), pitch=0.15)
+    image, volume = (
+        jax.random.uniform(jax.random.key(n), shape) for n, shape in enumerate((imager.sensor.shape, grid.volume_shape))
+    )
+    smooth = jnp.sin(jnp.arange(image.size) / 300).reshape(image.shape)
+    v = imager.sensor_distance
+    at = lambda v: eqx.tree_at(lambda i: i.sensor_distance, imager, v)
+    with compiled_for_cpu("accelerated"):
+        back = jax.jit(lambda image, v: backproject(image, at(v), grid))
+        forth = jax.jit(lambda volume, v: backproject_adjoint(volume, at(v), grid))
+        np.testing.assert_allclose(jnp.vdot(back(image, v), volume), jnp.vdot(image, forth(volume, v)), rtol=1e-12)
+        # Interpolations have kinks: steps that are small beside a pixel.
+        check_grads(back, (smooth, v), 1, eps=1e-6, atol=1e-5, rtol=1e-5)
+        check_grads(lambda *both: jnp.vdot(smooth, forth(*both)), (volume, v), 1, eps=1e-6, atol=1e-5, rtol=1e-5)
+        batch = jax.jit(jax.vmap(back))(jnp.stack([image, 2 * image]), jnp.stack([0.9 * v, v]))
+    np.testing.assert_allclose(batch[1], 2 * backproject(image, imager, grid), rtol=1e-12)
+
+
+TWO_TYPES_TILTED = {"lens": {"radius_of_curvature_mm": [2.0, 2.06] * 6}, "calibration": {"tilt_deg": (0.6, -0.4)}}
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(("fidelity", "tables"), [("full", {}), ("near", TWO_TYPES_TILTED)])
+def test_the_forward_model_is_the_same(fidelity, tables):
+    imager = cropped("geomscope", lenses=12, shape=(300, 280), **tables).imager()
+    grid = Grid.over(imager.sensor, depths=[18.0, 20.0], pitch=0.08)
+    optics = make_psf_model(imager, grid.depths, fidelity)
+    volume, image = np.random.default_rng(0).random(grid.volume_shape), np.ones(imager.sensor.shape)
+
+    def both(volume, image):
+        made, transpose = jax.vjp(lambda volume: forward(volume, imager, grid, optics), volume)
+        return made, transpose(image), backproject(made, imager, grid)
+
+    same(both, jnp.asarray(volume), jnp.asarray(image))
+
+
+def count(text: str) -> dict[str, int]:
+    """Operations of a StableHLO program."""
+    return {
+        "loops": text.count("stablehlo.while"),
+        "conditionals": text.count("stablehlo.case") + text.count("stablehlo.if"),
+        "scatters": text.count("stablehlo.scatter"),
+    }
+
+
+def exported(function: Callable, *arguments) -> dict[str, int]:
+    """What the program for NVIDIA's GPUs holds."""
+    return count(export.export(jax.jit(function), platforms=["cuda"])(*arguments).mlir_module())
+
+
+def test_projections_for_cuda_have_one_loop_with_a_traced_number_of_steps():
+    imager, grid = scene(jnp.float32)
+    image, volume = (jnp.zeros(shape, jnp.float32) for shape in (imager.sensor.shape, grid.volume_shape))
+    only = lambda loops: {"loops": loops, "conditionals": 0, "scatters": 0}
+    # And one over groups of depths, of the adjoint one over bands; of the gradient one over groups of lenses instead.
+    assert exported(backproject, image, imager, grid) == only(2)
+    assert exported(backproject_adjoint, volume, imager, grid) == only(3)
+    slope = lambda v: jnp.vdot(backproject(image, eqx.tree_at(lambda i: i.sensor_distance, imager, v), grid), volume)
+    assert exported(jax.grad(slope), imager.sensor_distance) == only(3)
+
+
+@pytest.mark.integration
+def test_the_whole_model_for_cuda_has_no_conditional():
+    imager, grid = test_full.imager(jnp.float32), test_full.grid(jnp.float32)
+    optics = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), field_varying_psf(imager, grid.depths))
+    found = exported(forward, jnp.zeros(grid.volume_shape, jnp.float32), imager, grid, optics)
+    assert found == {"loops": 15, "conditionals": 0, "scatters": 0}
