@@ -45,7 +45,8 @@ class LinearMap:
     kernels
         Names in `cpu.dispatch` of the functions that replace `function` and `transpose` on a CPU in float32.
     accelerated
-        Functions that replace `function` and `transpose` on GPUs and TPUs. None: the same as on CPUs.
+        Functions that replace `function` and `transpose` on GPUs and TPUs, but not in second derivatives. None: the
+        same as on CPUs.
     """
 
     function: Callable
@@ -212,7 +213,7 @@ def compiled_for_cpu(form: Literal["xla", "accelerated"]) -> Iterator[None]:
     """How CPUs run what is compiled within this context.
 
     `"xla"`: without kernels; for a single call that is faster than to import numba. `"accelerated"`: as GPUs and TPUs
-    do, which is several times slower; for tests.
+    do, for tests: that is far slower.
     """
     token = _form.set(form)
     try:

@@ -49,11 +49,7 @@ def gather(shapes: Shapes, rays: Rays, image) -> Float[Array, "depth y x"]:
         lens = jnp.moveaxis(lens, 2, 0)[:, None, :, None, :, None]
         y = _place(rays.y, lens, depth, row - _start(rays.y, lens, depth))
         x = _place(rays.x, lens, depth, column - _start(rays.x, lens, depth))
-        distance2 = [
-            jnp.where(place.exists, _take(axis.distance2, place.at), OUTSIDE)
-            for axis, place in ((rays.y, y), (rays.x, x))
-        ]
-        weight = shapes.weight(sum(distance2), parameters)
+        weight = shapes.weight(_distance2(rays.y, y) + _distance2(rays.x, x), parameters)
         if image is not None:
             pixel = _take(y_pair.low, y.at) * shapes.image[1] + _take(x_pair.low, x.at)
             corners = [_take(image, pixel + down + right) for down in (0, shapes.image[1]) for right in (0, 1)]
@@ -98,9 +94,8 @@ def scatter(shapes: Shapes, rays: Rays, volume) -> Float[Array, "row column"]:
                 terms.append(share * _take(volume, voxel))
             return image + sum(terms[1:], terms[0]).sum(0)
 
-        return lax.fori_loop(
-            0, lengths.max() * count**2, add_pairs, jnp.zeros((band, _PIXELS, wide, _PIXELS), volume.dtype)
-        )
+        image = jnp.zeros((band, _PIXELS, wide, _PIXELS), volume.dtype)
+        return lax.fori_loop(0, lengths.max() * count**2, add_pairs, image)
 
     first = _numbers(bands, axis=0, of=1) * (band * _PIXELS)
     in_bands = [a.reshape(bands, band, *a.shape[1:]) for a in (lists, lengths)]
@@ -142,6 +137,10 @@ def _place(axis: Axis, lens, depth, voxel) -> _Place:
     size = axis.pixel.shape[2]
     exists = (lens < len(axis.pixel)) & (voxel >= 0) & (voxel < size)
     return _Place(_of_lens(axis, lens, depth) * size + jnp.clip(voxel, 0, size - 1), exists)
+
+
+def _distance2(axis: Axis, place: _Place):
+    return jnp.where(place.exists, _take(axis.distance2, place.at), OUTSIDE)
 
 
 def _of_lens(axis: Axis, lens, depth):
