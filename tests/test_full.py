@@ -77,16 +77,6 @@ def test_the_adjoint_is_exact(dtype, rtol, pixels):
     assert A.mv(x).dtype == dtype and one > 0
 
 
-@pytest.mark.integration
-def test_nothing_is_scattered():
-    """Some versions of JAX compile a scatter-add for GPUs to loops that wait for each other."""
-    scope, voxels = imager(), grid(shape=(6, 5))
-    A = ImagingOperator(scope, voxels, field_varying_psf(scope, voxels.depths))
-    for operator in (A, A.T):
-        lowered = jax.jit(lambda x, operator=operator: operator.mv(x)).lower(operator.in_structure())
-        assert "stablehlo.scatter" not in lowered.as_text()
-
-
 @pytest.fixture(scope="module")
 def brightness():
     """A weighted sum of an image's pixels, by the volume and the microscope, and where it is taken."""
