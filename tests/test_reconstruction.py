@@ -195,6 +195,13 @@ def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
     assert skip_reason("admm, dense", 30, None, 1e9) is not None
 
 
+@pytest.mark.parametrize("pixels, binning", [(0.5, 1), (1.4, 1), (1.6, 2), (1.99, 2), (2.9, 2), (3.0, 3), (4.2, 4)])
+def test_pixels_are_about_as_wide_as_voxels(pixels, binning):
+    imager = scene(shape=(60, 80))[0]
+    grid = Grid([20.0], (11, 13), pixels * imager.sensor.pixel_pitch / float(imager.magnification(20.0)))
+    assert prepare_model(imager, grid, "pinhole", Progress()).binning == binning
+
+
 def test_pixels_of_any_number_are_summed():
     """61 and 83 have no common divisor: squares of four pixels, and what is left at the end is left out."""
     imager = scene(shape=(61, 83))[0]

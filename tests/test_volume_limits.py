@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from experiments import voxel_width
 from experiments.between_planes import PLANES, Slabs, count, on_planes, spread
 from experiments.surfaces import DEPTHS, STEP
 from experiments.volume_limits import KINDS, cell, flattened, scene
@@ -41,3 +42,14 @@ def test_voxels_between_planes_have_an_exact_adjoint():
 
 def test_intervals_are_students():
     assert cell(np.array([1.0, 2.0, 3.0])) == "2.0 ± 2.5" and cell(np.array([1.0])) == "1.0"
+
+
+def test_finer_voxels_keep_their_light_and_place():
+    grid = Grid([20.0], (9, 7), 0.08, (0.01, -0.02))
+    fine = voxel_width.finer(grid, 0.5)
+    assert fine.pitch == 0.04 and fine.shape == (19, 15) and fine.origin is grid.origin
+    volume = np.zeros(fine.volume_shape, np.float32)
+    volume[0, 9 + 4, 7 - 1] = 1  # 0.16 mm down, and half-way between two columns
+    wide = voxel_width.shared(volume, fine, grid)
+    assert wide[0, 6, 2:5].tolist() == pytest.approx([0.5 if column in (2, 3) else 0 for column in range(2, 5)])
+    assert wide.sum() == pytest.approx(1)

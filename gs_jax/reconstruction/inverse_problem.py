@@ -28,6 +28,8 @@ _DARK_PERCENTILE = 1
 # Minimum half wavelength of a background mode, in pixels of the stray light's grid: the width of a spot's stray light.
 _HALF_WAVE = 6.5
 _ROUNDING = 0.02
+# Largest distance of voxels on the sensor, in binned pixels. Voxels are points: farther apart, their images leave gaps.
+_FARTHEST = 1.5
 
 
 class ImageModel(NamedTuple):
@@ -55,7 +57,8 @@ def prepare_model(imager: Imager, grid: Grid, optics: PsfModel | str, progress: 
         return ImageModel(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
     # At least two binned pixels must remain along each side; what fills no square is left out.
     voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
-    binning = max(1, min(int(voxel + _ROUNDING), min(imager.sensor.shape) // 2))
+    binning = max(int(voxel + _ROUNDING), 1)
+    binning = max(1, min(binning + int(voxel > _FARTHEST * binning), min(imager.sensor.shape) // 2))
     imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
     return ImageModel(imager, make_psf_model(imager, grid.depths, optics, progress=progress), binning, optics != "full")
 

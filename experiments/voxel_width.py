@@ -1,0 +1,104 @@
+"""Reconstruct finer voxels than are wanted, and bring them to the wanted ones.
+
+Letters, beads and tilted sheets of `design_judge`, on voxels of 40 um, and the scenes of `volume_limits`, on voxels of
+80 um, are ray-traced through the paper's lenses. They are reconstructed on voxels of these widths and finer ones, which
+are shared linearly by the wanted voxels before they are scored as there.
+
+    python -m experiments.voxel_width [--draws 1] [--out DIR]
+
+Writes `voxel_width.json` and `voxel_width.md`; about ten minutes on two cores.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments import design_judge, surfaces, volume_limits
+from experiments.common import Report, main, table
+from experiments.ray_tracer import traced
+from gs_jax import Grid, Imager, geomscope, quality, rasterize, reconstruct
+from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.base.progress import Progress
+from gs_jax.reconstruction.methods import METHODS
+
+# Widths of voxels, relative to the wanted ones.
+WIDTHS = (1.0, 0.75, 0.5)
+NAMES = ("unrolled", "list-rl", "richardson-lucy")
+ITERATIONS, ELECTRONS = 20, 3000
+
+
+class Capture(NamedTuple):
+    """An image of a scene, the voxels that are wanted, the truth on these, and its score of a volume, dB."""
+
+    kind: str
+    imager: Imager
+    image: np.ndarray
+    grid: Grid
+    truth: np.ndarray
+    score: Callable[[np.ndarray, np.ndarray], float]
+
+
+def captures(draws: int) -> Iterator[Capture]:
+    """Scenes of both experiments."""
+    settings = design_judge.Settings()
+    imager = design_judge.device(geomscope().imager(), settings)
+    for draw, kind in product(range(draws), ("letters", "beads", "tilted sheets")):
+        one = design_judge.scene(kind, draw, settings)
+        image = surfaces.noisy(design_judge.image_of(one, imager, settings), ELECTRONS)
+        truth = np.asarray(rasterize(one.emitters, settings.grid), np.float32)
+        yield Capture(kind, imager, image, settings.grid, truth, lambda v, t: quality(v, t).psnr_db)
+    imager = surfaces.device("geomscope", volume_limits.PIXELS)
+    depths = np.arange(surfaces.DEPTHS[0], surfaces.DEPTHS[1] + 0.01, surfaces.STEP)
+    grid = Grid.over(imager.sensor, depths=depths, pitch=surfaces.VOXEL)
+    for draw, kind in product(range(draws), volume_limits.KINDS):
+        emitters = volume_limits.scene(kind, draw)
+        clean = traced(emitters, imager, volume_limits.RAYS, volume_limits.TILE)
+        image = surfaces.noisy(clean, volume_limits.ELECTRONS)
+        truth = np.asarray(rasterize(emitters, grid), np.float32)
+        yield Capture(kind, imager, image, grid, truth, volume_limits.gain)
+
+
+def finer(grid: Grid, width: float) -> Grid:
+    """Voxels of a relative width over the same field, one in the middle."""
+    rows, columns = (round(n / width) | 1 for n in grid.shape)
+    return Grid(grid.depths, (rows, columns), width * grid.pitch, grid.origin)
+
+
+def shared(volume: np.ndarray, fine: Grid, grid: Grid) -> np.ndarray:
+    """The light of fine voxels in linear shares of a grid's."""
+    share = lambda fine, wide: np.maximum(1 - np.abs(np.subtract.outer(wide, fine)) / grid.pitch, 0)
+    rows, columns = share(np.asarray(fine.y), np.asarray(grid.y)), share(np.asarray(fine.x), np.asarray(grid.x))
+    return np.einsum("ay,dyx,bx->dab", rows, volume, columns, optimize=True).astype(np.float32)
+
+
+def run(draws: int, progress: Progress) -> list[dict[str, Any]]:
+    """A record of each scene, width and method."""
+    records = []
+    for capture in progress.track(list(captures(draws)), "Scenes"):
+        for width, name in product(WIDTHS, NAMES):
+            fine, began = finer(capture.grid, width), time.process_time()
+            volume = reconstruct(capture.image, capture.imager, fine, METHODS[name](ITERATIONS))
+            record = {"kind": capture.kind, "width": width, "method": name, "seconds": time.process_time() - began}
+            score = capture.score(shared(volume, fine, capture.grid), capture.truth)
+            records.append(record | {"db": float(score)})
+    return records
+
+
+def report(draws: int, progress: Progress) -> Report:
+    records = run(draws, progress)
+    mean = lambda **wanted: np.mean([r["db"] for r in records if wanted.items() <= r.items()])
+    rows = []
+    for kind, name in product(dict.fromkeys(r["kind"] for r in records), NAMES):
+        first, *others = (mean(kind=kind, method=name, width=width) for width in WIDTHS)
+        rows.append([kind, name, f"{first:.1f}", *(f"{other - first:+.1f}" for other in others)])
+    columns = ("scene", "method", "dB", *(f"width {width:g}" for width in WIDTHS[1:]))
+    return Report(
+        {"voxel_width.json": records, "voxel_width.md": markdown_table(columns, rows)}, [table(columns, rows)]
+    )
+
+
+if __name__ == "__main__":
+    main(report, {"--draws": {"type": int, "default": 1}})
