@@ -98,9 +98,9 @@ def reconstruct(
     camera's offset, the image's first percentile (unless it is negative, because it was subtracted before). They run
     step by step and can be interrupted after each; a second call with the same shapes compiles nothing.
 
-    With optics by name, iterative methods bin pixels to about the width of voxels, and light that the optics lack is fitted
-    as background, not by voxels. With "full" that is smooth: FISTA and ADMM leave out the image's lowest cosine modes.
-    With "near" and "pinhole" it is most of the light: the level of squares of 32 pixels.
+    With optics by name, iterative methods bin pixels to about the width of voxels, and light that the optics lack is
+    fitted as background, not by voxels. With "full" that is smooth: FISTA and ADMM leave out the image's lowest cosine
+    modes. With "near" and "pinhole" it is most of the light: the level of squares of 32 pixels.
 
     Parameters
     ----------
