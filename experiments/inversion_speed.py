@@ -31,6 +31,8 @@ from gs_jax.base.progress import Progress
 
 DEPTHS = np.linspace(18.0, 22.0, 9)
 METHODS = ("list-rl", "richardson-lucy", "unrolled", "fista", "admm")
+# `find_points`, `simulate`, and the network that suppresses haze.
+OTHERS = "others"
 # Later calls of the model; a method takes long, and gets one.
 ROUNDS = 3
 HERE = Path(__file__).parents[1]
@@ -59,6 +61,27 @@ def scene(shape: tuple[int, int, int]) -> np.ndarray:
     return volume
 
 
+def others(scope: Any) -> dict[str, Any]:
+    """Time finding 100 points, imaging three planes, and five slices of the network."""
+    import gs_jax as gs
+    from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-8, 8, (100, 2)), rng.uniform(18, 22, 100), np.ones(100)])
+    image = np.asarray(gs.simulate(points, scope))
+    counts = rng.poisson(image * (2000 / image.max())).astype(np.float32)
+    fine, three = voxel_grid(scope, DEPTHS.tolist()), voxel_grid(scope, [18.0, 20.0, 22.0], pixels=PIXELS_PER_VOXEL)
+    planes = np.zeros(three.volume_shape, np.float32)
+    planes[:, 100:200, 100:120] = 1
+    slices = rng.random((5, 512, 512)).astype(np.float32)
+    calls = {
+        "find_points": lambda: gs.find_points(counts, scope, fine),
+        "simulate": lambda: np.asarray(gs.simulate(planes, scope, three)),
+        "suppress": lambda: gs.suppress(slices),
+    }
+    return {name: measure(call, ROUNDS)[0] for name, call in calls.items()}
+
+
 def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
     """Time the model, which renders the capture, or a method, whose volume goes to the folder."""
     import equinox as eqx
@@ -71,6 +94,8 @@ def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
 
     scope = gs.geomscope().imager()
     scope = eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))
+    if name == OTHERS:
+        return others(scope)
     grid = voxel_grid(scope, DEPTHS.tolist(), None, pixels=PIXELS_PER_VOXEL)
     if name == "model":
         began = time.perf_counter()
@@ -111,7 +136,7 @@ def run(checkouts: dict[str, Path], names: list[str], pixels: int, progress: Pro
             found, volumes = {}, []
             for label, checkout in checkouts.items():
                 found[label] = in_checkout(checkout, name, folder, pixels)
-                volumes += [np.load(folder / "volume.npy")] if name != "model" else []
+                volumes += [np.load(folder / "volume.npy")] if name in METHODS else []
             parts = next(iter(found.values()))
             rows += [{"name": part} | {label: each[part] for label, each in found.items()} for part in parts]
             if len(volumes) == 2:
@@ -134,8 +159,8 @@ def cells(row: dict[str, Any], labels: list[str]) -> list[str]:
 
 def report(before: Path | None, methods: str, pixels: int, progress: Progress) -> Report:
     names = methods.split(",")
-    if unknown := [name for name in names if name not in METHODS]:
-        raise InputError(f"--methods must be of {', '.join(METHODS)}, got {', '.join(unknown)}.")
+    if unknown := [name for name in names if name not in (*METHODS, OTHERS)]:
+        raise InputError(f"--methods must be of {', '.join((*METHODS, OTHERS))}, got {', '.join(unknown)}.")
     checkouts = ({"before": before.resolve()} if before else {}) | {"now": HERE}
     rows, labels = run(checkouts, names, pixels, progress), list(checkouts)
     ratio = ["ratio"] if before else []

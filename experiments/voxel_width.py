@@ -2,7 +2,8 @@
 
 Letters, beads and tilted sheets of `design_judge`, on voxels of 40 um, and the scenes of `volume_limits`, on voxels of
 80 um, are ray-traced through the paper's lenses. They are reconstructed on voxels of these widths and finer ones, which
-are shared linearly by the wanted voxels before they are scored as there.
+are shared linearly by the wanted voxels before they are scored as there. A last column has voxels of which the pixels
+are not binned, so that they leave gaps between their images.
 
     python -m experiments.voxel_width [--draws 1] [--out DIR]
 
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import product
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
@@ -22,10 +24,13 @@ from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, geomscope, quality, rasterize, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
+from gs_jax.reconstruction import inverse_problem
 from gs_jax.reconstruction.methods import METHODS
 
-# Widths of voxels, relative to the wanted ones.
-WIDTHS = (1.0, 0.75, 0.5)
+# Widths of voxels, relative to the wanted ones, and how far apart they may be on the sensor, in binned pixels. Those of
+# width 0.75 are 1.8 to 1.9 pixels apart, for which the package bins 2 x 2.
+APART = inverse_problem._FARTHEST
+CASES = ((1.0, APART), (0.75, APART), (0.5, APART), (0.75, np.inf))
 NAMES = ("unrolled", "list-rl", "richardson-lucy")
 ITERATIONS, ELECTRONS = 20, 3000
 
@@ -69,19 +74,21 @@ def finer(grid: Grid, width: float) -> Grid:
 
 def shared(volume: np.ndarray, fine: Grid, grid: Grid) -> np.ndarray:
     """The light of fine voxels in linear shares of a grid's."""
-    share = lambda fine, wide: np.maximum(1 - np.abs(np.subtract.outer(wide, fine)) / grid.pitch, 0)
-    rows, columns = share(np.asarray(fine.y), np.asarray(grid.y)), share(np.asarray(fine.x), np.asarray(grid.x))
-    return np.einsum("ay,dyx,bx->dab", rows, volume, columns, optimize=True).astype(np.float32)
+    z, y, x = np.meshgrid(np.asarray(fine.depths), np.asarray(fine.y), np.asarray(fine.x), indexing="ij")
+    voxels = np.column_stack([x.ravel(), y.ravel(), z.ravel(), volume.ravel()])
+    return np.asarray(rasterize(voxels, grid), np.float32)
 
 
 def run(draws: int, progress: Progress) -> list[dict[str, Any]]:
     """A record of each scene, width and method."""
     records = []
     for capture in progress.track(list(captures(draws)), "Scenes"):
-        for width, name in product(WIDTHS, NAMES):
+        for (width, farthest), name in product(CASES, NAMES):
             fine, began = finer(capture.grid, width), time.process_time()
-            volume = reconstruct(capture.image, capture.imager, fine, METHODS[name](ITERATIONS))
-            record = {"kind": capture.kind, "width": width, "method": name, "seconds": time.process_time() - began}
+            with patch.object(inverse_problem, "_FARTHEST", farthest):
+                volume = reconstruct(capture.image, capture.imager, fine, METHODS[name](ITERATIONS))
+            record = {"kind": capture.kind, "width": width, "farthest": farthest, "method": name}
+            record["seconds"] = time.process_time() - began
             score = capture.score(shared(volume, fine, capture.grid), capture.truth)
             records.append(record | {"db": float(score)})
     return records
@@ -92,12 +99,12 @@ def report(draws: int, progress: Progress) -> Report:
     mean = lambda **wanted: np.mean([r["db"] for r in records if wanted.items() <= r.items()])
     rows = []
     for kind, name in product(dict.fromkeys(r["kind"] for r in records), NAMES):
-        first, *others = (mean(kind=kind, method=name, width=width) for width in WIDTHS)
+        first, *others = (mean(kind=kind, method=name, width=width, farthest=most) for width, most in CASES)
         rows.append([kind, name, f"{first:.1f}", *(f"{other - first:+.1f}" for other in others)])
-    columns = ("scene", "method", "dB", *(f"width {width:g}" for width in WIDTHS[1:]))
-    return Report(
-        {"voxel_width.json": records, "voxel_width.md": markdown_table(columns, rows)}, [table(columns, rows)]
-    )
+    names = [f"width {width:g}" + (", no pixels binned" if most > APART else "") for width, most in CASES[1:]]
+    columns = ("scene", "method", "dB", *names)
+    files = {"voxel_width.json": records, "voxel_width.md": markdown_table(columns, rows)}
+    return Report(files, [table(columns, rows)])
 
 
 if __name__ == "__main__":
