@@ -39,8 +39,9 @@ from gs_jax.simulation.phantoms import snowflake
 PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
 ELECTRONS, READ = (10_000, 500), 2.0
 STEEPEST = np.deg2rad(60)
-# Emitters of a scene, rays of each toward each lens, and distance from an emitter to the next, mm.
-EMITTERS, RAYS, APART = 100_000, 8, 0.02
+# Rays of each tile toward each lens, the width of a tile, and the distance from an emitter to the next, mm. With a
+# tenth of the rays they are more noise than photons are.
+RAYS, TILE, APART = 1000, 0.1, 0.02
 
 # Scenes with one depth in each column.
 SHEETS = ("tilted snowflake", "curved leaf", "hemisphere")
@@ -107,14 +108,11 @@ def texture(x, y, seed: int, z: float | np.ndarray = 0.0) -> np.ndarray:
     return np.exp(0.8 * sum(np.cos(x * a + y * b + z * c + p) for (a, b), p, c in parts) / np.sqrt(20))
 
 
-def capture(emitters: Emitters, imager: Imager, count: int = EMITTERS) -> np.ndarray:
-    """The image without noise: emitters are drawn in proportion to their light, and placed within their squares."""
-    share = np.cumsum(emitters[:, 3]) / emitters[:, 3].sum()
-    chosen = np.minimum(np.searchsorted(share, (np.arange(count) + 0.5) / count), len(emitters) - 1)
-    lit = emitters[chosen]
-    lit[:, :2] += np.random.default_rng(0).uniform(-APART / 2, APART / 2, (count, 2))
-    lit[:, 3] = 1.0
-    return traced(lit, imager, RAYS)
+def capture(emitters: Emitters, imager: Imager) -> np.ndarray:
+    """The image without noise; emitters are placed within their squares."""
+    lit = emitters.copy()
+    lit[:, :2] += np.random.default_rng(0).uniform(-APART / 2, APART / 2, (len(lit), 2))
+    return traced(lit, imager, RAYS, TILE)
 
 
 def true_maps(emitters: Emitters, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
