@@ -5,14 +5,15 @@ Letters with bars, beads, tilted sheets and dense texture lie at three depths of
 the middle of the design's own sensor. Photon and read noise are those of one exposure time for all designs: 20,000,
 3,000 or 500 electrons in the brightest pixel of `geomscope`. Volumes are reconstructed with the full model on a grid
 that is the same for all, 40 x 40 x 300 um, three planes about each depth: by Richardson-Lucy, with the best of three
-numbers of steps for each scene, and by the unrolled inversion. Scores, after the best gain: PSNR and SSIM; the contrast
+numbers of steps for each scene, and by the unrolled inversion, on voxels half as wide, which are then shared linearly
+by those of the grid (`voxel_width.py`). Scores, after the best gain: PSNR and SSIM; the contrast
 of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of two designs are of the same
 scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with its own noise.
 
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--rays 600] [--records FILE]
 
 Writes the records after each scene, from which the next run goes on, and then `design_judge.md` and `design_judge.png`;
-about six minutes of a core for each design.
+about eight minutes of a core for each design.
 """
 
 import hashlib
@@ -30,20 +31,14 @@ from experiments.common import Report, design_file, main, table
 from experiments.lens_scenes import cropped
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax import Grid, Imager, RichardsonLucy, Unrolled, find_points, localization, quality, rasterize, read_design
+from gs_jax import Grid, Imager, RichardsonLucy, find_points, localization, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.io.files import make_folder, write_json
-from gs_jax.reconstruction.inverse_problem import (
-    InverseProblem,
-    lens_type_geometries,
-    num_detrend_modes,
-    prepare_data,
-    prepare_model,
-)
+from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import run_solver
+from gs_jax.reconstruction.pipeline import reconstructor
 from gs_jax.simulation.phantoms import letters
 
 # Those for 18 to 23 mm; the first defines the exposures.
@@ -61,7 +56,7 @@ class Settings(NamedTuple):
     """What designs are judged by; lengths in mm.
 
     `sensor` is the width of the sensor's middle; lenses beyond it by 0.4 mm are left out. `rays` go from each tile of
-    the scene to each lens.
+    the scene to each lens. `width`: of the unrolled inversion's voxels, relative to those that are scored.
     """
 
     span: tuple[float, float] = (18.0, 23.0)
@@ -73,6 +68,7 @@ class Settings(NamedTuple):
     methods: tuple[str, ...] = ("richardson-lucy", "unrolled")
     steps: tuple[int, ...] = (3, 6, 12)
     rays: int = 600
+    width: float = 0.5
 
     @property
     def depths(self) -> np.ndarray:
@@ -158,30 +154,44 @@ class Methods:
 
     def __init__(self, imager: Imager, settings: Settings):
         self.imager, self.grid, self.settings = imager, settings.grid, settings
-        self.model = prepare_model(imager, self.grid, "full", Progress())
-        problem = partial(InverseProblem, self.model.imager, self.grid, self.model.optics)
-        lucy, self.unrolled = METHODS["richardson-lucy"](1), Unrolled.pretrained()
-        assert isinstance(lucy, RichardsonLucy)
-        self.lucy: RichardsonLucy = lucy
-        self.problem = problem()
-        modes = num_detrend_modes(self.model.imager, self.model.optics)
-        self.unmatched = problem(lens_type_geometries(imager, self.grid), modes)
-        self.start = jax.jit(lambda problem, light: self.lucy.init(problem.operator, light))
-        self.step = jax.jit(lambda problem, light, state: self.lucy.step(problem.operator, light, state)[0])
+        if "richardson-lucy" in settings.methods:
+            self.model = prepare_model(imager, self.grid, "full", Progress())
+            self.problem = InverseProblem(self.model.imager, self.grid, self.model.optics)
+            lucy = METHODS["richardson-lucy"](1)
+            assert isinstance(lucy, RichardsonLucy)
+            self.lucy: RichardsonLucy = lucy
+            self.start = jax.jit(lambda problem, light: lucy.init(problem.operator, light))
+            self.step = jax.jit(lambda problem, light, state: lucy.step(problem.operator, light, state)[0])
+        if "unrolled" in settings.methods:
+            self.fine = finer(self.grid, settings.width)
+            self.unrolled = reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=Progress())
 
     def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
         """Volume by each method, Richardson-Lucy's with the number of its steps."""
-        light, background = prepare_data(image, self.model)
         found = {}
         if "richardson-lucy" in self.settings.methods:
+            light, _ = prepare_data(image, self.model)
             state = self.start(self.problem, light)
             for number in range(1, max(self.settings.steps) + 1):
                 state = self.step(self.problem, light, state)
                 if number in self.settings.steps:
                     found[f"richardson-lucy {number}"] = np.asarray(self.lucy.estimate(state))
         if "unrolled" in self.settings.methods:
-            found["unrolled"] = run_solver(self.unrolled, light - background, self.unmatched, Progress())
+            found["unrolled"] = shared(self.unrolled(image, Progress()), self.fine, self.grid)
         return found
+
+
+def finer(grid: Grid, width: float) -> Grid:
+    """Voxels of a relative width over the same field, one in the middle."""
+    rows, columns = (round(n / width) | 1 for n in grid.shape)
+    return Grid(grid.depths, (rows, columns), width * grid.pitch, grid.origin)
+
+
+def shared(volume: np.ndarray, fine: Grid, grid: Grid) -> np.ndarray:
+    """The light of fine voxels in linear shares of a grid's."""
+    z, y, x = np.meshgrid(np.asarray(fine.depths), np.asarray(fine.y), np.asarray(fine.x), indexing="ij")
+    voxels = np.column_stack([x.ravel(), y.ravel(), z.ravel(), volume.ravel()])
+    return np.asarray(rasterize(voxels, grid), np.float32)
 
 
 def scores(volume: np.ndarray, truth: np.ndarray, one: Scene, grid: Grid) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.pipeline import reconstructor
 from gs_jax.simulation.phantoms import letters
 
-PIXELS, EMITTERS, ELECTRONS, TRAINED, SCORED = 512, 40_000, 3000, 5, 3
+PIXELS, ELECTRONS, TRAINED, SCORED = 512, 3000, 5, 3
 # Of the radii, and slopes of 0.3 degrees along a diagonal.
 LARGER, SLOPE = 1.02, np.tan(np.radians(0.3)) / np.sqrt(2)
 
@@ -60,7 +60,7 @@ def run(steps: int, *, pixels: int = PIXELS, trained=TRAINED, scored=SCORED, pro
     known = device("geomscope", pixels)
     made, width = as_made(known), pixels * PITCH
     grid = Grid.over(known.sensor, depths=np.arange(DEPTHS[0], DEPTHS[1] + 0.01, STEP), pitch=VOXEL)
-    image = lambda seed: noisy(capture(words(seed, width), made, EMITTERS), ELECTRONS)
+    image = lambda seed: noisy(capture(words(seed, width), made), ELECTRONS)
     began, start = time.monotonic(), Unrolled.pretrained()
     images = [image(seed) for seed in progress.track(range(trained), "Tracing")]
     found = fine_tune(images, known, grid, start, steps=steps, progress=progress)

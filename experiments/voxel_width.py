@@ -20,6 +20,7 @@ import numpy as np
 
 from experiments import design_judge, surfaces, volume_limits
 from experiments.common import Report, main, table
+from experiments.design_judge import finer, shared
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, geomscope, quality, rasterize, reconstruct
 from gs_jax.apps.benchmark_report import markdown_table
@@ -64,19 +65,6 @@ def captures(draws: int) -> Iterator[Capture]:
         image = surfaces.noisy(clean, volume_limits.ELECTRONS)
         truth = np.asarray(rasterize(emitters, grid), np.float32)
         yield Capture(kind, imager, image, grid, truth, volume_limits.gain)
-
-
-def finer(grid: Grid, width: float) -> Grid:
-    """Voxels of a relative width over the same field, one in the middle."""
-    rows, columns = (round(n / width) | 1 for n in grid.shape)
-    return Grid(grid.depths, (rows, columns), width * grid.pitch, grid.origin)
-
-
-def shared(volume: np.ndarray, fine: Grid, grid: Grid) -> np.ndarray:
-    """The light of fine voxels in linear shares of a grid's."""
-    z, y, x = np.meshgrid(np.asarray(fine.depths), np.asarray(fine.y), np.asarray(fine.x), indexing="ij")
-    voxels = np.column_stack([x.ravel(), y.ravel(), z.ravel(), volume.ravel()])
-    return np.asarray(rasterize(voxels, grid), np.float32)
 
 
 def run(draws: int, progress: Progress) -> list[dict[str, Any]]:
