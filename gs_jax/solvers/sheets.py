@@ -1,8 +1,7 @@
-"""Sheets through a volume: their voxels, the squares of their derivatives, and the noise of a capture."""
+"""Sheets through a volume: their voxels, and the squares of their derivatives."""
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -15,8 +14,6 @@ from .richardson_lucy import hat_functions
 _SPACING = 5
 # Least brightness of a column at the start, relative to the mean: by its root, none has no gradient.
 _FAINT = 1e-3
-# Classes of brightness among which the noise is fitted, and steps of that.
-_CLASSES, _NOISE_STEPS = 32, 60
 
 
 class Sheets(NamedTuple):
@@ -90,28 +87,3 @@ def squared_derivatives(sheets):
     rows, columns = hats(sheets.root.shape[1:], sheets.depth.shape[1:], sheets.root.dtype)
     depth = jnp.einsum("yk,zyx,xl->zkl", rows**2, sheets.root**4, columns**2)
     return Sheets(4 * sheets.root**2, depth, jnp.ones_like(sheets.background))
-
-
-def noise_variance(residual, expected):
-    """Variance of each pixel: `read + gain e + (relative e)^2`, the most likely for a residual.
-
-    Variances of classes of brightness are fitted by a multiplicative method, which leaves all three parts positive.
-    """
-    top = expected.max() + jnp.finfo(expected.dtype).tiny
-    unit = jnp.mean(residual**2)
-    place = jnp.minimum((safe_sqrt(expected / top) * _CLASSES).astype(jnp.int32), _CLASSES - 1).ravel()
-    total = lambda part: jax.ops.segment_sum(part.ravel(), place, _CLASSES)
-    count = total(jnp.ones_like(expected))
-    square = divide(total(residual**2), count * unit)
-    e = divide(total(expected), count * top)
-    parts = jnp.stack([jnp.ones_like(e), e, e**2])
-    least = 1e-6
-
-    def improve(shares, _):
-        variance = shares @ parts + least
-        ratio = divide(parts @ (count * square / variance**2), parts @ (count / variance))
-        return shares * jnp.sqrt(ratio), None
-
-    shares = lax.scan(improve, jnp.full(3, 1 / 3, e.dtype), length=_NOISE_STEPS)[0]
-    e = expected / top
-    return unit * (shares[0] + shares[1] * e + shares[2] * e**2 + least)

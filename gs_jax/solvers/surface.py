@@ -28,7 +28,7 @@ from .richardson_lucy import (
     extrapolate,
     momentum_after,
 )
-from .sheets import Sheets, first_sheets, hats, interpolated, noise_variance, squared_derivatives, volume_of
+from .sheets import Sheets, first_sheets, hats, interpolated, squared_derivatives, volume_of
 
 # Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end;
 # Gauss-Newton steps from a given start.
@@ -49,8 +49,9 @@ _EDGE_DEPTH, _EDGE_ROOT = 0.1, 0.3
 # Largest change of a depth in a Gauss-Newton step, planes: the derivative involves the two nearest planes.
 _MAX_MOVE = 1.0
 # Standard deviations by the Hessian's diagonal are too small by this factor, as it leaves out correlations with
-# neighbours and with brightness, and errors of the model. Measured on sheets of known depth, of 10,000 electrons.
-_UNDERSTATED = 3.6
+# neighbours and with brightness, and as errors of the model are alike in neighbours. Measured on sheets of known
+# depth, of 10,000 electrons.
+_UNDERSTATED = 8.0
 # Share of a Gauss-Newton step that is taken: depths of whole steps, of few gradients each, swing about their limit.
 _SHARE = 0.7
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
@@ -74,7 +75,7 @@ class State(NamedTuple):
     information
         Sum of the last probes of the Hessian's diagonal, for each depth.
     inverse
-        Inverse variance of each pixel.
+        Inverse variance of the residual.
     errors
         RMS misfit of the free voxels and of the sheets, relative to the image's RMS.
     number
@@ -88,7 +89,7 @@ class State(NamedTuple):
     direction: Sheets
     diagonal: Float[Array, "3"]
     information: Array
-    inverse: Array
+    inverse: Float[Array, ""]
     errors: Float[Array, "2"]
     number: Int[Array, ""]
 
@@ -100,17 +101,17 @@ class Surface(eqx.Module):
 
     The volume is `brightness max(0, 1 - |k - depth|)` on the planes `k`: linear shares of two planes. A few steps of
     Richardson-Lucy give the start; then brightness, depth and a smooth background are fitted by Gauss-Newton with
-    conjugate gradients. Pixels count by the inverse of their variance, `read + gain e + (relative e)^2` at the expected
-    light `e`, which is fitted to the residual: read noise, photons, and what the model lacks. Both maps are smoothed
-    but at edges (Charbonnier's penalty). There is no network. `fit_surface` returns the maps.
+    conjugate gradients. All pixels count alike: weights of photon noise would trust dark pixels, where the model's
+    errors are larger than noise. Both maps are smoothed but at edges (Charbonnier's penalty). There is no network.
+    `fit_surface` returns the maps.
 
     Parameters
     ----------
     sheets
         Sheets one behind the other in a column.
     smooth_depth, smooth_brightness
-        Weights of the penalties: of depth's differences between knots, 5 voxels apart, in planes, and of root
-        brightness between voxels, in its RMS.
+        Weights of the penalties beside half the squared residual over its mean square: of depth's differences between
+        knots, 5 voxels apart, in planes, and of root brightness between voxels, in its RMS.
     steps, tolerance
         As for `Solver`; at most the number of the schedule.
 
@@ -134,7 +135,7 @@ class Surface(eqx.Module):
     """
 
     sheets: int = eqx.field(static=True, default=1)
-    smooth_depth: float = eqx.field(static=True, default=1.0)
+    smooth_depth: float = eqx.field(static=True, default=5.0)
     smooth_brightness: float = eqx.field(static=True, default=0.0)
     steps: int = eqx.field(static=True, default=len(_SCHEDULE))
     tolerance: float = eqx.field(static=True, default=0.0)
@@ -155,7 +156,7 @@ class Surface(eqx.Module):
         none = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda: first_sheets(lucy.x, lucy.knots, self.sheets)))
         zeros = lambda count: jnp.zeros(count, image.dtype)
         number = jnp.zeros((), jnp.int32)
-        return State(lucy, none, none, none, none, zeros(3), none.depth, jnp.zeros_like(image), zeros(2), number)
+        return State(lucy, none, none, none, none, zeros(3), none.depth, zeros(()), zeros(2), number)
 
     def step(
         self, A: Operator, image: Num[Array | np.ndarray, "..."], state: State
@@ -176,8 +177,9 @@ class Surface(eqx.Module):
         volume, background = lax.switch(kind, inputs)
         shown = A.mv(volume) + bilinear_background(background, light)
         expected, residual = jnp.maximum(shown, 0), light - shown
-        fit_noise = lambda: divide(jnp.ones_like(light), noise_variance(residual, expected))
-        state = state._replace(inverse=lax.cond(kind == _LINEARISE, fit_noise, lambda: state.inverse))
+        square = jnp.mean(residual**2)
+        inverse = jnp.where(kind == _LINEARISE, divide(jnp.ones_like(square), square), state.inverse)
+        state = state._replace(inverse=inverse)
         rounding = jnp.finfo(light.dtype).eps * expected.max()
         pulled = lax.switch(
             jnp.minimum(kind, _PROBE),
@@ -188,7 +190,7 @@ class Surface(eqx.Module):
             ),
         )
         back = A.T.mv(pulled)
-        misfit = divide(jnp.mean(residual**2), jnp.mean(light**2)) ** 0.5
+        misfit = divide(square, jnp.mean(light**2)) ** 0.5
 
         def pullback():
             part = jax.vjp(lambda s: volume_of(s, planes), state.sheets)[1](back)[0]
@@ -218,7 +220,7 @@ class Surface(eqx.Module):
             means = (
                 divide(product.root.sum(), square * energy.root.sum()),
                 divide(product.depth.sum(), energy.depth.sum()),
-                ((rows**2).T @ state.inverse @ columns**2).mean(),
+                state.inverse * (rows**2).sum(0).mean() * (columns**2).sum(0).mean(),
             )
             # The last probes are of the depths alone.
             is_first = following == _GRADIENT
