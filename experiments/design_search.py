@@ -19,7 +19,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import cma
 import numpy as np
 from scipy.stats import qmc
 
@@ -105,6 +104,9 @@ class Tried:
 
 def search(side: str, start: np.ndarray, steps: int, gains: Callable[[list[Design]], np.ndarray]) -> np.ndarray:
     """CMA-ES from a start, so many generations; the best numbers that it tried."""
+    # Imported here, as tests of this file's designs do without it.
+    import cma
+
     to_unit = lambda at: (at - LOW) / (HIGH - LOW)
     options = {"bounds": [0, 1], "popsize": POPULATION, "seed": SEED, "verbose": -9}
     strategy = cma.CMAEvolutionStrategy(to_unit(start), SPREAD, options)

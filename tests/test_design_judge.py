@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from experiments import design_changes
-from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, scene
+from experiments import design_changes, design_search
+from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, finer, scene, shared
 from experiments.ray_tracer import traced
 from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
+from gs_jax.optics.theory import depth_in_focus
 
 IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
 
@@ -45,6 +46,25 @@ def test_records_of_other_settings_are_refused(tmp_path):
     file.write_text(json.dumps({"settings": {}, "scenes": {}, "found": {}}))
     with pytest.raises(InputError, match="must be of the settings"):
         Judge(file, Settings(), IMAGER)
+
+
+def test_finer_voxels_are_shared_by_those_of_the_grid():
+    settings = Settings()
+    one, fine = scene("texture", 0, settings), finer(settings.grid, 0.5)
+    found = shared(np.asarray(rasterize(one.emitters, fine)), fine, settings.grid)
+    wanted = np.asarray(rasterize(one.emitters, settings.grid))
+    assert found.sum() == pytest.approx(wanted.sum(), rel=1e-3)
+    assert np.corrcoef(found.ravel(), wanted.ravel())[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("side", design_search.SIDES)
+def test_designs_of_the_search_have_the_focus_that_was_asked_for(side):
+    for part in (0.0, 0.5, 1.0):
+        at = design_search.LOW + part * (design_search.HIGH - design_search.LOW)
+        imager = design_search.design_of(side, at).imager()
+        np.testing.assert_allclose(float(imager.sensor_distance), at[0])
+        reduced = depth_in_focus(imager.array.focal_length, imager.reduced_sensor_distance)
+        np.testing.assert_allclose(imager.depth_of(reduced), at[1], rtol=1e-4)
 
 
 @pytest.mark.integration
