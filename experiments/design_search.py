@@ -44,9 +44,10 @@ def design_of(side: str, at: np.ndarray) -> Design:
     """The paper's microscope with these numbers."""
     distance, focus, aperture, conic, pitch = np.clip(at, LOW, HIGH)
     start = geomscope()
-    thickness = start.array.substrate_thickness_mm / start.lens.refractive_index
+    index = float(start.imager().array.refractive_index)
+    thickness = start.array.substrate_thickness_mm / index
     front, behind = (focus, distance + thickness) if side == "curved" else (focus + thickness, distance)
-    radius = (start.lens.refractive_index - 1) / (1 / front + 1 / behind)
+    radius = (index - 1) / (1 / front + 1 / behind)
     centers = pitch * np.array(start.array.centers_mm)
     inside = (np.abs(centers) < np.array(start.array.size_mm) / 2).all(1)
     return start.replace(
