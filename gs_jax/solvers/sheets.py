@@ -12,6 +12,8 @@ from .richardson_lucy import hat_functions
 
 # Voxels from one knot of the depth to the next.
 _SPACING = 5
+# Steps of Lloyd's algorithm, and the light, relative to the mean column's, up to which depths stay with all columns'.
+_LLOYD, _ALIKE = 8, 3.0
 # Least brightness of a column at the start, relative to the mean: by its root, none has no gradient.
 _FAINT = 1e-3
 
@@ -56,16 +58,26 @@ def first_sheets(x, background, count):
     # Where it is dark, the mean of all.
     faint = 0.05 * local.sum(0).mean() + jnp.finfo(x.dtype).tiny
     overall = divide((k * local).sum(), local.sum())
-    mean = ((k * local).sum(0) + faint * overall) / (local.sum(0) + faint)
-    spread = safe_sqrt(divide((local * (k - mean[None]) ** 2).sum(0), local.sum(0)))
-    apart = jnp.asarray(np.linspace(-1, 1, count) if count > 1 else np.zeros(1), x.dtype)
-    depth = mean[None] + apart[:, None, None] * spread[None]
-    # Several sheets divide the planes among them (Lloyd's algorithm).
-    for _ in range(8 if count > 1 else 0):
-        mine = nearest(k, depth) * local[None]
-        depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint)
+    if count == 1:
+        depth = (((k * local).sum(0) + faint * overall) / (local.sum(0) + faint))[None]
+    else:
+        # Several sheets divide the planes among them (Lloyd's algorithm), first those of all columns together: where
+        # there is one sheet only, the others must not share its light.
+        spread = safe_sqrt(divide((local * (k - overall) ** 2).sum(), local.sum()))
+        depth = overall + spread * jnp.asarray(np.linspace(-1, 1, count), x.dtype)[:, None, None]
+        depth = _divided(local.sum((1, 2), keepdims=True), depth, 0.0)
+        depth = _divided(local, jnp.broadcast_to(depth, (count, *local.shape[1:])), _ALIKE * local.sum(0).mean())
     bright = (nearest(k, interpolated(depth, tuple(shape))) * x[None]).sum(1)
     return Sheets(safe_sqrt(bright + _FAINT * bright.mean()), depth, background)
+
+
+def _divided(light, depth, faint):
+    """Mean depths of the light `(plane, y, x)` that is nearest to each sheet; those of faint columns hardly change."""
+    k = jnp.arange(len(light), dtype=light.dtype)[:, None, None]
+    for _ in range(_LLOYD):
+        mine = nearest(k, depth) * light[None]
+        depth = ((mine * k[None]).sum(1) + faint * depth) / (mine.sum(1) + faint + jnp.finfo(light.dtype).tiny)
+    return depth
 
 
 def widened(x, axis):
