@@ -177,8 +177,8 @@ class Surface(eqx.Module):
         volume, background = lax.switch(kind, inputs)
         shown = A.mv(volume) + bilinear_background(background, light)
         expected, residual = jnp.maximum(shown, 0), light - shown
-        square = jnp.mean(residual**2)
-        inverse = jnp.where(kind == _LINEARISE, divide(jnp.ones_like(square), square), state.inverse)
+        variance = jnp.mean(residual**2)
+        inverse = jnp.where(kind == _LINEARISE, divide(jnp.ones_like(variance), variance), state.inverse)
         state = state._replace(inverse=inverse)
         rounding = jnp.finfo(light.dtype).eps * expected.max()
         pulled = lax.switch(
@@ -190,7 +190,7 @@ class Surface(eqx.Module):
             ),
         )
         back = A.T.mv(pulled)
-        misfit = divide(square, jnp.mean(light**2)) ** 0.5
+        misfit = divide(variance, jnp.mean(light**2)) ** 0.5
 
         def pullback():
             part = jax.vjp(lambda s: volume_of(s, planes), state.sheets)[1](back)[0]
