@@ -250,6 +250,18 @@ def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():
     np.testing.assert_allclose(apparent_depths(scope, many)[::29], few, atol=1e-6)
 
 
+def test_the_core_of_a_sharp_spot_with_coma_is_near_the_middle_of_its_light():
+    scope = read_design(Path(__file__).parents[1] / "design" / "geomscope-asphere.toml").imager()
+    fields, aperture = np.linspace(0, float(scope.field_radius), 17), aperture_profile(scope.array, by_area=False)
+    depths = np.array([18.5, 20.5, 22.5])
+    for depth, found in zip(depths, core_magnification(scope, depths), strict=True):
+        rays = sample_pupil(scope, depth, fields, aperture, 8192)
+        weight = rays.light * fields[:, None]
+        middle = -(weight * rays.landing[..., 0] * fields[:, None]).sum() / (weight * fields[:, None] ** 2).sum()
+        # Where spots are brightest, it is 0.4 to 0.8 % larger.
+        np.testing.assert_allclose(found, middle, rtol=3.5e-3)
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("fidelity", ["full", "near", "pinhole"])
 def test_every_fidelity_reconstructs(fidelity):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tifffile
@@ -12,6 +13,7 @@ from gs_jax.base.progress import Progress
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.surfaces import read_surface, write_surface
 from gs_jax.reconstruction.surface_fit import surface_fitter
+from gs_jax.solvers.sheets import first_sheets, interpolated
 from gs_jax.widget.layers import reader
 
 GRID = {"shape": (45, 45), "pitch": 0.08}
@@ -151,3 +153,15 @@ def test_dark_captures_and_single_planes_are_finite():
 def test_what_is_refused(make, words):
     with pytest.raises(gs.InputError, match=words):
         make()
+
+
+def test_two_sheets_side_by_side_start_as_one_each():
+    """Each has the light of its side, and hardly any of the other's."""
+    volume = np.zeros((11, 20, 30), np.float32)
+    for plane, side in ((2, slice(0, 15)), (8, slice(15, 30))):
+        volume[plane - 1 : plane + 2, :, side] = np.array([0.5, 1.0, 0.5])[:, None, None]
+    sheets = first_sheets(jnp.asarray(volume), jnp.zeros((8, 8), jnp.float32), 2)
+    depth, light = np.asarray(interpolated(sheets.depth, (20, 30))), np.asarray(sheets.root) ** 2
+    np.testing.assert_allclose(depth[0, :, :10], 2, atol=0.1)
+    np.testing.assert_allclose(depth[1, :, 20:], 8, atol=0.1)
+    assert light[0, :, 20:].sum() < 0.01 * light[1, :, 20:].sum() and light[1, :, :10].sum() < 0.01 * light[0].sum()
