@@ -19,7 +19,7 @@ from .pipeline import check_call, reconstructor
 # Columns of less light, of the 99th percentile, have no depth.
 _DARK = 0.03
 # What one more sheet leaves unexplained, of what these leave, below which these are too few. Where they are enough it
-# was 1.03 or more, as the one more takes fewer steps, 0.85 for two sheets and 0.68 for blobs.
+# was 1.03 or more, as the one more takes fewer steps, 0.85 for two sheets and 0.56 for blobs.
 _ENOUGH = 0.95
 # What a fit that starts from the last one may leave unexplained, of what the last one that started afresh left.
 _CHANGED = 1.1

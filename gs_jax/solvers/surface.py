@@ -57,7 +57,7 @@ _SHARE = 0.7
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
 _DAMPING = 1e-3
 # At the start the brightness is nearly right and depths are not: the preconditioner lets depths change first.
-_BRIGHTNESS_LATER = 0.1
+_BRIGHTNESS_LATER = 0.3
 _START = RichardsonLucy(accelerate=True, background_knots=BACKGROUND_KNOTS, min_sensitivity=0.3)
 
 
