@@ -27,7 +27,7 @@ _DEGREE, _FIELDS, _RAYS = 6, 16, 8192
 # Search of the magnification: largest difference to the chief ray's, coarse steps, the fraction of the rays that these
 # use, and the final step (a twentieth of a pixel where cores are farthest from the axis).
 _FARTHEST, _STEPS, _SPARSE, _FINE = 0.08, 81, 8, 1e-4
-# Side, in pixels, of the square that blurs spots before their sharpness is judged: the image of a voxel is as wide.
+# Spots are blurred by a square of so many pixels before their sharpness is judged: it is as wide as a voxel's image.
 _BLUR = 3.0
 # Largest pixel by which sharpness is judged, in images of the widest field; depths traced before interpolating.
 _SHARP, _MOST = 0.006, 9
@@ -181,7 +181,7 @@ def _distance_from_core(rays: PupilSamples, fields, magnification) -> np.ndarray
 
 def _sharpest(rays: PupilSamples, fields, weight, chief: float, pitch: float) -> float:
     """Distortion at which the weighted mean of the spots, blurred, has the largest sum of squares."""
-    # A spot with coma is brightest beside the middle of its light. That is less than a pixel, but 0.1 mm of depth.
+    # A spot with coma is brightest beside the middle of its light: by less than a pixel, which is 0.1 mm in depth.
     blur = np.random.default_rng(0).uniform(-_BLUR / 2, _BLUR / 2, rays.landing.shape) * pitch
     rays = rays._replace(landing=rays.landing + blur, light=rays.light * weight[:, None])
     # Large pixels find the maximum as well as small ones.

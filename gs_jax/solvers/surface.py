@@ -48,9 +48,8 @@ RESTARTED_STEPS = 1 + _RESTARTED * (1 + _GRADIENTS) + 1
 _EDGE_DEPTH, _EDGE_ROOT = 0.1, 0.3
 # Largest change of a depth in a Gauss-Newton step, planes: the derivative involves the two nearest planes.
 _MAX_MOVE = 1.0
-# Standard deviations by the Hessian's diagonal are too small by this factor, as it leaves out correlations with
-# neighbours and with brightness, and as errors of the model are alike in neighbours. Measured on sheets of known
-# depth, of 10,000 electrons.
+# Standard deviations by the Hessian's diagonal are too small by this factor: it leaves out correlations with neighbours
+# and with brightness, and neighbours share errors of the model. Measured on ray-traced sheets (`surfaces.py`).
 _UNDERSTATED = 8.0
 # Share of a Gauss-Newton step that is taken: depths of whole steps, of few gradients each, swing about their limit.
 _SHARE = 0.7
@@ -110,8 +109,8 @@ class Surface(eqx.Module):
     sheets
         Sheets one behind the other in a column.
     smooth_depth, smooth_brightness
-        Weights of the penalties beside half the squared residual over its mean square: of depth's differences between
-        knots, 5 voxels apart, in planes, and of root brightness between voxels, in its RMS.
+        Weights of the penalties, relative to half of the squared residual over its mean square: of differences in depth
+        between knots, 5 voxels apart, in planes, and in root brightness between voxels, relative to its RMS.
     steps, tolerance
         As for `Solver`; at most the number of the schedule.
 
