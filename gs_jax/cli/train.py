@@ -20,7 +20,7 @@ from .options import (
     given_options,
     worker_options,
 )
-from .outputs import PARTIAL, RESUMABLE, check_may_write, partial_outputs, provenance_of
+from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
 STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
@@ -53,6 +53,7 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 @click.option("--weights", type=Path, help="WEIGHTS.npz to begin with.  [default: ours]")
 @worker_options
 @capture_options
+@force_option
 def train_command(
     network: str | None,
     steps: int | None,
@@ -72,7 +73,9 @@ def train_command(
 
     \b
     Fine-tune the unrolled inversion by your own captures, of several scenes of one kind:
-    gs-jax train --from-captures run7 --design my.toml --depths 18:22:0.5 -o mine.npz
+    gs-jax train --from-captures run7 --design mine.toml --depths 18:22:0.5 -o tuned.npz
+    First, one factor of all radii is fitted, as the focus may differ from the design's. If one predicts lenses clearly
+    better, the design with it is written to tuned.toml.
     """
     check_output(output, [".npz"])
     if from_captures:
@@ -147,11 +150,15 @@ def _from_captures(
     depths: list[float] | None,
     voxel_um: float | None,
     weights: Path | None,
+    force: bool,
 ) -> None:
-    from ..apps.training.from_captures import fine_tune
-    from ..design.design import design_text, read_design
+    import numpy as np
+
+    from ..apps.training.from_captures import check_number, fine_tune
+    from ..design.design import design_text, read_design, write_design
     from ..io.recordings import capture_files
     from ..reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+    from ..reconstruction.radius_fit import fit_radius
     from ..solvers.unrolled import Unrolled, read_unrolled, write_unrolled
 
     if design is None or depths is None:
@@ -159,12 +166,14 @@ def _from_captures(
     files = capture_files(folder)
     if files is None:
         raise InputError(f"--from-captures must be a folder of captures, got {folder}.")
-    history = output.with_suffix(".json")
-    check_may_write(output, history, inputs=(*files, design, weights, *camera.files))
+    check_number(files)
+    history, made = output.with_suffix(".json"), output.with_suffix(".toml")
+    check_may_write(output, history, made, inputs=(*files, design, weights, *camera.files), force=force)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=PIXELS_PER_VOXEL)
     provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
+    start = read_unrolled(weights) if weights else Unrolled.pretrained()
 
     def on_better(networks):
         write_unrolled(output, networks, provenance)
@@ -172,14 +181,26 @@ def _from_captures(
 
     with Progress() as progress:
         images = [camera.read(file) for file in files]
-        start = read_unrolled(weights) if weights else Unrolled.pretrained()
+        radius = fit_radius(images, imager, grid, start, progress=progress)
+        if radius.factor != 1:
+            radii = np.round(radius.factor * np.array(microscope.lens.radius_of_curvature_mm), 6)
+            record = {**microscope.provenance, **provenance, "radius_factor": radius.factor}
+            microscope = microscope.replace(radius_of_curvature_mm=radii, provenance=record)
+            write_design(made, microscope)
+            partial_outputs[made] = PARTIAL
+            provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
         how = {"steps": steps, "seed": seed, "on_better": on_better, "progress": progress}
-        found = fine_tune(images, imager, grid, start, **how)
+        found = fine_tune(images, radius.imager, grid, start, **how)
         write_unrolled(output, found.networks, provenance)
         held_out = [{"step": step, "loss": loss} for step, loss in found.held_out]
         numbers = {"loss": found.losses, "held_out": held_out, "before": found.before, "after": found.after}
-        write_json(history, {"seed": seed} | numbers)
+        write_json(history, {"seed": seed, "radius": dict(radius.trials)} | numbers)
     camera.print_corrections()
+    if radius.factor != 1:
+        errors = dict(radius.trials)
+        error = f"{errors[1.0]:.1%} before, {errors[radius.factor]:.1%} after (RMS)"
+        words = f"radii {radius.factor - 1:+.1%}; lenses left out are predicted with an error of"
+        click.echo(f"{made}: {words} {error}. Use it with {output}.")
     error = f"{found.before**0.5:.1%} before, {found.after**0.5:.1%} after (RMS)"
     words = f"{len(files)} captures, {len(found.losses)} steps"
     click.echo(f"{output}: {words}; of captures held out, lenses left out are predicted with an error of {error}")

@@ -108,8 +108,7 @@ def fine_tune(
     InputError
         If there are fewer than 3 captures, or fewer than 4 lenses.
     """
-    if len(images) < _LEAST:
-        raise InputError(f"there must be {_LEAST} captures or more, of different scenes, got {len(images)}.")
+    check_number(images)
     progress = progress or Progress()
     trained, held_out = _split(images, imager, grid, networks, optics, seed, progress)
     loss = eqx.filter_jit(prediction_loss)
@@ -137,6 +136,12 @@ def fine_tune(
     after, chosen = min(errors, key=lambda each: each[0])
     losses = [float(each) for each in state.losses[: int(state.step)]]
     return FineTuned(chosen, losses, history, errors[0][0], after)
+
+
+def check_number(captures: Sequence) -> None:
+    """Raise `InputError` if there are too few captures to train with."""
+    if len(captures) < _LEAST:
+        raise InputError(f"there must be {_LEAST} captures or more, of different scenes, got {len(captures)}.")
 
 
 def prediction_loss(networks: Unrolled, capture: SplitCapture) -> Float[Array, ""]:
