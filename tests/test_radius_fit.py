@@ -58,9 +58,12 @@ def test_surfaces_still_reach_the_edge_of_their_apertures(conic, least):
     assert _least(dataclasses.replace(scope(), array=array)) == pytest.approx(1.001 * least)
 
 
-@pytest.mark.parametrize("pitch, shape, binning", [(0.01, (96, 96), 1), (0.1, (66, 66), 3)])
-def test_the_middle_keeps_its_place(pitch, shape, binning):
-    readout = _readout(scope(), GRID.depths, pitch)
-    part = readout.sensor(scope().sensor)
-    assert (part.shape, readout.binning) == (shape, binning)
+@pytest.mark.parametrize(
+    "radius, pitch, shape, binning, margin", [(2.0, 0.1, (66, 66), 3, 0), (0.5, 0.01, (130, 130), 1, 25)]
+)
+def test_the_middle_keeps_its_place(radius, pitch, shape, binning, margin):
+    one = dataclasses.replace(scope(), field_radius=radius)
+    readout, margins = _readout(one, GRID.depths, pitch)
+    part = readout.sensor(one.sensor)
+    assert (part.shape, readout.binning, margins) == (shape, binning, (margin, margin))
     np.testing.assert_allclose(part.origin, 0, atol=0.02)

@@ -26,12 +26,12 @@ from .pipeline import reconstructor
 
 _FOLDS = 4
 # Largest change, its tolerance, and most trials.
-_RANGE, _TOLERANCE, _TRIALS = 0.06, 3e-3, 12
+_RANGE, _TOLERANCE, _TRIALS = 0.06, 3e-3, 7
 # Width of the voxels over that of those that are wanted, and least number of voxels that a pixel is wide. Points that
 # stand for a volume leave gaps in a sharp image, which a wrong radius would blur.
 _FINER, _VOXELS_PER_PIXEL = 1 / 3, 2
-# Most captures, and most voxels along a side: one number needs no more.
-_CAPTURES, _SIDE = 4, 192
+# Most captures, and most voxels along a side of the middle that is judged: one number needs no more.
+_CAPTURES, _SIDE = 3, 160
 # An error smaller by less is no reason to change a design: on ray-traced captures of devices as designed it was smaller
 # by up to 3 % elsewhere (`own_captures.py`).
 _BETTER = 0.05
@@ -66,15 +66,16 @@ def fit_radius(
 ) -> RadiusFit:
     """Fit one factor of all radii to captures of any scenes, within 6 %.
 
-    *Host.* Takes about ten reconstructions of the middle of each of four captures.
+    *Host.* Takes about eight reconstructions of the middle of each of three captures.
 
     Each capture is reconstructed without some lenses, whose light is predicted, as `cross_validated` does. The voxels
-    are a third as wide as those of the grid.
+    are a third as wide as those of the grid. Of a large sensor the middle is judged, and reconstructed with what shines
+    there.
 
     Parameters
     ----------
     images
-        Captures of the microscope, of different scenes; of more than four, four are used.
+        Captures of the microscope, of different scenes; of more than three, two or three are used.
     imager, grid, method, optics, progress
         As for `cross_validated`; optics by name.
 
@@ -89,13 +90,16 @@ def fit_radius(
         raise InputError("there must be a capture or more to fit the radius to, got none.")
     progress, images = progress or Progress(), images[:: math.ceil(len(images) / _CAPTURES)]
     pitch = _FINER * grid.pitch
-    readout = _readout(imager, grid.depths, pitch)
+    readout, (above, beside) = _readout(imager, grid.depths, pitch)
+    assert readout.roi is not None
     part = eqx.tree_at(lambda i: i.sensor, imager, readout.sensor(imager.sensor))
     fine = Grid.over(part.sensor, depths=grid.depths, pitch=pitch)
-    assert readout.roi is not None
     row, column, high, wide = readout.roi
     middles = [np.asarray(image, np.float32)[row : row + high, column : column + wide] for image in images]
     images = [sum_pixels(image, readout.binning) for image in middles]
+    rows, columns = part.sensor.shape
+    judged = np.zeros((rows, columns), bool)
+    judged[above : rows - above, beside : columns - beside] = True
     trials: dict[float, float] = {}
 
     with progress.counter("Fitting the radius", _TRIALS + 1) as advance:
@@ -108,7 +112,7 @@ def fit_radius(
             squares = []
             for image, kept in zip(images, cycle(kept_pixels_of_folds(model.imager, _FOLDS))):
                 light, residual = comparison(image, model, fine, is_named=True)
-                rest, left_out = residual(volume_of(image, progress, kept=kept), kept), kept == 0
+                rest, left_out = residual(volume_of(image, progress, kept=kept), kept), (kept == 0) & judged
                 squares.append(np.sum(rest[left_out] ** 2) / max(np.sum(light[left_out] ** 2), 1e-30))
             trials[factor] = float(np.mean(squares) ** 0.5)
             advance()
@@ -137,12 +141,15 @@ def _least(imager: Imager) -> float:
     return 1.001 * float(np.max(reach / np.asarray(array.radius_of_curvature)))
 
 
-def _readout(imager: Imager, depths, pitch: float) -> Readout:
-    """The middle of the sensor, as wide as the most voxels of a pitch, with pixels that are wider than voxels."""
+def _readout(imager: Imager, depths, pitch: float) -> tuple[Readout, tuple[int, int]]:
+    """The middle of the sensor, with pixels wider than voxels, and how many along its edges are not judged, each way."""
     sensor = imager.sensor
     voxel = float(imager.magnification(depths).mean()) * pitch / sensor.pixel_pitch
-    most = round(_SIDE * pitch / sensor.pixel_pitch)
+    # Around what is judged as far as light comes from.
+    most = round((_SIDE * pitch + 2 * imager.field_radius) / sensor.pixel_pitch)
     high, wide = (min(n, most) for n in sensor.shape)
-    row, column = (sensor.shape[0] - high) // 2, (sensor.shape[1] - wide) // 2
     binning = min(math.ceil(_VOXELS_PER_PIXEL * voxel), min(high, wide) // 2)
-    return Readout((row, column, high, wide), binning)
+    row, column = ((n - side) // 2 for n, side in zip(sensor.shape, (high, wide), strict=True))
+    margin = round(imager.field_radius / sensor.pixel_pitch / binning)
+    margins = margin if high < sensor.shape[0] else 0, margin if wide < sensor.shape[1] else 0
+    return Readout((row, column, high, wide), binning), margins
