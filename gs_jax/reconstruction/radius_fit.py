@@ -142,7 +142,7 @@ def _least(imager: Imager) -> float:
 
 
 def _readout(imager: Imager, depths, pitch: float) -> tuple[Readout, tuple[int, int]]:
-    """The middle of the sensor, with pixels wider than voxels, and how many along its edges are not judged, each way."""
+    """The middle of the sensor, with pixels wider than voxels, and how many along its edges are not judged."""
     sensor = imager.sensor
     voxel = float(imager.magnification(depths).mean()) * pitch / sensor.pixel_pitch
     # Around what is judged as far as light comes from.
