@@ -31,6 +31,7 @@ from gs_jax.mold.height_files import write_heights
 from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
+from gs_jax.reconstruction.radius_fit import fit_radius
 from gs_jax.reconstruction.warm_start import following_reconstructor
 
 from .test_calibration_pattern import discs
@@ -204,6 +205,13 @@ def scored(case: Case, _) -> None:
     assert found.noise < found.error < 0.95 and found.folds.shape == (4,)
 
 
+def refocused(case: Case, _) -> None:
+    found = fit_radius([case.of_truth], case.imager, case.grid, METHODS["list-rl"](10), optics=case.optics)
+    before, after = case.imager.array, found.imager.array
+    np.testing.assert_allclose(after.radius_of_curvature, found.factor * before.radius_of_curvature, rtol=1e-6)
+    assert abs(found.factor - 1) < 0.03 and len(found.trials) > 3
+
+
 def followed(case: Case, _) -> None:
     """A frame that starts from the same frame's volume keeps its gain, but for a tenth: its steps end 2 % above."""
     empty = gs.quality(np.zeros_like(case.truth), case.truth).psnr_db
@@ -323,6 +331,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
     "points": points,
     **{method: partial(inverted, method) for method in METHODS},
     "score": scored,
+    "radius": refocused,
     "follow": followed,
     "calibrate": calibrate,
     "pattern": pattern,
@@ -338,6 +347,7 @@ TASKS: dict[str, Callable[[Case, Path], None]] = {
 REFUSED: dict[tuple[str, str], str] = {
     ("one lens", "points"): "3 or more lenses must agree on a point, got 1 lens",
     ("one lens", "score"): "2 or more lenses",
+    ("one lens", "radius"): "2 or more lenses",
     ("one lens", "calibrate"): "got 0 of 1 bright spots",
     ("one lens", "pattern"): "a pattern needs an array of 6 lenses or more, got 1",
     ("one lens", "tolerance"): "2 or more lenses must see .*, got 1",
@@ -355,9 +365,9 @@ ALSO = (
     ("geomscope-optimized", "report"),
 )
 
-# A score is four reconstructions of pixels that are masked the same way for every lens, and frames that follow are
-# starts of solvers that all devices have: so on the richest devices.
-ON_THE_RICHEST = ("score", "follow")
+# A score and a radius are reconstructions of pixels that are masked the same way for every lens, and frames that follow
+# are starts of solvers that all devices have: so on the richest devices.
+ON_THE_RICHEST = ("score", "radius", "follow")
 RICHEST = ("geomscope", "curved, tilted, two radii, layers", "one lens")
 
 
