@@ -121,13 +121,13 @@ def cross_validated(
         rest = compare(volume_of(image, progress, kept=kept), kept)
         left_out = kept == 0
         residual[left_out] = rest[left_out]
-        parts.append(_relative(rest[left_out], light[left_out]))
+        parts.append(relative(rest[left_out], light[left_out]))
     noise = math.sqrt(binned_variance(np.asarray(image), light.shape).mean())
     rms = float(np.sqrt(np.mean(light**2)))
     # Any volume predicts a dark capture.
     regions = rms_of_regions(residual) / (rms if rms > 0 else 1)
     return CrossValidation(
-        _relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
+        relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
     )
 
 
@@ -182,6 +182,7 @@ def folds_of_lenses(centers: Float[np.ndarray, "lens 2"], count: int) -> Int[np.
     return folds
 
 
-def _relative(residual, light):
+def relative(residual: Float[np.ndarray, "..."], light: Float[np.ndarray, "..."]) -> float:
+    """RMS of a residual, relative to that of the light; 0 without light."""
     energy = float(np.sum(light**2))
     return float(np.sqrt(np.sum(residual**2) / energy)) if energy > 0 else 0.0
