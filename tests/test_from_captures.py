@@ -9,7 +9,7 @@ import gs_jax as gs
 from gs_jax.apps.training.from_captures import FineTuned, fine_tune
 from gs_jax.cli.train import train_command
 from gs_jax.io.captures import write_capture
-from gs_jax.reconstruction.radius_fit import RadiusFit
+from gs_jax.reconstruction.radius_fit import RadiusFit, _with_radii
 from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
 
 from .test_cli import DESIGN
@@ -56,14 +56,18 @@ def test_the_command(tmp_path):
 
 def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monkeypatch):
     (tmp_path / "my.toml").write_text(DESIGN)
+    mine = gs.read_design(tmp_path / "my.toml")
     (tmp_path / "run").mkdir()
     command = ["--from-captures", str(tmp_path / "run"), "--design", str(tmp_path / "my.toml"), "--depths", "19:21:1"]
     command += ["-o", str(tmp_path / "tuned.npz")]
 
+    factor = 1.02
+
     def fitted(images, imager, grid, networks, progress):
-        return RadiusFit(imager, 1.02, [(1.0, 0.2), (1.02, 0.15)])
+        return RadiusFit(_with_radii(imager, factor), factor, [(1.0, 0.2), (1.02, 0.15)])
 
     def trained(images, imager, grid, networks, **how):
+        assert float(imager.array.radius_of_curvature) == pytest.approx(factor * mine.lens.radius_of_curvature_mm)
         return FineTuned(networks, [0.1], [(0, 0.1)], 0.04, 0.03)
 
     monkeypatch.setattr("gs_jax.reconstruction.radius_fit.fit_radius", fitted)
@@ -75,11 +79,14 @@ def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monke
     write_capture(tmp_path / "run" / "2.tif", np.full((96, 80), 7, np.uint16))
     done = CliRunner().invoke(train_command, command, catch_exceptions=False)
     assert "tuned.toml: radii +2.0%" in done.output and "20.0% before, 15.0% after" in done.output
-    mine, made = gs.read_design(tmp_path / "my.toml"), gs.read_design(tmp_path / "tuned.toml")
+    made = gs.read_design(tmp_path / "tuned.toml")
     assert made.lens.radius_of_curvature_mm == pytest.approx(1.02 * np.array(mine.lens.radius_of_curvature_mm))
-    assert made.provenance["radius_factor"] == 1.02 and (made.array, made.imaging) == (mine.array, mine.imaging)
+    assert made.provenance["radius_factor"] == "1.02" and (made.array, made.imaging) == (mine.array, mine.imaging)
     again = CliRunner().invoke(train_command, command)
     assert isinstance(again.exception, gs.InputError) and "tuned.toml" in str(again.exception)
+    factor = 1.0
+    done = CliRunner().invoke(train_command, [*command, "--force"], catch_exceptions=False)
+    assert "kept" in done.output and not (tmp_path / "tuned.toml").exists()
 
 
 @pytest.mark.parametrize(

@@ -108,9 +108,7 @@ def cross_validated(
     >>> print(found.error < 1, found.folds.shape)
     True (3,)
     """
-    check_call(image, imager, grid, method, optics)
-    if isinstance(method, Surface):
-        raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
+    check_scored(image, imager, grid, method, optics)
     progress = progress or Progress()
     model = prepare_model(imager, grid, optics, progress)
     options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
@@ -129,6 +127,13 @@ def cross_validated(
     return CrossValidation(
         relative(residual, light), min(noise / rms, 1.0) if rms > 0 else 0.0, np.array(parts), regions
     )
+
+
+def check_scored(image, imager, grid, method, optics):
+    """Raise the errors of `cross_validated` that need no computation."""
+    check_call(image, imager, grid, method, optics)
+    if isinstance(method, Surface):
+        raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
 
 
 def comparison(
