@@ -62,6 +62,7 @@ def test_surfaces_still_fall_outward_to_the_edges_of_their_apertures(change, lea
     np.testing.assert_allclose(_bounds(one), (least, most), atol=1e-9)
 
 
+@pytest.mark.integration
 def test_captures_without_light_are_not_counted():
     dark = np.zeros((200, 200))
     found = fit_radius([dark], scope(), GRID, METHODS["list-rl"](1), optics="near")
