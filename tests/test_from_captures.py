@@ -57,6 +57,7 @@ def test_the_command(tmp_path):
 def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monkeypatch):
     (tmp_path / "my.toml").write_text(DESIGN)
     mine = gs.read_design(tmp_path / "my.toml")
+    known = mine.imager()
     (tmp_path / "run").mkdir()
     command = ["--from-captures", str(tmp_path / "run"), "--design", str(tmp_path / "my.toml"), "--depths", "19:21:1"]
     command += ["-o", str(tmp_path / "tuned.npz")]
@@ -67,7 +68,7 @@ def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monke
         return RadiusFit(_with_radii(imager, factor), factor, [(1.0, 0.2), (1.02, 0.15)])
 
     def trained(images, imager, grid, networks, **how):
-        assert float(imager.array.radius_of_curvature) == pytest.approx(factor * mine.lens.radius_of_curvature_mm)
+        assert float(imager.array.radius_of_curvature) == pytest.approx(factor * known.array.radius_of_curvature)
         return FineTuned(networks, [0.1], [(0, 0.1)], 0.04, 0.03)
 
     monkeypatch.setattr("gs_jax.reconstruction.radius_fit.fit_radius", fitted)

@@ -89,6 +89,7 @@ def test_the_middle_keeps_its_place(radius, pitch, binning, margin):
     readout, margins = _readout(one, GRID.depths, pitch)
     part = readout.sensor(one.sensor)
     assert (readout.binning, margins) == (binning, margin)
+    assert readout.roi is not None
     row, column, high, wide = readout.roi
     image = np.zeros(one.sensor.shape, np.float32)
     image[107, 101] = 1
