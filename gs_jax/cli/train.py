@@ -169,6 +169,8 @@ def _from_captures(
         raise InputError(f"--from-captures must be a folder of captures, got {folder}.")
     check_number(files)
     history, made = output.with_suffix(".json"), output.with_suffix(".toml")
+    if made.exists() and design.exists() and made.samefile(design):
+        raise InputError(f"-o must not be beside {design} by the same name: other radii are written there, got {output}.")
     check_may_write(output, history, made, inputs=(*files, design, weights, *camera.files), force=force)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
