@@ -86,7 +86,7 @@ def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monke
     again = CliRunner().invoke(train_command, command)
     assert isinstance(again.exception, gs.InputError) and "tuned.toml" in str(again.exception)
     same = CliRunner().invoke(train_command, [*command[:-1], str(tmp_path / "my.npz")])
-    assert isinstance(same.exception, gs.InputError) and "-o must not be beside" in str(same.exception)
+    assert isinstance(same.exception, gs.InputError) and "-o must have another name" in str(same.exception)
     factor = 1.0
     done = CliRunner().invoke(train_command, [*command, "--force"], catch_exceptions=False)
     assert "kept" in done.output and not (tmp_path / "tuned.toml").exists()

@@ -170,7 +170,7 @@ def _from_captures(
     check_number(files)
     history, made = output.with_suffix(".json"), output.with_suffix(".toml")
     if made.exists() and design.exists() and made.samefile(design):
-        raise InputError(f"-o must not be beside {design} by the same name: other radii are written there, got {output}.")
+        raise InputError(f"-o must have another name than {design}: other radii are written beside it, got {output}.")
     check_may_write(output, history, made, inputs=(*files, design, weights, *camera.files), force=force)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
