@@ -9,7 +9,7 @@ import gs_jax as gs
 from gs_jax.apps.training.from_captures import FineTuned, fine_tune
 from gs_jax.cli.train import train_command
 from gs_jax.io.captures import write_capture
-from gs_jax.reconstruction.radius_fit import RadiusFit, _with_radii
+from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
 from gs_jax.solvers.unrolled import initialize_unrolled, read_unrolled, write_unrolled
 
 from .test_cli import DESIGN
@@ -50,22 +50,22 @@ def test_the_command(tmp_path):
     done = CliRunner().invoke(train_command, words, catch_exceptions=False)
     assert done.exit_code == 0 and "3 captures, 1 steps" in done.output
     # Noise tells nothing of the radius.
-    assert not (tmp_path / "mine.toml").exists()
+    radii = [gs.read_design(tmp_path / f"{name}.toml").lens.radius_of_curvature_mm for name in ("mine", "design")]
+    assert radii[0] == radii[1]
     assert read_unrolled(tmp_path / "mine.npz").first == 2
 
 
-def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monkeypatch):
+def test_the_design_with_the_fitted_radii_is_written_beside_the_weights(tmp_path, monkeypatch):
     (tmp_path / "my.toml").write_text(DESIGN)
     mine = gs.read_design(tmp_path / "my.toml")
     known = mine.imager()
     (tmp_path / "run").mkdir()
     command = ["--from-captures", str(tmp_path / "run"), "--design", str(tmp_path / "my.toml"), "--depths", "19:21:1"]
     command += ["-o", str(tmp_path / "tuned.npz")]
-
     factor = 1.02
 
     def fitted(images, imager, grid, networks, progress):
-        return RadiusFit(_with_radii(imager, factor), factor, [(1.0, 0.2), (1.02, 0.15)])
+        return RadiusFit(with_radii(imager, factor), factor, [(1.0, 0.2), (1.02, 0.15)])
 
     def trained(images, imager, grid, networks, **how):
         assert float(imager.array.radius_of_curvature) == pytest.approx(factor * known.array.radius_of_curvature)
@@ -79,7 +79,7 @@ def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monke
     assert isinstance(few.exception, gs.InputError) and "3 captures or more" in str(few.exception)
     write_capture(tmp_path / "run" / "2.tif", np.full((96, 80), 7, np.uint16))
     done = CliRunner().invoke(train_command, command, catch_exceptions=False)
-    assert "tuned.toml: radii +2.0%" in done.output and "20.0% before, 15.0% after" in done.output
+    assert "tuned.toml: radii +2.0%, by an error of 15.0% of lenses left out (20.0% with the radii of" in done.output
     made = gs.read_design(tmp_path / "tuned.toml")
     assert made.lens.radius_of_curvature_mm == pytest.approx(1.02 * np.array(mine.lens.radius_of_curvature_mm))
     assert made.provenance["radius_factor"] == "1.02" and (made.array, made.imaging) == (mine.array, mine.imaging)
@@ -89,7 +89,8 @@ def test_a_design_with_other_radii_is_written_beside_the_weights(tmp_path, monke
     assert isinstance(same.exception, gs.InputError) and "-o must have another name" in str(same.exception)
     factor = 1.0
     done = CliRunner().invoke(train_command, [*command, "--force"], catch_exceptions=False)
-    assert "kept" in done.output and not (tmp_path / "tuned.toml").exists()
+    kept = gs.read_design(tmp_path / "tuned.toml")
+    assert "tuned.toml: radii +0.0%" in done.output and kept.lens == mine.lens
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,7 @@ def scored(case: Case, _) -> None:
 
 
 def refocused(case: Case, _) -> None:
+    """Of bars in one plane, ten steps show the radius to 3 %; all lenses change alike."""
     found = fit_radius([case.of_truth], case.imager, case.grid, METHODS["list-rl"](10), optics=case.optics)
     before, after = case.imager.array, found.imager.array
     np.testing.assert_allclose(after.radius_of_curvature, found.factor * before.radius_of_curvature, rtol=1e-6)

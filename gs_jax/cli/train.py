@@ -75,8 +75,8 @@ def train_command(
     Fine-tune the unrolled inversion by your own captures, of several scenes of one kind:
     gs-jax train --from-captures run7 --design mine.toml --depths 18:22:0.5 -o tuned.npz
 
-    First, one factor of all radii is fitted, as the focus may differ from the design's. If a factor lowers the error of
-    prediction by 5 % or more, the design with it is written beside WEIGHTS.npz, as WEIGHTS.toml.
+    First, one factor of all radii is fitted, as the focus may differ from the design's. It is 1 unless another lowers
+    the error of prediction by 5 % or more. The design with these radii is written beside WEIGHTS.npz, as WEIGHTS.toml.
     """
     check_output(output, [".npz"])
     if from_captures:
@@ -170,49 +170,43 @@ def _from_captures(
     check_number(files)
     history, made = output.with_suffix(".json"), output.with_suffix(".toml")
     if made.exists() and design.exists() and made.samefile(design):
-        raise InputError(f"-o must have another name than {design}: other radii are written beside it, got {output}.")
+        raise InputError(
+            f"-o must have another name than {design}: the fitted design is written beside WEIGHTS, got {output}."
+        )
     check_may_write(output, history, made, inputs=(*files, design, weights, *camera.files), force=force)
     microscope = read_design(design)
     imager = camera.imager(microscope.imager())
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=PIXELS_PER_VOXEL)
-    provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
     start = read_unrolled(weights) if weights else Unrolled.pretrained()
-
-    def keep(networks):
-        if radius.factor != 1:
-            write_design(made, microscope)
-            partial_outputs[made] = PARTIAL
-        write_unrolled(output, networks, provenance)
-        partial_outputs[output] = PARTIAL
-
+    record = camera.recorded(provenance_of(folder, design, weights, *camera.files))
     with Progress() as progress:
         images = [camera.read(file) for file in files]
         radius = fit_radius(images, imager, grid, start, progress=progress)
-        errors = dict(radius.trials)
-        if radius.factor != 1:
-            lens = microscope.lens
-            larger = {"radius_of_curvature_mm": lens.radius_of_curvature_mm, "focal_length_mm": lens.focal_length_mm}
-            larger = {key: np.round(radius.factor * np.array(x), 6) for key, x in larger.items() if x is not None}
-            record = camera.recorded(provenance_of(folder, design, weights, *camera.files))
-            record |= {"radius_factor": f"{radius.factor:.6g}"}
-            microscope = microscope.replace(**larger, provenance={**microscope.provenance, **record})
-            provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
+        record |= {"radius_factor": f"{radius.factor:.6g}"}
+        scaled = lambda value: None if value is None else np.round(radius.factor * np.array(value), 6)
+        microscope = microscope.replace(
+            radius_of_curvature_mm=scaled(microscope.lens.radius_of_curvature_mm),
+            focal_length_mm=scaled(microscope.lens.focal_length_mm),
+            provenance={**microscope.provenance, **record},
+        )
+        provenance = provenance_of(folder, design, weights, *camera.files, design=design_text(microscope))
+
+        def keep(networks):
+            write_design(made, microscope)
+            write_unrolled(output, networks, provenance)
+            partial_outputs.update({made: PARTIAL, output: PARTIAL})
+
         how = {"steps": steps, "seed": seed, "on_better": keep, "progress": progress}
         found = fine_tune(images, radius.imager, grid, start, **how)
         keep(found.networks)
-        if radius.factor == 1:
-            made.unlink(missing_ok=True)
         held_out = [{"step": step, "loss": loss} for step, loss in found.held_out]
         numbers = {"loss": found.losses, "held_out": held_out, "before": found.before, "after": found.after}
         trials = [{"factor": factor, "rms_error": error} for factor, error in radius.trials]
         write_json(history, {"seed": seed, "radius_factor": radius.factor, "radius_trials": trials} | numbers)
     camera.print_corrections()
-    if radius.factor == 1:
-        click.echo(f"radii of {design}: kept, no others predict lenses clearly better")
-    else:
-        error = f"{errors[1.0]:.1%} before, {errors[radius.factor]:.1%} after (RMS)"
-        words = f"radii {radius.factor - 1:+.1%}; lenses left out are predicted with an error of"
-        click.echo(f"{made}: {words} {error}. Use it with {output}.")
+    errors = dict(radius.trials)
+    words = f"radii {radius.factor - 1:+.1%}, by an error of {errors[radius.factor]:.1%} of lenses left out"
+    click.echo(f"{made}: {words} ({errors[1.0]:.1%} with the radii of {design}, RMS)")
     error = f"{found.before**0.5:.1%} before, {found.after**0.5:.1%} after (RMS)"
     words = f"{len(files)} captures, {len(found.losses)} steps"
     click.echo(f"{output}: {words}; of captures held out, lenses left out are predicted with an error of {error}")

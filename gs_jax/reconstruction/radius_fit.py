@@ -7,7 +7,7 @@ else, and takes any other cause of a wrong focus for the radius: calibrate first
 import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import cycle
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from .inverse_problem import prepare_model, sum_pixels
 from .methods import Method
 from .pipeline import reconstructor
 
+# Groups of lenses, one of which is predicted.
 _FOLDS = 4
 # Largest change, its tolerance, and most trials.
 _RANGE, _TOLERANCE, _TRIALS = 0.06, 3e-3, 7
@@ -33,8 +34,8 @@ _RANGE, _TOLERANCE, _TRIALS = 0.06, 3e-3, 7
 _FINER, _VOXELS_PER_PIXEL = 1 / 3, 2
 # Most captures, and most voxels along a side of the middle that is judged: one number needs no more.
 _CAPTURES, _SIDE = 3, 160
-# An error smaller by less is no reason to change a design: by ray-traced captures of devices as designed it was smaller
-# elsewhere by up to 2.7 % (`own_captures.py`).
+# An error smaller by less is no reason to change a design: that of a device as designed is a little smaller with radii
+# that it does not have (`own_captures.py`).
 _BETTER = 0.05
 
 
@@ -93,55 +94,53 @@ def fit_radius(
     for image in images:
         check_scored(image, imager, grid, method, optics)
     progress, images = progress or Progress(), images[:: math.ceil(len(images) / _CAPTURES)]
-    pitch = _FINER * grid.pitch
-    readout, (above, beside) = _readout(imager, grid.depths, pitch)
-    assert readout.roi is not None
-    part = eqx.tree_at(lambda i: i.sensor, imager, readout.sensor(imager.sensor))
-    fine = Grid.over(part.sensor, depths=grid.depths, pitch=pitch)
-    row, column, high, wide = readout.roi
-    middles = [np.asarray(image, np.float32)[row : row + high, column : column + wide] for image in images]
-    images = [sum_pixels(image, readout.binning) for image in middles]
-    rows, columns = part.sensor.shape
-    judged = np.zeros((rows, columns), bool)
-    judged[above : rows - above, beside : columns - beside] = True
+    part, fine, cut, judged = _middle(imager, grid.depths, _FINER * grid.pitch)
     folds = kept_pixels_of_folds(part, min(_FOLDS, len(part.centers)))
+    captures = [(cut(np.asarray(image, np.float32)), kept) for image, kept in zip(images, cycle(folds))]
     trials: dict[float, float] = {}
+    with progress.counter("Fitting the radius", _TRIALS + 1) as advance, warnings.catch_warnings():
+        # Trials may be out of focus.
+        warnings.simplefilter("ignore", InputWarning)
 
-    with progress.counter("Fitting the radius", _TRIALS + 1) as advance:
-
-        def error(factor: float) -> float:
-            factor = float(factor)
-            made = _with_radii(part, factor)
-            model = prepare_model(made, fine, optics, progress)
-            volume_of = reconstructor(made, fine, method, optics=optics, progress=progress)
-            errors = []
-            for image, kept in zip(images, cycle(folds)):
-                light, residual = comparison(image, model, fine, is_named=True)
-                rest, left_out = residual(volume_of(image, progress, kept=kept), kept), (kept == 0) & judged
-                if light[left_out].any():
-                    errors.append(relative(rest[left_out], light[left_out]))
-            # Captures whose error depends on the radius decide, however large those of others are.
-            trials[factor] = float(np.exp(np.mean(np.log(errors)))) if errors else 0.0
+        def error(factor) -> float:
+            made = with_radii(part, float(factor))
+            trials[float(factor)] = found = _prediction_error(captures, judged, made, fine, method, optics, progress)
             advance()
-            return trials[factor]
+            return found
 
-        bounds, options = _bounds(imager), {"xatol": _TOLERANCE, "maxiter": _TRIALS}
-        with warnings.catch_warnings():
-            # Trials may be out of focus.
-            warnings.simplefilter("ignore", InputWarning)
-            as_known = error(1.0)
-            minimize_scalar(error, bounds=bounds, method="bounded", options=options)
+        as_known = error(1.0)
+        options = {"xatol": _TOLERANCE, "maxiter": _TRIALS}
+        minimize_scalar(error, bounds=_bounds(imager), method="bounded", options=options)
     best = min(trials, key=lambda factor: trials[factor])
     factor = best if trials[best] < (1 - _BETTER) * as_known else 1.0
-    return RadiusFit(_with_radii(imager, factor), factor, sorted(trials.items()))
+    return RadiusFit(with_radii(imager, factor), factor, sorted(trials.items()))
 
 
-def _with_radii(imager: Imager, factor: float) -> Imager:
-    """The microscope with all radii larger by a factor, or the focal length, where it is given in their place."""
+def with_radii(imager: Imager, factor: float) -> Imager:
+    """Return the microscope with all radii larger by a factor, and the focal length, where that overrides them."""
     array = imager.array
-    names = ["radius_of_curvature", *(["thin_lens_focal_length"] if array.thin_lens_focal_length is not None else [])]
-    larger = {name: factor * getattr(array, name) for name in names}
+    larger = {"radius_of_curvature": factor * array.radius_of_curvature}
+    if array.thin_lens_focal_length is not None:
+        larger["thin_lens_focal_length"] = factor * array.thin_lens_focal_length
     return dataclasses.replace(imager, array=dataclasses.replace(array, **larger))
+
+
+def _prediction_error(captures, judged, imager, grid, method, optics, progress) -> float:
+    """RMS error of the judged pixels that are predicted, relative to their light: geometric mean of the captures.
+
+    By this mean, captures whose error depends on the radius decide, however large the errors of others are. Captures
+    without light do not count.
+    """
+    model = prepare_model(imager, grid, optics, progress)
+    volume_of = reconstructor(imager, grid, method, optics=optics, progress=progress)
+    errors = []
+    for image, kept in captures:
+        light, residual = comparison(image, model, grid, is_named=True)
+        left_out = (kept == 0) & judged
+        rest = residual(volume_of(image, progress, kept=kept), kept)
+        if light[left_out].any():
+            errors.append(relative(rest[left_out], light[left_out]))
+    return float(np.exp(np.mean(np.log(errors)))) if errors else 0.0
 
 
 def _bounds(imager: Imager) -> tuple[float, float]:
@@ -149,20 +148,32 @@ def _bounds(imager: Imager) -> tuple[float, float]:
     squared = (np.asarray(imager.array.aperture_diameter) / 2) ** 2
     falls = lambda array: np.all(array.reaches(squared) & (array.sag_slope_over_r(squared) > 0))
     factors = np.linspace(1 - _RANGE, 1 + _RANGE, 25)
-    possible = [factor for factor in factors if falls(_with_radii(imager, factor).array)] or [1.0]
+    possible = [factor for factor in factors if falls(with_radii(imager, factor).array)] or [1.0]
     return min(possible), max(possible)
 
 
-def _readout(imager: Imager, depths, pitch: float) -> tuple[Readout, tuple[int, int]]:
-    """The middle of the sensor, with pixels wider than voxels, and how many along its edges are not judged."""
-    sensor = imager.sensor
-    voxel = float(imager.magnification(depths).mean()) * pitch / sensor.pixel_pitch
+def _middle(
+    imager: Imager, depths, pitch: float
+) -> tuple[Imager, Grid, Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """Return the microscope and the grid at the middle of the sensor, a function that cuts images, and what is judged.
+
+    Pixels are wider than voxels. Around those that are judged are as many as see the same sources.
+    """
+    sensor, magnification = imager.sensor, np.asarray(imager.magnification(depths))
     # A pixel sees a source through a lens between them: so far away at most.
-    away = (1 + float(imager.magnification(depths).max())) * field_limit(imager.field_radius)
+    away = (1 + magnification.max()) * field_limit(imager.field_radius)
     most = round((_SIDE * pitch + 2 * away) / sensor.pixel_pitch)
     high, wide = (min(n, most) for n in sensor.shape)
-    binning = min(math.ceil(_VOXELS_PER_PIXEL * voxel), min(high, wide) // 2)
     row, column = ((n - side) // 2 for n, side in zip(sensor.shape, (high, wide), strict=True))
-    margin = round(away / sensor.pixel_pitch / binning)
-    margins = margin if high < sensor.shape[0] else 0, margin if wide < sensor.shape[1] else 0
-    return Readout((row, column, high, wide), binning), margins
+    binning = min(
+        math.ceil(_VOXELS_PER_PIXEL * magnification.mean() * pitch / sensor.pixel_pitch), min(high, wide) // 2
+    )
+    part = eqx.tree_at(lambda i: i.sensor, imager, Readout((row, column, high, wide), binning).sensor(sensor))
+    judged = np.ones(part.sensor.shape, bool)
+    margin = round(away / part.sensor.pixel_pitch)
+    if high < sensor.shape[0]:
+        judged[:margin] = judged[-margin:] = False
+    if wide < sensor.shape[1]:
+        judged[:, :margin] = judged[:, -margin:] = False
+    cut = lambda image: sum_pixels(image[row : row + high, column : column + wide], binning)
+    return part, Grid.over(part.sensor, depths=depths, pitch=pitch), cut, judged
