@@ -38,7 +38,9 @@ def test_two_captures_are_too_few():
 
 
 @pytest.mark.integration
-def test_the_command(tmp_path):
+def test_the_command(tmp_path, monkeypatch):
+    # Fewer trials than users have: each is a reconstruction of every capture.
+    monkeypatch.setattr("gs_jax.reconstruction.radius_fit._TRIALS", 1)
     (tmp_path / "design.toml").write_text(DESIGN)
     (tmp_path / "run").mkdir()
     for number in range(3):
