@@ -248,6 +248,16 @@ def test_a_browser_moves_it(server, browser):
         for name in ("new.toml", "new-2.toml"):
             page.click("#save")
             expect(page.locator("#said")).to_have_text(f"Saved as {name}.")
+        held = []
+        page.route("**/move", lambda route: held.append(route))
+        page.click("[data-kept='1']")
+        page.click("#save")
+        expect(page.locator("#said")).to_have_text("Saved as new-3.toml.")
+        with page.expect_response("**/move"):
+            held.pop().continue_()
+        page.unroute("**/move")
+        page.wait_for_timeout(50)
+        expect(page.locator("#said")).to_have_text("Saved as new-3.toml.")  # an answer that comes later leaves it
         saved = read_design(folder / "new.toml")
         assert saved.imaging.sensor_distance_mm > 5.8 and saved.provenance["command"] == "gs-jax explore design.toml"
         with page.expect_response(lambda answer: answer.url.endswith("/move")):

@@ -29,17 +29,17 @@ let kept = [], busy = false, wanted = false, later = 0;
 const failed = error => { at("said").textContent = error.message; };
 const move = async () => {
   wanted = true;
+  at("said").textContent = "";  // at the start: what is said while the answer is awaited must stay
   if (busy) return;
   busy = true;
   while (wanted) {
     wanted = false;
     try {
       const began = performance.now(), found = await ask("move", values());
-      at("said").textContent = "";
       at("time").textContent = `${found.ms} ms`;
       at("time").dataset.ms = found.ms;
       at("time").dataset.whole = Math.round(performance.now() - began);
-    } catch (error) { failed(error); }
+    } catch (error) { if (!wanted) failed(error); }
   }
   busy = false;
   clearTimeout(later);
