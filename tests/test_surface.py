@@ -144,7 +144,7 @@ def test_dark_captures_and_single_planes_are_finite():
     [
         (lambda: gs.Surface(sheets=0), "sheets must be 1 or more, got 0"),
         (lambda: gs.Surface(smooth_depth=-1.0), "smooth_depth must be 0 or more, got -1"),
-        (lambda: gs.Surface(steps=10_000), "steps must be 1 to 44, got 10000"),
+        (lambda: gs.Surface(steps=10_000), "steps must be 1 to 36, got 10000"),
         (lambda: gs.reconstruct(np.zeros((300, 300)), scope(), gs.Grid([20, 18], **GRID), gs.Surface()), "must ascend"),
         (lambda: gs.fit_surface(np.zeros((3, 3)), scope(), gs.Grid(DEPTHS, **GRID)), "must have the sensor's shape"),
         (lambda: gs.fit_surface(np.zeros((3, 3)), scope(), gs.Grid(DEPTHS, **GRID), bad()), "must be a Surface"),

@@ -32,7 +32,7 @@ from .sheets import Sheets, first_sheets, hats, interpolated, squared_derivative
 
 # Steps of Richardson-Lucy, Gauss-Newton steps, conjugate gradients in each, and probes of the Hessian at the end;
 # Gauss-Newton steps from a given start.
-_FIRST, _ROUNDS, _GRADIENTS, _PROBES, _RESTARTED = 10, 7, 3, 4, 2
+_FIRST, _ROUNDS, _GRADIENTS, _PROBES, _RESTARTED = 10, 5, 3, 4, 2
 # What a step is for.
 _LUCY, _LINEARISE, _PROBE, _GRADIENT = range(4)
 _SCHEDULE = (
@@ -52,7 +52,7 @@ _MAX_MOVE = 1.0
 # and with brightness, and neighbours share errors of the model. Measured on ray-traced sheets (`surfaces.py`).
 _UNDERSTATED = 8.0
 # Share of a Gauss-Newton step that is taken: depths of whole steps, of few gradients each, swing about their limit.
-_SHARE = 0.7
+_SHARE = 0.9
 # Damping of the Gauss-Newton steps, of the mean diagonal of the Hessian.
 _DAMPING = 1e-3
 # At the start the brightness is nearly right and depths are not: the preconditioner lets depths change first.
