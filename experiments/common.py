@@ -6,12 +6,14 @@ of the command line, calls `run` at full size, and returns what to write and pri
 """
 
 import argparse
+import dataclasses
 import inspect
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import matplotlib
 import numpy as np
 from cycler import cycler
@@ -19,11 +21,13 @@ from matplotlib.figure import Figure
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from gs_jax import Imager, Sensor
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import Design, read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.files import make_folder, write_figure, write_json, write_text
+from gs_jax.lenses import EACH
 from gs_jax.pictures import PALETTE
 
 # Designs that only experiments use.
@@ -109,3 +113,13 @@ def design_of(data: Path | None) -> Design:
 def points_of(data: Path, scene: str) -> np.ndarray:
     """Points `(x, y, z, flux)` of a ray-traced scene, mm."""
     return np.array(json.loads((data / f"{scene}.json").read_text())["points_x_y_z_flux"])
+
+
+def cropped(imager: Imager, pixels: int, reach: float) -> Imager:
+    """The middle of a sensor, and the lenses so near to it, mm."""
+    centers = np.asarray(imager.array.centers)
+    near = np.hypot(*centers.T) < reach
+    own = {name: value[near] for name in EACH if (value := np.asarray(getattr(imager.array, name))).ndim}
+    array = dataclasses.replace(imager.array, centers=centers[near], **own)
+    sensor = Sensor((pixels, pixels), imager.sensor.pixel_pitch)
+    return eqx.tree_at(lambda i: (i.array, i.sensor), imager, (array, sensor))

@@ -27,8 +27,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.common import Report, design_file, main, table
-from experiments.lens_scenes import cropped
+from experiments.common import Report, cropped, design_file, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
 from gs_jax import Grid, Imager, RichardsonLucy, find_points, localization, quality, rasterize, read_design

@@ -21,11 +21,11 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
+from scipy.ndimage import gaussian_filter
 
-from experiments import lens_scenes
-from experiments.common import Report, main, table
+from experiments.common import Report, cropped, main, table
 from experiments.ray_tracer import traced
-from gs_jax import Grid, RichardsonLucy, random_layout, reconstruct, run_study
+from gs_jax import Grid, RichardsonLucy, quality, random_layout, reconstruct, run_study
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.study import Study
 from gs_jax.design.design import Design
@@ -44,7 +44,11 @@ START = (2.95, 1.34, 0.75)
 STEPS = 60
 _OF_KINDS = ("radius_of_curvature", "aperture_diameter")
 # Letters: number of emitters, and electrons of all light of an emitter; the brightest pixels have some thousands.
-_SAMPLES, _ELECTRONS = 200_000, 2e10
+_SAMPLES, _ELECTRONS, _READ_NOISE, _RAYS = 200_000, 2e10, 2.0, 12
+# Position and size of each depth's letter; voxels and width of the volume; pixels of the cropped sensor, and distance
+# of the lenses from the axis; mm.
+_PLACES, _HEIGHT = ((-1.2, -0.5), (0.0, 0.9), (1.2, -0.5)), 1.1
+_VOXEL, _FIELD, _PIXELS, _REACH = 0.04, 4.4, 2560, 6.5
 
 
 def start(seed: int, lenses: int) -> Design:
@@ -107,20 +111,36 @@ def run(
 def judged(
     design: Design, span: tuple[float, float], *, samples: int = _SAMPLES, progress: Progress
 ) -> dict[str, float]:
-    """PSNR, dB, of ray-traced letters with the result for the first layout; as in `lens_scenes`."""
-    imager, near = lens_scenes.cropped(design.imager()), (span[0], sum(span) / 2, span[1])
-    parts = zip("GSJ", near, lens_scenes.PLACES, strict=True)
-    words = [letters(a, depth=z, height=lens_scenes.HEIGHT, pitch=0.008) + [*xy, 0, 0] for a, z, xy in parts]
+    """PSNR, dB, of ray-traced letters with the result for the first layout, unblurred and blurred by a voxel."""
+    imager, near = cropped(design.imager(), _PIXELS, _REACH), (span[0], sum(span) / 2, span[1])
+    parts = zip("GSJ", near, _PLACES, strict=True)
+    words = [letters(a, depth=z, height=_HEIGHT, pitch=0.008) + [*xy, 0, 0] for a, z, xy in parts]
     emitters = np.concatenate(words)
-    side = round(lens_scenes.FIELD / lens_scenes.VOXEL) | 1
-    grid = Grid(near, (side, side), lens_scenes.VOXEL)
+    side = round(_FIELD / _VOXEL) | 1
+    grid = Grid(near, (side, side), _VOXEL)
     truth = np.asarray(rasterize(emitters, grid), np.float32)
-    clean = traced(lens_scenes.sampled(emitters, samples), imager, lens_scenes.RAYS)
+    clean = traced(sampled(emitters, samples), imager, _RAYS)
     rng = np.random.default_rng(0)
     # Equal exposure for all: images are in shares of an emitter's light.
-    image = rng.poisson(_ELECTRONS * clean) + rng.normal(0, lens_scenes.READ_NOISE, clean.shape)
-    volume = reconstruct(image.astype(np.float32), imager, grid, RichardsonLucy(lens_scenes.STEPS), progress=progress)
-    return lens_scenes.scores(np.asarray(volume), truth)
+    image = rng.poisson(_ELECTRONS * clean) + rng.normal(0, _READ_NOISE, clean.shape)
+    volume = np.asarray(reconstruct(image.astype(np.float32), imager, grid, RichardsonLucy(20), progress=progress))
+    blurred = (gaussian_filter(part, (0, 1, 1)) for part in (volume, truth))
+    return {"psnr_db": quality(volume, truth).psnr_db, "blurred_psnr_db": quality(*blurred).psnr_db}
+
+
+def sampled(emitters: np.ndarray, count: int, blur: float = 0.004) -> np.ndarray:
+    """Draw emitters in proportion to their brightness, each with a small displacement, so that they form no lattice.
+
+    They are drawn evenly along rows of the scene. Random draws would put their own unevenness into all images of a
+    scene, which would limit the volumes.
+    """
+    rng = np.random.default_rng(0)
+    rows = emitters[np.lexsort((emitters[:, 0], emitters[:, 1], emitters[:, 2]))]
+    share = np.cumsum(rows[:, 3]) / rows[:, 3].sum()
+    some = rows[np.minimum(np.searchsorted(share, (np.arange(count) + 0.5) / count), len(rows) - 1)]
+    some[:, :2] += rng.uniform(-blur, blur, (count, 2))
+    some[:, 3] = 1 / count
+    return some
 
 
 def gain(alike: Sequence[float], several: Sequence[float]) -> dict:

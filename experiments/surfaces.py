@@ -25,8 +25,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from experiments.common import Report, main, table
-from experiments.lens_scenes import cropped
+from experiments.common import Report, cropped, main, table
 from experiments.ray_tracer import traced
 from gs_jax import Grid, Imager, Sensor, Surface, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
