@@ -4,7 +4,8 @@ Free are the sensor distance, the depth of the paraxial focus, the aperture, the
 of the lenses may face the object. The refractive index, the plate and the pixels are the paper's; plate and sensor
 distance are 7 mm at most. A design's score is the mean over four kinds of scenes of its PSNR above `geomscope`'s, for
 the same exposure time, 3,000 electrons in its brightest pixel, as in `design_judge.py` but for a smaller field.
-Searches start from a Sobol sequence; from the best start of each side CMA-ES (`cma`) goes on.
+The starts are of a Sobol sequence, for both sides; from the best one CMA-ES (`cma`) goes on. A second table has the
+correlations of ranks of the terms of studies with these scores, as in `design_ranks.py`.
 
     python -m experiments.design_search [--starts 8] [--steps 3] [--records FILE] [--out DIR]
 
@@ -15,11 +16,13 @@ for each design.
 from pathlib import Path
 
 import cma
+import jax
 import numpy as np
 from scipy.stats import qmc
 
 from experiments.common import Report, main, table
 from experiments.design_judge import KINDS, Judge, Settings, mean_of
+from experiments.design_ranks import BETTER, correlation, term_of
 from gs_jax import Design, geomscope
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
@@ -64,25 +67,30 @@ class Search:
 
     def __init__(self, judge: Judge, progress: Progress):
         self.judge, self.progress = judge, progress
-        self.gains: dict[tuple[str, ...], list[float]] = {}
+        self.judged: dict[str, tuple[Design, np.ndarray]] = {}
         self.reference = self.psnr_of(geomscope())
 
     def psnr_of(self, design: Design) -> np.ndarray:
         """PSNR of each kind of scene, dB."""
         records = self.judge.judge(design.name, design.imager(), range(1), self.progress)
+        # The programs of a design are of no use to the next one, and those of a hundred crash the process.
+        jax.clear_caches()
         return np.array([mean_of(records, kind, EXPOSURE, lambda r: r["unrolled"]["psnr_db"]) for kind in KINDS])
 
     def score(self, side: str, at: np.ndarray) -> float:
         """Mean gain of a design."""
         design = design_of(side, at)
         gains = self.psnr_of(design) - self.reference
-        self.gains[tuple(design.name.split())] = gains.tolist()
+        self.judged[design.name] = design, gains
         return float(gains.mean())
 
     def go_on(self, side: str, start: np.ndarray, steps: int) -> None:
         """Search by CMA-ES from a start, so many generations."""
         width = HIGH - LOW
+        # A generator of its own: the global one is drawn from elsewhere, and a search that goes on would be another.
+        normal = np.random.default_rng(SEED).standard_normal
         options = {"bounds": [0, 1], "popsize": POPULATION, "seed": SEED, "verbose": -9}
+        options["randn"] = lambda *shape: normal(shape)
         strategy = cma.CMAEvolutionStrategy((start - LOW) / width, SPREAD, options)
         for _ in range(steps):
             units = strategy.ask()
@@ -95,13 +103,29 @@ def report(starts: int, steps: int, records: Path, progress: Progress) -> Report
     make_folder(records.parent)
     search = Search(Judge(records, SETTINGS, geomscope().imager()), progress)
     points = [PAPER, *qmc.scale(qmc.Sobol(len(LOW), rng=SEED).random(starts), LOW, HIGH)]
-    for side in SIDES:
-        scores = [search.score(side, at) for at in points]
-        search.go_on(side, points[int(np.argmax(scores))], steps)
-    best = sorted(search.gains.items(), key=lambda item: -np.mean(item[1]))
-    rows = [[*design, *(f"{gain:+.1f}" for gain in gains)] for design, gains in best]
+    scores = {(side, number): search.score(side, at) for side in SIDES for number, at in enumerate(points)}
+    side, number = max(scores, key=lambda start: scores[start])
+    search.go_on(side, points[number], steps)
+    best = sorted(search.judged.items(), key=lambda item: -item[1][1].mean())
+    rows = [[*name.split(), *(f"{gain:+.1f}" for gain in gains)] for name, (_, gains) in best]
     columns = ("side", *NAMES, *(f"{kind}, dB" for kind in KINDS))
-    return Report({"design_search.md": markdown_table(columns, rows)}, [table(columns, rows[:12])])
+    ranked = ranks([design for _, (design, _) in best], np.array([gains for _, (_, gains) in best]), progress)
+    tables = (markdown_table(columns, rows), markdown_table(*ranked))
+    return Report({"design_search.md": "\n\n".join(tables)}, [table(columns, rows[:12]), table(*ranked)])
+
+
+def ranks(designs: list[Design], gains: np.ndarray, progress: Progress) -> tuple[tuple[str, ...], list[list[str]]]:
+    """Spearman's correlations of terms of studies with the mean gain, and with those of sparse and dense scenes."""
+    # As in `design_ranks`.
+    jax.config.update("jax_enable_x64", True)
+    imagers = [design.imager() for design in designs]
+    judges = (gains.mean(1), gains[:, :2].mean(1), gains[:, 2:].mean(1))
+    rows = []
+    for name, sign in progress.track(list(BETTER.items()), "Terms"):
+        values = sign * np.array([term_of(name, imager) for imager in imagers])
+        rows.append([f"`{name}`", *("{:.2f} ({:.2f} to {:.2f})".format(*correlation(values, by)) for by in judges)])
+    rows.sort(key=lambda row: -float(row[1].split()[0]))
+    return ("objective", f"{len(designs)} designs", "letters, beads", "tilted sheets, texture"), rows
 
 
 if __name__ == "__main__":

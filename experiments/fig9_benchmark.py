@@ -32,7 +32,7 @@ from experiments.common import Report, main, points_of
 from experiments.profiles import local_maxima
 from experiments.ray_tracer import traced
 from experiments.true_image import DEVICES, bars, strokes
-from gs_jax import Grid, Imager, Unrolled, forward_residual
+from gs_jax import Grid, Imager, Surface, Unrolled, forward_residual
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import render_points, timed
 from gs_jax.base.errors import InputError
@@ -151,6 +151,7 @@ def methods(s: Scene, networks: Unrolled, steps: int, progress: Progress) -> dic
         "backproject + paper's U-Net": lambda: Result(suppress(solve("backproject"), pretrained("paper"))),
         "backproject + our U-Net": lambda: Result(suppress(solve("backproject"), pretrained())),
         "unrolled": lambda: Result(by(networks)),
+        "surface": lambda: Result(by(Surface())),
         **{name: (lambda name=name: Result(solve(name))) for name in ITERATIVE},
         "truth": lambda: Result(s.truth),
     }
