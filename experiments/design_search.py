@@ -5,7 +5,8 @@ of the lenses may face the object. The refractive index, the plate and the pixel
 distance are 7 mm at most. A design's score is the mean over four kinds of scenes of its PSNR above `geomscope`'s, for
 the same exposure time, 3,000 electrons in its brightest pixel, as in `design_judge.py` but for a smaller field.
 The starts are of a Sobol sequence, for both sides; from the best one CMA-ES (`cma`) goes on. A second table has the
-correlations of ranks of the terms of studies with these scores, as in `design_ranks.py`.
+correlations of ranks of the terms of studies with these scores, as in `design_ranks.py`, and those of a Gaussian
+process of the six numbers, which predicts each design's score from the others'.
 
     python -m experiments.design_search [--starts 8] [--steps 3] [--records FILE] [--out DIR]
 
@@ -18,6 +19,8 @@ from pathlib import Path
 import cma
 import jax
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
 from scipy.stats import qmc
 
 from experiments.common import Report, main, table
@@ -32,6 +35,8 @@ from gs_jax.io.files import make_folder
 EXPOSURE = 3000
 SETTINGS = Settings(field=1.6, sensor=7.0, exposures=(EXPOSURE,), methods=("unrolled",), rays=300)
 SIDES = ("plano", "curved")
+# Terms of studies whose ranks are compared: the two that rank best in `design_ranks.py`, light, and a volume's error.
+OBJECTIVES = ("psf_width_um", "encircled_radius_um", "light_percent", "volume_error")
 # Sensor distance, mm; paraxial focus, mm; aperture, mm; conic constant; pitch, of the paper's.
 LOW, HIGH = np.array([3.0, 17.0, 0.5, -1.5, 0.85]), np.array([6.0, 32.0, 2.0, 0.5, 1.4])
 NAMES = ("v, mm", "focus, mm", "D, mm", "k", "pitch")
@@ -67,7 +72,8 @@ class Search:
 
     def __init__(self, judge: Judge, progress: Progress):
         self.judge, self.progress = judge, progress
-        self.judged: dict[str, tuple[Design, np.ndarray]] = {}
+        # By name: the design, its numbers in units of the bounds after that of its side, and its gains.
+        self.judged: dict[str, tuple[Design, np.ndarray, np.ndarray]] = {}
         self.reference = self.psnr_of(geomscope())
 
     def psnr_of(self, design: Design) -> np.ndarray:
@@ -81,7 +87,7 @@ class Search:
         """Mean gain of a design."""
         design = design_of(side, at)
         gains = self.psnr_of(design) - self.reference
-        self.judged[design.name] = design, gains
+        self.judged[design.name] = design, np.append(SIDES.index(side), (at - LOW) / (HIGH - LOW)), gains
         return float(gains.mean())
 
     def go_on(self, side: str, start: np.ndarray, steps: int) -> None:
@@ -106,26 +112,50 @@ def report(starts: int, steps: int, records: Path, progress: Progress) -> Report
     scores = {(side, number): search.score(side, at) for side in SIDES for number, at in enumerate(points)}
     side, number = max(scores, key=lambda start: scores[start])
     search.go_on(side, points[number], steps)
-    best = sorted(search.judged.items(), key=lambda item: -item[1][1].mean())
-    rows = [[*name.split(), *(f"{gain:+.1f}" for gain in gains)] for name, (_, gains) in best]
+    best = sorted(search.judged.items(), key=lambda item: -item[1][2].mean())
+    rows = [[*name.split(), *(f"{gain:+.1f}" for gain in gains)] for name, (_, _, gains) in best]
     columns = ("side", *NAMES, *(f"{kind}, dB" for kind in KINDS))
-    ranked = ranks([design for _, (design, _) in best], np.array([gains for _, (_, gains) in best]), progress)
+    designs, numbers, all_gains = zip(*(judged for _, judged in best), strict=True)
+    ranked = ranks(list(designs), np.array(numbers), np.array(all_gains), progress)
     tables = (markdown_table(columns, rows), markdown_table(*ranked))
     return Report({"design_search.md": "\n\n".join(tables)}, [table(columns, rows[:12]), table(*ranked)])
 
 
-def ranks(designs: list[Design], gains: np.ndarray, progress: Progress) -> tuple[tuple[str, ...], list[list[str]]]:
+def ranks(
+    designs: list[Design], numbers: np.ndarray, gains: np.ndarray, progress: Progress
+) -> tuple[tuple[str, ...], list[list[str]]]:
     """Spearman's correlations of terms of studies with the mean gain, and with those of sparse and dense scenes."""
     # As in `design_ranks`.
     jax.config.update("jax_enable_x64", True)
     imagers = [design.imager() for design in designs]
     judges = (gains.mean(1), gains[:, :2].mean(1), gains[:, 2:].mean(1))
-    rows = []
-    for name, sign in progress.track(list(BETTER.items()), "Terms"):
-        values = sign * np.array([term_of(name, imager) for imager in imagers])
-        rows.append([f"`{name}`", *("{:.2f} ({:.2f} to {:.2f})".format(*correlation(values, by)) for by in judges)])
+    cell = lambda a, b: "{:.2f} ({:.2f} to {:.2f})".format(*correlation(a, b))
+    rows = [["Gaussian process, each design left out", *(cell(predicted(numbers, by), by) for by in judges)]]
+    for name in progress.track(OBJECTIVES, "Terms"):
+        values = BETTER[name] * np.array([term_of(name, imager) for imager in imagers])
+        rows.append([f"`{name}`", *(cell(values, by) for by in judges)])
     rows.sort(key=lambda row: -float(row[1].split()[0]))
     return ("objective", f"{len(designs)} designs", "letters, beads", "tilted sheets, texture"), rows
+
+
+def predicted(numbers: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Predict each value from the others by a Gaussian process of the numbers, with the likeliest widths."""
+    count, columns = numbers.shape
+    apart = (numbers[:, None] - numbers) ** 2
+
+    def covariance(logs):
+        return np.exp(logs[-2] - (apart * np.exp(-2 * logs[:columns])).sum(-1) / 2) + np.exp(logs[-1]) * np.eye(count)
+
+    def unlikely(logs):
+        lower = np.linalg.cholesky(covariance(logs))
+        white = solve_triangular(lower, values - values.mean(), lower=True)
+        return white @ white / 2 + np.log(np.diag(lower)).sum()
+
+    bounds = [(-3, 3)] * columns + [(-2, 6), (-6, 3)]
+    starts = (np.append(np.full(columns, width), [3, 0]) for width in (-1, 0, 1))
+    fits = [minimize(unlikely, start, method="L-BFGS-B", bounds=bounds) for start in starts]
+    inverse = np.linalg.inv(covariance(min(fits, key=lambda fit: fit.fun).x))
+    return values - inverse @ (values - values.mean()) / np.diag(inverse)
 
 
 if __name__ == "__main__":

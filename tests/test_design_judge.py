@@ -86,3 +86,9 @@ def test_changes_of_the_microscope_are_designs():
         assert start.replace(**change).imager().array.centers.shape == (200, 2)
     fewer = np.array(design_changes.fewer_lenses(start).array.centers_mm)
     assert len(fewer) == pytest.approx(200 / design_changes.SPREAD**2, rel=0.1)
+
+
+def test_a_smooth_function_is_predicted_from_the_other_designs():
+    at = np.random.default_rng(0).uniform(size=(40, 3))
+    true = np.sin(3 * at[:, 0]) + at[:, 1] ** 2
+    assert np.corrcoef(design_search.predicted(at, true), true)[0, 1] > 0.99
