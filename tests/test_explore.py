@@ -2,9 +2,12 @@
 
 import http.client
 import json
+import socket
+import struct
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +219,18 @@ def test_nobody_else_is_let_in(server):
     for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
         assert request(server, ours, method="GET", **headers)[0] == 403
         assert request(server, f"{ours}save", **headers)[0] == 403
+
+
+def test_a_page_that_is_closed_before_its_answer_prints_nothing(server, capfd):
+    server, _ = server
+    with server.lock:
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
+        connection.request("POST", f"/{server.token}/history", "{}")
+        time.sleep(0.1)
+        connection.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+    time.sleep(0.2)
+    assert request(server, f"/{server.token}/history")[0] == 200 and capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("body", ["[]", "{", '{"near_mm": "x"}', '{"near_mm": 1e9}', "x" * 5000])
