@@ -4,14 +4,14 @@ Free are the sensor distance, the depth of the paraxial focus, the aperture, the
 of the lenses may face the object. The refractive index, the plate and the pixels are the paper's; plate and sensor
 distance are 7 mm at most. A design's score is the mean over four kinds of scenes of its PSNR above `geomscope`'s, for
 the same exposure time, 3,000 electrons in its brightest pixel, as in `design_judge.py` but for a smaller field.
-The starts are of a Sobol sequence, for both sides; from the best one CMA-ES (`cma`) goes on. A second table has the
-correlations of ranks of the terms of studies with these scores, as in `design_ranks.py`, and those of a Gaussian
-process of the six numbers, which predicts each design's score from the others'.
+Starts are from a Sobol sequence, for both sides; from the best one CMA-ES (`cma`) goes on. A second table has
+Spearman's correlations of terms of studies with these scores, as in `design_ranks.py`, and that of a Gaussian process
+of the side and the five numbers, which predicts each design's score from the others'.
 
     python -m experiments.design_search [--starts 8] [--steps 3] [--records FILE] [--out DIR]
 
-Writes the records after each scene, from which the next run goes on, and then `design_search.md`; a minute of two cores
-for each design.
+Writes the records after each scene, from which the next run goes on, and then `design_search.md`; about a minute and a
+quarter of two cores for each design.
 """
 
 from pathlib import Path
@@ -35,8 +35,8 @@ from gs_jax.io.files import make_folder
 EXPOSURE = 3000
 SETTINGS = Settings(field=1.6, sensor=7.0, exposures=(EXPOSURE,), methods=("unrolled",), rays=300)
 SIDES = ("plano", "curved")
-# Terms of studies whose ranks are compared: the two that rank best in `design_ranks.py`, light, and a volume's error.
-OBJECTIVES = ("psf_width_um", "encircled_radius_um", "light_percent", "volume_error")
+# Terms of studies whose ranks are compared: light, a volume's error, and the two that rank best in `design_ranks.py`.
+OBJECTIVES = ("light_percent", "volume_error", "psf_width_um", "encircled_radius_um")
 # Sensor distance, mm; paraxial focus, mm; aperture, mm; conic constant; pitch, of the paper's.
 LOW, HIGH = np.array([3.0, 17.0, 0.5, -1.5, 0.85]), np.array([6.0, 32.0, 2.0, 0.5, 1.4])
 NAMES = ("v, mm", "focus, mm", "D, mm", "k", "pitch")
@@ -79,7 +79,7 @@ class Search:
     def psnr_of(self, design: Design) -> np.ndarray:
         """PSNR of each kind of scene, dB."""
         records = self.judge.judge(design.name, design.imager(), range(1), self.progress)
-        # The programs of a design are of no use to the next one, and those of a hundred crash the process.
+        # The next design needs other programs; those of some fifty designs, kept, crashed the process.
         jax.clear_caches()
         return np.array([mean_of(records, kind, EXPOSURE, lambda r: r["unrolled"]["psnr_db"]) for kind in KINDS])
 
@@ -125,16 +125,15 @@ def ranks(
     designs: list[Design], numbers: np.ndarray, gains: np.ndarray, progress: Progress
 ) -> tuple[tuple[str, ...], list[list[str]]]:
     """Spearman's correlations of terms of studies with the mean gain, and with those of sparse and dense scenes."""
-    # As in `design_ranks`.
+    # Terms are evaluated in float64; the judge before them, as users reconstruct, in float32.
     jax.config.update("jax_enable_x64", True)
-    imagers = [design.imager() for design in designs]
     judges = (gains.mean(1), gains[:, :2].mean(1), gains[:, 2:].mean(1))
     cell = lambda a, b: "{:.2f} ({:.2f} to {:.2f})".format(*correlation(a, b))
     rows = [["Gaussian process, each design left out", *(cell(predicted(numbers, by), by) for by in judges)]]
+    imagers = [design.imager() for design in designs]
     for name in progress.track(OBJECTIVES, "Terms"):
         values = BETTER[name] * np.array([term_of(name, imager) for imager in imagers])
         rows.append([f"`{name}`", *(cell(values, by) for by in judges)])
-    rows.sort(key=lambda row: -float(row[1].split()[0]))
     return ("objective", f"{len(designs)} designs", "letters, beads", "tilted sheets, texture"), rows
 
 
