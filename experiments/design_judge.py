@@ -2,7 +2,7 @@
 
 Letters with bars, beads, tilted sheets and dense texture lie at three depths of a span, at random places and turns.
 `experiments/ray_tracer.py`, which shares no code with `gs_jax`, images them through the lenses about the middle, onto
-the middle of the design's own sensor. Photon and read noise are those of one exposure time for all designs: 20,000,
+the middle of the design's own sensor, and images are blurred by the diffraction of the lenses' clear area. Photon and read noise are those of one exposure time for all designs: 20,000,
 3,000 or 500 electrons in the brightest pixel of `geomscope`. Volumes are reconstructed with the full model on a grid
 that is the same for all, 40 x 40 x 300 um, three planes about each depth: by Richardson-Lucy, with the best of three
 numbers of steps for each scene, and by the unrolled inversion, on voxels half as wide, which are then shared linearly
@@ -35,6 +35,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.io.files import make_folder, write_json
+from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import reconstructor
@@ -145,7 +146,23 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
     """The image without noise: the share of all light in each pixel."""
     light = one.emitters.copy()
     light[:, 3] /= light[:, 3].sum()
-    return traced(light, imager, settings.rays, TILE)
+    return diffracted(traced(light, imager, settings.rays, TILE), imager)
+
+
+def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
+    """The image by rays, blurred by the diffraction of a disc with the mean clear area of the lenses.
+
+    The product of the transfer function by rays and that of a perfect lens is as good as exact both for spots much
+    wider and much narrower than diffraction's.
+    """
+    diameter = 2 * np.sqrt(float(clear_area(imager.array).mean()) / np.pi)
+    rows, columns = image.shape
+    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)) / float(imager.sensor.pixel_pitch)
+    cutoff = diameter / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
+    part = np.minimum(frequency / cutoff, 1)
+    transfer = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
+    # Rays land in single pixels, whose spectrum is not band-limited: it rings below zero.
+    return np.maximum(np.fft.irfft2(np.fft.rfft2(image) * transfer, image.shape), 0)
 
 
 class Methods:

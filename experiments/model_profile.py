@@ -42,10 +42,10 @@ def timed(function: Callable, *arguments, rounds: int) -> tuple[dict[str, float]
 
 
 def with_rings(optics: FieldVaryingPsf, count: int) -> FieldVaryingPsf:
-    """The inner rings of the field alone, two or more."""
+    """The inner rings of the field alone, at least one more than those on the sensor's pixels."""
     some = {"distortion": optics.distortion[:, :count], "light": optics.light[:, :count]}
     return dataclasses.replace(
-        optics, **some, wide_kernels=optics.wide_kernels[:, : count - 1], rings=optics.rings[:count]
+        optics, **some, wide_kernels=optics.wide_kernels[:, : count - optics.kernels.shape[1]], rings=optics.rings[:count]
     )
 
 
@@ -77,7 +77,7 @@ def run(pixels: int = 5120, depths: np.ndarray = DEPTHS, rounds: int = 7) -> lis
     both_ways("cores", _pairs(imager, grid, optics, slice(None)), cores_of, volume, imager, optics)
     work = _pairs(imager, grid, optics, slice(2))
     part("cores: two inner rings", work, cores_of, volume, imager, with_rings(optics, 2))
-    points = dataclasses.replace(optics, kernel=jnp.ones_like(optics.kernel[:, :1, :1]))
+    points = dataclasses.replace(optics, kernels=jnp.ones_like(optics.kernels[..., :1, :1]))
     part("cores without the inner ring's convolutions", "", cores_of, volume, imager, points)
     to_nodes = lambda x: stray_light.to_nodes(x, grid, optics.stray_light.grid)
     nodes = part("stray light: volume to nodes", "", to_nodes, volume)

@@ -24,11 +24,13 @@ from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
-from .psf_core import RINGS, PsfCores, render_kernel, ring_edges, ring_light, sample_profile, trace_cores
+from .psf_core import BINS, RINGS, PsfCores, render_kernel, ring_edges, ring_light, sample_profile, trace_cores
 from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
 
 # Reach of a core's kernel, in pixels of stray light: what is wider is smooth enough for these.
 CORE_REACH = 5
+# Cores with half of their light within so many of the sensor's pixels are too sharp for pixels twice as large.
+_SHARP = 2.0
 # Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
 _WIDEST = 0.9
 # The object's nodes are evenly spaced up to about this part of the widest field, then exponentially; nodes in that
@@ -83,14 +85,14 @@ class StrayLight(eqx.Module):
 class FieldVaryingPsf(eqx.Module):
     """Where all of a point's light goes, at some depths; made by `field_varying_psf`.
 
-    `distortion`: magnification of the cores over the chief ray's. `light`: coefficients of `ring_light`. `kernel`: of
-    the inner ring, on the sensor's pixels, with the sum 1. `wide_kernels`: of the outer rings, on pixels twice as
+    `distortion`: magnification of the cores over the chief ray's. `light`: coefficients of `ring_light`. `kernels`: of
+    the inner rings, on the sensor's pixels, with the sum 1. `wide_kernels`: of the outer rings, on pixels twice as
     large. `rings`: outer radii of the rings, in field radii.
     """
 
     distortion: Float[Array, "depth ring"]
     light: Float[Array, "depth ring coefficient"]
-    kernel: Float[Array, "depth size size"]
+    kernels: Float[Array, "depth inner size size"]
     wide_kernels: Float[Array, "depth outer small small"]
     stray_light: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
@@ -157,7 +159,7 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     arrays = cached_on_disk(key, lambda: _trace_tables(request))
     tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
     stray_light = StrayLight(tables["table"], tables["area"], tables["sensor_distance"], request.grid)
-    kernels = {"kernel": tables["kernel"], "wide_kernels": tables["wide_kernels"]}
+    kernels = {name: tables[name] for name in ("kernels", "wide_kernels")}
     return FieldVaryingPsf(
         tables["distortion"], tables["light"], **kernels, stray_light=stray_light, rings=request.rings
     )
@@ -169,11 +171,36 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, request.rings, progress)
     stray_light = trace_stray_light(imager, depths, grid, cores, request.rings, progress)
     size = kernel_size(imager, grid)
-    kernel = np.stack([render_kernel(profile, size) for profile in cores.profile[:, 0]])
-    outer = cores.profile[:, 1:]
-    wide = np.stack([[render_kernel(profile, size // 4 * 2 + 1, 0.5) for profile in profiles] for profiles in outer])
-    arrays = {"distortion": cores.distortion, "light": cores.light, "kernel": kernel, "wide_kernels": wide}
+    inner = sharp_rings(cores)
+    kernels = [[_unblurred(render_kernel(one, size)) for one in rings[:inner]] for rings in cores.profile]
+    small = size // 4 * 2 + 1
+    wide = [[_unblurred(render_kernel(one, small, 0.5), 0.5) for one in rings[inner:]] for rings in cores.profile]
+    arrays = {"distortion": cores.distortion, "light": cores.light}
+    arrays |= {"kernels": np.stack(kernels), "wide_kernels": np.stack(wide)}
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
+
+
+def sharp_rings(cores: PsfCores) -> int:
+    """Number of inner rings that need the sensor's pixels at some depth: the first at least, and not the last."""
+    # Half of the light is within the first bin beyond which the sum is a half.
+    half = (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
+    narrow = np.append(half[1:-1] < _SHARP, False)
+    return 1 + int(np.argmin(narrow))
+
+
+def _unblurred(kernel: Float64[np.ndarray, "row column"], parts: float = 1) -> Float64[np.ndarray, "row column"]:
+    """A kernel sharpened for light that the four pixels around each chief ray share, which blurs it.
+
+    Over all places within a pixel it has the least mean squared error, but for what would be negative. `parts` is the
+    size of the sensor's pixels in the kernel's: 0.5 of those of wide kernels, whose image is interpolated.
+    """
+    turn = np.fft.fftfreq(len(kernel))
+    # Mean of the shares' spectrum in the phase of the chief ray, over their mean power.
+    shares = np.sinc(turn) ** 2 / (1 - (1 - np.cos(2 * np.pi * turn)) / 3)
+    factor = shares * np.sinc(parts * turn) / np.sinc(turn)
+    spectrum = np.fft.fft2(np.fft.ifftshift(kernel)) * np.multiply.outer(factor, factor)
+    sharp = np.maximum(np.fft.fftshift(np.fft.ifft2(spectrum).real), 0)
+    return sharp / sharp.sum()
 
 
 def kernel_size(imager: Imager, grid: PolarGrid) -> int:

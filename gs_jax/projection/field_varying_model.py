@@ -37,20 +37,20 @@ def full_image(
 
 
 def _cores_image(volume, imager, grid, optics):
-    """The inner ring on the sensor's pixels, the others, whose cores are wider, on pixels twice as large.
+    """The inner rings on the sensor's pixels, the others, whose cores are wider, on pixels twice as large.
 
     The light of the others comes from voxels as wide as these pixels, if that is several of the volume's.
     """
     sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
-    size = optics.wide_kernels.shape[-1]
-    wide, wide_half = with_margin(imager, optics.kernel.shape[-1]), with_margin(_half_resolution(imager), size)
+    (_, inner, reach, _), size = optics.kernels.shape, optics.wide_kernels.shape[-1]
+    wide, wide_half = with_margin(imager, reach), with_margin(_half_resolution(imager), size)
     dtype, nodes = volume.dtype, optics.stray_light.grid
     voxels_per_pixel = 2 * sensor.pixel_pitch / (grid.pitch * nodes.pixel / nodes.step)
     outer_grid, outer_volume = wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
 
     def sharp(imager, plane, number):
-        depth, inner, outer, distortion, light, _, _ = plane
-        grid_here, voxels = (outer_grid, outer) if number else (grid, inner)
+        depth, fine_voxels, wide_voxels, distortion, light, _, _ = plane
+        grid_here, voxels = (grid, fine_voxels) if number < inner else (outer_grid, wide_voxels)
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * distortion[number]
         at = grid_here.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
@@ -67,13 +67,13 @@ def _cores_image(volume, imager, grid, optics):
     def add_depths(images, planes):
         fine, coarse = images
         depths = [jax.tree.map(lambda a, n=n: a[n], planes) for n in range(len(planes[0]))]
-        *_, kernels, wide_kernels = planes
-        fine = fine + sum_of_convolutions([sharp(wide, plane, 0) for plane in depths], kernels, symmetric=True)
-        outer = [sharp(wide_half, plane, number) for plane in depths for number in range(1, len(rings))]
-        wide_kernels = wide_kernels.reshape(-1, size, size)
-        return fine, coarse + sum_of_convolutions(outer, wide_kernels, whole=True, symmetric=True)
+        kernels, wide_kernels = (part.reshape(-1, *part.shape[2:]) for part in planes[-2:])
+        near = [sharp(wide, plane, number) for plane in depths for number in range(inner)]
+        far = [sharp(wide_half, plane, number) for plane in depths for number in range(inner, len(rings))]
+        fine = fine + sum_of_convolutions(near, kernels, symmetric=True)
+        return fine, coarse + sum_of_convolutions(far, wide_kernels, whole=True, symmetric=True)
 
-    kernels = (part.astype(dtype) for part in (optics.kernel, optics.wide_kernels))
+    kernels = (part.astype(dtype) for part in (optics.kernels, optics.wide_kernels))
     planes = grid.depths, volume, outer_volume, optics.distortion, optics.light, *kernels
     whole = [n + size - 1 for n in wide_half.sensor.shape]
     dark = jnp.zeros(sensor.shape, dtype), jnp.zeros(whole, dtype)

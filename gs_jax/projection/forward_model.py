@@ -157,9 +157,9 @@ def forward(
         images = [forward(volume, one, grid, psf) for one, psf in types]
         return sum(images[1:], images[0])
     if isinstance(optics, FieldVaryingPsf):
-        if len(optics.kernel) != grid.depths.size:
+        if len(optics.kernels) != grid.depths.size:
             raise ValueError(
-                f"`optics` must be of {grid.depths.size} depths, as the grid is, got {len(optics.kernel)}."
+                f"`optics` must be of {grid.depths.size} depths, as the grid is, got {len(optics.kernels)}."
             )
         return full_image(volume, imager, grid, optics)
     size = optics.shape[-1]
