@@ -31,6 +31,9 @@ from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pu
 CORE_REACH = 5
 # Cores with half of their light within so many of the sensor's pixels are too sharp for pixels twice as large.
 _SHARP = 2.0
+# What widens spots beside their kernels, as a variance in pixels: light shared by the four pixels around a chief ray,
+# on average over its places; and pixels twice as large as those that they are interpolated to.
+_SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
 # Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
 _WIDEST = 0.9
 # The object's nodes are evenly spaced up to about this part of the widest field, then exponentially; nodes in that
@@ -172,11 +175,13 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     stray_light = trace_stray_light(imager, depths, grid, cores, request.rings, progress)
     size = kernel_size(imager, grid)
     inner = sharp_rings(cores)
-    kernels = [[_unblurred(render_kernel(one, size)) for one in rings[:inner]] for rings in cores.profile]
     small = size // 4 * 2 + 1
-    wide = [[_unblurred(render_kernel(one, small, 0.5), 0.5) for one in rings[inner:]] for rings in cores.profile]
+    sharp = lambda profile: _narrowed(render_kernel(profile, size), _SHARED)
+    wide = lambda profile: _narrowed(render_kernel(profile, small, 0.5), _SHARED + _LARGE)
+    each = lambda kernel, profiles: np.stack([[kernel(one) for one in rings] for rings in profiles])
     arrays = {"distortion": cores.distortion, "light": cores.light}
-    arrays |= {"kernels": np.stack(kernels), "wide_kernels": np.stack(wide)}
+    arrays["kernels"] = each(sharp, cores.profile[:, :inner])
+    arrays["wide_kernels"] = each(wide, cores.profile[:, inner:])
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
 
 
@@ -188,19 +193,13 @@ def sharp_rings(cores: PsfCores) -> int:
     return 1 + int(np.argmin(narrow))
 
 
-def _unblurred(kernel: Float64[np.ndarray, "row column"], parts: float = 1) -> Float64[np.ndarray, "row column"]:
-    """A kernel sharpened for light that the four pixels around each chief ray share, which blurs it.
-
-    Over all places within a pixel it has the least mean squared error, but for what would be negative. `parts` is the
-    size of the sensor's pixels in the kernel's: 0.5 of those of wide kernels, whose image is interpolated.
-    """
-    turn = np.fft.fftfreq(len(kernel))
-    # Mean of the shares' spectrum in the phase of the chief ray, over their mean power.
-    shares = np.sinc(turn) ** 2 / (1 - (1 - np.cos(2 * np.pi * turn)) / 3)
-    factor = shares * np.sinc(parts * turn) / np.sinc(turn)
-    spectrum = np.fft.fft2(np.fft.ifftshift(kernel)) * np.multiply.outer(factor, factor)
-    sharp = np.maximum(np.fft.fftshift(np.fft.ifft2(spectrum).real), 0)
-    return sharp / sharp.sum()
+def _narrowed(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
+    """A kernel with so much less variance each way, in pixels, but for what would be negative."""
+    for axis in (0, 1):
+        around = np.roll(kernel, 1, axis) + np.roll(kernel, -1, axis)
+        kernel = kernel - variance / 2 * (around - 2 * kernel)
+    kernel = np.maximum(kernel, 0)
+    return kernel / kernel.sum()
 
 
 def kernel_size(imager: Imager, grid: PolarGrid) -> int:
