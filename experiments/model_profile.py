@@ -44,9 +44,8 @@ def timed(function: Callable, *arguments, rounds: int) -> tuple[dict[str, float]
 def with_rings(optics: FieldVaryingPsf, count: int) -> FieldVaryingPsf:
     """The inner rings of the field alone, at least one more than those on the sensor's pixels."""
     some = {"distortion": optics.distortion[:, :count], "light": optics.light[:, :count]}
-    return dataclasses.replace(
-        optics, **some, wide_kernels=optics.wide_kernels[:, : count - optics.kernels.shape[1]], rings=optics.rings[:count]
-    )
+    wide = optics.wide_kernels[:, : count - optics.kernels.shape[1]]
+    return dataclasses.replace(optics, **some, wide_kernels=wide, rings=optics.rings[:count])
 
 
 def run(pixels: int = 5120, depths: np.ndarray = DEPTHS, rounds: int = 7) -> list[dict[str, Any]]:

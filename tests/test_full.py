@@ -133,12 +133,27 @@ def test_it_holds_the_light_that_rays_bring(point):
 ALSO = pytest.mark.integration
 
 
+def alone(name: str, sensor: Sensor) -> Imager:
+    """One lens of a shipped design."""
+    lens = read_design(Path(__file__).parents[1] / "design" / f"{name}.toml").imager()
+    return dataclasses.replace(
+        lens, array=dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0)), sensor=sensor
+    )
+
+
+def test_sharp_spots_of_voxels_are_those_of_points():
+    """At any place within a pixel, up to 1.6 field radii: as spots widened by their shares they differ by 0.30."""
+    scope = alone("geomscope-optimized", Sensor((121, 401), 0.0045, (-0.44, 0.0)))
+    grid = Grid([20.0], (1, 33), 0.1371, (2.4, 0.01))
+    image = np.asarray(forward(jnp.ones(grid.volume_shape), scope, grid, field_varying_psf(scope, grid.depths)))
+    points = full_image_of_points(np.array([[x, 0.01, 20.0, 1.0] for x in np.asarray(grid.x)]), scope)
+    assert np.linalg.norm(image - points) < 0.2 * np.linalg.norm(points)
+
+
 @pytest.mark.parametrize("pitch", [pytest.param(0.0045, marks=ALSO), 0.018, pytest.param(0.052, marks=ALSO)])
 def test_a_lens_that_is_sharp_has_no_halo(pitch):
     """Whatever the pixels: what cores do not explain of sharp spots would be sharpened by the halo's filter."""
-    lens = read_design(Path(__file__).parents[1] / "design" / "geomscope-asphere.toml").imager()
-    array = dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0))
-    scope = dataclasses.replace(lens, array=array, sensor=Sensor((41, 41), pitch, (-0.148, 0.0)))
+    scope = alone("geomscope-asphere", Sensor((41, 41), pitch, (-0.148, 0.0)))
     one = Grid([20.0], (1, 1), 0.1, (1.0, 0.0))
     image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, field_varying_psf(scope, one.depths)))
     # All in a few pixels, and nothing that is negative.
