@@ -29,8 +29,10 @@ from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pu
 
 # Reach of a core's kernel, in pixels of stray light: what is wider is smooth enough for these.
 CORE_REACH = 5
-# Cores with half of their light within so many of the sensor's pixels are too sharp for pixels twice as large.
-_SHARP = 2.0
+# Cores with half of their light within so many of the sensor's pixels are too sharp for pixels twice as large; within
+# this part of the field radius's image, for one magnification in a wide ring: they are placed by these rings.
+_SHARP, _PRECISE = 2.0, 0.012
+_SHARP_RINGS = (0.35, 0.6, 0.8, 1.0, 1.17, 1.33, 1.5, 1.67, 2.0, 2.5, 3.0)
 # What widens spots beside their kernels, as a variance in pixels: light shared by the four pixels around a chief ray,
 # on average over its places; and pixels twice as large as those that they are interpolated to.
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
@@ -107,7 +109,7 @@ def field_varying_psf(
     *,
     extent: float | None = None,
     polar_grid: PolarGrid | None = None,
-    rings: Sequence[float] = RINGS,
+    rings: Sequence[float] | None = None,
     progress: Progress | None = None,
 ) -> FieldVaryingPsf:
     """Trace the tables of a microscope at some depths: a second each. They are kept in the user's cache folder.
@@ -126,8 +128,8 @@ def field_varying_psf(
     polar_grid
         Nodes of the stray light, by `make_polar_grid`: tables with the same nodes share compiled programs.
     rings
-        Outer radii of the field's rings, in field radii; each has a core of its own. Fewer, such as `(1.0, 2.5)`, are
-        faster and less accurate.
+        Outer radii of the field's rings, in field radii; each has a core of its own. By default six, or eleven if cores
+        are sharp. Fewer, such as `(1.0, 2.5)`, are faster and less accurate.
     progress
         Shows how many depths are done.
 
@@ -139,7 +141,7 @@ def field_varying_psf(
     leaves, structure = jax.tree.flatten(imager)
     key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
     polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
-    return _cached_tables(_Request(key, polar_grid, tuple(rings), imager, depths, progress))
+    return _cached_tables(_Request(key, polar_grid, rings and tuple(rings), imager, depths, progress))
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ class _Request:
 
     key: tuple
     grid: PolarGrid
-    rings: tuple[float, ...]
+    rings: tuple[float, ...] | None
     imager: Imager = field(compare=False)
     depths: Float64[np.ndarray, " depth"] = field(compare=False)
     progress: Progress | None = field(compare=False)
@@ -160,37 +162,39 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     structure, *leaves = request.key
     key = (repr((structure, request.grid, request.rings)).encode(), *leaves)
     arrays = cached_on_disk(key, lambda: _trace_tables(request))
+    rings = tuple(arrays.pop("rings").tolist())
     tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
     stray_light = StrayLight(tables["table"], tables["area"], tables["sensor_distance"], request.grid)
     kernels = {name: tables[name] for name in ("kernels", "wide_kernels")}
-    return FieldVaryingPsf(
-        tables["distortion"], tables["light"], **kernels, stray_light=stray_light, rings=request.rings
-    )
+    return FieldVaryingPsf(tables["distortion"], tables["light"], **kernels, stray_light=stray_light, rings=rings)
 
 
 def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name."""
     imager, depths, grid, progress = request.imager, request.depths, request.grid, request.progress
-    cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, request.rings, progress)
-    stray_light = trace_stray_light(imager, depths, grid, cores, request.rings, progress)
+    rings, reach = request.rings or RINGS, CORE_REACH * grid.pixel
+    cores = trace_cores(imager, depths, reach, rings, progress)
+    half = half_light_radii(cores) * imager.sensor.pixel_pitch
+    if not request.rings and half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step:
+        rings = _SHARP_RINGS
+        cores = trace_cores(imager, depths, reach, rings, progress)
+    stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
-    inner = sharp_rings(cores)
+    # The first ring at least, and not the last.
+    inner = 1 + int(np.argmin(np.append(half_light_radii(cores)[1:-1] < _SHARP, False)))
     small = size // 4 * 2 + 1
     sharp = lambda profile: _narrowed(render_kernel(profile, size), _SHARED)
     wide = lambda profile: _narrowed(render_kernel(profile, small, 0.5), _SHARED + _LARGE)
     each = lambda kernel, profiles: np.stack([[kernel(one) for one in rings] for rings in profiles])
-    arrays = {"distortion": cores.distortion, "light": cores.light}
+    arrays = {"distortion": cores.distortion, "light": cores.light, "rings": np.array(rings)}
     arrays["kernels"] = each(sharp, cores.profile[:, :inner])
     arrays["wide_kernels"] = each(wide, cores.profile[:, inner:])
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
 
 
-def sharp_rings(cores: PsfCores) -> int:
-    """Number of inner rings that need the sensor's pixels at some depth: the first at least, and not the last."""
-    # Half of the light is within the first bin beyond which the sum is a half.
-    half = (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
-    narrow = np.append(half[1:-1] < _SHARP, False)
-    return 1 + int(np.argmin(narrow))
+def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
+    """Radius that holds half of a core's light, in pixels, for each ring at the depth where it is least."""
+    return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
 
 
 def _narrowed(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
