@@ -141,7 +141,7 @@ def field_varying_psf(
     leaves, structure = jax.tree.flatten(imager)
     key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
     polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
-    return _cached_tables(_Request(key, polar_grid, rings and tuple(rings), imager, depths, progress))
+    return _cached_tables(_Request(key, polar_grid, None if rings is None else tuple(rings), imager, depths, progress))
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     rings, reach = request.rings or RINGS, CORE_REACH * grid.pixel
     cores = trace_cores(imager, depths, reach, rings, progress)
     half = half_light_radii(cores) * imager.sensor.pixel_pitch
-    if not request.rings and half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step:
+    if request.rings is None and half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step:
         rings = _SHARP_RINGS
         cores = trace_cores(imager, depths, reach, rings, progress)
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
