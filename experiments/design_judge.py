@@ -2,14 +2,15 @@
 
 Letters with bars, beads, tilted sheets and dense texture lie at three depths of a span, at random places and turns.
 `experiments/ray_tracer.py`, which shares no code with `gs_jax`, images them through the lenses about the middle, onto
-the middle of the design's own sensor; the images are blurred as the diffraction of a lens's clear area blurs. Photon
-and read noise are those of one exposure time for all designs: 20,000, 3,000 or 500 electrons in the brightest pixel of
-`geomscope`. Volumes are reconstructed with the full model on a grid that is the same for all, 40 x 40 x 300 um, three
-planes about each depth: by Richardson-Lucy, with the best of three numbers of steps for each scene, and by the unrolled
-inversion, on voxels half as wide, which are then shared linearly by those of the grid (`voxel_width.py`). Scores, after
-the best gain: PSNR and SSIM; the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`.
-Differences of two designs are of the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the
-scenes, each with its own noise.
+the middle of the design's own sensor, and the diffraction of their clear area blurs the images. Photon and read noise
+are those of one exposure time for all designs: 20,000, 3,000 or 500 electrons in the brightest pixel of `geomscope`.
+Volumes are reconstructed with the full model on a grid that is the same for all, 40 x 40 x 300 um, three planes about
+each depth: by Richardson-Lucy, with the best of three numbers of steps for each scene, and by the unrolled inversion,
+on voxels half as wide, which are then shared linearly by those of the grid (`voxel_width.py`). Scores, after the best
+gain: PSNR and SSIM; the contrast of bars of 60 um over that of the truth; for beads F1 by `find_points`. Differences of
+two designs are of the same scenes, with 95 % intervals by a bootstrap over squares of 0.7 mm of the scenes, each with
+its own noise. A second table has the error that the full model leaves of images without noise, of scenes that lie in
+planes.
 
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--rays 600] [--records FILE]
 
@@ -31,7 +32,7 @@ from matplotlib.figure import Figure
 from experiments.common import Report, cropped, design_file, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax import Grid, Imager, RichardsonLucy, find_points, localization, quality, rasterize, read_design
+from gs_jax import Grid, Imager, RichardsonLucy, find_points, forward, localization, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
@@ -46,9 +47,12 @@ from gs_jax.simulation.phantoms import letters
 DESIGNS = ("geomscope", "geomscope-exposure", "geomscope-optimized", "geomscope-asphere", "geomscope-table1")
 DESIGNS += ("geomscope-targets",)
 KINDS = ("letters", "beads", "tilted sheets", "texture")
+IN_PLANES = KINDS[:2]
 VOXEL, PLANE, READ_NOISE = 0.04, 0.3, 2.0
 # Distance of emitters, of which so many share rays, mm; and squares of a scene that the bootstrap draws, along a side.
 APART, TILE, SQUARES = 0.01, 0.1, 3
+# How images are made; records of others are refused.
+IMAGES = "by rays and diffraction"
 # Bars: their period and size, mm. A bead's diameter, and beads at each depth.
 PERIOD, SIZE, BEAD, BEADS = 0.12, 0.48, 0.06, 10
 
@@ -151,10 +155,10 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
 
 
 def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
-    """The image by rays, blurred by the diffraction of a disc with the mean clear area of the lenses.
+    """Blur an image by rays with the diffraction of a disc, as large as the mean clear area of the lenses.
 
-    The product of the transfer function by rays and that of a perfect lens is as good as exact both for spots much
-    wider and much narrower than diffraction's.
+    The product of the transfer functions by rays and by diffraction is what lens design programs show beside the one by
+    rays; it is exact for spots that are small beside that of diffraction.
     """
     diameter = 2 * np.sqrt(float(clear_area(imager.array).mean()) / np.pi)
     rows, columns = image.shape
@@ -162,7 +166,7 @@ def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
     cutoff = diameter / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
     part = np.minimum(frequency / cutoff, 1)
     transfer = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
-    # Rays land in single pixels, whose spectrum is not band-limited: it rings below zero.
+    # An image by rays is not band-limited, so that the product rings below zero.
     return np.maximum(np.fft.irfft2(np.fft.rfft2(image) * transfer, image.shape), 0)
 
 
@@ -259,7 +263,7 @@ class Judge:
 
     def __init__(self, file: Path, settings: Settings, reference: Imager):
         self.file, self.settings, self.reference = file, settings, device(reference, settings)
-        as_json = json.loads(json.dumps(settings._asdict()))
+        as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES}))
         self.kept = json.loads(file.read_text()) if file.exists() else {"settings": as_json, "scenes": {}, "found": {}}
         if self.kept["settings"] != as_json:
             raise InputError(f"{file} must be of the settings {as_json}, got {self.kept['settings']}.")
@@ -329,6 +333,18 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
     return ("scene", "electrons", *names), rows
 
 
+def model_error(imager: Imager, kind: str, settings: Settings) -> float:
+    """Error of the full model's image of a scene on fine voxels, after the best gain, relative to the image."""
+    small, one = device(imager, settings), scene(kind, 0, settings)
+    fine = finer(settings.grid, settings.width)
+    model = prepare_model(small, fine, "full", Progress())
+    light, _ = prepare_data(image_of(one, small, settings).astype(np.float32), model)
+    truth = np.asarray(rasterize(one.emitters, fine), np.float32)
+    image = np.asarray(jax.jit(forward)(truth, model.imager, fine, model.optics))
+    gain = np.vdot(image, light) / np.vdot(image, image)
+    return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
+
+
 def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
     """Maxima over the depths of the truth and of volumes by the last method, at the second exposure, of each kind."""
     kept = json.loads(file.read_text())
@@ -365,9 +381,14 @@ def report(designs: list[Path], span: list[float], draws: int, rays: int, record
     imagers = {read_design(file).name or file.stem: read_design(file).imager() for file in files}
     found = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
     columns, rows = rows_of(found, settings)
-    few = dict(list(imagers.items())[:2])
-    shown = picture(few, judge.file, settings)
-    return Report({"design_judge.md": markdown_table(columns, rows), "design_judge.png": shown}, [table(columns, rows)])
+    of_model = ("design", *(f"{kind}, error of the model" for kind in IN_PLANES))
+    errors = [
+        [name, *(f"{model_error(imager, kind, settings):.3f}" for kind in IN_PLANES)]
+        for name, imager in progress.track(list(imagers.items()), "Images of the model")
+    ]
+    text = "\n\n".join((markdown_table(columns, rows), markdown_table(of_model, errors)))
+    shown = picture(dict(list(imagers.items())[:2]), judge.file, settings)
+    return Report({"design_judge.md": text, "design_judge.png": shown}, [table(columns, rows), table(of_model, errors)])
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from gs_jax.io.captures import read_capture
 from gs_jax.layouts import random_layout
 from gs_jax.lenses import Orientation
 from gs_jax.optics.aberrations import best_focus
-from gs_jax.optics.field_varying import RINGS, field_varying_psf
+from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.optics.psf import psf_of_depth
 from gs_jax.projection.point_sources import full_image_of_points
 from gs_jax.simulation.phantoms import letters, random_points, rasterize
@@ -110,7 +110,7 @@ def of_volume(emitters: np.ndarray, imager: Imager, pitch: float, image: np.ndar
     kernel = psf_of_depth(imager, depths, "geometric")
     near = forward(volume, imager, grid, jnp.stack([kernel(depth) for depth in depths]))
     results = {"near": scores(np.asarray(near), image)}
-    for name, rings in (("full", RINGS), ("two rings", TWO_RINGS)):
+    for name, rings in (("full", None), ("two rings", TWO_RINGS)):
         optics = field_varying_psf(imager, depths, rings=rings, progress=progress)
         results[name] = scores(np.asarray(forward(volume, imager, grid, optics)), image)
     return results

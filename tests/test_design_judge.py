@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.special import j1
 
 from experiments import design_changes, design_search
-from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, finer, scene, shared
+from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, diffracted, finer, scene, shared
 from experiments.ray_tracer import traced
 from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
@@ -33,6 +34,18 @@ def test_the_contrast_of_bars_falls_with_blur():
     sharp, soft = (contrast(gaussian_filter(truth, (0, s, s)), one.bars[1], settings.grid) for s in (0, 1))
     # A Gaussian of 40 um leaves exp(-2 (pi 40 / 120)^2) of 120 um, and light leaves the ends of the bars.
     assert 0.8 < sharp < 1.1 and soft / sharp == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), abs=0.08)
+
+
+def test_a_point_is_blurred_to_an_airy_disc():
+    lens = MicrolensArray([[0.0, 0.0]], radius_of_curvature=2.0, aperture_diameter=0.3)
+    scope = Imager(lens, Sensor((101, 101), 0.001), 5.8, 3.0)
+    point = np.zeros((101, 101))
+    point[50, 50] = 1
+    image = diffracted(point, scope)
+    x, y = np.meshgrid(0.001 * np.arange(-50, 51), 0.001 * np.arange(-50, 51))
+    argument = np.pi * 0.3 * np.maximum(np.hypot(x, y), 1e-9) / (float(scope.wavelength) * 5.8)
+    np.testing.assert_allclose(image / image.max(), (2 * j1(argument) / argument) ** 2, atol=2e-3)
+    assert image.sum() == pytest.approx(1, rel=1e-3)
 
 
 def test_differences_are_of_pairs():

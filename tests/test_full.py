@@ -66,10 +66,12 @@ def volume(shape, dtype=float) -> jax.Array:
 
 @pytest.mark.integration
 @pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-11), (jnp.float32, 1e-5)])
-@pytest.mark.parametrize("pixels", [(96, 81), (80, 80)])
-def test_the_adjoint_is_exact(dtype, rtol, pixels):
-    scope, voxels = imager(dtype, pixels=pixels), grid(dtype)
-    A = ImagingOperator(scope, voxels, field_varying_psf(scope, voxels.depths))
+@pytest.mark.parametrize(("pixels", "pitch", "inner"), [((96, 81), 0.06, 5), ((80, 80), 0.0045, 1)])
+def test_the_adjoint_is_exact(dtype, rtol, pixels, pitch, inner):
+    scope, voxels = imager(dtype, pixels=pixels, pitch=pitch), grid(dtype)
+    optics = field_varying_psf(scope, voxels.depths)
+    assert optics.kernels.shape[1] == inner and optics.wide_kernels.shape[1] == 6 - inner
+    A = ImagingOperator(scope, voxels, optics)
     x = volume(voxels.volume_shape, dtype)
     y = jax.random.uniform(jax.random.key(1), pixels, dtype)
     one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
@@ -136,13 +138,15 @@ ALSO = pytest.mark.integration
 def alone(name: str, sensor: Sensor) -> Imager:
     """One lens of a shipped design."""
     lens = read_design(Path(__file__).parents[1] / "design" / f"{name}.toml").imager()
-    return dataclasses.replace(
-        lens, array=dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0)), sensor=sensor
-    )
+    array = dataclasses.replace(lens.array, centers=jnp.zeros((1, 2)), size=(2.0, 2.0))
+    return dataclasses.replace(lens, array=array, sensor=sensor)
 
 
 def test_sharp_spots_of_voxels_are_those_of_points():
-    """At any place within a pixel, up to 1.6 field radii: as spots widened by their shares they differ by 0.30."""
+    """At any place within a pixel, up to 1.6 field radii. Points have 28 rings, to a tenth of a pixel: 0.15 is left.
+
+    Six rings of which one is on the sensor's pixels, with the blur by shared light, leave 0.30.
+    """
     scope = alone("geomscope-optimized", Sensor((121, 401), 0.0045, (-0.44, 0.0)))
     grid = Grid([20.0], (1, 33), 0.1371, (2.4, 0.01))
     image = np.asarray(forward(jnp.ones(grid.volume_shape), scope, grid, field_varying_psf(scope, grid.depths)))
@@ -170,13 +174,18 @@ def test_fewer_rings_hold_the_same_light():
     wanted: tuple[dict[str, Any], ...] = ({}, {"rings": (1.0, 2.5)})
     six, two = (forward(x, scope, voxels, field_varying_psf(scope, voxels.depths, **o)) for o in wanted)
     np.testing.assert_allclose(two.sum(), six.sum(), rtol=0.02)
-    y, z, x_all = (np.ravel(part) for part in np.meshgrid(voxels.y, voxels.depths, voxels.x))
-    points = full_image_of_points(np.column_stack([x_all, y, z, np.ravel(x)]), scope)
+    places = np.meshgrid(voxels.depths, voxels.y, voxels.x, indexing="ij")
+    points = full_image_of_points(np.stack([*places[::-1], x], -1).reshape(-1, 4), scope)
     binned = lambda image: np.asarray(image)[:, :80].reshape(24, 4, 20, 4).sum((1, 3))
     alike = lambda a, b: np.corrcoef(np.ravel(a), np.ravel(b))[0, 1]
-    assert alike(six, points) > 0.95 and alike(binned(two), binned(six)) > 0.99
-    # Two rings place cores less well.
-    assert alike(two, points) < 0.9
+    # Two rings place cores less well: they differ within a few of these pixels.
+    assert alike(six, points) > max(alike(two, points), 0.95) and alike(binned(two), binned(six)) > 0.99
+
+
+@pytest.mark.parametrize("rings", [(), (1.0,), (1.0, 1.0), (2.0, 1.0), (0.0, 1.0)])
+def test_rings_that_are_none_are_refused(rings):
+    with pytest.raises(InputError, match="rings must be two or more radii that ascend, got"):
+        field_varying_psf(imager(), DEPTHS, rings=rings)
 
 
 def test_points_are_voxels_that_lie_anywhere():

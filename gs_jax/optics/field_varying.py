@@ -20,21 +20,34 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, Int, Num
 
 from ..base.disk_cache import cached_on_disk
+from ..base.errors import InputError, short_repr
 from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
-from .psf_core import BINS, RINGS, PsfCores, render_kernel, ring_edges, ring_light, sample_profile, trace_cores
+from .psf_core import (
+    RINGS,
+    PsfCores,
+    half_light_radii,
+    narrow_kernel,
+    render_kernel,
+    ring_edges,
+    ring_light,
+    sample_profile,
+    trace_cores,
+)
 from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
 
 # Reach of a core's kernel, in pixels of stray light: what is wider is smooth enough for these.
 CORE_REACH = 5
-# Cores with half of their light within so many of the sensor's pixels are too sharp for pixels twice as large; within
-# this part of the field radius's image, for one magnification in a wide ring: they are placed by these rings.
-_SHARP, _PRECISE = 2.0, 0.012
+# Rings whose cores have half of their light within so many of the sensor's pixels are computed on these.
+_SHARP = 2.0
+# Cores with half of their light within this part of the field radius's image are too sharp for one magnification in a
+# wide ring, and get these rings.
+_PRECISE = 0.012
 _SHARP_RINGS = (0.35, 0.6, 0.8, 1.0, 1.17, 1.33, 1.5, 1.67, 2.0, 2.5, 3.0)
-# What widens spots beside their kernels, as a variance in pixels: light shared by the four pixels around a chief ray,
-# on average over its places; and pixels twice as large as those that they are interpolated to.
+# What the model adds to the width of a core, as a variance in squared pixels each way: four pixels share the light of a
+# chief ray (the mean over its places); and large pixels stand for those of half their width.
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
 # Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
 _WIDEST = 0.9
@@ -133,15 +146,23 @@ def field_varying_psf(
     progress
         Shows how many depths are done.
 
+    Raises
+    ------
+    InputError
+        If `rings` are not two or more that ascend.
+
     Examples
     --------
     >>> image = forward(volume, imager, grid, field_varying_psf(imager, grid.depths))
     """
+    rings = None if rings is None else tuple(rings)
+    if rings is not None and (len(rings) < 2 or not (np.diff((0.0, *rings)) > 0).all()):
+        raise InputError(f"rings must be two or more radii that ascend, got {short_repr(rings)}.")
     depths = np.asarray(depths, np.float64)
     leaves, structure = jax.tree.flatten(imager)
     key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
     polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
-    return _cached_tables(_Request(key, polar_grid, None if rings is None else tuple(rings), imager, depths, progress))
+    return _cached_tables(_Request(key, polar_grid, rings, imager, depths, progress))
 
 
 @dataclass(frozen=True)
@@ -180,30 +201,16 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
         cores = trace_cores(imager, depths, reach, rings, progress)
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
-    # The first ring at least, and not the last.
+    # Of each kind of pixels there is one ring at least.
     inner = 1 + int(np.argmin(np.append(half_light_radii(cores)[1:-1] < _SHARP, False)))
     small = size // 4 * 2 + 1
-    sharp = lambda profile: _narrowed(render_kernel(profile, size), _SHARED)
-    wide = lambda profile: _narrowed(render_kernel(profile, small, 0.5), _SHARED + _LARGE)
-    each = lambda kernel, profiles: np.stack([[kernel(one) for one in rings] for rings in profiles])
+    sharp = lambda profile: narrow_kernel(render_kernel(profile, size), _SHARED)
+    wide = lambda profile: narrow_kernel(render_kernel(profile, small, 0.5), _SHARED + _LARGE)
+    each = lambda kernel, profiles: np.stack([[kernel(one) for one in at_depth] for at_depth in profiles])
     arrays = {"distortion": cores.distortion, "light": cores.light, "rings": np.array(rings)}
     arrays["kernels"] = each(sharp, cores.profile[:, :inner])
     arrays["wide_kernels"] = each(wide, cores.profile[:, inner:])
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
-
-
-def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
-    """Radius that holds half of a core's light, in pixels, for each ring at the depth where it is least."""
-    return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
-
-
-def _narrowed(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
-    """A kernel with so much less variance each way, in pixels, but for what would be negative."""
-    for axis in (0, 1):
-        around = np.roll(kernel, 1, axis) + np.roll(kernel, -1, axis)
-        kernel = kernel - variance / 2 * (around - 2 * kernel)
-    kernel = np.maximum(kernel, 0)
-    return kernel / kernel.sum()
 
 
 def kernel_size(imager: Imager, grid: PolarGrid) -> int:

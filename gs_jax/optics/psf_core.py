@@ -32,7 +32,7 @@ _BLUR = 3.0
 # Largest pixel by which sharpness is judged, in images of the widest field; depths traced before interpolating.
 _SHARP, _MOST = 0.006, 9
 # Radial bins in a pixel, which are fine beside the nodes of stray light, and samples of a rendered kernel.
-BINS, _SAMPLES = 16, 2**17
+_BINS, _SAMPLES = 16, 2**17
 
 
 class PsfCores(NamedTuple):
@@ -99,7 +99,7 @@ def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, rea
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
-    edges = np.arange(0, math.ceil(reach / pitch) * BINS + 1) * pitch / BINS
+    edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
     parts = [_ring_core(rays, fields, chief, pitch, edges, *ring) for ring in rings]
     return PsfCores(*map(np.stack, zip(*parts, strict=True)))
 
@@ -116,7 +116,7 @@ def _ring_core(rays, fields, chief, pitch, edges, inner, outer):
     profile = np.histogram(radius, edges, weights=mine.light * weight[:, None])[0]
     profile = profile / profile.sum()
     # As pixels see it: without differences within a pixel.
-    density = np.repeat(profile.reshape(-1, BINS).sum(1) / np.diff(edges[::BINS] ** 2), BINS)
+    density = np.repeat(profile.reshape(-1, _BINS).sum(1) / np.diff(edges[::_BINS] ** 2), _BINS)
     bins = np.minimum((radius / edges[1]).astype(int), density.size)
     amount = (mine.light * np.append(density, 0)[bins]).sum(1) / (profile * density).sum()
     powers = (fields[used] / outer)[:, None] ** (2 * np.arange(_DEGREE + 1))
@@ -236,5 +236,19 @@ def render_kernel(
 def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
     """Points `(x, y)` in pixels whose density follows a core's profile."""
     order = np.arange(count) + 0.5
-    edges = np.arange(profile.size + 1) / BINS
+    edges = np.arange(profile.size + 1) / _BINS
     return vogel_spiral(np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2)), order)
+
+
+def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
+    """Radius that holds half of the light of each ring's cores, in pixels, at the depth where it is least."""
+    return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / _BINS
+
+
+def narrow_kernel(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
+    """Subtract a variance in squared pixels, each way, from a kernel; what would be negative is zero."""
+    for axis in (0, 1):
+        around = np.roll(kernel, 1, axis) + np.roll(kernel, -1, axis)
+        kernel = kernel - variance / 2 * (around - 2 * kernel)
+    kernel = np.maximum(kernel, 0)
+    return kernel / kernel.sum()
