@@ -7,17 +7,15 @@ angle: a small matrix over the radii maps each angular harmonic of the object to
 each lens counts to first order.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Float64, Int, Num
+from jaxtyping import Array, Float, Float32, Float64
 
 from ..base.disk_cache import cached_on_disk
 from ..base.errors import InputError, short_repr
@@ -25,6 +23,7 @@ from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
+from .polar_grid import PolarGrid, make_polar_grid, polar_weights
 from .psf_core import (
     RINGS,
     PsfCores,
@@ -49,42 +48,10 @@ _SHARP_RINGS = (0.35, 0.6, 0.8, 1.0, 1.17, 1.33, 1.5, 1.67, 2.0, 2.5, 3.0)
 # What the model adds to the width of a core, as a variance in squared pixels each way: four pixels share the light of a
 # chief ray (the mean over its places); and large pixels stand for those of half their width.
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
-# Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
-_WIDEST = 0.9
-# The object's nodes are evenly spaced up to about this part of the widest field, then exponentially; nodes in that
-# part.
-_LINEAR, _NODES = 0.45, 44
-# How far beyond the widest field's chief ray light is followed on the sensor, in images of the widest field.
-_BEYOND = 0.35
 # Order of the low-pass filter of angular harmonics, which ends where a wave is two pixels.
 _FILTER_ORDER = 8
 # Rays of each field, and samples of a core.
 _RAYS, _CORE_SAMPLES = 16384, 2048
-
-
-class PolarGrid(NamedTuple):
-    """Polar nodes about a lens's axis, on the object's side and on the sensor's.
-
-    `step`: spacing of the inner nodes in the object, mm; `pixel`: of those on the sensor. `bend`: radius from which on
-    the spacing grows, in steps. `angles`, `fields`, `radii`: numbers of nodes around, and outward on either side.
-    """
-
-    step: float
-    pixel: float
-    bend: float
-    angles: int
-    fields: int
-    radii: int
-
-    def nodes(self, count: int) -> Float64[np.ndarray, " node"]:
-        """Radii of the nodes, in steps. Where the spacing grows, it is that around."""
-        return self.bend * np.sinh(np.arange(count) / self.bend)
-
-    def areas(self, count: int) -> Float64[np.ndarray, " node"]:
-        """Area of a node's cell, in squared steps."""
-        edges = self.bend * np.sinh((np.arange(count + 1) - 0.5) / self.bend)
-        edges[0] = 0
-        return np.pi * np.diff(edges**2) / self.angles
 
 
 class StrayLight(eqx.Module):
@@ -218,25 +185,6 @@ def kernel_size(imager: Imager, grid: PolarGrid) -> int:
     return 2 * round(CORE_REACH * grid.pixel / imager.sensor.pixel_pitch) + 1
 
 
-def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> PolarGrid:
-    """Nodes of the stray light for a range of depths and an object's extent, mm; by default the sensor's."""
-    extent = extent or 2 * max(map(abs, imager.sensor.extent))
-    largest_field = math.sqrt(2) * (float(jnp.abs(imager.array.centers).max()) + extent / 2)
-    near = float(imager.reduced_depth(float(depths.min())))
-    widest = min(_WIDEST * near, largest_field)
-    middle = float(imager.magnification(float(depths.min() + depths.max()) / 2))
-    linear = _LINEAR * _WIDEST * near
-    # A whole number of pixels.
-    pixels = max(round(middle * linear / _NODES / imager.sensor.pixel_pitch), 1)
-    pixel = pixels * imager.sensor.pixel_pitch
-    step = pixel / middle
-    bend = linear / step
-    count = lambda reach: math.ceil(bend * math.asinh(reach / bend)) + 2
-    largest = float(imager.magnification(float(depths.min()))) / middle
-    radii = count((1 + _BEYOND) * largest * widest / step)
-    return PolarGrid(step, pixel, bend, 4 * round(2 * math.pi * bend / 4), count(widest / step), radii)
-
-
 def trace_stray_light(
     imager: Imager,
     depths: Float64[np.ndarray, " depth"],
@@ -295,24 +243,3 @@ def _bin_polar(grid, landing, light):
     x, y = -landing.T / grid.pixel
     ray, node, share = polar_weights(grid, grid.radii, x, y)
     return np.bincount(node, light[ray] * share, grid.radii * grid.angles)
-
-
-def polar_weights(
-    grid: PolarGrid, count: int, x: Num[np.ndarray, " place"], y: Num[np.ndarray, " place"]
-) -> tuple[Int[np.ndarray, " entry"], Int[np.ndarray, " entry"], Float64[np.ndarray, " entry"]]:
-    """Bilinear weights of the four nodes around each place (in steps), as entries (place, node, weight).
-
-    Places beyond the nodes, `count` outward, have no entries.
-    """
-    outward = grid.bend * np.arcsinh(np.hypot(x, y) / grid.bend)
-    place = np.flatnonzero(outward < count - 1)
-    outward = outward[place]
-    turned = np.arctan2(y, x)[place] * (grid.angles / (2 * np.pi)) % grid.angles
-    radius, around = outward.astype(int), turned.astype(int)
-    parts = []
-    for step, turn in np.ndindex(2, 2):
-        node = (radius + step) * grid.angles + (around + turn) % grid.angles
-        share = np.abs(1 - step - (outward - radius)) * np.abs(1 - turn - (turned - around))
-        parts.append((place, node, share))
-    place, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return place, node, share

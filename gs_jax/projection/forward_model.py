@@ -12,8 +12,9 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import lenses_by_type
-from ..optics.field_varying import FieldVaryingPsf, field_varying_psf, make_polar_grid
+from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
 from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type
+from ..optics.polar_grid import make_polar_grid
 from ..optics.psf import psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import scan_in_groups, sum_of_convolutions, with_margin

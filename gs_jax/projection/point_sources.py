@@ -15,7 +15,8 @@ from scipy.spatial import KDTree
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
-from ..optics.field_varying import CORE_REACH, kernel_size, make_polar_grid, trace_stray_light
+from ..optics.field_varying import CORE_REACH, kernel_size, trace_stray_light
+from ..optics.polar_grid import make_polar_grid
 from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
 from ..typing import Points

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..optics.apertures import clear_area
-from ..optics.field_varying import PolarGrid, StrayLight, polar_weights
+from ..optics.field_varying import StrayLight
+from ..optics.polar_grid import PolarGrid, polar_weights
 from .linear_map import LinearMap
 
 # Lenses whose stray light is computed at once, which bounds the memory.

@@ -21,8 +21,9 @@ from ..io.point_tables import read_points
 from ..io.volumes import read_volume
 from ..layers import object_index
 from ..lenses import lenses_by_type
-from ..optics.field_varying import field_varying_psf, make_polar_grid
+from ..optics.field_varying import field_varying_psf
 from ..optics.lens_types import relative_areas, split_by_type
+from ..optics.polar_grid import make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
 from ..projection.point_sources import STEPS, forward_points, full_image_of_points, make_stamps

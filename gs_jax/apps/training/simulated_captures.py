@@ -20,7 +20,8 @@ from ...geometry import Imager
 from ...grid import Grid, Sensor
 from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ...lenses import MicrolensArray
-from ...optics.field_varying import FieldVaryingPsf, PolarGrid, field_varying_psf, make_polar_grid
+from ...optics.field_varying import FieldVaryingPsf, field_varying_psf
+from ...optics.polar_grid import PolarGrid, make_polar_grid
 from ...projection.forward_model import forward
 from ...simulation.synthetic import Camera, electrons, expose
 from ...typing import Volume
