@@ -373,6 +373,10 @@ def picture(names: dict[str, Imager], file: Path, settings: Settings) -> Figure:
 
 
 def report(designs: list[Path], span: list[float], draws: int, rays: int, records: Path, progress: Progress) -> Report:
+    # Planes about the three depths must not meet.
+    if draws < 1 or rays < 1 or not 0 < span[0] < span[1] - 2:
+        wanted = "--draws and --rays must be 1 or more, and --span positive and wider than 2 mm"
+        raise InputError(f"{wanted}, got {draws}, {rays} and {span}.")
     settings = Settings(span=(span[0], span[1]), rays=rays)
     files = designs or [design_file(name) for name in DESIGNS]
     reference = read_design(design_file(DESIGNS[0])).imager()
