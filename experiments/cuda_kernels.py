@@ -59,7 +59,7 @@ extern "C" __global__ void scatter(const float2* lens, const float* magnificatio
 def cuda_kernels(geometry: Geometry, image: np.ndarray, volume: np.ndarray) -> tuple[Callable, Callable] | None:
     """Calls on the GPU, of the image and of the volume, that return CuPy arrays when they end; None without CuPy."""
     try:
-        import cupy as cp
+        import cupy as cp  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     g = geometry

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.accelerator_speed import FROM_HOST, OURS, race, rows_of
 from experiments.backprojection_speed import Job, memory, report
 from experiments.common import write
 from experiments.kernels import count_pairs, lens_patches, numpy_patches, paper_loop, plain
@@ -63,3 +64,11 @@ def test_run_at_toy_size(tmp_path):
 def test_memory_holds_the_volume():
     found = memory("NumPy", Job(voxels=2200, pixels=120, lenses=9, depths=2))
     assert found["process_mib"] > found["extra_mib"] > 2200 * 2200 * 2 * 4 / 2**20
+
+
+def test_accelerators_are_timed_at_toy_size():
+    result = race(Job(voxels=20, pixels=120, lenses=9, depths=2), rounds=1)
+    names = [row[0] for row in rows_of(result)]
+    # Without CuPy, as here, there are no kernels in CUDA.
+    assert names == [*OURS, FROM_HOST]
+    assert all(one["many_s"] > 0 for one in result["contestants"].values())
