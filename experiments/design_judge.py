@@ -160,14 +160,19 @@ def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
     The product of the transfer functions by rays and by diffraction is what lens design programs show beside the one by
     rays; it is exact for spots that are small beside that of diffraction.
     """
-    diameter = 2 * np.sqrt(float(clear_area(imager.array).mean()) / np.pi)
-    rows, columns = image.shape
-    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)) / float(imager.sensor.pixel_pitch)
-    cutoff = diameter / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
-    part = np.minimum(frequency / cutoff, 1)
-    transfer = 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
+    transfer = diffraction_transfer(imager, image.shape, float(imager.sensor.pixel_pitch))
     # An image by rays is not band-limited, so that the product rings below zero.
     return np.maximum(np.fft.irfft2(np.fft.rfft2(image) * transfer, image.shape), 0)
+
+
+def diffraction_transfer(imager: Imager, shape: tuple[int, ...], pixel: float) -> np.ndarray:
+    """Transfer function of a disc of the lenses' mean clear area, at the frequencies of `rfft2`; `pixel` in mm."""
+    diameter = 2 * np.sqrt(float(clear_area(imager.array).mean()) / np.pi)
+    rows, columns = shape
+    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)) / pixel
+    cutoff = diameter / (float(imager.wavelength) * float(imager.reduced_sensor_distance))
+    part = np.minimum(frequency / cutoff, 1)
+    return 2 / np.pi * (np.arccos(part) - part * np.sqrt(1 - part**2))
 
 
 class Methods:

@@ -3,15 +3,15 @@
 Designs are the shipped ones and random ones between bounds of R, D, conic constant, pitch, side and layout, with v from
 0.8 to 1.2 of the paraxial focus. The judge is that of `experiments/design_judge.py` on a field of 1.2 mm, at 3,000
 electrons: letters, beads and texture at 18.4, 20.5 and 22.6 mm, traced by rays, with noise of one exposure time. Its
-solver is Richardson-Lucy with a system matrix of rays of its own, which takes seconds where the full model takes
-minutes; a scene counts with its best number of steps. The mean of the PSNR is compared with each term of studies, and
-with the judge's own repeat, of other scenes and noise: for all designs, and for the better half, in which focus is no
-longer what tells them apart. Intervals are 95 %, by a bootstrap over designs.
+solver is Richardson-Lucy with a system matrix of rays and diffraction of its own, which takes seconds where the full
+model takes minutes; a scene counts with its best number of steps. The mean of the PSNR is compared with each term of
+studies, and with the judge's own repeat, of other scenes and noise: for all designs, and for the better half, in which
+focus is no longer what tells them apart. Intervals are 95 %, by a bootstrap over designs.
 
     python -m experiments.design_ranks [--records FILE] [--out DIR]
 
-Writes the records after each design, from which the next run goes on, and then `design_ranks.md`; about a quarter of
-an hour of a core.
+Writes the records after each design, from which the next run goes on, and then `design_ranks.md`; about half an
+hour of a core.
 """
 
 import json
@@ -26,10 +26,21 @@ import scipy.sparse as sp
 from scipy.stats import rankdata
 
 from experiments.common import Report, design_file, main, table
-from experiments.design_judge import DESIGNS, READ_NOISE, VOXEL, Settings, device, image_of, scene
+from experiments.design_judge import (
+    DESIGNS,
+    IMAGES,
+    READ_NOISE,
+    VOXEL,
+    Settings,
+    device,
+    diffraction_transfer,
+    image_of,
+    scene,
+)
 from experiments.ray_tracer import bundles
 from gs_jax import Imager, quality, random_layout, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
+from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design
@@ -39,7 +50,7 @@ from gs_jax.layouts import hexagonal_layout
 from gs_jax.objectives import Conditions
 from gs_jax.reconstruction.inverse_problem import sum_pixels
 
-RANDOM = 20
+RANDOM = 40
 SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
 STEPS = (4, 12)
 # Rays of a voxel to each lens, and voxels along a side that share them.
@@ -124,15 +135,26 @@ def system(imager: Imager) -> sp.csr_matrix:
     return sp.csr_matrix((values.ravel(), columns.ravel(), starts), (len(columns), side * side))
 
 
-def richardson_lucy(adjoint: sp.csr_matrix, images: np.ndarray, noise: float) -> dict[int, np.ndarray]:
-    """Volumes `(voxel, image)` after each number of steps; Gaussian noise counts as light that is known."""
+def richardson_lucy(
+    adjoint: sp.csr_matrix, transfer: np.ndarray, images: np.ndarray, noise: float
+) -> dict[int, np.ndarray]:
+    """Volumes `(voxel, image)` after each number of steps; Gaussian noise counts as light that is known.
+
+    `transfer` is that of diffraction, at the frequencies of `rfft2`.
+    """
     seen = adjoint @ np.ones((len(images), 1), np.float32)
+
+    def diffracted(columns):
+        square = columns.reshape(transfer.shape[0], -1, columns.shape[1])
+        spectra = np.fft.rfft2(square, axes=(0, 1)) * transfer[..., None]
+        return np.fft.irfft2(spectra, square.shape[:2], axes=(0, 1)).reshape(columns.shape).astype(np.float32)
+
     seen = np.maximum(seen, 0.1 * seen.mean())
     x = np.ones((len(seen), images.shape[1]), np.float32) * images.sum(0) / seen.sum()
     found = {}
     for number in range(1, max(STEPS) + 1):
-        ratio = np.maximum(images + noise, 0) / (adjoint.T @ x + noise)
-        x = x * (adjoint @ ratio.astype(np.float32)) / seen
+        ratio = np.maximum(images + noise, 0) / (np.maximum(diffracted(adjoint.T @ x), 0) + noise)
+        x = x * np.maximum(adjoint @ diffracted(ratio.astype(np.float32)), 0) / seen
         if number in STEPS:
             found[number] = x
     return found
@@ -151,7 +173,9 @@ def judged(imager: Imager, brightest: Callable[[str, int], float], draws=(0, 1))
             cases.append(kind)
             images.append(sum_pixels(image, side).ravel().astype(np.float32))
             truths.append(np.asarray(rasterize(one.emitters, grid), np.float32))
-    found = richardson_lucy(adjoint, np.stack(images, 1), (side * READ_NOISE) ** 2)
+    rows = small.sensor.shape[0] // side
+    transfer = diffraction_transfer(small, (rows, rows), side * float(small.sensor.pixel_pitch))
+    found = richardson_lucy(adjoint, transfer, np.stack(images, 1), (side * READ_NOISE) ** 2)
     records: dict[str, list[float]] = {kind: [] for kind in SETTINGS.kinds}
     for number, (kind, truth) in enumerate(zip(cases, truths, strict=True)):
         volumes = (x[:, number].reshape(grid.volume_shape) for x in found.values())
@@ -187,7 +211,10 @@ def spearman(a: np.ndarray, b: np.ndarray) -> float:
 def report(records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
     make_folder(records.parent)
-    kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else {"bright": {}, "found": {}}
+    new = {"images": IMAGES, "bright": {}, "found": {}}
+    kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else new
+    if kept.get("images") != IMAGES:
+        raise InputError(f"{records} must be of images {IMAGES}, got {kept.get('images', 'by rays')}.")
     reference = device(read_design(design_file(DESIGNS[0])).imager(), SETTINGS)
 
     def brightest(kind: str, draw: int) -> float:

@@ -17,7 +17,8 @@ def test_random_designs_are_in_focus_or_nearly(seed):
 def test_richardson_lucy_finds_voxels_that_share_no_pixel():
     adjoint = sp.csr_matrix(np.kron(np.eye(3), np.full((1, 4), 0.25)).astype(np.float32))
     truth = np.array([[10.0], [40.0], [90.0]], np.float32)
-    assert richardson_lucy(adjoint, adjoint.T @ truth, 0.0)[STEPS[-1]] == pytest.approx(truth, rel=1e-4)
+    no_diffraction = np.ones((12, 1))
+    assert richardson_lucy(adjoint, no_diffraction, adjoint.T @ truth, 0.0)[STEPS[-1]] == pytest.approx(truth, rel=1e-4)
 
 
 def test_the_correlation_is_of_ranks():
