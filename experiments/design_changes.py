@@ -1,8 +1,8 @@
 """Change one thing of the paper's microscope at a time, and judge the volumes as `design_judge` does.
 
-The changes are a narrower aperture, spots as sharp as the search of the ten-minutes page makes them, conics with the
-curved side facing the object, fewer lenses, and a smaller image. The numbers of the second, third and last are of
-searches for the least `psf_width_um` with the others fixed.
+The changes are a narrower aperture, spots as sharp as a search makes them, conics with the curved side facing the
+object, fewer lenses, and a smaller image. The numbers of the second, third and last are of searches for the least
+`psf_width_um` with the others fixed.
 
     python -m experiments.design_changes [--rays 600] [--records FILE]
 

@@ -57,6 +57,7 @@ STEPS = (4, 12)
 RAYS, SHARED = 120, 3
 # Terms, and whether more is better. What depends on the layout alone, or is a limit, is left out.
 BETTER = {
+    "width_per_light_um": -1,
     "psf_width_um": -1,
     "encircled_radius_um": -1,
     "blur_um": -1,

@@ -110,6 +110,8 @@ def test_width_of_an_ideal_lens_out_of_focus(focused):
     airy = 0.5145 * 0.52 * 5.0 / 0.5 / np.asarray(lens.imager.magnification(lens.at.depths))
     expected = np.sqrt((radius**2 / 4 + pixel**2 / 12) * 8 * np.log(2) + airy**2)
     np.testing.assert_allclose(jax.jit(lambda c: c.term("psf_width_um"))(lens), expected, rtol=1e-9)
+    per_light = expected / np.asarray(lens.term("light_percent")) ** 0.25
+    np.testing.assert_allclose(jax.jit(lambda c: c.term("width_per_light_um"))(lens), per_light, rtol=1e-9)
     np.testing.assert_allclose(jax.jit(lambda c: c.term("encircled_radius_um"))(lens), np.sqrt(0.8) * radius, rtol=0.03)
 
 

@@ -217,6 +217,9 @@ TERMS: dict[str, Term] = {
     "field_of_view_mm": Term("width of the field of view", objectives.field_of_view),
     "thickness_mm": Term("thickness: filters, plate and sensor distance", _of_imager(objectives.thickness)),
     "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", _scaled(UM, objectives.spot_width)),
+    "width_per_light_um": Term(
+        "width of the spot over the fourth root of the light in percent", _scaled(UM, objectives.width_per_light)
+    ),
     "encircled_radius_um": Term("radius of 80 % of the rays, in the object", _scaled(UM, objectives.encircled_radius)),
     "depth_span_mm": Term("span of the depths", lambda _, at: at.depths[-1] - at.depths[0]),
     "spacing_mm": Term("distance of nearest lenses", _of_imager(objectives.spacing)),

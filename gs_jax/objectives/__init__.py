@@ -45,4 +45,5 @@ from .quantities import (
     thickness as thickness,
     uncovered_distance as uncovered_distance,
     wavefront_error as wavefront_error,
+    width_per_light as width_per_light,
 )

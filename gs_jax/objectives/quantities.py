@@ -289,6 +289,15 @@ def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     return theory.FWHM * jnp.sqrt(total) / imager.magnification(at.depths)
 
 
+def width_per_light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
+    """`spot_width` over the fourth root of the light of all lenses in percent, mm: sharpness and noise in one number.
+
+    It ranks designs as reconstructions at equal exposure do (`experiments/design_ranks.py`); so do roots near to it.
+    """
+    at = as_conditions(imager, depths)
+    return spot_width(imager, at) / (100 * light(imager, at)) ** 0.25
+
+
 @best_type
 def encircled_radius(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Radius about the rays' centroid that holds 80 % of them, seen in the object, mm; rays as for `spot_width`.
