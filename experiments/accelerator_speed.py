@@ -1,13 +1,13 @@
 """Time back-projection, its adjoint and their gradients on a GPU or TPU, beside kernels written by hand in CUDA.
 
 The problems are those of `backprojection_speed.py`, in float32. On NVIDIA GPUs with CuPy two kernels written by hand
-(`cuda_kernels.py`) compute the same sums; results are compared before all are timed in interleaved rounds. "Many" is
+(`cuda_kernels.py`) compute the same sums; results are compared before all are timed in interleaved rounds. "Of many" is
 the time of a call where ten are started one after the other, so that the host prepares the next while the device
 computes. "From the host" includes the transfer of a camera's uint16 image to the device.
 
     python -m experiments.accelerator_speed [--out DIR]
 
-Writes `accelerator_speed.json` and `accelerator_speed.md`; a minute on an H200. `inversion_speed.py` times the
+Writes `accelerator_speed.json` and `accelerator_speed.md`; a minute or two on an H200. `inversion_speed.py` times the
 iterative methods there.
 """
 
@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.backprojection_speed import CONTESTANTS, FULL, Inputs, Job, check, count_pairs, inputs, plain
+from experiments.backprojection_speed import CONTESTANTS, FULL, Inputs, Job, check, inputs
 from experiments.common import Report, main, table
 from experiments.cuda_kernels import cuda_kernels
+from experiments.kernels import count_pairs, plain
 from gs_jax import backproject
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.method_benchmark import timed

@@ -147,6 +147,12 @@ def device(imager: Imager, settings: Settings) -> Imager:
     return cropped(imager, pixels, settings.sensor / 2 + 0.4)
 
 
+def mark(name: str, imager: Imager) -> str:
+    """The key of a design's records, which another design of the same name does not share."""
+    numbers = np.concatenate([np.ravel(x) for x in jax.tree.leaves(imager)])
+    return f"{name} {hashlib.sha256(numbers.tobytes()).hexdigest()[:8]}"
+
+
 def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
     """The image without noise: the share of all light in each pixel."""
     light = one.emitters.copy()
@@ -276,9 +282,7 @@ class Judge:
     def judge(self, name: str, imager: Imager, draws: Sequence[int], progress: Progress) -> dict[str, Any]:
         """Records of a design by kind of scene and draw."""
         small, methods = device(imager, self.settings), None
-        lenses = np.concatenate([np.ravel(x) for x in jax.tree.leaves(small)])
-        mark = f"{name} {hashlib.sha256(lenses.tobytes()).hexdigest()[:8]}"
-        records = self.kept["found"].setdefault(mark, {})
+        records = self.kept["found"].setdefault(mark(name, small), {})
         for draw in draws:
             for kind in progress.track(list(self.settings.kinds), name):
                 key = f"{kind} {draw}"

@@ -8,10 +8,10 @@ model takes minutes; a scene counts with its best number of steps. The mean of t
 studies, and with the judge's own repeat, of other scenes and noise: for all designs, and for the better half, in which
 focus is no longer what tells them apart. Intervals are 95 %, by a bootstrap over designs.
 
-    python -m experiments.design_ranks [--records FILE] [--out DIR]
+    python -m experiments.design_ranks [DESIGN.toml ...] [--records FILE] [--out DIR]
 
-Writes the records after each design, from which the next run goes on, and then `design_ranks.md`; about half an
-hour of a core.
+Writes the records after each design, from which the next run goes on, and then `design_ranks.md`; about half an hour of
+a core. Designs that are given are judged beside the others, and do not count in the correlations.
 """
 
 import json
@@ -35,6 +35,7 @@ from experiments.design_judge import (
     device,
     diffraction_transfer,
     image_of,
+    mark,
     scene,
 )
 from experiments.ray_tracer import bundles
@@ -53,6 +54,8 @@ from gs_jax.reconstruction.inverse_problem import sum_pixels
 RANDOM = 40
 SETTINGS = Settings(field=1.2, around=0, kinds=("letters", "beads", "texture"), exposures=(3000,), rays=200)
 STEPS = (4, 12)
+# Powers of the light that are tried beside the width of the spot, and those that are shown; draws of halves of designs.
+POWERS, SHOWN, DRAWS = np.arange(0, 0.61, 0.05), (0.1, 0.2, 0.3, 0.4), 300
 # Rays of a voxel to each lens, and voxels along a side that share them.
 RAYS, SHARED = 120, 3
 # Terms, and whether more is better. What depends on the layout alone, or is a limit, is left out.
@@ -143,13 +146,13 @@ def richardson_lucy(
 
     `transfer` is that of diffraction, at the frequencies of `rfft2`.
     """
-    seen = adjoint @ np.ones((len(images), 1), np.float32)
 
     def diffracted(columns):
         square = columns.reshape(transfer.shape[0], -1, columns.shape[1])
         spectra = np.fft.rfft2(square, axes=(0, 1)) * transfer[..., None]
         return np.fft.irfft2(spectra, square.shape[:2], axes=(0, 1)).reshape(columns.shape).astype(np.float32)
 
+    seen = adjoint @ np.ones((len(images), 1), np.float32)
     seen = np.maximum(seen, 0.1 * seen.mean())
     x = np.ones((len(seen), images.shape[1]), np.float32) * images.sum(0) / seen.sum()
     found = {}
@@ -209,7 +212,22 @@ def spearman(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
 
-def report(records: Path, progress: Progress) -> Report:
+def held_out(width: np.ndarray, light: np.ndarray, judge: np.ndarray) -> tuple[float, float, float]:
+    """Correlation of `width / light^p` in half of the designs, with the power that is best in the others.
+
+    The mean and 95 % of the draws of halves.
+    """
+    rng, found = np.random.default_rng(0), []
+    for _ in range(DRAWS):
+        chosen, others = np.array_split(rng.permutation(len(judge)), 2)
+        score = lambda power, some: spearman((power * np.log(light) - np.log(width))[some], judge[some])
+        best = max(POWERS, key=lambda power: score(power, chosen))  # noqa: B023
+        found.append(score(best, others))
+    low, high = np.quantile(found, (0.025, 0.975))
+    return float(np.mean(found)), float(low), float(high)
+
+
+def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
     make_folder(records.parent)
     new = {"images": IMAGES, "bright": {}, "found": {}}
@@ -223,24 +241,31 @@ def report(records: Path, progress: Progress) -> Report:
             kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
         return kept["bright"][key]
 
-    designs = [read_design(design_file(name)) for name in DESIGNS] + [random_design(k) for k in range(RANDOM)]
-    for design in progress.track(designs, "Designs"):
-        record = kept["found"].setdefault(str(design.name), {})
-        if "psnr_db" not in record:
-            record["psnr_db"] = judged(design.imager(), brightest)
+    named = [read_design(file) for file in (*map(design_file, DESIGNS), *designs)]
+    ranked = named[: len(DESIGNS)] + [random_design(k) for k in range(RANDOM)]
+    imagers = {str(design.name): design.imager() for design in (*named, *ranked)}
+    found = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
+    for name, imager in progress.track(list(imagers.items()), "Designs"):
+        if "psnr_db" not in found[name]:
+            found[name]["psnr_db"] = judged(imager, brightest)
             write_json(records, kept)
-    cases = [(name, design) for name in BETTER for design in designs]
-    for name, design in progress.track(cases, "Terms"):
-        values = kept["found"][str(design.name)].setdefault("terms", {})
-        if name not in values:
-            values[name] = term_of(name, design.imager())
+    cases = [(term, str(design.name)) for term in BETTER for design in ranked]
+    for term, name in progress.track(cases, "Terms"):
+        values = found[name].setdefault("terms", {})
+        if term not in values:
+            values[term] = term_of(term, imagers[name])
             write_json(records, kept)
-    return shown(kept["found"])
+    return shown({str(d.name): found[str(d.name)] for d in ranked}, {str(d.name): found[str(d.name)] for d in named})
 
 
-def shown(found: dict[str, Any]) -> Report:
-    """Table of correlations with the judge."""
-    means = np.array([[np.mean([v[k] for v in r["psnr_db"].values()]) for k in (0, 1)] for r in found.values()])
+def mean_psnr(records: dict[str, Any]) -> np.ndarray:
+    """Mean PSNR over the kinds of scenes `(design, draw)`, dB."""
+    return np.array([np.mean(list(r["psnr_db"].values()), axis=0) for r in records.values()])
+
+
+def shown(found: dict[str, Any], named: dict[str, Any]) -> Report:
+    """Tables of correlations with the judge, and of the judge's means of designs that have a name."""
+    means = mean_psnr(found)
     judge = means.mean(1)
     better = np.argsort(-judge)[: len(judge) // 2]
     cell = lambda a, b: "{:.2f} ({:.2f} to {:.2f})".format(*correlation(a, b))
@@ -249,10 +274,18 @@ def shown(found: dict[str, Any]) -> Report:
     names = sorted(BETTER, key=lambda name: -spearman(judge, values[name]))
     rows = [["the judge's repeat", *both(means[:, 0], means[:, 1])]]
     rows += [[f"`{name}`", *both(judge, values[name])] for name in names]
+    width, light = -values["psf_width_um"], values["light_percent"]
+    rows += [[f"width / light^{p:.2f}", *both(judge, p * np.log(light) - np.log(width))] for p in SHOWN]
+    rows.append(
+        ["the power chosen by half, the others", "{:.2f} ({:.2f} to {:.2f})".format(*held_out(width, light, judge)), ""]
+    )
     columns = ("objective", f"all {len(judge)} designs", "the better half")
-    files = {"design_ranks.md": markdown_table(columns, rows), "design_ranks.json": found}
-    return Report(files, [table(columns, rows)])
+    means = [[name, f"{psnr:.1f}"] for name, psnr in zip(named, mean_psnr(named).mean(1), strict=True)]
+    tables = ((columns, rows), (("design", "the judge's mean PSNR, dB"), means))
+    files = {"design_ranks.md": "\n\n".join(markdown_table(*one) for one in tables), "design_ranks.json": found}
+    return Report(files, [table(*one) for one in tables])
 
 
 if __name__ == "__main__":
-    main(report, {"--records": {"type": Path, "default": Path("out/design_ranks/records.json")}})
+    records = {"type": Path, "default": Path("out/design_ranks/records.json")}
+    main(report, {"designs": {"type": Path, "nargs": "*"}, "--records": records})

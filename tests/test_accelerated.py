@@ -28,6 +28,13 @@ from .test_matrix import cropped
 ENVELOPE, RING = Envelope(0.45), RingLight(0.3, 0.5)
 
 
+@pytest.fixture(autouse=True)
+def _on_a_processor():
+    """Also where there is a GPU, which has the one form only."""
+    with jax.default_device(jax.devices("cpu")[0]):
+        yield
+
+
 def lowered(form, function: Callable, *arguments):
     """A new program: those that were made before are kept."""
     with compiled_for_cpu(form):

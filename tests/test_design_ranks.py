@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from experiments.design_ranks import STEPS, correlation, random_design, richardson_lucy
+from experiments.design_ranks import STEPS, correlation, held_out, random_design, report, richardson_lucy
+from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -19,6 +21,35 @@ def test_richardson_lucy_finds_voxels_that_share_no_pixel():
     truth = np.array([[10.0], [40.0], [90.0]], np.float32)
     no_diffraction = np.ones((12, 1))
     assert richardson_lucy(adjoint, no_diffraction, adjoint.T @ truth, 0.0)[STEPS[-1]] == pytest.approx(truth, rel=1e-4)
+
+
+def test_richardson_lucy_undoes_diffraction():
+    """A point, of which an image of a third of its frequencies is left."""
+    truth = np.zeros((256, 1), np.float32)
+    truth[100] = 1000
+    frequency = np.hypot(np.fft.fftfreq(16)[:, None], np.fft.rfftfreq(16))
+    transfer = np.maximum(1 - 3 * frequency, 0)
+    image = np.fft.irfft2(np.fft.rfft2(truth.reshape(16, 16)) * transfer, (16, 16)).reshape(-1, 1).astype(np.float32)
+    known, unknown = (
+        richardson_lucy(sp.identity(256, np.float32, "csr"), each, np.maximum(image, 0), 1.0)[STEPS[-1]]
+        for each in (transfer, np.ones_like(transfer))
+    )
+    assert known[100] > 2 * unknown[100] and known.argmax() == 100
+
+
+def test_records_of_other_images_are_refused(tmp_path):
+    file = tmp_path / "records.json"
+    file.write_text('{"bright": {}, "found": {}}')
+    with pytest.raises(InputError, match="must be of images by rays and diffraction, got by rays"):
+        report([], file, Progress())
+
+
+def test_the_power_of_the_light_is_judged_by_designs_that_did_not_choose_it():
+    rng = np.random.default_rng(0)
+    width, light = np.exp(rng.normal(size=(2, 40)))
+    mean, low, high = held_out(width, light, 0.3 * np.log(light) - np.log(width))
+    assert low <= mean <= high == pytest.approx(1) and low > 0.99
+    assert held_out(width, light, rng.normal(size=40))[0] < 0.3
 
 
 def test_the_correlation_is_of_ranks():

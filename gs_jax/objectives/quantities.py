@@ -290,9 +290,10 @@ def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 
 def width_per_light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """`spot_width` over the fourth root of the light of all lenses in percent, mm: sharpness and noise in one number.
+    """`spot_width` over the fourth root of the percentage of light that all lenses collect: sharpness and noise in one.
 
-    It ranks designs as reconstructions at equal exposure do (`experiments/design_ranks.py`); so do roots near to it.
+    In mm, as `spot_width` where the lenses collect 1 %. It ranks designs as Richardson-Lucy at equal exposure does
+    (`experiments/design_ranks.py`).
     """
     at = as_conditions(imager, depths)
     return spot_width(imager, at) / (100 * light(imager, at)) ** 0.25
