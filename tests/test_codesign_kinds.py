@@ -183,7 +183,7 @@ def test_webs_are_between_apertures_of_their_own_size():
 def test_gradients():
     """By what is free of each kind, apart and where discs overlap; every entry, so that ties do not matter."""
     _, parent = two_kinds()
-    names = ("volume_error", "crowded_precision_um", "light_percent", "web_mm", "psf_width_um")
+    names = ("volume_error", "crowded_precision_um", "light_percent", "web_mm", "psf_width_um", "width_per_light_um")
     values = {
         name: start_values(*parent)[name] for name in ("radius_of_curvature_mm", "sensor_distance_mm", "pitch_mm")
     }

@@ -258,6 +258,10 @@ def metrics(case: Case, _) -> None:
     np.testing.assert_allclose(case.sheet["magnification"], magnification, rtol=1e-5)
     for name in ("lateral_resolution_um", "axial_resolution_um", "occupancy", "lenses_per_point"):
         assert np.all(np.asarray(case.sheet[name]) > 0), name
+    # The sheet's widths have five digits.
+    light = 100 * np.asarray(gs.objectives.light(case.imager, np.array(case.depths)))
+    found = jax.jit(gs.objectives.width_per_light)(case.imager, np.array(case.depths))
+    np.testing.assert_allclose(1000 * np.asarray(found), case.sheet["spot_width_um"] / light**0.25, rtol=1e-4)
 
 
 def one_map(case: Case, _) -> None:
