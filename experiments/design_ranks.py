@@ -16,6 +16,7 @@ a core. Designs that are given are judged beside the others, and do not count in
 
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -241,21 +242,25 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
             kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
         return kept["bright"][key]
 
-    named = [read_design(file) for file in (*map(design_file, DESIGNS), *designs)]
-    ranked = named[: len(DESIGNS)] + [random_design(k) for k in range(RANDOM)]
-    imagers = {str(design.name): design.imager() for design in (*named, *ranked)}
+    # Those that are ranked, and those that were given.
+    shipped = {name: read_design(design_file(name)) for name in DESIGNS}
+    ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
+    given = {design.name or file.stem: design for file, design in zip(designs, map(read_design, designs), strict=True)}
+    if both := ranked.keys() & given:
+        raise InputError(f"designs must have names of their own, got {', '.join(sorted(both))}.")
+    imagers = {name: design.imager() for name, design in (ranked | given).items()}
     found = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
     for name, imager in progress.track(list(imagers.items()), "Designs"):
         if "psnr_db" not in found[name]:
             found[name]["psnr_db"] = judged(imager, brightest)
             write_json(records, kept)
-    cases = [(term, str(design.name)) for term in BETTER for design in ranked]
-    for term, name in progress.track(cases, "Terms"):
+    for term, name in progress.track(list(product(BETTER, ranked)), "Terms"):
         values = found[name].setdefault("terms", {})
         if term not in values:
             values[term] = term_of(term, imagers[name])
             write_json(records, kept)
-    return shown({str(d.name): found[str(d.name)] for d in ranked}, {str(d.name): found[str(d.name)] for d in named})
+    of = lambda names: {name: found[name] for name in names}
+    return shown(of(ranked), of((*shipped, *given)))
 
 
 def mean_psnr(records: dict[str, Any]) -> np.ndarray:

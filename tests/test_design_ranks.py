@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from experiments.common import design_file
 from experiments.design_ranks import STEPS, correlation, held_out, random_design, report, richardson_lucy
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
@@ -31,7 +32,7 @@ def test_richardson_lucy_undoes_diffraction():
     transfer = np.maximum(1 - 3 * frequency, 0)
     image = np.fft.irfft2(np.fft.rfft2(truth.reshape(16, 16)) * transfer, (16, 16)).reshape(-1, 1).astype(np.float32)
     known, unknown = (
-        richardson_lucy(sp.identity(256, np.float32, "csr"), each, np.maximum(image, 0), 1.0)[STEPS[-1]]
+        richardson_lucy(sp.csr_matrix(np.eye(256, dtype=np.float32)), each, np.maximum(image, 0), 1.0)[STEPS[-1]]
         for each in (transfer, np.ones_like(transfer))
     )
     assert known[100] > 2 * unknown[100] and known.argmax() == 100
@@ -42,6 +43,11 @@ def test_records_of_other_images_are_refused(tmp_path):
     file.write_text('{"bright": {}, "found": {}}')
     with pytest.raises(InputError, match="must be of images by rays and diffraction, got by rays"):
         report([], file, Progress())
+
+
+def test_a_design_with_the_name_of_another_is_refused(tmp_path):
+    with pytest.raises(InputError, match="names of their own, got geomscope-asphere"):
+        report([design_file("geomscope-asphere")], tmp_path / "records.json", Progress())
 
 
 def test_the_power_of_the_light_is_judged_by_designs_that_did_not_choose_it():
