@@ -105,6 +105,15 @@ def design_file(name: str) -> Path:
     return shipped if shipped.exists() else DESIGNS / shipped.name
 
 
+def designs_by_name(files: Sequence[Path]) -> dict[str, Design]:
+    """Read designs by their names, or those of their files; raise `InputError` if two have the same."""
+    designs = [read_design(file) for file in files]
+    names = [design.name or file.stem for file, design in zip(files, designs, strict=True)]
+    if same := {name for name in names if names.count(name) > 1}:
+        raise InputError(f"designs must have names of their own, got {', '.join(sorted(same))} twice.")
+    return dict(zip(names, designs, strict=True))
+
+
 def design_of(data: Path | None) -> Design:
     """Design of the ray-traced captures in a folder; without a folder, the built-in design."""
     return read_design(data / "P1.toml") if data else geomscope()

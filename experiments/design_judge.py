@@ -29,7 +29,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.common import Report, cropped, design_file, main, table
+from experiments.common import Report, cropped, design_file, designs_by_name, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
 from gs_jax import Grid, Imager, RichardsonLucy, find_points, forward, localization, quality, rasterize, read_design
@@ -391,7 +391,7 @@ def report(designs: list[Path], span: list[float], draws: int, rays: int, record
     reference = read_design(design_file(DESIGNS[0])).imager()
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
-    imagers = {read_design(file).name or file.stem: read_design(file).imager() for file in files}
+    imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     found = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
     columns, rows = rows_of(found, settings)
     of_model = ("design", *(f"{kind}, error of the model" for kind in IN_PLANES))

@@ -26,7 +26,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.stats import rankdata
 
-from experiments.common import Report, design_file, main, table
+from experiments.common import Report, design_file, designs_by_name, main, table
 from experiments.design_judge import (
     DESIGNS,
     IMAGES,
@@ -245,7 +245,7 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     # Those that are ranked, and those that were given.
     shipped = {name: read_design(design_file(name)) for name in DESIGNS}
     ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
-    given = {design.name or file.stem: design for file, design in zip(designs, map(read_design, designs), strict=True)}
+    given = designs_by_name(designs)
     if both := ranked.keys() & given:
         raise InputError(f"designs must have names of their own, got {', '.join(sorted(both))}.")
     imagers = {name: design.imager() for name, design in (ranked | given).items()}

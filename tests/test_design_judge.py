@@ -8,10 +8,12 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import j1
 
 from experiments import design_changes, design_search
+from experiments.common import designs_by_name
 from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, diffracted, finer, scene, shared
 from experiments.ray_tracer import traced
 from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
+from gs_jax.design.design import write_design
 from gs_jax.optics.theory import depth_in_focus
 
 IMAGER = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((200, 200), 0.02), 5.8, 3.0)
@@ -59,6 +61,13 @@ def test_records_of_other_settings_are_refused(tmp_path):
     file.write_text(json.dumps({"settings": {}, "scenes": {}, "found": {}}))
     with pytest.raises(InputError, match="must be of the settings"):
         Judge(file, Settings(), IMAGER)
+
+
+def test_designs_of_one_name_are_refused(tmp_path):
+    for name in ("one.toml", "two.toml"):
+        write_design(tmp_path / name, geomscope())
+    with pytest.raises(InputError, match="names of their own, got geomscope twice"):
+        designs_by_name([tmp_path / "one.toml", tmp_path / "two.toml"])
 
 
 def test_finer_voxels_are_shared_by_those_of_the_grid():

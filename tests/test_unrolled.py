@@ -173,7 +173,8 @@ def test_training_makes_it_better():
     recipe = unrolled_recipe(cases)
     state = train(recipe, init(recipe, steps=30, seed=0))
     mean = lambda networks: np.mean([unrolled_loss(networks, case) for case in cases])
-    assert mean(state.network) < 0.9 * mean(recipe.network(jax.random.key(0)))
+    # A tenth of the squared error.
+    assert mean(state.network) < mean(recipe.network(jax.random.key(0))) + np.log10(0.9)
 
 
 def test_a_volume_imaged_again():

@@ -109,7 +109,8 @@ def field_varying_psf(
         Nodes of the stray light, by `make_polar_grid`: tables with the same nodes share compiled programs.
     rings
         Outer radii of the field's rings, in field radii; each has a core of its own. By default six, or eleven if cores
-        are sharp. Fewer, such as `(1.0, 2.5)`, are faster and less accurate.
+        are sharp. Fewer, such as `(1.0, 2.5)`, are faster and less accurate. If they are given, those beyond the field
+        radius are on pixels twice as large, so that microscopes with the same nodes and rings share compiled programs.
     progress
         Shows how many depths are done.
 
@@ -169,7 +170,8 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
     # Of each kind of pixels there is one ring at least.
-    inner = 1 + int(np.argmin(np.append(half_light_radii(cores)[1:-1] < _SHARP, False)))
+    fine = half_light_radii(cores) < _SHARP if request.rings is None else np.array(rings) <= 1
+    inner = 1 + int(np.argmin(np.append(fine[1:-1], False)))
     small = size // 4 * 2 + 1
     sharp = lambda profile: narrow_kernel(render_kernel(profile, size), _SHARED)
     wide = lambda profile: narrow_kernel(render_kernel(profile, small, 0.5), _SHARED + _LARGE)

@@ -22,6 +22,7 @@ from ...layouts import hexagonal_layout, poisson_disc_layout, random_layout
 from ...lenses import MicrolensArray
 from ...optics.field_varying import FieldVaryingPsf, field_varying_psf
 from ...optics.polar_grid import PolarGrid, make_polar_grid
+from ...optics.psf_core import RINGS
 from ...projection.forward_model import forward
 from ...simulation.synthetic import Camera, electrons, expose
 from ...typing import Volume
@@ -35,6 +36,9 @@ LENS_SPACING = 1.37
 _DEPTHS = np.array([16.5, 24.5])
 # Largest distance of a point from a lens, along x or y, in widths of the sensor.
 _FARTHEST = 1.3
+# Diameters of the lenses' apertures, mm: half of the microscopes have the paper's, the others narrower ones,
+# log-uniform.
+_APERTURE, _NARROWEST = 2.0, 0.5
 # Standard deviations of what calibration leaves: lens positions, mm; sensor distance, relative; rotation, radians;
 # shift, mm.
 _LENS_ERROR, _DISTANCE_ERROR, _ROTATION_ERROR, _SHIFT_ERROR = 0.0015, 7e-4, 2e-4, 0.003
@@ -96,10 +100,12 @@ def random_microscope(
     """The true imager and the calibrated one, the depths of its volumes and scenes, and its optics at the latter."""
     rng = np.random.default_rng([seed, 1, number])
     centers = _layout(spec, rng)
+    aperture = _APERTURE * (_NARROWEST / _APERTURE) ** max(rng.uniform(-1, 1), 0)
     sensor = Sensor((spec.pixels, spec.pixels), spec.pixel)
-    calibrated = Imager(MicrolensArray(centers), sensor, rng.uniform(5.6, 6.0), FIELD_RADIUS)
+    lenses = lambda centers: MicrolensArray(centers, aperture_diameter=aperture)
+    calibrated = Imager(lenses(centers), sensor, rng.uniform(5.6, 6.0), FIELD_RADIUS)
     imager = Imager(
-        MicrolensArray(centers + rng.normal(0, _LENS_ERROR, centers.shape)),
+        lenses(centers + rng.normal(0, _LENS_ERROR, centers.shape)),
         sensor,
         float(calibrated.sensor_distance) * (1 + rng.normal(0, _DISTANCE_ERROR)),
         FIELD_RADIUS,
@@ -114,7 +120,7 @@ def random_microscope(
 
 def trace_optics(imager: Imager, depths: np.ndarray, spec: CaptureSpec) -> FieldVaryingPsf:
     """All of the light of a microscope, in tables of one shape for all examples of a spec."""
-    return to_float32(field_varying_psf(imager, depths, polar_grid=_nodes(spec)))
+    return to_float32(field_varying_psf(imager, depths, polar_grid=_nodes(spec), rings=RINGS))
 
 
 @cache

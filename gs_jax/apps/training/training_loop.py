@@ -27,8 +27,8 @@ from .training_slices import Batch, Stack, sample_paper_batch, sample_patches
 
 # Captures of the unrolled networks: pixels are sums of 4 x 4, voxels as wide as those by default.
 UNROLLED = CaptureSpec(288, 0.018, 0.064, 7, binning=4)
-# The loss is relative to the truth's mean square plus this share of the start's.
-_START_SHARE = 0.2
+# Errors are relative to the truth's mean square plus this share of the start's; and the least error that counts.
+_START_SHARE, _LEAST_ERROR = 0.2, 0.01
 # Steps before the networks, and conjugate gradients after them, in use.
 _FIRST, _LAST = 20, 10
 
@@ -121,7 +121,7 @@ def multislice_recipe(stacks: list[Stack]) -> Recipe:
 
 
 def unrolled_recipe(examples: "list[UnrolledExample]") -> Recipe:
-    """Adam and relative squared error through all steps, and so through the operators and their exact adjoints."""
+    """Adam and the error in decibels through all steps, and so through the operators and their exact adjoints."""
     batch = lambda rng: examples[rng.integers(len(examples))]
     return Recipe(lambda key: initialize_unrolled(key=key), partial(_adam, 2e-3), batch, unrolled_loss)
 
@@ -147,11 +147,15 @@ class UnrolledExample(NamedTuple):
 
 
 def unrolled_loss(network: Unrolled, example: UnrolledExample) -> Float[Array, ""]:
-    """Squared error of the volume, relative to the truth's mean square and a share of the start's."""
+    """Common logarithm of the volume's squared error, relative to the truth's mean square and a share of the start's.
+
+    By the error itself sparse scenes, of which less is left, would count less than dense ones.
+    """
     truth = jnp.asarray(example.truth)
     volume = unroll(network, example.system.operator, jnp.asarray(example.light), example.start)
     start = network.estimate(example.start)
-    return jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
+    error = jnp.mean((volume - truth) ** 2) / (jnp.mean(truth**2) + _START_SHARE * jnp.mean(start**2))
+    return jnp.log10(error + _LEAST_ERROR)
 
 
 def unroll(
