@@ -23,11 +23,11 @@ from .options import (
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
 # Steps of the weights that come with the package.
-STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1200}
+STEPS = {"paper": 2000, "multislice": 4000, "unrolled": 1400}
 # At most, to fine-tune by captures.
 FINE_STEPS = 60
 _EVERY = 50
-_STACKS, _CASES = 96, 112
+_STACKS, _CASES = 96, 128
 _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 
 
