@@ -9,7 +9,7 @@ import argparse
 import dataclasses
 import inspect
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,13 +105,16 @@ def design_file(name: str) -> Path:
     return shipped if shipped.exists() else DESIGNS / shipped.name
 
 
-def designs_by_name(files: Sequence[Path]) -> dict[str, Design]:
-    """Read designs by their names, or those of their files; raise `InputError` if two have the same."""
-    designs = [read_design(file) for file in files]
-    names = [design.name or file.stem for file, design in zip(files, designs, strict=True)]
-    if same := {name for name in names if names.count(name) > 1}:
-        raise InputError(f"designs must have names of their own, got {', '.join(sorted(same))} twice.")
-    return dict(zip(names, designs, strict=True))
+def designs_by_name(files: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Design]:
+    """Read designs, by name or by that of their file; raise `InputError` if two have the same name, or one is taken."""
+    found: dict[str, Design] = {}
+    for file in files:
+        design = read_design(file)
+        name = design.name or file.stem
+        if name in found or name in taken:
+            raise InputError(f"designs must have names of their own, got {name} twice.")
+        found[name] = design
+    return found
 
 
 def design_of(data: Path | None) -> Design:

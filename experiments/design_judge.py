@@ -389,9 +389,9 @@ def report(designs: list[Path], span: list[float], draws: int, rays: int, record
     settings = Settings(span=(span[0], span[1]), rays=rays)
     files = designs or [design_file(name) for name in DESIGNS]
     reference = read_design(design_file(DESIGNS[0])).imager()
+    imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     make_folder(records.parent)
     judge = Judge(records, settings, reference)
-    imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
     found = {name: judge.judge(name, imager, range(draws), progress) for name, imager in imagers.items()}
     columns, rows = rows_of(found, settings)
     of_model = ("design", *(f"{kind}, error of the model" for kind in IN_PLANES))

@@ -245,9 +245,7 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     # Those that are ranked, and those that were given.
     shipped = {name: read_design(design_file(name)) for name in DESIGNS}
     ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
-    given = designs_by_name(designs)
-    if both := ranked.keys() & given:
-        raise InputError(f"designs must have names of their own, got {', '.join(sorted(both))}.")
+    given = designs_by_name(designs, ranked)
     imagers = {name: design.imager() for name, design in (ranked | given).items()}
     found = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
     for name, imager in progress.track(list(imagers.items()), "Designs"):

@@ -121,7 +121,7 @@ def multislice_recipe(stacks: list[Stack]) -> Recipe:
 
 
 def unrolled_recipe(examples: "list[UnrolledExample]") -> Recipe:
-    """Adam and the error in decibels through all steps, and so through the operators and their exact adjoints."""
+    """Adam, and the logarithm of the squared error; its gradient passes the operators and their exact adjoints."""
     batch = lambda rng: examples[rng.integers(len(examples))]
     return Recipe(lambda key: initialize_unrolled(key=key), partial(_adam, 2e-3), batch, unrolled_loss)
 
@@ -149,7 +149,7 @@ class UnrolledExample(NamedTuple):
 def unrolled_loss(network: Unrolled, example: UnrolledExample) -> Float[Array, ""]:
     """Common logarithm of the volume's squared error, relative to the truth's mean square and a share of the start's.
 
-    By the error itself sparse scenes, of which less is left, would count less than dense ones.
+    The error itself is small for sparse scenes, which would count less than dense ones.
     """
     truth = jnp.asarray(example.truth)
     volume = unroll(network, example.system.operator, jnp.asarray(example.light), example.start)
