@@ -112,7 +112,7 @@ def designs_by_name(files: Sequence[Path], taken: Collection[str] = ()) -> dict[
         design = read_design(file)
         name = design.name or file.stem
         if name in found or name in taken:
-            raise InputError(f"designs must have names of their own, got {name} twice.")
+            raise InputError(f"designs must have names of their own, got another {name}.")
         found[name] = design
     return found
 

@@ -230,22 +230,22 @@ def held_out(width: np.ndarray, light: np.ndarray, judge: np.ndarray) -> tuple[f
 
 def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
+    # Those that are ranked, and those that were given.
+    shipped = {name: read_design(design_file(name)) for name in DESIGNS}
+    ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
+    given = designs_by_name(designs, ranked)
     make_folder(records.parent)
     new = {"images": IMAGES, "bright": {}, "found": {}}
     kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else new
     if kept.get("images") != IMAGES:
         raise InputError(f"{records} must be of images {IMAGES}, got {kept.get('images', 'by rays')}.")
-    reference = device(read_design(design_file(DESIGNS[0])).imager(), SETTINGS)
+    reference = device(shipped[DESIGNS[0]].imager(), SETTINGS)
 
     def brightest(kind: str, draw: int) -> float:
         if (key := f"{kind} {draw}") not in kept["bright"]:
             kept["bright"][key] = float(image_of(scene(kind, draw, SETTINGS), reference, SETTINGS).max())
         return kept["bright"][key]
 
-    # Those that are ranked, and those that were given.
-    shipped = {name: read_design(design_file(name)) for name in DESIGNS}
-    ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
-    given = designs_by_name(designs, ranked)
     imagers = {name: design.imager() for name, design in (ranked | given).items()}
     found = {name: kept["found"].setdefault(mark(name, imager), {}) for name, imager in imagers.items()}
     for name, imager in progress.track(list(imagers.items()), "Designs"):

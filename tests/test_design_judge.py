@@ -66,7 +66,7 @@ def test_records_of_other_settings_are_refused(tmp_path):
 def test_designs_of_one_name_are_refused(tmp_path):
     for name in ("one.toml", "two.toml"):
         write_design(tmp_path / name, geomscope())
-    with pytest.raises(InputError, match="names of their own, got geomscope twice"):
+    with pytest.raises(InputError, match="names of their own, got another geomscope"):
         designs_by_name([tmp_path / "one.toml", tmp_path / "two.toml"])
 
 

@@ -46,7 +46,7 @@ def test_records_of_other_images_are_refused(tmp_path):
 
 
 def test_a_design_with_the_name_of_another_is_refused(tmp_path):
-    with pytest.raises(InputError, match="names of their own, got geomscope-asphere"):
+    with pytest.raises(InputError, match="names of their own, got another geomscope-asphere"):
         report([design_file("geomscope-asphere")], tmp_path / "records.json", Progress())
 
 
