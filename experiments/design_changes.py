@@ -4,7 +4,7 @@ The changes are a narrower aperture, spots as sharp as a search makes them, coni
 object, fewer lenses, and a smaller image. The numbers of the second, third and last are of searches for the least
 `psf_width_um` with the others fixed.
 
-    python -m experiments.design_changes [--rays 600] [--records FILE]
+    python -m experiments.design_changes [--rays 10000] [--records FILE]
 
 Writes the records after each scene, from which the next run goes on, and then `design_changes.md`; about 20 minutes on
 two cores.

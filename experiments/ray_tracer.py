@@ -81,7 +81,8 @@ def _lenses(imager: Imager):
     lenses = np.column_stack([centers, *(np.broadcast_to(np.asarray(x, np.float64), len(centers)) for x in each)])
     curve_first = a.orientation == "curved"
     shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
-    numbers = (*(float(x) for x in shared), _turn(imager))
+    origin = np.asarray(imager.sensor.origin, np.float64)
+    numbers = (*(float(x) for x in shared), origin, _turn(imager))
     return lenses, near, numbers, curve_first
 
 
@@ -113,12 +114,12 @@ def _bundles(places, lenses, near, numbers, curve_first, landed, magnification):
 def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
     place = tile[:, 0].mean(), tile[:, 1].mean(), tile[:, 2].mean()
     magnification = _land(landed, place, lens, others, numbers, curve_first)
-    pixel = numbers[3]
+    pixel, origin = numbers[3], numbers[4]
     for x, y, share in landed:
         if share > 0:
             for one in tile:
-                row = math.floor((y - magnification * (one[1] - place[1])) / pixel + image.shape[0] / 2)
-                column = math.floor((x - magnification * (one[0] - place[0])) / pixel + image.shape[1] / 2)
+                row = math.floor((y - magnification * (one[1] - place[1]) - origin[1]) / pixel + image.shape[0] / 2)
+                column = math.floor((x - magnification * (one[0] - place[0]) - origin[0]) / pixel + image.shape[1] / 2)
                 if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
                     image[row, column] += share * one[3]
 
@@ -126,7 +127,7 @@ def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
 @njit(fastmath=True, error_model="numpy")
 def _land(landed, place, lens, others, numbers, curve_first):
     """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
-    n, t, v, _, turned = numbers
+    n, t, v, _, _, turned = numbers
     radius, conic, aperture = lens[2:]
     x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]
     sag = _sag(aperture**2, radius, conic)

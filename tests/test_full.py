@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from experiments.design_judge import diffracted
+from experiments.ray_tracer import traced
 from gs_jax import (
     Grid,
     Imager,
@@ -32,6 +34,7 @@ from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
 from gs_jax.optics.psf_core import (
     apparent_depths,
     core_magnification,
+    render_harmonics,
     render_kernel,
     ring_edges,
     ring_window,
@@ -142,6 +145,7 @@ def alone(name: str, sensor: Sensor) -> Imager:
     return dataclasses.replace(lens, array=array, sensor=sensor)
 
 
+@pytest.mark.integration
 def test_sharp_spots_of_voxels_are_those_of_points():
     """At any place within a pixel, up to 1.6 field radii. Points have 28 rings, to a tenth of a pixel: 0.15 is left.
 
@@ -265,6 +269,52 @@ def test_a_kernel_keeps_its_light_and_is_symmetric():
             np.testing.assert_allclose(kernel, same, atol=1e-15)
     radius = np.hypot(*sample_profile(profile, 20_000).T)
     assert abs(np.mean(radius < 2) - profile[:32].sum()) < 0.01
+
+
+def test_harmonics_are_the_waves_of_a_spot():
+    """Of a Gaussian times 1 + a r cos t + b r^2 cos 2t, turned by any angle: with the cosine and the sine of each."""
+    middle = (np.arange(320) + 0.5) / 16
+    profile = middle * np.exp(-(middle**2) / 18)
+    profile /= profile.sum()
+    kernel, waves = (
+        render_kernel(profile, 41),
+        render_harmonics(profile, np.stack([0.15 * middle, 0.02 * middle**2]) * profile, 41),
+    )
+    y, x = np.mgrid[-20:21, -20:21]
+    for turn in (0.0, 0.7, 2.0):
+        spot = kernel + sum(
+            factor * wave
+            for factor, wave in zip(
+                [np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)], waves, strict=True
+            )
+        )
+        radius, angle = np.hypot(x, y), np.arctan2(y, x) - turn
+        wanted = kernel * (1 + 0.15 * radius * np.cos(angle) + 0.02 * radius**2 * np.cos(2 * angle))
+        assert np.linalg.norm(spot - wanted) < 0.05 * np.linalg.norm(wanted)
+    np.testing.assert_allclose(waves.sum((1, 2)), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "tilt", "at", "sensor", "symmetric"),
+    [
+        ("geomscope-asphere", None, 3.3, (-0.45, -0.25), 0.138),
+        pytest.param("geomscope-optimized", (0.01, -0.006), 4.5, (-1.2, -0.5), 0.171, marks=ALSO),
+    ],
+)
+def test_sharp_spots_have_coma(name, tilt, at, sensor, symmetric):
+    """Beyond the field radius, on 4 x 4 pixels, against rays; symmetric cores leave more."""
+    scope = dataclasses.replace(alone(name, Sensor((160, 400), 0.0045, sensor)), tilt=tilt)
+    grid = Grid([20.5], (1, 9), 0.15, (at, 1.8))
+    image = np.asarray(forward(jnp.ones(grid.volume_shape), scope, grid, field_varying_psf(scope, grid.depths)))
+    points = np.array([[x, 1.8, 20.5, 1.0] for x in np.asarray(grid.x)])
+    rays = diffracted(traced(points, scope, 10_000), scope)
+
+    def error(image):
+        ours, wanted = (each.reshape(40, 4, 100, 4).sum((1, 3)) for each in (image, rays))
+        return np.linalg.norm(ours * np.vdot(ours, wanted) / np.vdot(ours, ours) - wanted) / np.linalg.norm(wanted)
+
+    assert error(image) < 0.65 * symmetric
+    assert error(full_image_of_points(points, scope)) < 0.65 * symmetric
 
 
 def test_a_lens_without_aberrations_has_its_cores_on_the_chief_rays():

@@ -25,14 +25,18 @@ from ..geometry import Imager
 from .apertures import clear_area
 from .polar_grid import PolarGrid, make_polar_grid, polar_weights
 from .psf_core import (
+    HARMONICS,
     RINGS,
     PsfCores,
     half_light_radii,
+    harmonic_shares,
     narrow_kernel,
+    render_harmonics,
     render_kernel,
     ring_edges,
     ring_light,
     sample_profile,
+    sharpen,
     trace_cores,
 )
 from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
@@ -42,9 +46,11 @@ CORE_REACH = 5
 # Rings whose cores have half of their light within so many of the sensor's pixels are computed on these.
 _SHARP = 2.0
 # Cores with half of their light within this part of the field radius's image are too sharp for one magnification in a
-# wide ring, and get these rings.
+# wide ring, and for symmetric kernels: they get these rings, and harmonics.
 _PRECISE = 0.012
 _SHARP_RINGS = (0.35, 0.6, 0.8, 1.0, 1.17, 1.33, 1.5, 1.67, 2.0, 2.5, 3.0)
+# The first rings of these have no harmonics: coma and astigmatism grow with the field.
+_PLAIN = 3
 # What the model adds to the width of a core, as a variance in squared pixels each way: four pixels share the light of a
 # chief ray (the mean over its places); and large pixels stand for those of half their width.
 _SHARED, _LARGE = 1 / 6, 1 / 12 - 1 / 48
@@ -72,13 +78,17 @@ class FieldVaryingPsf(eqx.Module):
 
     `distortion`: magnification of the cores over the chief ray's. `light`: coefficients of `ring_light`. `kernels`: of
     the inner rings, on the sensor's pixels, with the sum 1. `wide_kernels`: of the outer rings, on pixels twice as
-    large. `rings`: outer radii of the rings, in field radii.
+    large. `harmonics` and `wide_harmonics`: the kernels of `cos t`, `sin t`, `cos 2t` and `sin 2t` for those of the
+    rings that have them, which are the last; `t` is the angle from the field's direction (`PsfCores`). `rings`: outer
+    radii of the rings, in field radii.
     """
 
     distortion: Float[Array, "depth ring"]
     light: Float[Array, "depth ring coefficient"]
     kernels: Float[Array, "depth inner size size"]
     wide_kernels: Float[Array, "depth outer small small"]
+    harmonics: Float[Array, "depth oriented wave size size"]
+    wide_harmonics: Float[Array, "depth wide_oriented wave small small"]
     stray_light: StrayLight
     rings: tuple[float, ...] = eqx.field(static=True)
 
@@ -109,8 +119,9 @@ def field_varying_psf(
         Nodes of the stray light, by `make_polar_grid`: tables with the same nodes share compiled programs.
     rings
         Outer radii of the field's rings, in field radii; each has a core of its own. By default six, or eleven if cores
-        are sharp. Fewer, such as `(1.0, 2.5)`, are faster and less accurate. If they are given, those beyond the field
-        radius are on pixels twice as large, so that microscopes with the same nodes and rings share compiled programs.
+        are sharp, which have coma and astigmatism from 0.8 field radii on. Fewer, such as `(1.0, 2.5)`, are faster and
+        less accurate. Those that are given have symmetric cores, and if they are beyond the field radius, pixels twice
+        as large, so that microscopes with the same nodes and rings share compiled programs.
     progress
         Shows how many depths are done.
 
@@ -154,32 +165,56 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     rings = tuple(arrays.pop("rings").tolist())
     tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
     stray_light = StrayLight(tables["table"], tables["area"], tables["sensor_distance"], request.grid)
-    kernels = {name: tables[name] for name in ("kernels", "wide_kernels")}
-    return FieldVaryingPsf(tables["distortion"], tables["light"], **kernels, stray_light=stray_light, rings=rings)
+    names = "distortion", "light", "kernels", "wide_kernels", "harmonics", "wide_harmonics"
+    return FieldVaryingPsf(**{name: tables[name] for name in names}, stray_light=stray_light, rings=rings)
 
 
 def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name."""
     imager, depths, grid, progress = request.imager, request.depths, request.grid, request.progress
-    rings, reach = request.rings or RINGS, CORE_REACH * grid.pixel
-    cores = trace_cores(imager, depths, reach, rings, progress)
-    half = half_light_radii(cores) * imager.sensor.pixel_pitch
-    if request.rings is None and half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step:
-        rings = _SHARP_RINGS
-        cores = trace_cores(imager, depths, reach, rings, progress)
+    orders = () if request.rings else core_harmonics(imager, depths, grid)
+    rings = request.rings or (_SHARP_RINGS if orders else RINGS)
+    cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, rings, progress, orders=orders)
+    cores.harmonics[:, :_PLAIN] = 0
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
     # Of each kind of pixels there is one ring at least.
     fine = half_light_radii(cores) < _SHARP if request.rings is None else np.array(rings) <= 1
     inner = 1 + int(np.argmin(np.append(fine[1:-1], False)))
-    small = size // 4 * 2 + 1
-    sharp = lambda profile: narrow_kernel(render_kernel(profile, size), _SHARED)
-    wide = lambda profile: narrow_kernel(render_kernel(profile, small, 0.5), _SHARED + _LARGE)
-    each = lambda kernel, profiles: np.stack([[kernel(one) for one in at_depth] for at_depth in profiles])
+    # The first ring with harmonics.
+    oriented = _PLAIN if orders else len(rings)
+    small, large = size // 4 * 2 + 1, _SHARED + _LARGE
     arrays = {"distortion": cores.distortion, "light": cores.light, "rings": np.array(rings)}
-    arrays["kernels"] = each(sharp, cores.profile[:, :inner])
-    arrays["wide_kernels"] = each(wide, cores.profile[:, inner:])
+    arrays["kernels"] = _kernels(cores, slice(inner), size, 1, _SHARED)
+    arrays["wide_kernels"] = _kernels(cores, slice(inner, None), small, 0.5, large)
+    arrays["harmonics"] = _harmonics(cores, slice(oriented, inner), size, 1, _SHARED)
+    arrays["wide_harmonics"] = _harmonics(cores, slice(max(oriented, inner), None), small, 0.5, large)
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
+
+
+def core_harmonics(imager: Imager, depths: Float64[np.ndarray, " depth"], grid: PolarGrid) -> tuple[int, ...]:
+    """The angular harmonics that the cores need: none, if they are not sharp at any of the depths."""
+    half = half_light_radii(trace_cores(imager, depths, CORE_REACH * grid.pixel, RINGS[:1])) * imager.sensor.pixel_pitch
+    return HARMONICS if half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step else ()
+
+
+def _kernels(
+    cores: PsfCores, rings: slice, size: int, parts: float | int, variance: float
+) -> Float64[np.ndarray, "depth ring size size"]:
+    """Kernels of rings, narrower by a variance, on pixels of which one is `parts` of the sensor's."""
+    make = lambda profile: narrow_kernel(render_kernel(profile, size, parts), variance)
+    return np.array([[make(profile) for profile in at_depth] for at_depth in cores.profile[:, rings]])
+
+
+def _harmonics(
+    cores: PsfCores, rings: slice, size: int, parts: float | int, variance: float
+) -> Float64[np.ndarray, "depth ring wave size size"]:
+    """`_kernels` of the harmonics."""
+    profiles, harmonics = cores.profile[:, rings], cores.harmonics[:, rings]
+    kernels = np.zeros((*profiles.shape[:2], 2 * harmonics.shape[2], size, size))
+    for place in np.ndindex(profiles.shape[:2]):
+        kernels[place] = sharpen(render_harmonics(profiles[place], harmonics[place], size, parts), variance)
+    return kernels
 
 
 def kernel_size(imager: Imager, grid: PolarGrid) -> int:
@@ -225,12 +260,16 @@ def stray_light_table(
     table[0] = binned(rays.landing, rays.light)
     if aperture.by_area.any():
         table[1] = binned(rays.landing, rays.light_per_area)
-    for (inner, outer), distortion, light, profile in zip(ring_edges(imager, ends), *cores, strict=True):
+    for (inner, outer), distortion, light, profile, harmonics in zip(ring_edges(imager, ends), *cores, strict=True):
         amount = ring_light(fields**2, light, inner, outer)
-        core = imager.sensor.pixel_pitch * sample_profile(profile, _CORE_SAMPLES)
+        core = sample_profile(profile, _CORE_SAMPLES)
+        shares = harmonic_shares(core, profile, harmonics)
         for number in np.flatnonzero(amount):
-            landing = core - [chief * distortion * fields[number], 0]
-            table[0, number] -= _bin_polar(grid, landing, np.full(len(core), amount[number] / len(core)))
+            landing = imager.sensor.pixel_pitch * core - [chief * distortion * fields[number], 0]
+            part = np.ones(len(core))
+            for order, (along, _) in zip(HARMONICS, shares, strict=False):
+                part += (fields[number] / outer) ** order * along
+            table[0, number] -= _bin_polar(grid, landing, amount[number] / len(core) * part)
     around = table.reshape(2, grid.fields, grid.radii, grid.angles)
     # Spots are symmetric about the field's direction: their spectra are real. Near the axis nodes are closer together
     # than pixels, so that high harmonics would alias.

@@ -31,6 +31,8 @@ _FARTHEST, _STEPS, _SPARSE, _FINE = 0.08, 81, 8, 1e-4
 _BLUR = 3.0
 # Largest pixel by which sharpness is judged, in images of the widest field; depths traced before interpolating.
 _SHARP, _MOST = 0.006, 9
+# Angular harmonics of a spot about its core that sharp cores keep beside the mean: coma and astigmatism.
+HARMONICS = (1, 2)
 # Radial bins in a pixel, which are fine beside the nodes of stray light, and samples of a rendered kernel.
 _BINS, _SAMPLES = 16, 2**17
 
@@ -39,12 +41,15 @@ class PsfCores(NamedTuple):
     """The cores of all rings at one depth, or with a leading axis at several.
 
     `distortion`: magnification over the chief ray's. `light`: coefficients of `ring_light`. `profile`: light in radial
-    bins of a sixteenth of a pixel, with the sum 1.
+    bins of a sixteenth of a pixel, with the sum 1. `harmonics`: in the same bins, the amplitudes of `cos(m t)`, where
+    `t` is the angle from the direction of the field, at the outer end of the ring; within it they are proportional to
+    the m-th power of the field. None, or those of `HARMONICS`.
     """
 
     distortion: Float64[np.ndarray, "*depth ring"]
     light: Float64[np.ndarray, "*depth ring coefficient"]
     profile: Float64[np.ndarray, "*depth ring bin"]
+    harmonics: Float64[np.ndarray, "*depth ring order bin"]
 
 
 def ring_window(distance_squared, inner, outer):
@@ -80,32 +85,35 @@ def trace_cores(
     reach: float,
     ends: Sequence[float] = RINGS,
     progress: Progress | None = None,
+    *,
+    orders: Sequence[int] = (),
 ) -> PsfCores:
     """The cores of the mean lens at some depths, by exact rays.
 
     Each ring has one kernel: the mean of its spots up to `reach` (mm), about the magnification at which that mean is
     the sharpest. The light of each spot in it is a least-squares fit. `ends` are outer radii of the rings, in field
-    radii.
+    radii. `orders` are those of the angular harmonics that are wanted: the spots are turned to one direction of the
+    field before their mean is taken.
     """
     aperture = aperture_profile(imager.array, by_area=False)
-    tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends), depths)
+    tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends, orders), depths)
     tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
     return PsfCores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
 
-def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, reach: float, ends) -> PsfCores:
+def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, reach: float, ends, orders) -> PsfCores:
     pitch = imager.sensor.pixel_pitch
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
-    parts = [_ring_core(rays, fields, chief, pitch, edges, *ring) for ring in rings]
+    parts = [_ring_core(rays, fields, chief, pitch, edges, orders, *ring) for ring in rings]
     return PsfCores(*map(np.stack, zip(*parts, strict=True)))
 
 
-def _ring_core(rays, fields, chief, pitch, edges, inner, outer):
-    """Distortion, light coefficients and radial profile of one ring."""
+def _ring_core(rays, fields, chief, pitch, edges, orders, inner, outer):
+    """Distortion, light coefficients, radial profile and harmonics of one ring."""
     share = ring_window(fields**2, inner, outer)
     used = share > 1e-6
     mine = PupilSamples(*(part[used] for part in rays))
@@ -124,7 +132,23 @@ def _ring_core(rays, fields, chief, pitch, edges, inner, outer):
     # Ridge regression: a ring that begins far out leaves the low powers undetermined.
     system = np.concatenate([powers * root[:, None], 1e-4 * root.max() * np.eye(_DEGREE + 1)])
     light = np.linalg.lstsq(system, np.append(amount * root, np.zeros(_DEGREE + 1)))[0]
-    return distortion, light, profile
+    along = (mine.landing[..., 0] + chief * distortion * fields[used][:, None]) / np.maximum(radius, 1e-12)
+    angle, harmonics = np.arccos(np.clip(along, -1, 1)), np.zeros((len(orders), profile.size))
+    for number, order in enumerate(orders):
+        share = weight * (fields[used] / outer) ** order
+        waves = 2 * mine.light * np.cos(order * angle) * share[:, None]
+        harmonics[number] = np.histogram(radius, edges, weights=waves)[0] / (
+            share * powers[:, 1] ** (order / 2) @ amount
+        )
+    return distortion, light, profile, _not_negative(profile, harmonics)
+
+
+def _not_negative(profile, harmonics):
+    """Harmonics, smaller where the spot would be negative: Richardson-Lucy's ratios suppose that it is not."""
+    angle = np.linspace(0, np.pi, 33)
+    orders = np.array(HARMONICS[: len(harmonics)])
+    lowest = (harmonics.T @ np.cos(np.outer(orders, angle))).min(-1)
+    return harmonics * np.minimum(1, np.divide(profile, -lowest, out=np.ones_like(profile), where=lowest < 0))
 
 
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
@@ -240,6 +264,39 @@ def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[
     return vogel_spiral(np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2)), order)
 
 
+def harmonic_shares(
+    points: Float64[np.ndarray, "point 2"],
+    profile: Float64[np.ndarray, " bin"],
+    harmonics: Float64[np.ndarray, "order bin"],
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Each harmonic at points of `sample_profile`, over the profile there: with its cosine, and with its sine."""
+    bins = np.minimum((np.hypot(*points.T) * _BINS).astype(int), profile.size - 1)
+    ratios = np.divide(harmonics, profile, out=np.zeros_like(harmonics), where=profile > 0)
+    angle = np.arctan2(*points.T[::-1])
+    return [
+        (ratio[bins] * np.cos(m * angle), ratio[bins] * np.sin(m * angle))
+        for m, ratio in zip(HARMONICS[: len(ratios)], ratios, strict=True)
+    ]
+
+
+def render_harmonics(
+    profile: Float64[np.ndarray, " bin"],
+    harmonics: Float64[np.ndarray, "order bin"],
+    size: int,
+    parts: float | int = 1,
+) -> Float64[np.ndarray, "wave row column"]:
+    """Kernels of a core's harmonics on such pixels as `render_kernel`'s, for each order a cosine's and a sine's."""
+    points = sample_profile(profile, _SAMPLES // 8)
+    points = np.concatenate([points * sign for sign in np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])])
+    points = np.concatenate([points, points[:, ::-1]])
+    column, row = np.floor(parts * points + size / 2).astype(int).T
+    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+    place = (row * size + column)[inside]
+    waves = [wave for both in harmonic_shares(points, profile, harmonics) for wave in both]
+    kernels = [np.bincount(place, wave[inside], size * size) / len(points) for wave in waves]
+    return np.reshape(kernels, (len(waves), size, size))
+
+
 def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
     """Radius that holds half of the light of each ring's cores, in pixels, at the depth where it is least."""
     return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / _BINS
@@ -247,8 +304,15 @@ def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
 
 def narrow_kernel(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
     """Subtract a variance in squared pixels, each way, from a kernel; what would be negative is zero."""
-    for axis in (0, 1):
-        around = np.roll(kernel, 1, axis) + np.roll(kernel, -1, axis)
-        kernel = kernel - variance / 2 * (around - 2 * kernel)
-    kernel = np.maximum(kernel, 0)
+    kernel = np.maximum(sharpen(kernel, variance), 0)
     return kernel / kernel.sum()
+
+
+def sharpen(
+    kernels: Float64[np.ndarray, "*wave row column"], variance: float
+) -> Float64[np.ndarray, "*wave row column"]:
+    """Subtract a variance in squared pixels, each way, from kernels that may be negative."""
+    for axis in (-2, -1):
+        around = np.roll(kernels, 1, axis) + np.roll(kernels, -1, axis)
+        kernels = kernels - variance / 2 * (around - 2 * kernels)
+    return kernels

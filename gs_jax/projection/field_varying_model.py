@@ -2,7 +2,7 @@
 
 import math
 import operator
-from functools import reduce
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
@@ -16,12 +16,10 @@ from ..grid import Grid, Sensor
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import ring_edges
 from .bilinear import Shapes, volume_to_image
-from .convolution import scan_in_groups, sum_of_convolutions, upsample_by_two, with_margin
+from .convolution import sum_of_convolutions, upsample_by_two, with_margin
 from .rays import RingLight, trace
 from .stray_light import cubic, stray_light_image, to_nodes
 
-# Depths whose cores are convolved at once.
-_DEPTHS = 1
 # Share of a voxel by which whole numbers of voxels may differ from a pixel.
 _ROUNDING = 0.02
 
@@ -44,13 +42,17 @@ def _cores_image(volume, imager, grid, optics):
     sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
     (_, inner, reach, _), size = optics.kernels.shape, optics.wide_kernels.shape[-1]
     wide, wide_half = with_margin(imager, reach), with_margin(_half_resolution(imager), size)
+    # The first ring with harmonics.
+    oriented = len(rings) - optics.harmonics.shape[1] - optics.wide_harmonics.shape[1]
     dtype, nodes = volume.dtype, optics.stray_light.grid
     voxels_per_pixel = 2 * sensor.pixel_pitch / (grid.pitch * nodes.pixel / nodes.step)
     outer_grid, outer_volume = wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
 
-    def sharp(imager, plane, number):
-        depth, fine_voxels, wide_voxels, distortion, light, _, _ = plane
-        grid_here, voxels = (grid, fine_voxels) if number < inner else (outer_grid, wide_voxels)
+    def sharp(plane, number):
+        """The light of the cores of a ring, and that of their harmonics."""
+        depth, fine_voxels, wide_voxels, distortion, light = plane
+        fine = wide, grid, fine_voxels
+        imager, grid_here, voxels = fine if number < inner else (wide_half, outer_grid, wide_voxels)
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * distortion[number]
         at = grid_here.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
@@ -60,25 +62,58 @@ def _cores_image(volume, imager, grid, optics):
             at = eqx.tree_at(lambda g: g.origin, at, at.origin + offset)
         weight = RingLight(*rings[number])
         rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
-        return volume_to_image(Shapes(imager.sensor.shape, at.volume_shape, weight), rays, voxels[None])
+        image = partial(volume_to_image, Shapes(imager.sensor.shape, at.volume_shape, weight), rays)
+        if number < oriented:
+            return [image(voxels[None])]
+        return _by_powers_of_field(image, voxels, imager, at, rings[number][1])
+
+    def add_rings(total, plane, numbers, kernels, harmonics, whole):
+        plain = [number for number in numbers if number < oriented]
+        if plain:
+            images = [sharp(plane, number)[0] for number in plain]
+            total = total + sum_of_convolutions(images, kernels[: len(plain)], whole=whole, symmetric=True)
+        for number, kernel, waves in zip(numbers[len(plain) :], kernels[len(plain) :], harmonics, strict=True):
+            # Ring by ring, so that few images are held at once.
+            images = sharp(plane, number)
+            total = total + sum_of_convolutions(images, jnp.concatenate([kernel[None], waves]), whole=whole)
+        return total
 
     # Not kept for the gradient: the sharp images of all depths are larger than the volume.
     @jax.checkpoint
-    def add_depths(images, planes):
+    def add_depth(images, plane):
         fine, coarse = images
-        depths = [jax.tree.map(lambda a, n=n: a[n], planes) for n in range(len(planes[0]))]
-        kernels, wide_kernels = (part.reshape(-1, *part.shape[2:]) for part in planes[-2:])
-        near = [sharp(wide, plane, number) for plane in depths for number in range(inner)]
-        far = [sharp(wide_half, plane, number) for plane in depths for number in range(inner, len(rings))]
-        fine = fine + sum_of_convolutions(near, kernels, symmetric=True)
-        return fine, coarse + sum_of_convolutions(far, wide_kernels, whole=True, symmetric=True)
+        kernels, wide_kernels, harmonics, wide_harmonics = plane[-4:]
+        fine = add_rings(fine, plane[:5], range(inner), kernels, harmonics, False)
+        coarse = add_rings(coarse, plane[:5], range(inner, len(rings)), wide_kernels, wide_harmonics, True)
+        return (fine, coarse), None
 
-    kernels = (part.astype(dtype) for part in (optics.kernels, optics.wide_kernels))
+    tables = optics.kernels, optics.wide_kernels, optics.harmonics, optics.wide_harmonics
+    kernels = (part.astype(dtype) for part in tables)
     planes = grid.depths, volume, outer_volume, optics.distortion, optics.light, *kernels
     whole = [n + size - 1 for n in wide_half.sensor.shape]
     dark = jnp.zeros(sensor.shape, dtype), jnp.zeros(whole, dtype)
-    fine, coarse = scan_in_groups(add_depths, dark, planes, _DEPTHS)
+    fine, coarse = lax.scan(add_depth, dark, planes)[0]
     return fine + upsample_by_two(coarse, size, sensor.shape)
+
+
+def _by_powers_of_field(image, voxels, imager, at, unit):
+    """The image of voxels, and those of their light times `x`, `y`, `x^2 - y^2` and `2 x y`.
+
+    Here `(x, y)` is the field: the voxel's place from the axis of the lens that sees it, in a unit, mm. A lens that
+    images the voxel at X to u has it at the field (X - u) / (1 + M), less the offset of a tilted axis. So voxels are
+    weighted by powers of X, and pixels by those of u, along the same rays.
+    """
+    sensor, scale = imager.sensor, unit * (1 + imager.magnification(at.depths)[0])
+    pixels = Grid(at.depths, sensor.shape, sensor.pixel_pitch, sensor.origin)
+    offset = scale / unit * imager.axis_offset(at.depths)[0]
+    voxel = at.x[None] / scale, at.y[:, None] / scale
+    pixel = (pixels.x[None] + offset[0]) / scale, (pixels.y[:, None] + offset[1]) / scale
+    (X, Y), (u, v) = ([each.astype(voxels.dtype) for each in pair] for pair in (voxel, pixel))
+    by = lambda weight: image((voxels * weight)[None])
+    plain, by_x, by_y = image(voxels[None]), by(X), by(Y)
+    second = by(X**2 - Y**2) - 2 * (u * by_x - v * by_y) + (u**2 - v**2) * plain
+    mixed = by(2 * X * Y) - 2 * (u * by_y + v * by_x) + 2 * u * v * plain
+    return [plain, by_x - u * plain, by_y - v * plain, second, mixed]
 
 
 def wider_voxels(grid, volume, factor):

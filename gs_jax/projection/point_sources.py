@@ -15,9 +15,9 @@ from scipy.spatial import KDTree
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
-from ..optics.field_varying import CORE_REACH, kernel_size, trace_stray_light
+from ..optics.field_varying import CORE_REACH, core_harmonics, kernel_size, trace_stray_light
 from ..optics.polar_grid import make_polar_grid
-from ..optics.psf_core import PsfCores, render_kernel, ring_edges, trace_cores
+from ..optics.psf_core import PsfCores, render_harmonics, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
 from ..typing import Points
 from .rays import Envelope, RingLight
@@ -44,21 +44,21 @@ class Ring(NamedTuple):
 
 
 class Stamps(NamedTuple):
-    """PSF_o at some depths, or the cores of a ring, shifted by fifths of a pixel.
+    """PSF_o at some depths, or the cores of a ring and their harmonics, shifted by fifths of a pixel.
 
-    `kernels[d, i, j]` is on the sensor's pixels, with its chief ray (or core) `(i - 2, j - 2)` fifths of a pixel (row,
-    column) from the middle of the central one.
+    `kernels[d, w, i, j]` is on the sensor's pixels, with its chief ray (or core) `(i - 2, j - 2)` fifths of a pixel
+    (row, column) from the middle of the central one.
     """
 
     depths: Float[np.ndarray, " depth"]
-    kernels: Float[np.ndarray, "depth 5 5 size size"]
+    kernels: Float[np.ndarray, "depth wave 5 5 size size"]
     ring: Ring | None = None
 
 
 def make_stamps(
-    depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth fine fine"], ring: Ring | None = None
+    depths: Float[np.ndarray, " depth"], fine: Float[np.ndarray, "depth *wave fine fine"], ring: Ring | None = None
 ) -> Stamps:
-    """Stamps from PSFs on pixels a fifth as large, `(depth, 5 size, 5 size)` with an odd size.
+    """Stamps from PSFs, or waves of PSFs, on pixels a fifth as large: `(depth, 5 size, 5 size)` with an odd size.
 
     Raises
     ------
@@ -66,17 +66,18 @@ def make_stamps(
         If the depths do not ascend, or the size is not five times an odd number.
     """
     size = fine.shape[-1] // STEPS
-    if fine.shape != (len(depths), STEPS * size, STEPS * size) or size % 2 == 0:
+    if (len(fine), *fine.shape[-2:]) != (len(depths), STEPS * size, STEPS * size) or size % 2 == 0:
         raise ValueError(f"`fine` must be ({len(depths)}, n, n) with n five times an odd number, got {fine.shape}.")
     if (np.diff(depths) <= 0).any():
         raise ValueError(f"`depths` must ascend, got {depths}.")
     half = STEPS // 2
-    wide = np.pad(fine, ((0, 0), (half, half), (half, half)), "wrap")
+    wide = np.pad(fine.reshape(-1, *fine.shape[-2:]), ((0, 0), (half, half), (half, half)), "wrap")
     # Pixels that begin at every fifth, along one axis after the other; a stamp that is moved up begins later.
     for axis in (1, 2):
         wide = sliding_window_view(wide, STEPS, axis).sum(-1)
     pixels = wide.reshape(-1, size, STEPS, size, STEPS)[:, :, ::-1, :, ::-1]
-    return Stamps(depths, np.ascontiguousarray(pixels.transpose(0, 2, 4, 1, 3)), ring)
+    kernels = pixels.transpose(0, 2, 4, 1, 3).reshape(len(depths), -1, STEPS, STEPS, size, size)
+    return Stamps(depths, np.ascontiguousarray(kernels), ring)
 
 
 def forward_points(
@@ -159,7 +160,7 @@ def _add_spots(
     parameters: Float[Array | np.ndarray, "spot parameter"],
     imager: Imager,
     depths: Float[Array, " depth"],
-    kernels: Float[Array, "depth 5 5 size size"],
+    kernels: Float[Array, "depth wave 5 5 size size"],
     weight: Envelope | RingLight,
 ) -> Float[Array, "tile side side"]:
     """Add the first `count` spots, each of a point and a lens, to the tiles, which overlap by a stamp."""
@@ -167,6 +168,7 @@ def _add_spots(
     points, distortion, parameters = (jnp.asarray(part, dtype) for part in (points, distortion, parameters))
     views = imager.views(points[:, :3], lenses, distortion=distortion)
     light = (points[:, 3] * weight(jnp.sum(views.offset**2, -1), parameters)).astype(kernels.dtype)
+    waves = _waves(views.offset, weight, kernels.shape[1]).astype(kernels.dtype)
     between = jnp.interp(points[:, 2], depths.astype(dtype), jnp.arange(len(depths), dtype=dtype))
     near = between.astype(int)
     far, part = jnp.minimum(near + 1, len(depths) - 1), (between - near.astype(dtype)).astype(kernels.dtype)
@@ -182,12 +184,23 @@ def _add_spots(
 
     def add(number, tiles):
         n = order[number]
-        stamp = (1 - part[n]) * kernels[near[n], i[n], j[n]] + part[n] * kernels[far[n], i[n], j[n]]
+        stamps = (1 - part[n]) * kernels[near[n], :, i[n], j[n]] + part[n] * kernels[far[n], :, i[n], j[n]]
+        stamp = jnp.tensordot(waves[n], stamps, 1)
         at = tile[n], row[n], column[n]
         patch = lax.dynamic_slice(tiles, at, (1, size, size))
         return lax.dynamic_update_slice(tiles, patch + light[n] * stamp[None], at)
 
     return lax.fori_loop(0, jnp.sum(lit), add, tiles)
+
+
+def _waves(offset: Float[Array, "spot 2"], weight: Envelope | RingLight, count: int) -> Float[Array, "spot wave"]:
+    """Factors of a spot's stamps: 1, and powers of the field in units of a ring's end, as in the full model."""
+    plain = jnp.ones((len(offset), 1), offset.dtype)
+    if count == 1:
+        return plain
+    assert isinstance(weight, RingLight)
+    x, y = (offset / weight.outer).T
+    return jnp.concatenate([plain, jnp.stack([x, y, x**2 - y**2, 2 * x * y], -1)], -1)
 
 
 def full_image_of_points(
@@ -214,15 +227,22 @@ def full_image_of_points(
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2
     grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress)
+    orders = core_harmonics(imager, fine, grid)
+    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress, orders=orders)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
     stray_light = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
     image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, jnp.zeros(2, nodes.dtype)))
     size = kernel_size(imager, stray_light.grid)
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
-    for edges, *parts, profiles in rings:
-        kernels = np.stack([render_kernel(profile, STEPS * size, STEPS) for profile in profiles])
+    for edges, *parts, profiles, harmonics in rings:
+        shapes = STEPS * size, STEPS
+        kernels = np.stack(
+            [
+                np.concatenate([render_kernel(profile, *shapes)[None], render_harmonics(profile, waves, *shapes)])
+                for profile, waves in zip(profiles, harmonics, strict=True)
+            ]
+        )
         stamps = make_stamps(fine, kernels.astype(np.float32), Ring(edges, *parts))
         image += forward_points(points, imager, stamps, progress)
     # The stray light ripples below zero in places; clipping adds light, which scaling removes.
