@@ -114,8 +114,8 @@ class Imager(eqx.Module):
     wavelength
         Of the light, mm: 520e-6 for 520 nm.
     tilt
-        Slopes `(x, y)` of the array's plane toward the object along +x and +y, about the point `v` above the sensor's
-        centre. None, the default, is an array parallel to the sensor.
+        Slopes `(x, y)` of the array's plane toward the object along +x and +y, about the point of the lens vertices'
+        plane above the sensor's centre. None, the default, is an array parallel to the sensor.
     filters
         Layers on the object's side, from the array's front outward, in contact with it unless the first is of index 1.
         They tilt with the array.
