@@ -172,9 +172,9 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
 def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     """Arrays of `FieldVaryingPsf` and its `StrayLight`, by name."""
     imager, depths, grid, progress = request.imager, request.depths, request.grid, request.progress
-    orders = () if request.rings else core_harmonics(imager, depths, grid)
-    rings = request.rings or (_SHARP_RINGS if orders else RINGS)
-    cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, rings, progress, orders=orders)
+    sharp = not request.rings and has_sharp_cores(imager, depths, grid)
+    rings = request.rings or (_SHARP_RINGS if sharp else RINGS)
+    cores = trace_cores(imager, depths, CORE_REACH * grid.pixel, rings, progress, oriented=sharp)
     cores.harmonics[:, :_PLAIN] = 0
     stray_light = trace_stray_light(imager, depths, grid, cores, rings, progress)
     size = kernel_size(imager, grid)
@@ -182,7 +182,7 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     fine = half_light_radii(cores) < _SHARP if request.rings is None else np.array(rings) <= 1
     inner = 1 + int(np.argmin(np.append(fine[1:-1], False)))
     # The first ring with harmonics.
-    oriented = _PLAIN if orders else len(rings)
+    oriented = _PLAIN if sharp else len(rings)
     small, large = size // 4 * 2 + 1, _SHARED + _LARGE
     arrays = {"distortion": cores.distortion, "light": cores.light, "rings": np.array(rings)}
     arrays["kernels"] = _kernels(cores, slice(inner), size, 1, _SHARED)
@@ -192,10 +192,10 @@ def _trace_tables(request: _Request) -> dict[str, np.ndarray]:
     return arrays | {name: np.asarray(getattr(stray_light, name)) for name in ("table", "area", "sensor_distance")}
 
 
-def core_harmonics(imager: Imager, depths: Float64[np.ndarray, " depth"], grid: PolarGrid) -> tuple[int, ...]:
-    """The angular harmonics that the cores need: none, if they are not sharp at any of the depths."""
+def has_sharp_cores(imager: Imager, depths: Float64[np.ndarray, " depth"], grid: PolarGrid) -> bool:
+    """Whether cores within the field radius are so sharp, at one of the depths, that they are to be oriented."""
     half = half_light_radii(trace_cores(imager, depths, CORE_REACH * grid.pixel, RINGS[:1])) * imager.sensor.pixel_pitch
-    return HARMONICS if half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step else ()
+    return bool(half[0] < _PRECISE * imager.field_radius * grid.pixel / grid.step)
 
 
 def _kernels(

@@ -31,7 +31,7 @@ _FARTHEST, _STEPS, _SPARSE, _FINE = 0.08, 81, 8, 1e-4
 _BLUR = 3.0
 # Largest pixel by which sharpness is judged, in images of the widest field; depths traced before interpolating.
 _SHARP, _MOST = 0.006, 9
-# Angular harmonics of a spot about its core that sharp cores keep beside the mean: coma and astigmatism.
+# Angular harmonics m of oriented cores: coma, astigmatism.
 HARMONICS = (1, 2)
 # Radial bins in a pixel, which are fine beside the nodes of stray light, and samples of a rendered kernel.
 _BINS, _SAMPLES = 16, 2**17
@@ -43,7 +43,7 @@ class PsfCores(NamedTuple):
     `distortion`: magnification over the chief ray's. `light`: coefficients of `ring_light`. `profile`: light in radial
     bins of a sixteenth of a pixel, with the sum 1. `harmonics`: in the same bins, the amplitudes of `cos(m t)`, where
     `t` is the angle from the direction of the field, at the outer end of the ring; within it they are proportional to
-    the m-th power of the field. None, or those of `HARMONICS`.
+    the m-th power of the field. Those of `HARMONICS`, or none.
     """
 
     distortion: Float64[np.ndarray, "*depth ring"]
@@ -86,33 +86,32 @@ def trace_cores(
     ends: Sequence[float] = RINGS,
     progress: Progress | None = None,
     *,
-    orders: Sequence[int] = (),
+    oriented: bool = False,
 ) -> PsfCores:
     """The cores of the mean lens at some depths, by exact rays.
 
     Each ring has one kernel: the mean of its spots up to `reach` (mm), about the magnification at which that mean is
     the sharpest. The light of each spot in it is a least-squares fit. `ends` are outer radii of the rings, in field
-    radii. `orders` are those of the angular harmonics that are wanted: the spots are turned to one direction of the
-    field before their mean is taken.
+    radii. Cores that are `oriented` have harmonics.
     """
     aperture = aperture_profile(imager.array, by_area=False)
-    tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends, orders), depths)
+    tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends, oriented), depths)
     tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
     return PsfCores(*map(np.stack, zip(*(table for _, table in tracked), strict=True)))
 
 
-def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, reach: float, ends, orders) -> PsfCores:
+def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, reach: float, ends, oriented) -> PsfCores:
     pitch = imager.sensor.pixel_pitch
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
-    parts = [_ring_core(rays, fields, chief, pitch, edges, orders, *ring) for ring in rings]
+    parts = [_ring_core(rays, fields, chief, pitch, edges, oriented, *ring) for ring in rings]
     return PsfCores(*map(np.stack, zip(*parts, strict=True)))
 
 
-def _ring_core(rays, fields, chief, pitch, edges, orders, inner, outer):
+def _ring_core(rays, fields, chief, pitch, edges, oriented, inner, outer):
     """Distortion, light coefficients, radial profile and harmonics of one ring."""
     share = ring_window(fields**2, inner, outer)
     used = share > 1e-6
@@ -132,22 +131,22 @@ def _ring_core(rays, fields, chief, pitch, edges, orders, inner, outer):
     # Ridge regression: a ring that begins far out leaves the low powers undetermined.
     system = np.concatenate([powers * root[:, None], 1e-4 * root.max() * np.eye(_DEGREE + 1)])
     light = np.linalg.lstsq(system, np.append(amount * root, np.zeros(_DEGREE + 1)))[0]
-    along = (mine.landing[..., 0] + chief * distortion * fields[used][:, None]) / np.maximum(radius, 1e-12)
-    angle, harmonics = np.arccos(np.clip(along, -1, 1)), np.zeros((len(orders), profile.size))
-    for number, order in enumerate(orders):
-        share = weight * (fields[used] / outer) ** order
-        waves = 2 * mine.light * np.cos(order * angle) * share[:, None]
-        harmonics[number] = np.histogram(radius, edges, weights=waves)[0] / (
-            share * powers[:, 1] ** (order / 2) @ amount
-        )
-    return distortion, light, profile, _not_negative(profile, harmonics)
+    if not oriented:
+        return distortion, light, profile, np.zeros((0, profile.size))
+    angle = np.arctan2(mine.landing[..., 1], mine.landing[..., 0] + chief * distortion * fields[used][:, None])
+    harmonics = []
+    for order in HARMONICS:
+        # Least squares of what grows as this power of the field.
+        field = (fields[used] / outer) ** order
+        waves = mine.light * np.cos(order * angle) * (2 * weight * field)[:, None]
+        harmonics.append(np.histogram(radius, edges, weights=waves)[0] / (weight * field**2 @ amount))
+    return distortion, light, profile, _positive_spots(profile, np.array(harmonics))
 
 
-def _not_negative(profile, harmonics):
+def _positive_spots(profile, harmonics):
     """Harmonics, smaller where the spot would be negative: Richardson-Lucy's ratios suppose that it is not."""
-    angle = np.linspace(0, np.pi, 33)
-    orders = np.array(HARMONICS[: len(harmonics)])
-    lowest = (harmonics.T @ np.cos(np.outer(orders, angle))).min(-1)
+    waves = np.cos(np.outer(HARMONICS, np.linspace(0, np.pi, 33)))
+    lowest = (harmonics.T @ waves).min(-1)
     return harmonics * np.minimum(1, np.divide(profile, -lowest, out=np.ones_like(profile), where=lowest < 0))
 
 
@@ -269,7 +268,7 @@ def harmonic_shares(
     profile: Float64[np.ndarray, " bin"],
     harmonics: Float64[np.ndarray, "order bin"],
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Each harmonic at points of `sample_profile`, over the profile there: with its cosine, and with its sine."""
+    """The cosine and the sine of each harmonic at points of `sample_profile`, relative to the profile there."""
     bins = np.minimum((np.hypot(*points.T) * _BINS).astype(int), profile.size - 1)
     ratios = np.divide(harmonics, profile, out=np.zeros_like(harmonics), where=profile > 0)
     angle = np.arctan2(*points.T[::-1])

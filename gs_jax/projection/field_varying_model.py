@@ -49,10 +49,10 @@ def _cores_image(volume, imager, grid, optics):
     outer_grid, outer_volume = wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
 
     def sharp(plane, number):
-        """The light of the cores of a ring, and that of their harmonics."""
+        """The light of a ring's cores before they are spread, and if they are oriented, that of each harmonic."""
         depth, fine_voxels, wide_voxels, distortion, light = plane
-        fine = wide, grid, fine_voxels
-        imager, grid_here, voxels = fine if number < inner else (wide_half, outer_grid, wide_voxels)
+        fine, coarse = (wide, grid, fine_voxels), (wide_half, outer_grid, wide_voxels)
+        imager, grid_here, voxels = fine if number < inner else coarse
         # Chief rays of this apparent depth land where the cores of the true one do.
         magnification = imager.magnification(depth) * distortion[number]
         at = grid_here.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
@@ -67,7 +67,8 @@ def _cores_image(volume, imager, grid, optics):
             return [image(voxels[None])]
         return _by_powers_of_field(image, voxels, imager, at, rings[number][1])
 
-    def add_rings(total, plane, numbers, kernels, harmonics, whole):
+    def add_rings(total, plane, numbers, kernels, harmonics, *, whole):
+        """Add the light of some of the rings, convolved with their kernels."""
         plain = [number for number in numbers if number < oriented]
         if plain:
             images = [sharp(plane, number)[0] for number in plain]
@@ -82,9 +83,9 @@ def _cores_image(volume, imager, grid, optics):
     @jax.checkpoint
     def add_depth(images, plane):
         fine, coarse = images
-        kernels, wide_kernels, harmonics, wide_harmonics = plane[-4:]
-        fine = add_rings(fine, plane[:5], range(inner), kernels, harmonics, False)
-        coarse = add_rings(coarse, plane[:5], range(inner, len(rings)), wide_kernels, wide_harmonics, True)
+        *at, kernels, wide_kernels, harmonics, wide_harmonics = plane
+        fine = add_rings(fine, at, range(inner), kernels, harmonics, whole=False)
+        coarse = add_rings(coarse, at, range(inner, len(rings)), wide_kernels, wide_harmonics, whole=True)
         return (fine, coarse), None
 
     tables = optics.kernels, optics.wide_kernels, optics.harmonics, optics.wide_harmonics

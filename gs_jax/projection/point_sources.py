@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
-from ..optics.field_varying import CORE_REACH, core_harmonics, kernel_size, trace_stray_light
+from ..optics.field_varying import CORE_REACH, has_sharp_cores, kernel_size, trace_stray_light
 from ..optics.polar_grid import make_polar_grid
 from ..optics.psf_core import PsfCores, render_harmonics, render_kernel, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
@@ -227,8 +227,8 @@ def full_image_of_points(
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2
     grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    orders = core_harmonics(imager, fine, grid)
-    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress, orders=orders)
+    sharp = has_sharp_cores(imager, fine, grid)
+    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
     stray_light = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
