@@ -17,7 +17,7 @@ from ..base.arrays import array_namespace
 from ..base.machine import map_in_threads
 from ..base.progress import Progress
 from ..geometry import Imager, falloff
-from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil, vogel_spiral
+from .pupil import ApertureProfile, PupilSamples, add_diffraction, aperture_profile, sample_pupil
 from .raytrace import to_numpy
 
 # Outer radii of the rings of the field, in field radii. Farther out cores are as wide as the pixels of stray light.
@@ -33,8 +33,8 @@ _BLUR = 3.0
 _SHARP, _MOST = 0.006, 9
 # Angular harmonics m of oriented cores: coma, astigmatism.
 HARMONICS = (1, 2)
-# Radial bins in a pixel, which are fine beside the nodes of stray light, and samples of a rendered kernel.
-_BINS, _SAMPLES = 16, 2**17
+# Radial bins in a pixel, which are fine beside the nodes of stray light.
+BINS = 16
 
 
 class PsfCores(NamedTuple):
@@ -106,7 +106,7 @@ def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, rea
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
     rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
     chief = float(imager.magnification(float(depth)))
-    edges = np.arange(0, math.ceil(reach / pitch) * _BINS + 1) * pitch / _BINS
+    edges = np.arange(0, math.ceil(reach / pitch) * BINS + 1) * pitch / BINS
     parts = [_ring_core(rays, fields, chief, pitch, edges, oriented, *ring) for ring in rings]
     return PsfCores(*map(np.stack, zip(*parts, strict=True)))
 
@@ -123,7 +123,7 @@ def _ring_core(rays, fields, chief, pitch, edges, oriented, inner, outer):
     profile = np.histogram(radius, edges, weights=mine.light * weight[:, None])[0]
     profile = profile / profile.sum()
     # As pixels see it: without differences within a pixel.
-    density = np.repeat(profile.reshape(-1, _BINS).sum(1) / np.diff(edges[::_BINS] ** 2), _BINS)
+    density = np.repeat(profile.reshape(-1, BINS).sum(1) / np.diff(edges[::BINS] ** 2), BINS)
     bins = np.minimum((radius / edges[1]).astype(int), density.size)
     amount = (mine.light * np.append(density, 0)[bins]).sum(1) / (profile * density).sum()
     powers = (fields[used] / outer)[:, None] ** (2 * np.arange(_DEGREE + 1))
@@ -245,73 +245,6 @@ def _golden_section(cost: Callable[[float], float], low: float, high: float) -> 
     return inner[int(np.argmin(costs))]
 
 
-def render_kernel(
-    profile: Float64[np.ndarray, " bin"], size: int, parts: float | int = 1
-) -> Float64[np.ndarray, "row column"]:
-    """Symmetric kernel with a radial profile, on `size` x `size` (odd) pixels or `parts` of a pixel, with the sum 1."""
-    column, row = np.floor(parts * sample_profile(profile, _SAMPLES) + size / 2).astype(int).T
-    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
-    light = np.bincount((row * size + column)[inside], minlength=size * size).reshape(size, size) / _SAMPLES
-    light = light + light[::-1] + light[:, ::-1] + light[::-1, ::-1]
-    return (light + light.T) / 8
-
-
-def sample_profile(profile: Float64[np.ndarray, " bin"], count: int) -> Float64[np.ndarray, "point 2"]:
-    """Points `(x, y)` in pixels whose density follows a core's profile."""
-    order = np.arange(count) + 0.5
-    edges = np.arange(profile.size + 1) / _BINS
-    return vogel_spiral(np.sqrt(np.interp(order / count, np.append(0, np.cumsum(profile)), edges**2)), order)
-
-
-def harmonic_shares(
-    points: Float64[np.ndarray, "point 2"],
-    profile: Float64[np.ndarray, " bin"],
-    harmonics: Float64[np.ndarray, "order bin"],
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The cosine and the sine of each harmonic at points of `sample_profile`, relative to the profile there."""
-    bins = np.minimum((np.hypot(*points.T) * _BINS).astype(int), profile.size - 1)
-    ratios = np.divide(harmonics, profile, out=np.zeros_like(harmonics), where=profile > 0)
-    angle = np.arctan2(*points.T[::-1])
-    return [
-        (ratio[bins] * np.cos(m * angle), ratio[bins] * np.sin(m * angle))
-        for m, ratio in zip(HARMONICS[: len(ratios)], ratios, strict=True)
-    ]
-
-
-def render_harmonics(
-    profile: Float64[np.ndarray, " bin"],
-    harmonics: Float64[np.ndarray, "order bin"],
-    size: int,
-    parts: float | int = 1,
-) -> Float64[np.ndarray, "wave row column"]:
-    """Kernels of a core's harmonics on such pixels as `render_kernel`'s, for each order a cosine's and a sine's."""
-    points = sample_profile(profile, _SAMPLES // 8)
-    points = np.concatenate([points * sign for sign in np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])])
-    points = np.concatenate([points, points[:, ::-1]])
-    column, row = np.floor(parts * points + size / 2).astype(int).T
-    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
-    place = (row * size + column)[inside]
-    waves = [wave for both in harmonic_shares(points, profile, harmonics) for wave in both]
-    kernels = [np.bincount(place, wave[inside], size * size) / len(points) for wave in waves]
-    return np.reshape(kernels, (len(waves), size, size))
-
-
 def half_light_radii(cores: PsfCores) -> Float64[np.ndarray, " ring"]:
     """Radius that holds half of the light of each ring's cores, in pixels, at the depth where it is least."""
-    return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / _BINS
-
-
-def narrow_kernel(kernel: Float64[np.ndarray, "row column"], variance: float) -> Float64[np.ndarray, "row column"]:
-    """Subtract a variance in squared pixels, each way, from a kernel; what would be negative is zero."""
-    kernel = np.maximum(sharpen(kernel, variance), 0)
-    return kernel / kernel.sum()
-
-
-def sharpen(
-    kernels: Float64[np.ndarray, "*wave row column"], variance: float
-) -> Float64[np.ndarray, "*wave row column"]:
-    """Subtract a variance in squared pixels, each way, from kernels that may be negative."""
-    for axis in (-2, -1):
-        around = np.roll(kernels, 1, axis) + np.roll(kernels, -1, axis)
-        kernels = kernels - variance / 2 * (around - 2 * kernels)
-    return kernels
+    return (np.cumsum(cores.profile, -1) < 0.5).sum(-1).min(0) / BINS
