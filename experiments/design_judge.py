@@ -12,8 +12,11 @@ two designs are of the same scenes, with 95 % intervals by a bootstrap over squa
 its own noise. A second table has the error that the full model leaves of images without noise, of scenes that lie in
 planes.
 
+With `--images model` the full model makes the images, of voxels as fine as the unrolled inversion's. They show what a
+perfect model would give, and what neither model nor noise explains.
+
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--exposures 3000]
-        [--rays 10000] [--records FILE]
+        [--rays 10000] [--images {rays,model}] [--records FILE]
 
 Writes the records after each scene, from which the next run goes on, and then `design_judge.md` and `design_judge.png`;
 about half an hour of two cores for each design, and an hour for sharp ones.
@@ -33,13 +36,24 @@ from matplotlib.figure import Figure
 from experiments.common import Report, cropped, design_file, designs_by_name, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
-from gs_jax import Grid, Imager, RichardsonLucy, find_points, forward, localization, quality, rasterize, read_design
+from gs_jax import (
+    Grid,
+    Imager,
+    RichardsonLucy,
+    find_points,
+    forward,
+    localization,
+    make_psf_model,
+    quality,
+    rasterize,
+    read_design,
+)
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
-from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model
+from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import reconstructor
 from gs_jax.simulation.phantoms import letters
@@ -53,7 +67,7 @@ VOXEL, PLANE, READ_NOISE = 0.04, 0.3, 2.0
 # Distance of emitters, of which so many share rays, mm; and squares of a scene that the bootstrap draws, along a side.
 APART, TILE, SQUARES = 0.01, 0.1, 3
 # How images are made; records of others are refused.
-IMAGES = "by rays and diffraction"
+IMAGES = {"rays": "by rays and diffraction", "model": "by the full model"}
 # Bars: their period and size, mm. A bead's diameter, and beads at each depth.
 PERIOD, SIZE, BEAD, BEADS = 0.12, 0.48, 0.06, 10
 
@@ -64,7 +78,7 @@ class Settings(NamedTuple):
     `sensor` is the width of the sensor's middle; lenses beyond it by 0.4 mm are left out. `rays` go from each tile of
     the scene to each lens: with 600, the images of `geomscope` differed by 5 % (letters) and 11 % (beads) from those
     with 10,000, and with 2,400 by 2 and 4 %. `width`: of the unrolled inversion's voxels, relative to those that are
-    scored.
+    scored. `images`: a key of `IMAGES`.
     """
 
     span: tuple[float, float] = (18.0, 23.0)
@@ -77,6 +91,7 @@ class Settings(NamedTuple):
     steps: tuple[int, ...] = (3, 6, 12)
     rays: int = 10_000
     width: float = 0.5
+    images: str = "rays"
 
     @property
     def depths(self) -> np.ndarray:
@@ -160,7 +175,15 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
     """The image without noise: the share of all light in each pixel."""
     light = one.emitters.copy()
     light[:, 3] /= light[:, 3].sum()
+    if settings.images == "model":
+        return image_by_model(light, imager, finer(settings.grid, settings.width))
     return diffracted(traced(light, imager, settings.rays, TILE), imager)
+
+
+def image_by_model(emitters: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
+    """The full model's image of emitters that the voxels of a grid share."""
+    model, volume = make_psf_model(imager, grid.depths, "full"), np.asarray(rasterize(emitters, grid), np.float32)
+    return np.asarray(jax.jit(forward)(volume, imager, grid, model))
 
 
 def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:
@@ -277,7 +300,7 @@ class Judge:
 
     def __init__(self, file: Path, settings: Settings, reference: Imager):
         self.file, self.settings, self.reference = file, settings, device(reference, settings)
-        as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES}))
+        as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES[settings.images]}))
         self.kept = json.loads(file.read_text()) if file.exists() else {"settings": as_json, "scenes": {}, "found": {}}
         if self.kept["settings"] != as_json:
             raise InputError(f"{file} must be of the settings {as_json}, got {self.kept['settings']}.")
@@ -348,11 +371,8 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
 def model_error(imager: Imager, kind: str, settings: Settings) -> float:
     """Error of the full model's image of a scene on fine voxels, after the best gain, relative to the image."""
     small, one = device(imager, settings), scene(kind, 0, settings)
-    fine = finer(settings.grid, settings.width)
-    model = prepare_model(small, fine, "full", Progress())
-    light, _ = prepare_data(image_of(one, small, settings).astype(np.float32), model)
-    truth = np.asarray(rasterize(one.emitters, fine), np.float32)
-    image = np.asarray(jax.jit(forward)(truth, model.imager, fine, model.optics))
+    light = subtract_offset(image_of(one, small, settings).astype(np.float32))
+    image = image_by_model(one.emitters, small, finer(settings.grid, settings.width))
     gain = np.vdot(image, light) / np.vdot(image, image)
     return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))
 
@@ -390,6 +410,7 @@ def report(
     draws: int,
     exposures: list[int],
     rays: int,
+    images: str,
     records: Path,
     progress: Progress,
 ) -> Report:
@@ -397,7 +418,7 @@ def report(
     if draws < 1 or rays < 1 or min(exposures) < 1 or not 0 < span[0] < span[1] - 2:
         wanted = "--draws, --exposures and --rays must be 1 or more, and --span positive and wider than 2 mm"
         raise InputError(f"{wanted}, got {draws}, {exposures}, {rays} and {span}.")
-    settings = Settings(span=(span[0], span[1]), exposures=tuple(exposures), rays=rays)
+    settings = Settings(span=(span[0], span[1]), exposures=tuple(exposures), rays=rays, images=images)
     files = designs or [design_file(name) for name in DESIGNS]
     reference = read_design(design_file(DESIGNS[0])).imager()
     imagers = {name: design.imager() for name, design in designs_by_name(files).items()}
@@ -424,6 +445,7 @@ if __name__ == "__main__":
             "--draws": {"type": int, "default": 1},
             "--exposures": {"type": int, "nargs": "+", "default": Settings().exposures},
             "--rays": {"type": int, "default": Settings().rays},
+            "--images": {"choices": list(IMAGES), "default": Settings().images},
             "--records": {"type": Path, "default": Path("out/design_judge/records.json")},
         },
     )

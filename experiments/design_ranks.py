@@ -235,10 +235,11 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
     given = designs_by_name(designs, ranked)
     make_folder(records.parent)
-    new = {"images": IMAGES, "bright": {}, "found": {}}
+    images = IMAGES[SETTINGS.images]
+    new = {"images": images, "bright": {}, "found": {}}
     kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else new
-    if kept.get("images") != IMAGES:
-        raise InputError(f"{records} must be of images {IMAGES}, got {kept.get('images', 'by rays')}.")
+    if kept.get("images") != images:
+        raise InputError(f"{records} must be of images {images}, got {kept.get('images', 'by rays')}.")
     reference = device(shipped[DESIGNS[0]].imager(), SETTINGS)
 
     def brightest(kind: str, draw: int) -> float:

@@ -9,10 +9,24 @@ from scipy.special import j1
 
 from experiments import design_changes, design_search
 from experiments.common import designs_by_name
-from experiments.design_judge import KINDS, Judge, Settings, contrast, difference, diffracted, finer, scene, shared
+from experiments.design_judge import (
+    IMAGES,
+    KINDS,
+    Judge,
+    Settings,
+    contrast,
+    difference,
+    diffracted,
+    finer,
+    image_of,
+    report,
+    scene,
+    shared,
+)
 from experiments.ray_tracer import traced
 from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
+from gs_jax.base.progress import Progress
 from gs_jax.design.design import write_design
 from gs_jax.optics.theory import depth_in_focus
 
@@ -50,6 +64,15 @@ def test_a_point_is_blurred_to_an_airy_disc():
     assert image.sum() == pytest.approx(1, rel=1e-3)
 
 
+def test_images_by_the_model_are_those_by_rays():
+    """On one scale: electrons of the reference's brightest pixel set the exposure of all designs."""
+    settings = Settings(rays=2000, around=0)
+    one = scene("beads", 0, settings)
+    by_rays, by_model = (image_of(one, IMAGER, settings._replace(images=name)) for name in IMAGES)
+    assert by_model.sum() == pytest.approx(by_rays.sum(), rel=0.02)
+    assert np.linalg.norm(by_model - by_rays) < 0.2 * np.linalg.norm(by_rays)
+
+
 def test_differences_are_of_pairs():
     record = lambda factor: {"letters 0": {"500": {"unrolled": {"squares": [factor * x for x in range(1, 10)]}}}}
     more, low, high = difference(record(0.1), record(1.0), "letters", 500, "unrolled")
@@ -61,6 +84,17 @@ def test_records_of_other_settings_are_refused(tmp_path):
     file.write_text(json.dumps({"settings": {}, "scenes": {}, "found": {}}))
     with pytest.raises(InputError, match="must be of the settings"):
         Judge(file, Settings(), IMAGER)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"draws": 0}, {"rays": 0}, {"exposures": [3000, 0]}, {"span": [0.0, 5.0]}, {"span": [18.0, 20.0]}]
+)
+def test_numbers_out_of_range_are_refused_before_anything_is_written(tmp_path, wrong):
+    right = {"designs": [], "span": [18.0, 23.0], "draws": 1, "exposures": [3000], "rays": 10, "images": "rays"}
+    records = tmp_path / "new" / "records.json"
+    with pytest.raises(InputError, match="--draws, --exposures and --rays must be 1 or more, and --span"):
+        report(**(right | wrong), records=records, progress=Progress())
+    assert not records.parent.exists()
 
 
 def test_designs_of_one_name_are_refused(tmp_path):
