@@ -276,18 +276,20 @@ def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
 
 @cache
 def _to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
-    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that none is lost.
+    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that no ring loses any.
 
-    About the axis the nodes are closer than the pixels, and are shared by the four around them instead.
+    Up to the radius `bend` nodes are closer around than pixels, so that some have no pixel: only all nodes of a ring
+    have the light of the ring. About the axis they are closer outward, too, and are shared by the four pixels around
+    them instead.
     """
     reach = math.ceil(polar_grid.nodes(polar_grid.radii)[-2])
     pixel, node, share = polar_weights(polar_grid, polar_grid.radii, *_square(reach))
     outer = (node >= _INNER_RINGS * polar_grid.angles) & (share > 0)
     pixel, node, share = pixel[outer], node[outer], share[outer]
-    total = np.bincount(node, share, polar_grid.radii * polar_grid.angles)
+    ring = node // polar_grid.angles
+    total = np.bincount(ring, share, polar_grid.radii) / polar_grid.angles
     # The last rings are cut by the window's edge, and have no more light than that.
-    whole = node < (polar_grid.radii - 3) * polar_grid.angles
-    share = share / np.where(whole, total[node], np.repeat(polar_grid.areas(polar_grid.radii), polar_grid.angles)[node])
+    share = share / np.where(ring < polar_grid.radii - 3, total[ring], polar_grid.areas(polar_grid.radii)[ring])
     parts = [(pixel, node, share), *_near_axis(polar_grid, reach)]
     pixel, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
     node = _angle_first(polar_grid, polar_grid.radii, node)
