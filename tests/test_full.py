@@ -195,6 +195,16 @@ def test_points_are_voxels_that_lie_anywhere():
     assert np.corrcoef(binned(found).ravel(), binned(image).ravel())[0, 1] > 0.98
 
 
+@pytest.mark.parametrize("field", [0.0, 0.8, 2.0])
+def test_one_lens_loses_no_light(field):
+    """About the axis polar nodes are closer to each other than the pixels that have their light."""
+    scope = alone("geomscope", Sensor((200, 200), 0.02))
+    point = np.array([field, 0.3 * field, 20.0])
+    one = Grid([20.0], (1, 1), 0.1, point[:2])
+    image = forward(jnp.ones((1, 1, 1)), scope, one, field_varying_psf(scope, one.depths))
+    np.testing.assert_allclose(image.sum(), traced_light(scope, point), rtol=0.01)
+
+
 def test_what_leaves_a_lens_is_what_its_solid_angle_holds():
     """Far away and without reflection, the clear disc over the sphere; a little less with Fresnel's few percent."""
     ideal = imager()
