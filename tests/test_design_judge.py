@@ -64,6 +64,7 @@ def test_a_point_is_blurred_to_an_airy_disc():
     assert image.sum() == pytest.approx(1, rel=1e-3)
 
 
+@pytest.mark.integration
 def test_images_by_the_model_are_those_by_rays():
     """On one scale: electrons of the reference's brightest pixel set the exposure of all designs."""
     settings = Settings(rays=300, around=0, field=1.2, width=1.0)

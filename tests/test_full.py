@@ -32,11 +32,13 @@ from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.core_kernels import render_harmonics, render_kernel, sample_profile
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
+from gs_jax.optics.polar_grid import make_polar_grid
 from gs_jax.optics.psf_core import apparent_depths, core_magnification, ring_edges, ring_window
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
 from gs_jax.projection.field_varying_model import wider_voxels
 from gs_jax.projection.point_sources import full_image_of_points
+from gs_jax.projection.stray_light import to_pixels_table
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 DEPTHS = (18.0, 21.0)
@@ -195,9 +197,18 @@ def test_points_are_voxels_that_lie_anywhere():
     assert np.corrcoef(binned(found).ravel(), binned(image).ravel())[0, 1] > 0.98
 
 
+def test_pixels_have_the_light_of_each_ring_of_nodes():
+    """About the axis nodes are closer to each other than the pixels."""
+    nodes = make_polar_grid(imager(), np.array(DEPTHS))
+    to_pixels = to_pixels_table(nodes).rows
+    light = np.bincount(to_pixels.place % nodes.radii, to_pixels.share) / nodes.angles
+    # The last rings are cut.
+    np.testing.assert_allclose(light[:-3], 1, rtol=1e-6)
+
+
+@pytest.mark.integration
 @pytest.mark.parametrize("field", [0.0, 0.8, 2.0])
 def test_one_lens_loses_no_light(field):
-    """About the axis polar nodes are closer to each other than the pixels that have their light."""
     scope = alone("geomscope", Sensor((200, 200), 0.02))
     point = np.array([field, 0.3 * field, 20.0])
     one = Grid([20.0], (1, 1), 0.1, point[:2])

@@ -45,7 +45,7 @@ def stray_light_image(
     polar_grid, v = optics.grid, (imager.reduced_sensor_distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the coarse pixels with it.
     pixel = polar_grid.pixel * v
-    to_polar, to_pixels = _to_polar_table(polar_grid), _to_pixels_table(polar_grid)
+    to_polar, to_pixels = _to_polar_table(polar_grid), to_pixels_table(polar_grid)
     inner, outer = to_polar.side, to_pixels.side
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / polar_grid.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
     nodes = jnp.pad(nodes, [(0, 0), *[(inner + 1, inner + 1 + _SPARE)] * 2])
@@ -275,7 +275,7 @@ def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
 
 
 @cache
-def _to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
+def to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
     """From polar nodes to the pixels about a lens: the density of light, interpolated, so that no ring loses any.
 
     Up to the radius `bend` nodes are closer around than pixels, so that some have no pixel: only all nodes of a ring
