@@ -369,9 +369,9 @@ def rows_of(found: dict[str, dict], settings: Settings) -> tuple[tuple[str, ...]
 
 
 def model_error(imager: Imager, kind: str, settings: Settings) -> float:
-    """Error of the full model's image of a scene on fine voxels, after the best gain, relative to the image."""
+    """Error of the full model's image of a scene on fine voxels, after the best gain, relative to that by rays."""
     small, one = device(imager, settings), scene(kind, 0, settings)
-    light = subtract_offset(image_of(one, small, settings).astype(np.float32))
+    light = subtract_offset(image_of(one, small, settings._replace(images="rays")).astype(np.float32))
     image = image_by_model(one.emitters, small, finer(settings.grid, settings.width))
     gain = np.vdot(image, light) / np.vdot(image, image)
     return float(np.linalg.norm(gain * image - light) / np.linalg.norm(light))

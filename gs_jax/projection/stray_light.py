@@ -278,9 +278,9 @@ def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
 def to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
     """From polar nodes to the pixels about a lens: the density of light, interpolated, so that no ring loses any.
 
-    Up to the radius `bend` nodes are closer around than pixels, so that some have no pixel: only all nodes of a ring
-    have the light of the ring. About the axis they are closer outward, too, and are shared by the four pixels around
-    them instead.
+    Up to the radius `bend` nodes are closer around than pixels, and some are near no pixel: the nodes of a ring keep
+    their light together, not each its own. About the axis they are closer outward, too, and are shared by the four
+    pixels around them instead.
     """
     reach = math.ceil(polar_grid.nodes(polar_grid.radii)[-2])
     pixel, node, share = polar_weights(polar_grid, polar_grid.radii, *_square(reach))
