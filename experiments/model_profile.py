@@ -101,7 +101,7 @@ def _stages(part, rows, nodes, imager, light) -> None:
     groups = [jnp.asarray(each) for each in stray_light._lens_groups(imager, light, nodes.dtype)]
     centers, excess = (each[0] for each in groups)
     lenses, depths, calls = len(centers), len(nodes), len(groups[0])
-    to_polar, to_pixels = stray_light._to_polar_table(polar), stray_light._to_pixels_table(polar)
+    to_polar, to_pixels = stray_light._to_polar_table(polar), stray_light.to_pixels_table(polar)
     side = to_polar.side
     plane = jnp.pad(nodes[0], side + 1 + stray_light._SPARE)
     places = stray_light._window_places(centers, jnp.zeros(2, nodes.dtype), polar.step, plane.shape, side)
