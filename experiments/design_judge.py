@@ -12,8 +12,8 @@ two designs are of the same scenes, with 95 % intervals by a bootstrap over squa
 its own noise. A second table has the error that the full model leaves of images without noise, of scenes that lie in
 planes.
 
-With `--images model` the full model makes the images, of voxels as fine as the unrolled inversion's. They show what a
-perfect model would give, and what neither model nor noise explains.
+With `--images model` the full model makes the images, from voxels as fine as the unrolled inversion's: the scores that
+a model without errors would have.
 
     python -m experiments.design_judge [DESIGN.toml ...] [--span 15 30] [--draws 2] [--exposures 3000]
         [--rays 10000] [--images {rays,model}] [--records FILE]
@@ -182,8 +182,8 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
 
 def image_by_model(emitters: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
     """The full model's image of emitters that the voxels of a grid share."""
-    model, volume = make_psf_model(imager, grid.depths, "full"), np.asarray(rasterize(emitters, grid), np.float32)
-    return np.asarray(jax.jit(forward)(volume, imager, grid, model))
+    volume = np.asarray(rasterize(emitters, grid), np.float32)
+    return np.asarray(jax.jit(forward)(volume, imager, grid, make_psf_model(imager, grid.depths, "full")))
 
 
 def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:

