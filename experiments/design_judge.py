@@ -183,7 +183,9 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
 def image_by_model(emitters: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
     """The full model's image of emitters that the voxels of a grid share."""
     volume = np.asarray(rasterize(emitters, grid), np.float32)
-    return np.asarray(jax.jit(forward)(volume, imager, grid, make_psf_model(imager, grid.depths, "full")))
+    image = jax.jit(forward)(volume, imager, grid, make_psf_model(imager, grid.depths, "full"))
+    # Sharpened kernels leave less than nothing about a sharp edge: of the brightest pixel, 0.3 %.
+    return np.maximum(np.asarray(image), 0)
 
 
 def diffracted(image: np.ndarray, imager: Imager) -> np.ndarray:

@@ -71,7 +71,7 @@ def test_images_by_the_model_are_those_by_rays():
     one = scene("beads", 0, settings)
     by_rays, by_model = (image_of(one, IMAGER, settings._replace(images=name)) for name in IMAGES)
     # A few rays, and the errors of the model (beads: 0.14 with many lenses).
-    assert by_model.sum() == pytest.approx(by_rays.sum(), rel=0.02)
+    assert by_model.min() >= 0 and by_model.sum() == pytest.approx(by_rays.sum(), rel=0.02)
     assert np.linalg.norm(by_model - by_rays) < 0.2 * np.linalg.norm(by_rays)
 
 
