@@ -230,16 +230,18 @@ def held_out(width: np.ndarray, light: np.ndarray, judge: np.ndarray) -> tuple[f
 
 def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
-    # Those that are ranked, and those that were given.
-    shipped = {name: read_design(design_file(name)) for name in DESIGNS}
-    ranked = shipped | {str(design.name): design for design in map(random_design, range(RANDOM))}
-    given = designs_by_name(designs, ranked)
-    make_folder(records.parent)
+    # Refuse what is wrong before random designs are made.
+    random = [f"random {seed}" for seed in range(RANDOM)]
+    given = designs_by_name(designs, (*DESIGNS, *random))
     images = IMAGES[SETTINGS.images]
-    new = {"images": images, "bright": {}, "found": {}}
-    kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else new
+    kept: dict[str, Any] = {"images": images, "bright": {}, "found": {}}
+    if records.exists():
+        kept = json.loads(records.read_text())
     if kept.get("images") != images:
         raise InputError(f"{records} must be of images {images}, got {kept.get('images', 'by rays')}.")
+    make_folder(records.parent)
+    shipped = {name: read_design(design_file(name)) for name in DESIGNS}
+    ranked = shipped | dict(zip(random, map(random_design, range(RANDOM)), strict=True))
     reference = device(shipped[DESIGNS[0]].imager(), SETTINGS)
 
     def brightest(kind: str, draw: int) -> float:

@@ -1,7 +1,8 @@
 """Independent ray tracer for random microlens arrays, which shares no code with `gs_jax`, as a reference for its model.
 
 Rays from an isotropic emitter pass the plano face, then a conic, to the sensor, or the conic first, by the vector law
-of refraction and with Fresnel losses; no diffraction. From `gs_jax` it takes only the parameters of an imager.
+of refraction and with Fresnel losses; no diffraction, no layers and no aspheric terms. From `gs_jax` it takes only the
+parameters of an imager.
 """
 
 import dataclasses
@@ -10,7 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from gs_jax import Imager
+from gs_jax import Imager, InputError
 
 # Parts of a scene, traced by threads, each into its own image.
 PARTS = 4
@@ -25,7 +26,7 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
 
     `rays` go from each emitter toward each lens, random but reproducible. Apertures end at their disc and where a
     neighbour's surface is higher, which is half-way for identical lenses. A tilted array is traced in its own frame, in
-    which emitters and the sensor are turned about the point `v` above the sensor's centre.
+    which emitters and the sensor are turned about the point of the vertices' plane above the sensor's centre.
 
     With a `tile`, mm, emitters within a square of that width and a hundredth of a millimetre in depth share the rays of
     their mean place, displaced by the magnification: many times the rays for the same time. Spots must hardly change
@@ -41,6 +42,12 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
         first = np.r_[0, np.flatnonzero((np.diff(place, axis=0) != 0).any(1)) + 1, len(emitters)]
     _traced(emitters, first, *_lenses(imager), images, rays)
     return images.sum(0)
+
+
+def can_trace(imager: Imager) -> bool:
+    """Whether an imager has only what is traced."""
+    layers = imager.filters, imager.windows, imager.sample, imager.band
+    return all(part is None for part in layers) and not imager.array.aspheric_terms.size
 
 
 def bundles(places: np.ndarray, imager: Imager, rays: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,12 +73,15 @@ def _turn(imager: Imager) -> np.ndarray:
 
 def _before(emitters: np.ndarray, imager: Imager) -> np.ndarray:
     """Emitters in the array's frame."""
-    lift = np.array([0.0, 0.0, float(imager.array.substrate_thickness)])
+    behind = float(imager.array.substrate_thickness) if imager.array.orientation == "plano" else 0.0
+    lift = np.array([0.0, 0.0, behind])
     return np.column_stack([(emitters[:, :3] + lift) @ _turn(imager).T - lift, emitters[:, 3:]])
 
 
 def _lenses(imager: Imager):
     """Lenses, the numbers of their nearest neighbours, what all share, and whether the curved side is in front."""
+    if not can_trace(imager):
+        raise InputError("The ray tracer knows neither layers, bands nor aspheric terms: remove them.")
     centers = np.asarray(dataclasses.replace(imager, tilt=None).centers, np.float64)
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
     a = imager.array
@@ -129,6 +139,7 @@ def _land(landed, place, lens, others, numbers, curve_first):
     """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
     n, t, v, _, _, turned = numbers
     radius, conic, aperture = lens[2:]
+    vertices = v + t if curve_first else v
     x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]
     sag = _sag(aperture**2, radius, conic)
     # The disc of the front plane through which light reaches the aperture.
@@ -164,8 +175,8 @@ def _land(landed, place, lens, others, numbers, curve_first):
         if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
         # Heights in the array's frame are minus the way toward the sensor, whose height is 0 in its own frame.
-        at = lens[0] + last[0], lens[1] + last[1], to_sensor - v
-        height = v + turned[0, 2] * at[0] + turned[1, 2] * at[1] + turned[2, 2] * at[2]
+        at = lens[0] + last[0], lens[1] + last[1], to_sensor - vertices
+        height = vertices + turned[0, 2] * at[0] + turned[1, 2] * at[1] + turned[2, 2] * at[2]
         way = height / (turned[2, 2] * ray[2] - turned[0, 2] * ray[0] - turned[1, 2] * ray[1])
         hit = at[0] + way * ray[0], at[1] + way * ray[1], at[2] - way * ray[2]
         landed[i, 0] = turned[0, 0] * hit[0] + turned[1, 0] * hit[1] + turned[2, 0] * hit[2]

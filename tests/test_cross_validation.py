@@ -64,6 +64,7 @@ def test_what_is_left_out_is_not_read(scene, name):
     assert np.abs(volume - whole).max() > 0.1 * volume.max() > 0
 
 
+@pytest.mark.integration
 def test_the_score_ranks_as_the_truth_does(scene):
     """Steps of Richardson-Lucy on a noisy capture: too few, some, and so many that they fit the noise."""
     truth, psf, clean = scene

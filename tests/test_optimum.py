@@ -79,6 +79,7 @@ def test_kinds_of_lenses_stay_kinds():
     np.testing.assert_allclose(found.array.radius_of_curvature, [2.4, 2.6, 2.4], atol=1e-6)
 
 
+@pytest.mark.integration
 def test_objectives_of_lens_types_under_trace():
     """The best type at each depth, by a search: numbers that JAX traces are still of two types."""
     scope = small(radius_of_curvature=[2.0, 2.4, 2.0])

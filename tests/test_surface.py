@@ -57,6 +57,7 @@ def test_the_depth_of_a_tilted_sheet_is_found(fit):
     assert np.isnan(fit.depth[0, 0, 0]) and (fit.depth_sd[np.isfinite(fit.depth)] > 0).all()
 
 
+@pytest.mark.integration
 def test_frames_start_from_the_one_before_unless_the_scene_is_another():
     """A sheet that moves away is followed; another one is not."""
     grid = gs.Grid(DEPTHS, **GRID)
@@ -130,12 +131,16 @@ def test_files_without_sheets_are_refused(fit, tmp_path):
         read_surface(tmp_path / "grey.tif")
 
 
-def test_dark_captures_and_single_planes_are_finite():
+def test_the_sheet_of_a_dark_capture_is_dark():
     grid = gs.Grid(DEPTHS, **GRID)
     dark = gs.reconstruct(np.zeros((300, 300), np.float32), scope(), grid, gs.Surface(), optics="near")
     assert not dark.any()
+
+
+@pytest.mark.integration
+def test_the_sheet_of_a_single_plane_is_finite():
     image = np.asarray(gs.simulate(emitters(lambda x, y: 20 + 0 * x), scope(), optics="near", psf="geometric"))
-    plane = gs.reconstruct(image, scope(), grid.at([20.0]), gs.Surface(), optics="near")
+    plane = gs.reconstruct(image, scope(), gs.Grid([20.0], **GRID), gs.Surface(), optics="near")
     assert plane.shape == (1, 45, 45) and np.isfinite(plane).all() and plane[0, 22, 22] > 0
 
 
