@@ -45,9 +45,9 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
 
 
 def can_trace(imager: Imager) -> bool:
-    """Whether an imager has only what is traced."""
-    layers = imager.filters, imager.windows, imager.sample, imager.band
-    return all(part is None for part in layers) and not imager.array.aspheric_terms.size
+    """Whether an imager has neither layers, a band nor aspheric terms, which are not traced."""
+    parts = imager.filters, imager.windows, imager.sample, imager.band
+    return all(part is None for part in parts) and not imager.array.aspheric_terms.size
 
 
 def bundles(places: np.ndarray, imager: Imager, rays: int) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +81,7 @@ def _before(emitters: np.ndarray, imager: Imager) -> np.ndarray:
 def _lenses(imager: Imager):
     """Lenses, the numbers of their nearest neighbours, what all share, and whether the curved side is in front."""
     if not can_trace(imager):
-        raise InputError("The ray tracer knows neither layers, bands nor aspheric terms: remove them.")
+        raise InputError("the ray tracer takes no layers, no emission band and no aspheric terms")
     centers = np.asarray(dataclasses.replace(imager, tilt=None).centers, np.float64)
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
     a = imager.array

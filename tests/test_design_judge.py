@@ -1,5 +1,6 @@
 """The judge of designs: its scenes, its scores, and records that a second run goes on from."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -24,7 +25,7 @@ from experiments.design_judge import (
     shared,
 )
 from experiments.ray_tracer import traced
-from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
+from gs_jax import Imager, Layers, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import write_design
@@ -73,6 +74,14 @@ def test_images_by_the_model_are_those_by_rays():
     # A few rays, and the errors of the model (beads: 0.14 with many lenses).
     assert by_model.min() >= 0 and by_model.sum() == pytest.approx(by_rays.sum(), rel=0.02)
     assert np.linalg.norm(by_model - by_rays) < 0.2 * np.linalg.norm(by_rays)
+
+
+def test_what_rays_do_not_know_is_refused():
+    layered = dataclasses.replace(IMAGER, filters=Layers([1.0], [1.5]))
+    aspheric = dataclasses.replace(IMAGER, array=dataclasses.replace(IMAGER.array, aspheric_terms=[1e-3]))
+    for imager in (layered, aspheric):
+        with pytest.raises(InputError, match="takes no layers, no emission band and no aspheric terms"):
+            traced(np.array([[0.0, 0.0, 20.0, 1.0]]), imager, 10)
 
 
 def test_differences_are_of_pairs():

@@ -42,7 +42,7 @@ SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "design").gl
 LENSES, PIXELS = 24, 600
 # Of all devices alike, in field radii: what is compiled for one serves the others.
 PIXEL_PITCH, PLATE = 13e-3 / 3, 9.2 / 3
-# From a point to each lens.
+# Rays from a point to each lens.
 RAYS = 20_000
 
 
@@ -162,7 +162,7 @@ class Case:
         return volume
 
     def capture(self, scene: np.ndarray, grid: Grid | None = None) -> np.ndarray:
-        """Points by an independent tracer; those that it cannot trace, as `gs-jax simulate` images them."""
+        """A volume by our own model. Points by an independent tracer or, if it takes no such device, by `simulate`."""
         if grid is None and can_trace(self.imager):
             image = diffracted(traced(scene, self.imager, RAYS), self.imager).astype(np.float32)
         else:
@@ -387,8 +387,8 @@ RICHEST = ("geomscope", "curved, tilted, two radii, layers", "one lens")
 
 def pairs():
     for number, device in enumerate(name for name in DEVICES if name != LARGE):
-        groups = IN_TURN if device in OF_BOTH else IN_TURN[number % 2 :][:1]
-        chosen = {*ALWAYS, *(tasks[number // len(IN_TURN) % len(tasks)] for tasks in groups)}
+        groups = IN_TURN if device in OF_BOTH else (IN_TURN[number % 2],)
+        chosen = {*ALWAYS, *(tasks[number % len(tasks)] for tasks in groups)}
         for task in TASKS:
             if task in ON_THE_RICHEST and device not in RICHEST:
                 continue

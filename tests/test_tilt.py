@@ -12,6 +12,7 @@ from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from experiments.ray_tracer import bundles
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, find_points, forward
 from gs_jax.projection.point_sources import forward_points, make_stamps
 
@@ -44,6 +45,24 @@ def test_chief_rays_are_straight_lines_through_the_vertices():
     onward = (vertices[:, 2] + 5.8) / (source[2] - vertices[:, 2])
     landing = vertices[:, :2] + onward[:, None] * (vertices[:, :2] - source[:2])
     np.testing.assert_allclose(imager.project(point)[:, 0], landing, atol=1e-12)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("orientation", ["plano", "curved"])
+def test_rays_differ_from_the_map_by_what_a_tilted_plate_displaces(orientation):
+    """It tilts about the vertices; the plate moves points in front of it, or spots behind it, alike for all lenses."""
+    lenses = MicrolensArray([[0.0, 0.0], [1.0, 0.5], [-0.8, 1.0]], aperture_diameter=0.02, orientation=orientation)
+    tilt = np.array([0.0175, -0.0105])
+    imager = Imager(lenses, Sensor((600, 600), 0.013), 5.3, 3.0, tilt=tilt)
+    points = np.array([[0.0, 0.0, 18.0], [0.5, -0.3, 20.0], [0.1, 0.4, 22.0]])
+    landed, _ = bundles(points, imager, 2000)
+    light = landed[..., 2:]
+    spots = (landed[..., :2] * light).sum(2) / light.sum(2)
+    plate = lenses.substrate_thickness * (1 - 1 / lenses.refractive_index)
+    moved = -imager.magnification(points[:, 2]) if orientation == "plano" else jnp.ones(3)
+    expected = imager.project(points).swapaxes(0, 1) + (plate * moved)[:, None, None] * tilt[None, None]
+    # Products of tilt and field are left out: 0.2 um of 5.
+    np.testing.assert_allclose(spots, expected, atol=3e-4)
 
 
 def test_light_is_brightest_on_the_axis_that_leans():
