@@ -6,6 +6,7 @@ of the command line, calls `run` at full size, and returns what to write and pri
 """
 
 import argparse
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -70,12 +71,17 @@ def main(report: Callable[..., Report], arguments: dict[str, dict[str, Any]] | N
         parser.add_argument(name, **options)
     parser.add_argument("--out", type=Path, default=Path("out") / (folder or Path(inspect.getfile(report)).stem))
     values = vars(parser.parse_args())
+    out = values.pop("out")
+    empty = not out.exists()
     try:
-        out = make_folder(values.pop("out"))
+        make_folder(out)
         with Progress() as progress:
             results = report(**values, progress=progress)
         write(out, results)
     except InputError as error:
+        if empty:
+            with contextlib.suppress(OSError):
+                out.rmdir()
         parser.error(str(error))
     Console(width=160).print(*results.shown, sep="\n")
 
@@ -115,6 +121,23 @@ def designs_by_name(files: Sequence[Path], taken: Collection[str] = ()) -> dict[
             raise InputError(f"designs must have names of their own, got another {name}.")
         found[name] = design
     return found
+
+
+def read_records(file: Path, key: str, value: Any, empty: dict[str, Any]) -> dict[str, Any]:
+    """Read the records that earlier runs left in a file; without a file, return empty ones of this value of a key.
+
+    Raise `InputError` if the file holds records of another value, or none.
+    """
+    if not file.exists():
+        return {key: value} | empty
+    try:
+        kept = json.loads(file.read_text())
+    except ValueError:
+        kept = None
+    if not isinstance(kept, dict) or kept.get(key) != value:
+        got = kept.get(key, "none") if isinstance(kept, dict) else "no records"
+        raise InputError(f"{file} must be of {key} {value}, got {got}.")
+    return kept
 
 
 def design_of(data: Path | None) -> Design:

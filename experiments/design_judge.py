@@ -33,7 +33,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.common import Report, cropped, design_file, designs_by_name, main, table
+from experiments.common import Report, cropped, design_file, designs_by_name, main, read_records, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import texture
 from gs_jax import (
@@ -302,9 +302,7 @@ class Judge:
     def __init__(self, file: Path, settings: Settings, reference: Imager):
         self.file, self.settings, self.reference = file, settings, device(reference, settings)
         as_json = json.loads(json.dumps(settings._asdict() | {"images": IMAGES[settings.images]}))
-        self.kept = json.loads(file.read_text()) if file.exists() else {"settings": as_json, "scenes": {}, "found": {}}
-        if self.kept["settings"] != as_json:
-            raise InputError(f"{file} must be of the settings {as_json}, got {self.kept['settings']}.")
+        self.kept = read_records(file, "settings", as_json, {"scenes": {}, "found": {}})
 
     def judge(self, name: str, imager: Imager, draws: Sequence[int], progress: Progress) -> dict[str, Any]:
         """Records of a design by kind of scene and draw."""

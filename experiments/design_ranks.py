@@ -14,7 +14,6 @@ Writes the records after each design, from which the next run goes on, and then 
 a core. Designs that are given are judged beside the others, and do not count in the correlations.
 """
 
-import json
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -26,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.stats import rankdata
 
-from experiments.common import Report, design_file, designs_by_name, main, table
+from experiments.common import Report, design_file, designs_by_name, main, read_records, table
 from experiments.design_judge import (
     DESIGNS,
     IMAGES,
@@ -42,7 +41,6 @@ from experiments.design_judge import (
 from experiments.ray_tracer import bundles
 from gs_jax import Imager, quality, random_layout, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
-from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.design import Design
@@ -234,11 +232,7 @@ def report(designs: list[Path], records: Path, progress: Progress) -> Report:
     jax.config.update("jax_enable_x64", True)
     # Refuse what is wrong before random designs are made.
     given = designs_by_name(designs, (*NAMED, *RANDOM))
-    images = IMAGES[SETTINGS.images]
-    new = {"images": images, "bright": {}, "found": {}}
-    kept: dict[str, Any] = json.loads(records.read_text()) if records.exists() else new
-    if kept.get("images") != images:
-        raise InputError(f"{records} must be of images {images}, got {kept.get('images', 'by rays')}.")
+    kept = read_records(records, "images", IMAGES[SETTINGS.images], {"bright": {}, "found": {}})
     make_folder(records.parent)
     named = {name: read_design(design_file(name)) for name in NAMED}
     ranked = named | {name: random_design(seed) for seed, name in enumerate(RANDOM)}

@@ -1,7 +1,6 @@
 """The judge of designs: its scenes, its scores, and records that a second run goes on from."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -90,10 +89,13 @@ def test_differences_are_of_pairs():
     assert (more, low, high) == pytest.approx((10, 10, 10))
 
 
-def test_records_of_other_settings_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "got"), [('{"settings": {}, "scenes": {}, "found": {}}', "{}"), ("[1]", "no records"), ("{", "no records")]
+)
+def test_records_of_other_settings_are_refused(tmp_path, text, got):
     file = tmp_path / "records.json"
-    file.write_text(json.dumps({"settings": {}, "scenes": {}, "found": {}}))
-    with pytest.raises(InputError, match="must be of the settings"):
+    file.write_text(text)
+    with pytest.raises(InputError, match=f"must be of settings .*, got {got}"):
         Judge(file, Settings(), IMAGER)
 
 

@@ -41,7 +41,7 @@ def test_richardson_lucy_undoes_diffraction():
 def test_records_of_other_images_are_refused(tmp_path):
     file = tmp_path / "records.json"
     file.write_text('{"bright": {}, "found": {}}')
-    with pytest.raises(InputError, match="must be of images by rays and diffraction, got by rays"):
+    with pytest.raises(InputError, match="must be of images by rays and diffraction, got none"):
         report([], file, Progress())
 
 
