@@ -80,7 +80,7 @@ def run(pixels: int = 5120, depths: np.ndarray = DEPTHS, rounds: int = 7) -> lis
     part("cores without the inner ring's convolutions", "", cores_of, volume, imager, points)
     to_nodes = lambda x: stray_light.to_nodes(x, grid, optics.stray_light.grid)
     nodes = part("stray light: volume to nodes", "", to_nodes, volume)
-    image_of = lambda x, imager, light: stray_light.stray_light_image(x, imager, light, grid.origin)
+    image_of = lambda x, imager, light: stray_light.stray_light_image(x, imager, light, grid.depths, grid.origin)
     both_ways("stray light", "", image_of, nodes, imager, optics.stray_light)
     _stages(part, rows, nodes, imager, optics.stray_light)
     return rows

@@ -1,8 +1,9 @@
 """Independent ray tracer for random microlens arrays, which shares no code with `gs_jax`, as a reference for its model.
 
-Rays from an isotropic emitter pass the plano face, then a conic, to the sensor, or the conic first, by the vector law
-of refraction and with Fresnel losses; no diffraction, no layers and no aspheric terms. From `gs_jax` it takes only the
-parameters of an imager.
+Rays from an isotropic emitter pass the layers in front, the plano face and then a conic, or the conic first, and the
+windows, to the sensor, by the vector law of refraction and with Fresnel losses; no diffraction, no band and no aspheric
+terms. Filters, and a sample in contact with them or the array, tilt with it; windows and a sample with a surface of its
+own are parallel to the sensor. From `gs_jax` it takes only the parameters of an imager.
 """
 
 import dataclasses
@@ -45,9 +46,8 @@ def traced(emitters: np.ndarray, imager: Imager, rays: int, tile: float = 0.0) -
 
 
 def can_trace(imager: Imager) -> bool:
-    """Whether an imager has neither layers, a band nor aspheric terms, which are not traced."""
-    parts = imager.filters, imager.windows, imager.sample, imager.band
-    return all(part is None for part in parts) and not imager.array.aspheric_terms.size
+    """Whether an imager has neither a band nor aspheric terms, which are not traced."""
+    return imager.band is None and not imager.array.aspheric_terms.size
 
 
 def bundles(places: np.ndarray, imager: Imager, rays: int) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +81,7 @@ def _before(emitters: np.ndarray, imager: Imager) -> np.ndarray:
 def _lenses(imager: Imager):
     """Lenses, the numbers of their nearest neighbours, what all share, and whether the curved side is in front."""
     if not can_trace(imager):
-        raise InputError("the ray tracer takes no layers, no emission band and no aspheric terms")
+        raise InputError("the ray tracer takes no emission band and no aspheric terms")
     centers = np.asarray(dataclasses.replace(imager, tilt=None).centers, np.float64)
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
     a = imager.array
@@ -92,8 +92,47 @@ def _lenses(imager: Imager):
     curve_first = a.orientation == "curved"
     shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
     origin = np.asarray(imager.sensor.origin, np.float64)
-    numbers = (*(float(x) for x in shared), origin, _turn(imager))
+    numbers = (*(float(x) for x in shared), origin, _turn(imager), *_layers(imager))
     return lenses, near, numbers, curve_first
+
+
+def _layers(imager: Imager):
+    """Faces in front of the array, what shortens the way to them, and the windows.
+
+    A face is its unit normal along the light, the product of that and a point on it, and the index behind it. Points
+    are in the array's frame, from its front along the light. The last face is the front of a plano array, or where a
+    filter ends before the curved side. The others: whether the sample tilts with the array, where it begins, its index,
+    and by how much layers beside it are optically thinner. Windows are thickness and index from the array on.
+    """
+    slabs = lambda part: [] if part is None else np.stack([part.thickness, part.refractive_index], -1).tolist()
+    plano, sample = imager.array.orientation == "plano", imager.sample
+    filters, cover = slabs(imager.filters), slabs(None if sample is None else sample.layers)
+    index = 1.0 if sample is None else float(sample.refractive_index)
+    contact = sample is None or sample.surface is None
+    thick = lambda parts: float(sum(t for t, _ in parts))
+    begins = thick(filters) + thick(cover) if sample is None or sample.surface is None else float(sample.surface)
+    turn = _turn(imager)
+    behind = float(imager.array.substrate_thickness) if plano else 0.0
+    level = lambda z: (*-turn[:2, 2], turn[2, 2], turn[2, 2] * behind - (z + behind))
+    along = lambda z: (0.0, 0.0, 1.0, -z)
+    faces, at, place = [], begins, along if contact else level
+    # A face lies in front of each layer, which the light meets in this order.
+    for t, n in cover:
+        faces.append((*place(at), n))
+        at -= t
+    if not contact:
+        faces.append((*level(at), 1.0))
+    at = thick(filters)
+    for t, n in filters[::-1]:
+        faces.append((*along(at), n))
+        at -= t
+    if plano or filters:
+        faces.append((*along(0.0), float(imager.array.refractive_index) if plano else 1.0))
+    elif contact and sample is not None:
+        raise InputError("the ray tracer takes no sample in contact with a curved side")
+    shorter = float(sum(t * (1 - 1 / n) for t, n in (*filters, *cover)))
+    windows = np.array(slabs(imager.windows)[::-1], float).reshape(-1, 2)
+    return np.array(faces, float).reshape(-1, 5), (contact, begins, index, shorter), windows
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
@@ -137,52 +176,96 @@ def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
 @njit(fastmath=True, error_model="numpy")
 def _land(landed, place, lens, others, numbers, curve_first):
     """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
-    n, t, v, _, _, turned = numbers
+    n, t, v, _, _, turned, faces, (contact, begins, index, shorter), windows = numbers
     radius, conic, aperture = lens[2:]
     vertices = v + t if curve_first else v
     x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]
+    behind = 0.0 if curve_first else t
+    depth = turned[0, 2] * place[0] + turned[1, 2] * place[1] + turned[2, 2] * (z + behind) - behind
+    # Distance from the front in air.
+    away = z - shorter - ((z if contact else depth) - begins) * (1 - 1 / index)
     sag = _sag(aperture**2, radius, conic)
     # The disc of the front plane through which light reaches the aperture.
     if curve_first:
-        air = math.hypot(x, y) / z
-        disc, toward = aperture * (1 + sag / z) + sag * air / 2, sag / 2 / z
+        air = math.hypot(x, y) / away
+        disc, toward = aperture * (1 + sag / away) + sag * air / 2, sag / 2 / away
     else:
-        air = math.hypot(x, y) / (z + t / n)
-        glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (z + t / n)
-        disc, toward = aperture + sag * air / n / 2 + (t + sag) * aperture / z, glass * (t - sag / 2)
+        air = math.hypot(x, y) / (away + t / n)
+        glass = 1 / math.sqrt(n**2 + (n**2 - 1) * air**2) / (away + t / n)
+        disc, toward = aperture + sag * air / n / 2 + (t + sag) * aperture / away, glass * (t - sag / 2)
+    sign = -1 if curve_first else 1
+    middle = sign * x * toward, sign * y * toward
+    # Where a point in air would send its rays from: the ray toward the disc's middle must meet it.
+    source = x, y
+    if shorter or index != 1:
+        disc *= 1.03
+        for _ in range(4):
+            slope = (middle[0] - source[0]) / away, (middle[1] - source[1]) / away
+            met, _, _, _ = _through(place, slope, lens, index, contact, turned, faces)
+            source = source[0] + met[0] - middle[0], source[1] + met[1] - middle[1]
     rays = len(landed)
-    light, start = disc**2 / (4 * rays), 2 * np.pi * np.random.random()
+    light, start = disc**2 / (4 * rays * away**2), 2 * np.pi * np.random.random()
     for i in range(rays):
         landed[i, 2] = 0
         r, turn = disc * math.sqrt((i + np.random.random()) / rays), start + i * TURN
-        sign = -1 if curve_first else 1
-        front = r * math.cos(turn) + sign * x * toward, r * math.sin(turn) + sign * y * toward
-        # Isotropic emitter: solid angle of an element of the front plane.
-        length = math.sqrt((front[0] - x) ** 2 + (front[1] - y) ** 2 + z**2)
-        outside = (front[0] - x) / length, (front[1] - y) / length, z / length
+        front = middle[0] + r * math.cos(turn), middle[1] + r * math.sin(turn)
+        slope = (front[0] - source[0]) / away, (front[1] - source[1]) / away
+        front, ray, angle, before = _through(place, slope, lens, index, contact, turned, faces)
         if curve_first:
-            cap, normal = _met(front, outside, 0.0, 1.0, radius, conic)
-            inside, passed = _refracted(outside, normal, 1 / n)
+            cap, normal = _met(front, ray, 0.0, 1.0, radius, conic)
+            inside, passed = _refracted(ray, normal, 1 / n)
             way = (t - cap[2]) / inside[2]
             last = cap[0] + way * inside[0], cap[1] + way * inside[1]
             ray, again = _refracted(inside, (0.0, 0.0, 1.0), n)
             to_sensor = v
         else:
-            inside, passed = _refracted(outside, (0.0, 0.0, 1.0), 1 / n)
-            cap, normal = _met(front, inside, t, -1.0, radius, conic)
-            ray, again = _refracted(inside, normal, n)
-            last, to_sensor = (cap[0], cap[1]), v + cap[2]
-        if not cap[2] <= sag or passed * again == 0 or ray[2] <= 0 or _covered(cap, others):
+            cap, normal = _met(front, ray, t, -1.0, radius, conic)
+            ray, again = _refracted(ray, normal, n)
+            passed, last, to_sensor = 1.0, (cap[0], cap[1]), v + cap[2]
+        passed *= before * again
+        if not cap[2] <= sag or passed == 0 or ray[2] <= 0 or _covered(cap, others):
             continue
         # Heights in the array's frame are minus the way toward the sensor, whose height is 0 in its own frame.
         at = lens[0] + last[0], lens[1] + last[1], to_sensor - vertices
+        down = turned[2, 2] * ray[2] - turned[0, 2] * ray[0] - turned[1, 2] * ray[1]
+        across = turned[0, 0] * ray[0] + turned[1, 0] * ray[1] - turned[2, 0] * ray[2]
+        along = turned[0, 1] * ray[0] + turned[1, 1] * ray[1] - turned[2, 1] * ray[2]
         height = vertices + turned[0, 2] * at[0] + turned[1, 2] * at[1] + turned[2, 2] * at[2]
-        way = height / (turned[2, 2] * ray[2] - turned[0, 2] * ray[0] - turned[1, 2] * ray[1])
-        hit = at[0] + way * ray[0], at[1] + way * ray[1], at[2] - way * ray[2]
-        landed[i, 0] = turned[0, 0] * hit[0] + turned[1, 0] * hit[1] + turned[2, 0] * hit[2]
-        landed[i, 1] = turned[0, 1] * hit[0] + turned[1, 1] * hit[1] + turned[2, 1] * hit[2]
-        landed[i, 2] = light * passed * again * z / length**3
-    return (v + t / n) / z if curve_first else v / (z + t / n)
+        hit_x = turned[0, 0] * at[0] + turned[1, 0] * at[1] + turned[2, 0] * at[2]
+        hit_y = turned[0, 1] * at[0] + turned[1, 1] * at[1] + turned[2, 1] * at[2]
+        ray, gap, index_before = (across, along, down), height - windows[:, 0].sum(), 1.0
+        hit_x, hit_y = hit_x + gap * ray[0] / ray[2], hit_y + gap * ray[1] / ray[2]
+        for thickness, window in windows:
+            ray, again = _refracted(ray, (0.0, 0.0, 1.0), index_before / window)
+            passed, index_before = passed * again, window
+            hit_x, hit_y = hit_x + thickness * ray[0] / ray[2], hit_y + thickness * ray[1] / ray[2]
+        landed[i, 0], landed[i, 1], landed[i, 2] = hit_x, hit_y, light * angle * passed
+    v -= (windows[:, 0] * (1 - 1 / windows[:, 1])).sum()
+    return (v + t / n) / away if curve_first else v / (away + t / n)
+
+
+@njit(fastmath=True, error_model="numpy")
+def _through(place, slope, lens, index, contact, turned, faces):
+    """Where a ray meets the front plane, beside the lens, and its direction there.
+
+    `slope` is its slope in air, to the array's normal. Also returned are the solid angle in the object's medium over
+    the element of slopes, and the light that the faces transmit.
+    """
+    length = math.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
+    ray, angle, light, before = (slope[0] / length, slope[1] / length, 1 / length), length**-3, 1.0, index
+    if index != 1:
+        normal = (0.0, 0.0, 1.0) if contact else (-turned[0, 2], -turned[1, 2], turned[2, 2])
+        cosine = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
+        ray, _ = _refracted(ray, normal, 1 / index)
+        angle *= cosine / (index**2 * (normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]))
+    x, y, w = place[0] - lens[0], place[1] - lens[1], -place[2]
+    for a, b, c, offset, after in faces:
+        way = (offset - a * (x + lens[0]) - b * (y + lens[1]) - c * w) / (a * ray[0] + b * ray[1] + c * ray[2])
+        x, y, w = x + way * ray[0], y + way * ray[1], w + way * ray[2]
+        ray, passed = _refracted(ray, (a, b, c), before / after)
+        light, before = light * passed, after
+    way = -w / ray[2]
+    return (x + way * ray[0], y + way * ray[1]), ray, angle, light
 
 
 @njit(fastmath=True, error_model="numpy")

@@ -32,7 +32,7 @@ from gs_jax.apps.training.training_loop import Recipe, init, slices_loss, train
 from gs_jax.apps.training.training_slices import PLANES, Batch
 from gs_jax.base.progress import Progress
 from gs_jax.detection.unet import UNet, multislice_network, standardize
-from gs_jax.optics.psf_core import apparent_depths
+from gs_jax.optics.psf_core import core_distortion
 
 SPEC = CaptureSpec(640, 0.009, 0.04, PLANES)
 SIZE, COUNT = 96, 8
@@ -59,9 +59,9 @@ class Gated(eqx.Module):
 
 def stack(seed: int, number: int, spec: CaptureSpec = SPEC) -> Stack:
     image, imager, grid, truth = simulate_example(seed, number, spec)
-    seen = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
-    mean = lambda image: np.asarray(backproject(image, imager, seen, normalize=True))
-    volume, unit = standardize(np.asarray(backproject(image, imager, seen)))
+    on_cores = partial(backproject, imager=imager, grid=grid, distortion=core_distortion(imager, grid.depths))
+    mean = lambda image: np.asarray(on_cores(image, normalize=True))
+    volume, unit = standardize(np.asarray(on_cores(image)))
     level = np.float32(image.mean())
     variance = mean((image - level) ** 2) - mean(image - level) ** 2
     spread, spread_unit = standardize(np.sqrt(np.maximum(variance, 0)))

@@ -18,7 +18,17 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .base.arrays import FINITE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields
 from .base.errors import input_error
 from .grid import Sensor
-from .layers import Layers, Sample, check_room, depth_of_reduced, object_index, object_surface, reduced_distance
+from .layers import (
+    Layers,
+    Sample,
+    check_room,
+    depth_of_reduced,
+    object_index,
+    object_surface,
+    reduced_distance,
+    tilted_index,
+    tilted_shortening,
+)
 from .lenses import MicrolensArray
 from .materials import EmissionBand
 from .typing import Scalar, Scalars
@@ -121,9 +131,10 @@ class Imager(eqx.Module):
         They tilt with the array.
     windows
         Layers on the sensor's side, from the sensor toward the array: the gap to the window, the window, a filter. The
-        rest of `sensor_distance` is air.
+        rest of `sensor_distance` is air. They are parallel to the sensor.
     sample
-        The medium that holds the object. None, the default, is air.
+        The medium that holds the object. None, the default, is air. In contact with the array or its filters it tilts
+        with them; one with a `surface` of its own is parallel to the sensor.
     band
         Wavelengths over which PSFs are means. None, the default, is light of `wavelength` alone.
 
@@ -182,6 +193,18 @@ class Imager(eqx.Module):
         if self.tilt is None:
             return array_namespace(self.sensor_distance).zeros(len(self.array.centers), self.sensor_distance.dtype)
         return self._cosine * (self._in_plane @ self.tilt)
+
+    def moved(self, origin: Float[Array, "2"]) -> "Imager":
+        """The imager about another point `(x, y)` of its sensor, mm, at which depths begin where the array is there."""
+        if self.tilt is None:
+            return eqx.tree_at(lambda i: i.shift, self, self.shift - origin)
+        height, cosine = origin @ self.tilt, self._cosine
+        # In the plane the way to the point is longer.
+        shift = self.shift - origin - self.tilt * (height * cosine / (1 + cosine))
+        imager = eqx.tree_at(lambda i: (i.shift, i.sensor_distance), self, (shift, self.sensor_distance + height))
+        if self.sample is None or self.sample.surface is None:
+            return imager
+        return eqx.tree_at(lambda i: i.sample.surface, imager, self.sample.surface - height)
 
     @property
     def _in_plane(self):
@@ -248,22 +271,54 @@ class Imager(eqx.Module):
         """Lateral magnification `M_z = v'/z'` (Eq. 3)."""
         return self.reduced_sensor_distance / self.reduced_depth(depth)
 
-    def magnifications(self, depth: Float[ArrayLike, " depth"]) -> Float[Array, "lens depth"]:
+    def magnifications(
+        self, depth: Float[ArrayLike, " depth"], distortion: Scalars | float = 1.0
+    ) -> Float[Array, "lens depth"]:
         """Magnification of each lens, `(v' + h) / (z' - h)` at the height `h`; one row unless the array is tilted."""
-        if self.tilt is None:
-            return self.magnification(depth)[None]
-        return self.magnification_of(self.magnification(depth)[None], self.heights[:, None])
+        magnification = (distortion * self.magnification(depth))[None]
+        return magnification if self.tilt is None else self.magnification_of(magnification, self.heights[:, None])
 
     def magnification_of(self, magnification, height):
-        """Magnification of a lens at a height, mm, from `M = v'/z'`: `(v' + h) / (z' - h)`; they broadcast."""
+        """Magnification of a lens at a height, mm, from `M = v'/z'`: `(v' + h) / (z' - h)`; they broadcast.
+
+        A medium of index n in contact with the array is thinner by `h` in front of the lens, and `z'` by `h / n`.
+        """
         v = self.reduced_sensor_distance
-        return magnification * (v + height) / (v - height * magnification)
+        return magnification * (v + height) / (v - height / tilted_index(self.sample) * magnification)
 
     def axis_offset(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:
         """Offset of a lens's axis, which is normal to the array, from its vertex at a depth, mm, `(*batch, 2)`."""
-        xp, reduced = array_namespace(self.sensor_distance), self.reduced_depth(depth)
-        tilt = xp.zeros(2, reduced.dtype) if self.tilt is None else self.tilt
-        return -xp.multiply.outer(reduced, tilt)
+        return self._per_slope(-self._reduced_and_shortened(depth))
+
+    def _reduced_and_shortened(self, depth):
+        """`z'`, and by how much plates that tilt with the array make it less than the distance to the vertices, mm."""
+        depth = array_namespace(self.sensor_distance).asarray(depth)
+        plate = self.array.reduced_thickness_front * (self.array.refractive_index - 1)
+        return self.reduced_depth(depth) + plate + tilted_shortening(depth, self.filters, self.sample)
+
+    def _per_slope(self, length):
+        """A length, mm, times the slopes of the array: `(*batch, 2)`, zero unless it is tilted."""
+        xp = array_namespace(self.sensor_distance)
+        tilt = xp.zeros(2, length.dtype) if self.tilt is None else self.tilt
+        return xp.multiply.outer(length, tilt)
+
+    def lean(self, depth: Float[ArrayLike, "*batch"], distortion: Scalars | float = 1.0) -> Scalars:
+        """Displacement of points that makes the level map that of a tilted array, mm, `(*batch, 2)`.
+
+        Layers that tilt with the array displace rays by `t (1 - 1/n)` times its slopes; and spots are distorted about
+        the image of the lens's axis, which is tilted.
+        """
+        return -self.axis_offset(depth) - self._per_slope(self.reduced_depth(depth) / distortion)
+
+    @property
+    def spot_displacement(self) -> Scalars:
+        """Displacement of all spots by a plate behind the vertices that tilts with them, mm, `(2,)`."""
+        return self._per_slope(self.array.reduced_thickness_back * (self.array.refractive_index - 1))
+
+    @property
+    def image_of_axis(self) -> Scalars:
+        """Offset on the sensor of the image of a lens's axis from its vertex, mm, `(2,)`."""
+        return self._per_slope(self.reduced_sensor_distance) + self.spot_displacement
 
     def scale(self, depth: Float[ArrayLike, "*batch"]) -> Float[Array, "*batch"]:
         """Scale of the array's pattern on the sensor, `s_z = (z' + v') / z'` (Eq. 1)."""
@@ -297,11 +352,10 @@ class Imager(eqx.Module):
         center, point = self.centers[lenses], points[..., :2]
         if self.tilt is None:
             return Views(chief_ray(center, point, magnification[..., None]), point - center, reduced)
-        offset = self.axis_offset(depth)
         magnification = self.magnification_of(magnification, self.heights[lenses])
-        # Distances are from the lens's axis, which is tilted.
-        distorted = point + xp.broadcast_to(1 / distortion - 1, reduced.shape)[..., None] * offset
-        return Views(chief_ray(center, distorted, magnification[..., None]), point - center - offset, reduced)
+        spot = chief_ray(center, point + self.lean(depth, distortion), magnification[..., None])
+        spot = spot + xp.broadcast_to(self.spot_displacement, spot.shape)
+        return Views(spot, point - center - self.axis_offset(depth), reduced)
 
     def views_of_all(self, points: Float[Array | np.ndarray, "point 3"]) -> Views:
         """`views` of each point by each lens, `(lens, point)`."""

@@ -135,6 +135,20 @@ def depth_of_reduced(reduced: Scalars, filters: Layers | None, sample: Sample | 
     return (reduced - at_zero) * object_index(sample)
 
 
+def tilted_shortening(depth: Scalars, filters: Layers | None, sample: Sample | None) -> Scalars:
+    """By how much layers that tilt with the array shorten the distance to a depth, `sum t (1 - 1/n)`, mm.
+
+    These are the filters, and a sample in contact with them or the array; one with a surface of its own is level.
+    """
+    contact = sample if sample is not None and sample.surface is None else None
+    return depth - reduced_distance(depth, filters, contact)
+
+
+def tilted_index(sample: Sample | None) -> Scalar | float:
+    """Index of the medium in front of a tilted array whose thickness depends on a lens's height: 1 is air."""
+    return 1 if sample is None or sample.surface is not None else sample.refractive_index
+
+
 def check_room(
     sensor_distance: Scalar, filters: Layers | None, windows: Layers | None, sample: Sample | None, orientation: str
 ) -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 from typing import Any
 
 import jax
@@ -82,15 +83,15 @@ def test_reconstruct_is_back_projection_less_its_mean():
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("shape", [(60, 50), (61, 50), (96, 80)])
-def test_a_part_of_the_field_sees_what_the_whole_sees(shape):
+@pytest.mark.parametrize("shape, tilt", [((60, 50), None), ((61, 50), (0.1, 0.05)), ((96, 80), None)])
+def test_a_part_of_the_field_sees_what_the_whole_sees(shape, tilt):
     """A volume beside the axis, in the frame of the part and in that of the whole."""
-    whole, _ = scene()
-    part, lit = crop_field(whole, jnp.array([0.13, -0.21]), shape)
-    place = whole.shift - part.shift
+    whole = dataclasses.replace(scene()[0], tilt=tilt)
+    part, one, lit = crop_field(whole, Grid([20.0], (5, 5), 0.05), jnp.array([0.13, -0.21]), shape)
+    place = (whole.centers - part.centers)[0]
     np.testing.assert_allclose(place, [0.13, -0.21], atol=0.0101)
     volume = jax.random.uniform(KEY, (1, 5, 5))
-    one, grid = Grid([20.0], (5, 5), 0.05), Grid([20.0], (201, 201), 0.01)
+    grid = Grid([20.0], (201, 201), 0.01)
     # The same voxels on a grid of the whole: every fifth, around the place.
     assert jnp.abs(place / 0.01 - jnp.round(place / 0.01)).max() < 1e-6
     middle = np.round(np.asarray(place) / 0.01).astype(int) + 100

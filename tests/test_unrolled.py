@@ -42,7 +42,7 @@ def imager(pixels=(160, 160), pitch=0.03) -> Imager:
 def small(networks: Unrolled | None = None) -> tuple[Unrolled, UnrolledExample]:
     """Chief rays through nine lenses, and the exact image of random voxels."""
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
-    system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope, grid),))
+    system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope),))
     truth = jax.random.uniform(KEY, grid.volume_shape)
     light = system.operator.mv(truth)
     networks = networks or initialize_unrolled(1, 2, 3, 4, key=KEY)

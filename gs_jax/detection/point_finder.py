@@ -19,7 +19,7 @@ from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import FIELDS, HALF_SIDE, core_width, warn_if_blurred
-from ..optics.psf_core import apparent_depths, ensquared_light
+from ..optics.psf_core import ensquared_light
 from ..projection.backprojection import backproject
 from ..typing import Image
 from .background import DetectionImage, Pixels, for_each_band, subtract_background
@@ -81,7 +81,7 @@ def find_points(
 
     Nothing is random. Thresholds are multiples of the image's own noise, which is taken to be at least a thousandth of
     the brightest spot: points whose spots have less than a two-hundredth of its height are not found. Points are
-    searched for where the bright cores of the spots land, by exact rays (`gs_jax.optics.psf_core.apparent_depths`);
+    searched for where the bright cores of the spots land, by exact rays (`gs_jax.optics.psf_core.core_distortion`);
     lenses of several types are read at depths where they are sharp.
 
     Parameters
@@ -138,9 +138,7 @@ def find_points(
         warn_if_blurred(imager, grid, "points", NOT_TRUSTED)
     depths = _depths_around(grid)
     lens_types = lens_types_of(imager, depths)
-    # Alike lenses are read where chief rays of apparent depths land, which become depths at the end.
-    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
-    voxels = search_grid(imager, grid.at(np.interp(np.asarray(grid.depths), depths, apparent)))
+    voxels = search_grid(imager, grid)
     least = THRESHOLD_SNR * float(detection.noise.min())
     survival = survival_function(detection.light, least)
     points, samples, own = _accept(np.zeros((0, 3)), detection, survival, lens_types, voxels)
@@ -154,7 +152,6 @@ def find_points(
             lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
             new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
-    points = np.column_stack([points[:, :2], np.interp(points[:, 2], apparent, depths)])
     points = np.column_stack([points, _intensity(points, samples, own, detection, lens_types)])
     points = points[_inside(points, grid, float(voxels.depths[1] - voxels.depths[0]) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
@@ -221,11 +218,11 @@ def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Gr
 
 def _backproject_sharp(image, lens_types: Sequence[LensType], voxels: Grid) -> Float[Array, "depth y x"]:
     """`backproject` by the lenses that are sharp in each plane."""
-    if len(lens_types) == 1:
-        return backproject(image, lens_types[0].imager, voxels)
     depths, parts = np.asarray(voxels.depths, np.float64), []
     for lens_type in lens_types:
-        volume = backproject(image, lens_type.imager, voxels.at(lens_type.apparent_depth(depths)))
+        volume = backproject(image, lens_type.imager, voxels, distortion=lens_type.distortion_at(depths))
+        if len(lens_types) == 1:
+            return volume
         parts.append(jnp.where(lens_type.sees(depths)[:, None, None], volume, 0))
     return sum(parts[1:], parts[0])
 

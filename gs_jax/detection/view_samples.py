@@ -19,7 +19,7 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import lenses_by_type
 from ..optics.lens_types import core_width, split_by_type, type_weights
-from ..optics.psf_core import apparent_depths
+from ..optics.psf_core import core_distortion
 from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .background import DetectionImage, Pixels, subsample, subtract_background
@@ -60,19 +60,20 @@ class ViewSamples(NamedTuple):
 
 
 class LensType(NamedTuple):
-    """Lenses of one type, and how sharply they image points at `depths`.
+    """Lenses of one type, and how they image points at `depths`.
 
-    `apparent`: depths at which their chief rays meet the cores of spots. `sharpness`: light in a core relative to the
-    sharpest type. Both are None if all lenses are alike; points then lie at the depths of chief rays.
+    `distortion`: that of the cores of their spots, as for `Imager.views`. `sharpness`: light in a core relative to the
+    sharpest type; None if all lenses are alike.
     """
 
     imager: Imager
     depths: Float64[np.ndarray, " depth"]
-    apparent: Float64[np.ndarray, " depth"] | None = None
+    distortion: Float64[np.ndarray, " depth"]
     sharpness: Float64[np.ndarray, " depth"] | None = None
 
-    def apparent_depth(self, depth: Float[np.ndarray, " point"]) -> Float[np.ndarray, " point"]:
-        return depth if self.apparent is None else np.interp(depth, self.depths, self.apparent)
+    def distortion_at(self, depth: Float[np.ndarray, " point"]) -> Float[np.ndarray, " point"]:
+        """Distortion of points at these depths."""
+        return np.interp(depth, self.depths, self.distortion)
 
     def sees(self, depth: Float[np.ndarray, " point"]) -> Bool[np.ndarray, " point"]:
         """Whether these lenses are among the sharp ones at each depth."""
@@ -84,17 +85,24 @@ class LensType(NamedTuple):
 def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> list[LensType]:
     """Split an imager by the types of its lenses, with the sharpness of each type by exact rays."""
     if imager.array.alike:
-        return [LensType(imager, depths)]
+        return [LensType(imager, depths, core_distortion(imager, depths))]
     each = split_by_type(imager, lenses_by_type(imager.array))
     weights = type_weights(each, depths, core_width(imager))
-    apparent = [np.asarray(apparent_depths(one, depths), np.float64) for one in each]
-    return [LensType(one, depths, *parts) for one, *parts in zip(each, apparent, weights / weights.max(0), strict=True)]
+    return [
+        LensType(one, depths, core_distortion(one, depths), sharpness)
+        for one, sharpness in zip(each, weights / weights.max(0), strict=True)
+    ]
 
 
-def sample_views(points: Float[np.ndarray, "point 3"], image: DetectionImage, imager: Imager) -> ViewSamples:
+def sample_views(
+    points: Float[np.ndarray, "point 3"],
+    image: DetectionImage,
+    imager: Imager,
+    distortion: Float[np.ndarray, " point"] | float = 1.0,
+) -> ViewSamples:
     """Interpolate an image where each lens within the field radius images each point `(x, y, z)`.
 
-    Lenses that image a point beyond the sensor do not see it.
+    Lenses that image a point beyond the sensor do not see it. `distortion` is that of `Imager.views`.
     """
     # NumPy: another number of points would compile another program.
     host = to_numpy(imager)
@@ -104,7 +112,8 @@ def sample_views(points: Float[np.ndarray, "point 3"], image: DetectionImage, im
     # k = 1 would drop the axis of lenses.
     distance, lens = tree.query(from_axis, k=max(most, 2), distance_upper_bound=imager.field_radius)
     seen = np.isfinite(distance)
-    views = host.views(points[:, None], np.where(seen, lens, 0))
+    distortion = np.broadcast_to(distortion, len(points))[:, None]
+    views = host.views(points[:, None], np.where(seen, lens, 0), distortion=distortion)
     pixels = np.asarray(imager.sensor.to_pixels(views.spot))
     seen &= ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(-1)
     pixels = np.where(seen[..., None], pixels, 0)
@@ -118,12 +127,11 @@ def sample_views_by_type(
     points: Float[np.ndarray, "point 3"], image: DetectionImage, lens_types: Sequence[LensType]
 ) -> ViewSamples:
     """Concatenate the samples by all types of lenses that are sharp at the depth of each point."""
-    if len(lens_types) == 1:
-        return sample_views(points, image, lens_types[0].imager)
     parts = []
     for number, lens_type in enumerate(lens_types):
-        apparent = np.column_stack([points[:, :2], lens_type.apparent_depth(points[:, 2])])
-        samples = sample_views(apparent, image, lens_type.imager)
+        samples = sample_views(points, image, lens_type.imager, lens_type.distortion_at(points[:, 2]))
+        if len(lens_types) == 1:
+            return samples
         seen = samples.seen & lens_type.sees(points[:, 2])[:, None]
         light, noise = (np.where(seen, part, 0) for part in (samples.light, samples.noise))
         own_type = np.full(seen.shape, number)
@@ -239,12 +247,10 @@ def detection_stats(
     ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
     depths = np.concatenate([ends, points[:, 2]])
     lens_types = lens_types_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS))
-    # Alike lenses are read where chief rays of apparent depths land.
-    apparent = np.asarray(apparent_depths(imager, depths), np.float64) if len(lens_types) == 1 else depths
-    samples = sample_views_by_type(np.column_stack([points[:, :2], apparent[2:]]), image, lens_types)
+    samples = sample_views_by_type(points[:, :3], image, lens_types)
     lenses, noise = samples.seen.sum(1), samples.noise.max(1, initial=0)
     level = view_quantile(samples.light, samples.seen)
-    tests = num_hypotheses(search_grid(imager, grid.at(apparent[:2])))
+    tests = num_hypotheses(search_grid(imager, grid))
     log = log_false_alarms(level, lenses, survival_function(image.light), tests) / math.log(10)
     lit = (samples.seen & (samples.light > THRESHOLD_SNR * samples.noise)).sum(1)
     signal_to_noise = np.divide(level, noise, out=np.zeros_like(level), where=noise > 0)

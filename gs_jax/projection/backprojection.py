@@ -26,6 +26,7 @@ def backproject(
     *,
     method: str = "linear",
     normalize: bool = False,
+    distortion: Float[Array | np.ndarray, " depth"] | None = None,
 ) -> Float[Array, "depth y x"]:
     """Sum, for each voxel, the pixel under each lens that sees it (paper, "Object reconstruction").
 
@@ -45,6 +46,9 @@ def backproject(
     normalize
         Divide by the sum of the weights, so that a uniform image gives a uniform volume; voxels that no lens sees are
         zero.
+    distortion
+        Of each depth, as for `Imager.views`: that of the cores of spots, for example. By default the pixels of chief
+        rays are read.
 
     Returns
     -------
@@ -74,8 +78,9 @@ def backproject(
         raise ValueError(f"`image` must be of the sensor's shape {imager.sensor.shape}, got {image.shape}.")
     dtype = _type_of(image, imager)
 
-    def backproject_group(depths):
-        shapes, rays = _prepare(imager, grid.at(depths), method, dtype)
+    def backproject_group(planes):
+        depths, distortion = planes
+        shapes, rays = _prepare(imager, grid.at(depths), method, dtype, distortion)
         volume = image_to_volume(shapes, rays, image)
         if not normalize:
             return volume
@@ -83,7 +88,8 @@ def backproject(
         seen = total > 0
         return jnp.where(seen, volume / jnp.where(seen, total, 1), 0)
 
-    volume = lax.map(backproject_group, _in_groups(grid.depths))
+    distortion = jnp.ones_like(grid.depths) if distortion is None else jnp.asarray(distortion, grid.depths.dtype)
+    volume = lax.map(backproject_group, (_in_groups(grid.depths), _in_groups(distortion)))
     return volume.reshape(-1, *grid.shape)[: grid.depths.size]
 
 
@@ -154,14 +160,14 @@ def _type_of(array, imager):
 
 
 def _in_groups(depths: Float[Array, " depth"]) -> Float[Array, "group size"]:
-    """Depths in groups of one size, at most `_DEPTHS`; the last group is filled up with the last depth."""
+    """Numbers of depths in groups of one size, at most `_DEPTHS`; the last is filled up with that of the last depth."""
     groups = -(-depths.size // _DEPTHS)
     size = -(-depths.size // groups)
     return jnp.pad(depths, (0, groups * size - depths.size), mode="edge").reshape(groups, size)
 
 
-def _prepare(imager: Imager, grid: Grid, method: str, dtype) -> tuple[Shapes, Rays]:
+def _prepare(imager: Imager, grid: Grid, method: str, dtype, distortion=None) -> tuple[Shapes, Rays]:
     if method not in ("linear", "nearest"):
         raise ValueError(f'`method` must be "linear" or "nearest", got {method!r}.')
-    rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype)
+    rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype, distortion=distortion)
     return Shapes(imager.sensor.shape, grid.volume_shape, Envelope(imager.field_radius)), rays

@@ -30,7 +30,7 @@ def full_image(
     """`gs_jax.forward` with `FieldVaryingPsf`."""
     nodes = to_nodes(volume, grid, optics.stray_light.grid)
     return _cores_image(volume, imager, grid, optics) + stray_light_image(
-        nodes, imager, optics.stray_light, grid.origin
+        nodes, imager, optics.stray_light, grid.depths, grid.origin
     )
 
 
@@ -53,19 +53,20 @@ def _cores_image(volume, imager, grid, optics):
         depth, fine_voxels, wide_voxels, distortion, light = plane
         fine, coarse = (wide, grid, fine_voxels), (wide_half, outer_grid, wide_voxels)
         imager, grid_here, voxels = fine if number < inner else coarse
-        # Chief rays of this apparent depth land where the cores of the true one do.
-        magnification = imager.magnification(depth) * distortion[number]
-        at = grid_here.at(imager.depth_of(imager.reduced_sensor_distance / magnification))
-        if imager.tilt is not None:
-            # The distortion is about the lens's axis, which is tilted.
-            offset = (1 / distortion[number] - 1) * imager.axis_offset(depth[None])[0]
-            at = eqx.tree_at(lambda g: g.origin, at, at.origin + offset)
-        weight = RingLight(*rings[number])
-        rays = trace(imager, at, nearest=False, dtype=dtype, limit=weight.limit, parameters=light[number][None])
+        at, weight = grid_here.at(depth), RingLight(*rings[number])
+        rays = trace(
+            imager,
+            at,
+            nearest=False,
+            dtype=dtype,
+            distortion=distortion[number][None],
+            limit=weight.limit,
+            parameters=light[number][None],
+        )
         image = partial(volume_to_image, Shapes(imager.sensor.shape, at.volume_shape, weight), rays)
         if number < oriented:
             return [image(voxels[None])]
-        return _by_powers_of_field(image, voxels, imager, at, rings[number][1])
+        return _by_powers_of_field(image, voxels, imager, at, distortion[number], rings[number][1])
 
     def add_rings(total, plane, numbers, kernels, harmonics, *, whole):
         """Add the light of some of the rings, convolved with their kernels."""
@@ -97,16 +98,17 @@ def _cores_image(volume, imager, grid, optics):
     return fine + upsample_by_two(coarse, size, sensor.shape)
 
 
-def _by_powers_of_field(image, voxels, imager, at, unit):
+def _by_powers_of_field(image, voxels, imager, at, distortion, unit):
     """The image of voxels, and those of their light times `x`, `y`, `x^2 - y^2` and `2 x y`.
 
     Here `(x, y)` is the field: the voxel's place from the axis of the lens that sees it, in a unit, mm. A lens that
     images the voxel at X to u has it at the field (X - u) / (1 + M), less the offset of a tilted axis. So voxels are
     weighted by powers of X, and pixels by those of u, along the same rays.
     """
-    sensor, scale = imager.sensor, unit * (1 + imager.magnification(at.depths)[0])
+    sensor, scale = imager.sensor, unit * (1 + distortion * imager.magnification(at.depths)[0])
     pixels = Grid(at.depths, sensor.shape, sensor.pixel_pitch, sensor.origin)
-    offset = scale / unit * imager.axis_offset(at.depths)[0]
+    # The lens's axis and its image, of the lens in the middle.
+    offset = imager.axis_offset(at.depths)[0] - imager.image_of_axis
     voxel = at.x[None] / scale, at.y[:, None] / scale
     pixel = (pixels.x[None] + offset[0]) / scale, (pixels.y[:, None] + offset[1]) / scale
     (X, Y), (u, v) = ([each.astype(voxels.dtype) for each in pair] for pair in (voxel, pixel))

@@ -81,7 +81,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
 
     Parameters
     ----------
-    imager, grid, method, normalize
+    imager, grid, method, normalize, distortion
         As for `backproject`.
 
     Examples
@@ -98,12 +98,14 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     grid: Grid
     method: str = eqx.field(static=True, default="linear")
     normalize: bool = eqx.field(static=True, default=False)
+    distortion: Float[Array | np.ndarray, " depth"] | None = None
     in_structure, out_structure = _image_structure, _volume_structure
     transpose, as_matrix = transpose, as_matrix
 
     def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
-        return backproject(vector, self.imager, self.grid, method=self.method, normalize=self.normalize)
+        options = {"method": self.method, "normalize": self.normalize, "distortion": self.distortion}
+        return backproject(vector, self.imager, self.grid, **options)
 
 
 class Transposed(lx.AbstractLinearOperator):

@@ -233,7 +233,8 @@ def full_image_of_points(
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
     stray_light = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
-    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, jnp.zeros(2, nodes.dtype)))
+    planes = jnp.asarray(coarse, nodes.dtype)
+    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
     size = kernel_size(imager, stray_light.grid)
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for edges, *parts, profiles, harmonics in rings:

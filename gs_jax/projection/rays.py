@@ -84,24 +84,29 @@ def trace(
     *,
     nearest: bool,
     dtype,
+    distortion: Float[Array, " depth"] | None = None,
     limit: float | None = None,
     parameters: Float[Array, "depth parameter"] | None = None,
 ) -> Rays:
     """The rays of every voxel through every lens that sees it, in a cache-friendly order of lenses.
 
     With `nearest` they are moved to the nearest pixel centre, as in the paper. `dtype` is the type of the tables; the
-    coordinates are computed in that of the geometry. `limit` is the radius of a lens's field, mm; by default, it and
-    the `parameters` of the lens weight are those of the envelope.
+    coordinates are computed in that of the geometry. `distortion` is that of `Imager.views`, at each depth. `limit` is
+    the radius of a lens's field, mm; by default, it and the `parameters` of the lens weight are those of the envelope.
     """
+    distortion = jnp.ones_like(grid.depths) if distortion is None else distortion.astype(grid.depths.dtype)
     if parameters is None:
         parameters = jnp.asarray(imager.reduced_depth(grid.depths))[:, None]
     order = _snake(imager.centers, _BAND * imager.field_radius)
-    magnification = imager.magnifications(grid.depths)
+    magnification = imager.magnifications(grid.depths, distortion)
     magnification = magnification if len(magnification) == 1 else magnification[order]
     reach = field_limit(imager.field_radius) if limit is None else limit
     (x, y), (x_offset, y_offset) = imager.centers[order].T, imager.axis_offset(grid.depths).T
+    # Where a tilted array has the spots of points that are moved by `lean`, about a sensor that is moved back.
+    (x_lean, y_lean), (x_moved, y_moved) = imager.lean(grid.depths, distortion).T, imager.spot_displacement
+    sensor_x, sensor_y = imager.sensor.origin
 
-    def axis(center, origin, voxels, pixels, middle, axis_offset):
+    def axis(center, origin, voxels, pixels, middle, axis_offset, lean):
         size = min(voxels, int(2 * reach / grid.pitch) + 1)
         # The axes of a tilted array are tilted, and a lens's field moves with the depth.
         axis = center[:, None] if imager.tilt is None else center[:, None] + axis_offset[None, :]
@@ -111,7 +116,7 @@ def trace(
         index = voxel.astype(center.dtype) - (voxels - 1) / 2
         from_grid, center = center - origin, center - middle
         pixel, fraction, offset = _project(
-            center, from_grid, index, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
+            center, from_grid, index, lean, magnification, grid.pitch, imager.sensor.pixel_pitch, pixels, nearest
         )
         coordinate = pixel.astype(fraction.dtype) + fraction
         on_sensor = (coordinate >= 0) & (coordinate <= pixels - 1)
@@ -120,8 +125,8 @@ def trace(
         return Axis(start, pixel, fraction.astype(dtype), distance2.astype(dtype), first_coordinate)
 
     return Rays(
-        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], imager.sensor.origin[1], y_offset),
-        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], imager.sensor.origin[0], x_offset),
+        y=axis(y, grid.origin[1], grid.shape[0], imager.sensor.shape[0], sensor_y - y_moved, y_offset, y_lean),
+        x=axis(x, grid.origin[0], grid.shape[1], imager.sensor.shape[1], sensor_x - x_moved, x_offset, x_lean),
         spacing=jax.lax.stop_gradient(
             jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
         ),
@@ -129,18 +134,19 @@ def trace(
     )
 
 
-def _project(center, from_origin, index, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
+def _project(center, from_origin, index, lean, magnification, voxel_pitch, pixel_pitch, pixels, nearest):
     """Pixel and fraction `(lens, depth, voxel)` of one coordinate, and the offset `(lens, patch, voxel)` to the vertex.
 
     `index` is `(lens, patch, voxel)`: one patch for all depths, or one for each. The lens is at `center` from the
-    middle of the sensor's pixels, and at `from_origin` from the grid's origin. `magnification` is `(lens, depth)`.
+    middle of the sensor's pixels, and at `from_origin` from the grid's origin. `lean` `(depth,)` displaces voxels.
+    `magnification` is `(lens, depth)`.
     """
     # Relative to the pixel nearest to the lens's centre, where numbers are small: a float32 coordinate over 5,000
     # pixels would be 2e-4 of a pixel off. The map is the same for any origin.
     whole = jax.lax.stop_gradient(jnp.round(center / pixel_pitch))
     center_here = _minus_multiple(center, whole, pixel_pitch)[:, None, None]
     offset = _minus_multiple(from_origin[:, None, None], index, voxel_pitch)
-    ray = chief_ray(center_here, center_here - offset, magnification[:, :, None])
+    ray = chief_ray(center_here, center_here - offset + lean[None, :, None], magnification[:, :, None])
     middle = (pixels - 1) / 2
     coordinate = ray / pixel_pitch + middle % 1
     below = jax.lax.stop_gradient(jnp.floor(coordinate + 0.5 if nearest else coordinate))
@@ -188,11 +194,11 @@ def interpolate(corners, down, right):
 
 
 def crop_field(
-    imager: Imager, place: Float[Array | np.ndarray, "2"], shape: tuple[int, int]
-) -> tuple[Imager, Bool[Array, "row column"]]:
-    """An imager of a part of the field, for what does not fit into memory at once.
+    imager: Imager, grid: Grid, place: Float[Array | np.ndarray, "2"], shape: tuple[int, int]
+) -> tuple[Imager, Grid, Bool[Array, "row column"]]:
+    """An imager and a grid of a part of the field, for what does not fit into memory at once.
 
-    Its origin is at `place`, so that a centred grid lies around the place; lenses and sensor are moved by `-place`,
+    Their origin is at `place`, so that a centred grid lies around the place; lenses and sensor are moved by `-place`,
     rounded to whole pixels (half of one if the shapes differ by an odd number). A voxel at `q` from the place is imaged
     up to `|q| + (1 + M) field_radius` from it; light beyond the new sensor is lost.
 
@@ -200,6 +206,8 @@ def crop_field(
     ----------
     imager
         The whole.
+    grid
+        Voxels about the place.
     place
         `(x, y)`, mm.
     shape
@@ -208,7 +216,8 @@ def crop_field(
     Returns
     -------
     tuple
-        The imager, and which of its pixels are on the sensor of the whole.
+        The imager; the grid, whose depths are from the array's front at the place, where a tilted array is higher than
+        on the axis; and which pixels are on the sensor of the whole.
     """
     sensor = imager.sensor
     whole = jnp.array(sensor.shape, place.dtype)
@@ -221,7 +230,6 @@ def crop_field(
         (first + jnp.arange(size) >= 0) & (first + jnp.arange(size) < total)
         for first, size, total in zip(corner.astype(int), shape, sensor.shape, strict=True)
     )
-    local = eqx.tree_at(
-        lambda i: (i.sensor, i.shift), imager, (Sensor(shape, sensor.pixel_pitch), imager.shift - moved)
-    )
-    return local, rows[:, None] & columns[None]
+    imager = eqx.tree_at(lambda i: i.sensor, imager, Sensor(shape, sensor.pixel_pitch)).moved(moved)
+    height = 0 if imager.tilt is None else moved @ imager.tilt
+    return imager, grid.at(grid.depths - height), rows[:, None] & columns[None]

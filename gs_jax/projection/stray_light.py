@@ -38,9 +38,16 @@ _FEW = 8
 
 
 def stray_light_image(
-    nodes: Float[Array, "depth y x"], imager: Imager, optics: StrayLight, origin: Float[Array, "2"]
+    nodes: Float[Array, "depth y x"],
+    imager: Imager,
+    optics: StrayLight,
+    depths: Float[Array, " depth"],
+    origin: Float[Array, "2"],
 ) -> Float[Array, "row column"]:
-    """The stray light of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm."""
+    """The stray light of a volume whose light is given on coarse nodes, an odd number each way, about an origin, mm.
+
+    It turns with a tilted array: it is symmetric about the axes of the lenses and about their images.
+    """
     dtype = nodes.dtype
     polar_grid, v = optics.grid, (imager.reduced_sensor_distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the coarse pixels with it.
@@ -49,16 +56,17 @@ def stray_light_image(
     inner, outer = to_polar.side, to_pixels.side
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / polar_grid.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
     nodes = jnp.pad(nodes, [(0, 0), *[(inner + 1, inner + 1 + _SPARE)] * 2])
+    axes, image_of_axis = imager.axis_offset(depths).astype(dtype), imager.image_of_axis.astype(dtype)
     # One matrix for both orders.
     table = optics.table.astype(dtype).reshape(*optics.table.shape[:3], -1)
     half_turn = (jnp.arange(polar_grid.angles // 2 + 1) % 2 == 1)[:, None, None]
 
     def add_lenses(image, lenses):
         centers, excess = lenses
-        places = _window_places(centers, origin.astype(dtype), polar_grid.step, nodes.shape[1:], inner)
 
         def add_depth(spots, plane):
-            nodes, table = plane
+            nodes, table, axis = plane
+            places = _window_places(centers + axis[None], origin.astype(dtype), polar_grid.step, nodes.shape, inner)
             objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes)
             polar = times_table(to_polar, (), objects.reshape(-1, len(centers)))
             spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
@@ -66,12 +74,13 @@ def stray_light_image(
             return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)[None, None]], 1), None
 
         empty = jnp.zeros((polar_grid.angles // 2 + 1, polar_grid.radii, 2 * len(centers)), dtype)
-        spots = lax.scan(jax.checkpoint(add_depth), empty, (nodes, table))[0]
+        spots = lax.scan(jax.checkpoint(add_depth), empty, (nodes, table, axes))[0]
         # The image lies opposite to the object: half a turn.
         spots = lax.complex(*jnp.split(jnp.where(half_turn, -spots, spots), 2, -1))
         polar = jnp.fft.irfft(spots, polar_grid.angles, axis=0).reshape(-1, len(centers))
         spots = times_table(to_pixels, (), polar).reshape(outer, outer, -1)
-        places = _window_places(centers, jnp.asarray(imager.sensor.origin, dtype), pixel, image.shape, outer)
+        middle = jnp.asarray(imager.sensor.origin, dtype)
+        places = _window_places(centers + image_of_axis[None], middle, pixel, image.shape, outer)
         return image + interpolate_windows.T(Windows(image.shape, outer), places, spots), None
 
     # Outer pixels for spots that lie partly beyond; lenses that are farther off do not count.

@@ -17,7 +17,7 @@ from ..io.camera import Readout
 from ..lenses import lenses_by_type
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.lens_types import PerTypePsf, split_by_type, type_weights
-from ..optics.psf_core import apparent_depths
+from ..optics.psf_core import core_distortion
 from ..projection.forward_model import PsfModel, make_psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.base import Operator, UnmatchedAdjointOperator
@@ -85,13 +85,14 @@ def subtract_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray,
 
 
 class LensTypeGeometry(NamedTuple):
-    """Geometry that back-projects the lenses of one type: chief rays of `grid` land on the cores of their spots.
+    """Geometry that back-projects the lenses of one type.
 
-    `weight` is the weight of this type at each depth, `(depth, 1, 1)`, or None if there is only one.
+    `distortion` of each depth is that of their spots' cores, or None for the chief rays. `weight` is the weight of this
+    type at each depth, `(depth, 1, 1)`, or None if there is only one.
     """
 
     imager: Imager
-    grid: Grid
+    distortion: Float[Array | np.ndarray, " depth"] | None = None
     weight: Float[Array | np.ndarray, "depth 1 1"] | None = None
 
 
@@ -99,12 +100,12 @@ def lens_type_geometries(imager: Imager, grid: Grid) -> tuple[LensTypeGeometry, 
     """Geometry of each type of lens, weighted by how bright and sharp its spots are at each depth."""
     depths = np.asarray(grid.depths, np.float64)
     if imager.array.alike:
-        return (LensTypeGeometry(imager, grid.at(apparent_depths(imager, depths))),)
+        return (LensTypeGeometry(imager, core_distortion(imager, depths)),)
     imagers = split_by_type(imager, lenses_by_type(imager.array))
     side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
     weights = type_weights(imagers, depths, side)[..., None, None].astype(np.float32)
     pairs = zip(imagers, weights, strict=True)
-    return tuple(LensTypeGeometry(one, grid.at(apparent_depths(one, depths)), weight) for one, weight in pairs)
+    return tuple(LensTypeGeometry(one, core_distortion(one, depths), weight) for one, weight in pairs)
 
 
 class InverseProblem(eqx.Module):
@@ -152,7 +153,8 @@ class InverseProblem(eqx.Module):
             return least_squares
         # With the pixels of this problem, which may be binned.
         binned = lambda view: eqx.tree_at(lambda i: i.sensor, view.imager, self.imager.sensor)
-        pairs = [(BackprojectionOperator(binned(v), v.grid), v.weight) for v in self.back_projections]
+        of_type = lambda view: BackprojectionOperator(binned(view), self.grid, distortion=view.distortion)
+        pairs = [(of_type(view), view.weight) for view in self.back_projections]
         if len(pairs) == 1:
             return UnmatchedAdjointOperator(A, pairs[0][0], least_squares)
         total = lambda image: sum(jnp.asarray(weight, image.dtype) * B.mv(image) for B, weight in pairs)

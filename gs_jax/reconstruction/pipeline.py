@@ -179,9 +179,9 @@ def reconstructor(
     _check(method, optics, imager, grid)
     check_beyond(imager, np.asarray(grid.depths), "grid: depths")
     on_cores = by_name and optics != "pinhole"
-    views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager, grid),)
+    views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
     if isinstance(method, BackProjection):
-        return partial(_backproject_views, views(), method)
+        return partial(_backproject_views, views(), grid, method)
     if isinstance(method, Surface) and not (np.diff(np.asarray(grid.depths)) > 0).all():
         raise InputError(
             f"grid: depths must ascend with Surface(), got {short_repr(np.asarray(grid.depths).tolist())}."
@@ -237,20 +237,20 @@ def _check(method, optics, *arguments):
         raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(optics)}.")
 
 
-def _backproject_views(views, method, image, progress, kept=None):
+def _backproject_views(views, grid, method, image, progress, kept=None):
     """Sum the back-projections of all types of lenses, weighted; of kept pixels, in place of all."""
     if kept is not None:
         # Squares of pixels, and those that fill none.
         side = image.shape[0] // kept.shape[0]
         missing = [(0, n - side * m) for n, m in zip(image.shape, kept.shape, strict=True)]
         kept = np.pad(np.repeat(np.repeat(kept, side, 0), side, 1), missing, mode="edge")
-        share = _backproject_views(views, dataclasses.replace(method, normalize=True), kept, progress)
-        volume = _backproject_views(views, method, kept * image, progress)
+        share = _backproject_views(views, grid, dataclasses.replace(method, normalize=True), kept, progress)
+        volume = _backproject_views(views, grid, method, kept * image, progress)
         return np.divide(volume, share, out=np.zeros_like(volume), where=share > 0)
     if len(views) == 1:
-        return _backproject(image, views[0].imager, views[0].grid, method, progress)
+        return _backproject(image, views[0], grid, method, progress)
     plain = dataclasses.replace(method, normalize=False)
-    weighted = lambda image, view: view.weight * _backproject(image, view.imager, view.grid, plain, progress)
+    weighted = lambda image, view: view.weight * _backproject(image, view, grid, plain, progress)
     total = lambda image: sum(weighted(image, view) for view in views)
     volume = np.asarray(total(image), np.float32)
     if not method.normalize:
@@ -259,35 +259,41 @@ def _backproject_views(views, method, image, progress, kept=None):
     return np.divide(volume, weights, out=np.zeros_like(volume), where=weights > 0)
 
 
-def _backproject(image, imager, grid, method, progress):
+def _backproject(image, view, grid, method, progress):
     check_finite("image", image)
     options = {"method": method.interpolation, "normalize": method.normalize}
     planes = _PLANES * (devices := jax.local_device_count())
     project = backproject if devices == 1 else backproject_on_all_devices
+    distortion = np.ones(grid.depths.size) if view.distortion is None else view.distortion
     if grid.depths.size <= planes:
-        return np.asarray(project(image, imager, grid, **options), np.float32)
+        return np.asarray(project(image, view.imager, grid, distortion=distortion, **options), np.float32)
     image, depths = jnp.asarray(image), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
     for first in progress.track(range(0, depths.size, planes), "Back-projecting", quarter=_wider_voxels(grid)):
         part = slice(first, first + planes)
-        volume[part] = project(image, imager, grid.at(depths[part]), **options)
+        volume[part] = project(image, view.imager, grid.at(depths[part]), distortion=distortion[part], **options)
     return volume
 
 
-def backproject_on_all_devices(image: Image, imager: Imager, grid: Grid, **options) -> Float[Array, "depth y x"]:
+def backproject_on_all_devices(
+    image: Image, imager: Imager, grid: Grid, *, distortion: Float[np.ndarray, " depth"], **options
+) -> Float[Array, "depth y x"]:
     """`backproject` with the depths divided evenly among the devices of this process."""
-    count = grid.depths.size
-    padding = jnp.full(-count % jax.local_device_count(), grid.depths[-1])
-    return _backproject_sharded(image, imager, grid, jnp.concatenate([grid.depths, padding]), **options)[:count]
+    missing = -grid.depths.size % jax.local_device_count()
+    planes = (np.pad(part, (0, missing), mode="edge") for part in (grid.depths, distortion))
+    return _backproject_sharded(image, imager, grid, *planes, **options)[: grid.depths.size]
 
 
 @partial(jax.jit, static_argnames=("method", "normalize"))
-def _backproject_sharded(image, imager, grid, depths, **options):
+def _backproject_sharded(image, imager, grid, depths, distortion, **options):
     mesh, replicated, sharded = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec(), PartitionSpec("depth")
-    project = lambda image, imager, grid, depths: backproject(image, imager, grid.at(depths), **options)
+
+    def project(image, imager, grid, depths, distortion):
+        return backproject(image, imager, grid.at(depths), distortion=distortion, **options)
+
     # The kernels do not declare which results vary between devices.
-    specs = {"in_specs": (replicated, replicated, replicated, sharded), "out_specs": sharded}
-    return jax.shard_map(project, mesh=mesh, **specs, check_vma=False)(image, imager, grid, depths)
+    specs = {"in_specs": (replicated, replicated, replicated, sharded, sharded), "out_specs": sharded}
+    return jax.shard_map(project, mesh=mesh, **specs, check_vma=False)(image, imager, grid, depths, distortion)
 
 
 def _wider_voxels(grid):

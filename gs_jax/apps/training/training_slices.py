@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float16, Float32
 from scipy.ndimage import gaussian_filter
@@ -17,7 +16,7 @@ from ...base.machine import Workers
 from ...base.progress import Progress
 from ...detection.unet import standardize
 from ...io.files import atomic_write, decoding, make_folder
-from ...optics.psf_core import apparent_depths
+from ...optics.psf_core import core_distortion
 from ...projection.backprojection import backproject
 from ...typing import PathLike
 from .simulated_captures import SCENES, CaptureSpec, draw_objects, simulate_example
@@ -68,14 +67,14 @@ def sample_paper_batch(rng: np.random.Generator, size: int = 64) -> Batch:
 
 
 def simulate_stack(seed: int, number: int, specs: Sequence[CaptureSpec] = SPECS) -> Stack:
-    """Simulate an example of one of the specs, in turn, and back-project it at the apparent depths of bright cores.
+    """Simulate an example of one of the specs, in turn, and back-project it where the bright cores of spots are.
 
     The unit is that of `unet.standardize`. The truth is the scene on the volume's voxels, blurred by `TRUTH_BLUR`,
     times the slope of the volume's voxels against it: what is in focus keeps its brightness.
     """
     image, imager, grid, truth = simulate_example(seed, number, specs[number // SCENES % len(specs)])
-    apparent = grid.at(jnp.asarray(apparent_depths(imager, grid.depths), grid.depths.dtype))
-    volume, unit = standardize(np.asarray(backproject(image, imager, apparent)))
+    distortion = core_distortion(imager, grid.depths)
+    volume, unit = standardize(np.asarray(backproject(image, imager, grid, distortion=distortion)))
     truth = gaussian_filter(truth, (0, TRUTH_BLUR, TRUTH_BLUR))
     # In a unit of its own: a capture's is beyond half precision.
     truth = truth / max(float(truth.max()), 1e-30)
