@@ -132,7 +132,7 @@ def _layers(imager: Imager):
         raise InputError("the ray tracer takes no sample in contact with a curved side")
     shorter = float(sum(t * (1 - 1 / n) for t, n in (*filters, *cover)))
     windows = np.array(slabs(imager.windows)[::-1], float).reshape(-1, 2)
-    return np.array(faces, float).reshape(-1, 5), (contact, begins, index, shorter), windows
+    return np.array(faces, float).reshape(-1, 5), np.array([contact, begins, index, shorter]), windows
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy")
@@ -176,7 +176,8 @@ def _add_spots(image, tile, lens, others, numbers, curve_first, landed):
 @njit(fastmath=True, error_model="numpy")
 def _land(landed, place, lens, others, numbers, curve_first):
     """Trace rays to where they land, x, y, mm, and their share of the point's light; return the magnification."""
-    n, t, v, _, _, turned, faces, (contact, begins, index, shorter), windows = numbers
+    n, t, v, _, _, turned, faces, sample, windows = numbers
+    contact, begins, index, shorter = sample[0] == 1, sample[1], sample[2], sample[3]
     radius, conic, aperture = lens[2:]
     vertices = v + t if curve_first else v
     x, y, z = place[0] - lens[0], place[1] - lens[1], place[2]

@@ -201,7 +201,21 @@ class Imager(eqx.Module):
         height, cosine = origin @ self.tilt, self._cosine
         # In the plane the way to the point is longer.
         shift = self.shift - origin - self.tilt * (height * cosine / (1 + cosine))
-        imager = eqx.tree_at(lambda i: (i.shift, i.sensor_distance), self, (shift, self.sensor_distance + height))
+        return eqx.tree_at(lambda i: i.shift, self, shift)._lifted(height)
+
+    def level(self) -> tuple["Imager", Scalar | float]:
+        """An array without tilt at the mean height of these lenses, and that height, mm.
+
+        It images points that are nearer by the height as the tilted lenses do about their axes.
+        """
+        if self.tilt is None:
+            return self, 0.0
+        height = self.heights.mean()
+        return eqx.tree_at(lambda i: i.tilt, self, None)._lifted(height), height
+
+    def _lifted(self, height):
+        """The imager farther from the sensor, and as much nearer to a sample with a surface of its own."""
+        imager = eqx.tree_at(lambda i: i.sensor_distance, self, self.sensor_distance + height)
         if self.sample is None or self.sample.surface is None:
             return imager
         return eqx.tree_at(lambda i: i.sample.surface, imager, self.sample.surface - height)

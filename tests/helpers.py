@@ -94,19 +94,23 @@ def backproject_loop(image, imager, grid, method="linear"):
     thickness = float(imager.array.substrate_thickness) / float(imager.array.refractive_index)
     in_front = thickness if imager.array.orientation == "plano" else 0.0
     behind = float(imager.sensor_distance) + thickness - in_front
+    # A plate that leans with the array moves what is seen through it, the point or the spot.
+    plate = float(imager.array.substrate_thickness) - thickness
+    point_moves, spot_moves = (plate, 0.0) if in_front else (0.0, plate)
     pixel, radius2 = imager.sensor.pixel_pitch, imager.field_radius**2
     height, width = imager.sensor.shape
     for d, r, c in np.ndindex(*volume.shape):
         depth = float(grid.depths[d]) + in_front
         q = np.array([c - (grid.shape[1] - 1) / 2, r - (grid.shape[0] - 1) / 2]) * grid.pitch
         for center, lift in zip(centers, lifts, strict=True):
-            x, y = center + (center - q) * (behind + lift) / (depth - lift)
+            seen = q + point_moves * tilt
+            x, y = center + (center - seen) * (behind + lift) / (depth - lift) + spot_moves * tilt
             u, v = y / pixel + (height - 1) / 2, x / pixel + (width - 1) / 2
             if method == "nearest":
                 u, v = np.floor(u + 0.5), np.floor(v + 0.5)
             if not (0 <= u <= height - 1 and 0 <= v <= width - 1):
                 continue
-            distance2 = np.sum((center - depth * tilt - q) ** 2)  # from the axis, which leans with the array
+            distance2 = np.sum((center - depth * tilt - seen) ** 2)  # from the axis, which leans with the array
             t = np.clip((1.1 * radius2 - distance2) / (0.2 * radius2), 0, 1)
             weight = (depth**2 / (depth**2 + distance2)) ** 2 * t * t * (3 - 2 * t)
             i, j = min(int(u), height - 2), min(int(v), width - 2)

@@ -65,7 +65,7 @@ LAYERS = {
 @pytest.mark.parametrize("orientation", ["plano", "curved"])
 @pytest.mark.parametrize("layers", LAYERS)
 def test_a_tilt_moves_spots_as_rays_do(layers, orientation):
-    """By a plate and filters that tilt, a level sample, and one that tilts. The level map is paraxial: its own error."""
+    """By a plate and filters that tilt, and samples that are level or tilt. The map of no tilt is paraxial."""
     centers = np.array([[0.0, 0.0], [1.0, 0.5], [-0.8, 1.0], [4.0, -3.0], [5.0, -2.0]])
     lenses = MicrolensArray(centers, aperture_diameter=0.02, orientation=orientation)
     points = np.array([[0.0, 0.0, 18.0], [0.5, -0.3, 20.0], [4.1, -2.6, 22.0]])

@@ -17,8 +17,7 @@ from scipy.special import bdtrc
 
 from ..geometry import Imager
 from ..grid import Grid
-from ..lenses import lenses_by_type
-from ..optics.lens_types import core_width, split_by_type, type_weights
+from ..optics.lens_types import core_width, height_bands, split_groups, type_weights
 from ..optics.psf_core import core_distortion
 from ..optics.raytrace import to_numpy
 from ..typing import Image
@@ -84,14 +83,14 @@ class LensType(NamedTuple):
 
 def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> list[LensType]:
     """Split an imager by the types of its lenses, with the sharpness of each type by exact rays."""
+    each, groups = split_groups(imager)
+    distortions = [core_distortion(one, depths) for one in each]
     if imager.array.alike:
-        return [LensType(imager, depths, core_distortion(imager, depths))]
-    each = split_by_type(imager, lenses_by_type(imager.array))
-    weights = type_weights(each, depths, core_width(imager))
-    return [
-        LensType(one, depths, core_distortion(one, depths), sharpness)
-        for one, sharpness in zip(each, weights / weights.max(0), strict=True)
-    ]
+        return [LensType(one, depths, distortion) for one, distortion in zip(each, distortions, strict=True)]
+    bands = height_bands(imager)[[lenses[0] for lenses in groups]]
+    weights = type_weights(each, depths, core_width(imager), bands)
+    best = np.stack([weights[bands == band].max(0) for band in bands])
+    return [LensType(*parts) for parts in zip(each, [depths] * len(each), distortions, weights / best, strict=True)]
 
 
 def sample_views(

@@ -97,7 +97,8 @@ def field_varying_psf(
     Parameters
     ----------
     imager
-        Its lens, layout and sensor count; its rotation, shift and tilt do not.
+        Its lens, layout and sensor count, and the mean height of its lenses if it is tilted; its rotation and shift do
+        not.
     depths
         Of the planes, mm, in their order.
     extent
@@ -124,7 +125,8 @@ def field_varying_psf(
     rings = None if rings is None else tuple(rings)
     if rings is not None and (len(rings) < 2 or not (np.diff((0.0, *rings)) > 0).all()):
         raise InputError(f"rings must be two or more radii that ascend, got {short_repr(rings)}.")
-    depths = np.asarray(depths, np.float64)
+    imager, height = imager.level()
+    depths = np.asarray(depths, np.float64) - float(height)
     leaves, structure = jax.tree.flatten(imager)
     key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
     polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)

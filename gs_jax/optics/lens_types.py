@@ -1,6 +1,7 @@
 """Arrays of several lens types: the optics of each type, its weight in sums over the lenses, and the sharpness.
 
-Images are linear in the lenses: the image is the sum of the images by each type, whose lenses are identical.
+Images are linear in the lenses: the image is the sum of the images by each type, whose lenses are identical. The lenses
+of a tilted array differ in their distance from the sensor: they are divided into bands of height, which are as types.
 """
 
 import math
@@ -14,21 +15,25 @@ from jaxtyping import Array, Float, Float64, Int
 from ..base.errors import InputWarning
 from ..geometry import Imager
 from ..grid import Grid
-from ..lenses import lenses_by_type
+from ..lenses import type_of_lens
 from .apertures import clear_area
 from .field_varying import FieldVaryingPsf
 from .psf_core import ensquared_light
+from .raytrace import to_numpy
 
 # Smallest fraction of a spot's light in its core for finding points. The paper's microscope has 21 to 51 % in focus,
 # over 18 to 22 mm, and 1 % with its sensor at 4 mm; its first lenses on pixels three times as wide have 6 % there, and
 # show one of three points.
 MIN_SHARPNESS = 0.08
+# Lenses of a tilted array are as one type where their height changes the blur by so many pixels or less; bands of height
+# at most, as each costs as much as an array without tilt.
+_BLUR, _BANDS = 2.0, 5
 # Half the side of the square that collects a core's light, in pixels, and fields at which that is computed.
 HALF_SIDE, FIELDS = 3, 17
 
 
 class PerTypePsf(eqx.Module):
-    """PSFs of each lens type; `gs_jax.make_psf_model` makes it.
+    """PSFs of each lens type, or each `lens_groups` of a tilted array; `gs_jax.make_psf_model` makes it.
 
     `lenses`: indices of each type's lenses. `optics`: for each type, its PSF at each depth, with the sum of its light
     over that of the mean lens; or all of its light.
@@ -38,9 +43,31 @@ class PerTypePsf(eqx.Module):
     optics: tuple[Float[Array, "_ _ _"] | FieldVaryingPsf, ...]  # each of its own size
 
 
+def height_bands(imager: Imager) -> Int[np.ndarray, " lens"]:
+    """The number of each lens's band of height, 0 unless the array is so tilted that its lenses differ in blur."""
+    heights = np.asarray(to_numpy(imager).heights)
+    low, spread = heights.min(), np.ptp(heights)
+    blur = spread * float(np.max(imager.array.aperture_diameter)) / float(imager.reduced_sensor_distance)
+    count = min(max(math.ceil(blur / (_BLUR * imager.sensor.pixel_pitch)), 1), _BANDS)
+    return np.minimum((heights - low) / (spread / count or 1), count - 1).astype(int)
+
+
+def lens_groups(imager: Imager) -> tuple[tuple[int, ...], ...]:
+    """Indices of lenses that image alike: those of a type, and of a band of height if the array is tilted."""
+    types, bands = type_of_lens(imager.array), height_bands(imager)
+    numbers = np.unique(bands * (types.max() + 1) + types, return_inverse=True)[1]
+    return tuple(tuple(np.flatnonzero(numbers == number).tolist()) for number in range(numbers.max() + 1))
+
+
 def split_by_type(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
     """The imager with the lenses of each type alone, whose apertures the other lenses still bound."""
     return [eqx.tree_at(lambda i: i.array, imager, imager.array.subset(which)) for which in lenses]
+
+
+def split_groups(imager: Imager) -> tuple[list[Imager], tuple[tuple[int, ...], ...]]:
+    """The imager with the lenses of each group alone, and the `lens_groups`; itself where all lenses are alike."""
+    groups = lens_groups(imager)
+    return [imager] if len(groups) == 1 else split_by_type(imager, groups), groups
 
 
 def interleave(centers: Float[np.ndarray, "lens 2"], types: int) -> Int[np.ndarray, " lens"]:
@@ -71,21 +98,22 @@ def relative_areas(imagers: Sequence[Imager]) -> Float64[np.ndarray, " type"]:
 
 
 def type_weights(
-    imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float
+    imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float, bands: Sequence[int] | None = None
 ) -> Float64[np.ndarray, "type depth"]:
-    """Weights of the types in a sum over the lenses, at each depth; their mean over the lenses is 1.
+    """Weights of the types in a sum over the lenses, at each depth; their mean over the lenses of each band is 1.
 
     Matched filter: a point of brightness a gives the pixel that lens j reads for its voxel `y_j = s_j a + noise`, and
     of all sums `w_j y_j` that with `w_j = s_j / var_j` has the largest signal over noise. The variance (camera, and
     light of all voxels) is about the same under every lens, so the weight is `s_j`: the fraction of the point's light
     in a square of `side` (mm, on the sensor) about the core, by exact rays over the field. `imagers` are
-    `split_by_type`'s.
+    `split_by_type`'s. Lenses of other bands of height see other points, and are not compared.
     """
     fields = np.linspace(0, imagers[0].field_radius, FIELDS)
     # Lenses are spread evenly: their number at a field is proportional to the circle's length.
     signal = np.stack([ensquared_light(one, depths, fields, side) @ fields for one in imagers])
     count = np.array([len(one.array.centers) for one in imagers], np.float64)
-    mean = count @ signal / count.sum()
+    same = np.equal.outer(*2 * (np.zeros(len(imagers)) if bands is None else np.asarray(bands),)) * count
+    mean = same @ signal / same.sum(1, keepdims=True)
     return np.divide(signal, mean, out=np.ones_like(signal), where=mean > 0)
 
 
@@ -101,7 +129,7 @@ def sharpness(imager: Imager, grid: Grid) -> float:
     """
     depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
     fields = np.linspace(0, imager.field_radius, FIELDS)
-    each = [imager] if imager.array.alike else split_by_type(imager, lenses_by_type(imager.array))
+    each = split_groups(imager)[0]
     light = lambda one, side: ensquared_light(one, depths, fields, side) @ fields
     core = core_width(imager)
     return float(np.max([light(one, core) / light(one, math.inf) for one in each], 0).min())

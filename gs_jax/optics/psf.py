@@ -196,7 +196,7 @@ def psf_of_depth(
     Parameters
     ----------
     imager
-        The PSF is that of its mean clear aperture, and the mean over its emission band.
+        The PSF is that of its mean clear aperture and height, and the mean over its emission band.
     depths
         Their range, mm.
     kind
@@ -209,10 +209,11 @@ def psf_of_depth(
     InputError
         If the rays reach farther than 128 pixels. Rays that are reflected totally do not count.
     """
+    imager, height = imager.level()
     radius = clear_diameter(imager.array) / 2
     # All zones: near the focus of the rim's rays those of other zones land farther out.
     fan = radius * jnp.linspace(0, 1, _FAN)[:, None] * jnp.array([[1.0, 0.0]])
-    lines, ends = emission_lines(imager), (min(depths), max(depths))
+    lines, ends = emission_lines(imager), (min(depths) - float(height), max(depths) - float(height))
     rays = [[trace_lenslet(one, depth, fan) for _, one in lines] for depth in ends]
     reaches = [max(float(jnp.where(r.valid, jnp.abs(r.landing[:, 0]), 0).max()) for r in each) for each in rays]
     pixels = max(reaches) / (imager.sensor.pixel_pitch * steps)
@@ -228,7 +229,7 @@ def psf_of_depth(
         make = partial(make, samples=math.ceil(least_samples(imager, 2 * radius)))
 
     def mean_psf(depth):
-        each = [weight * make(one, depth, size=size, radius=radius) for weight, one in lines]
+        each = [weight * make(one, depth - float(height), size=size, radius=radius) for weight, one in lines]
         return jnp.sum(jnp.stack(each), 0)
 
     return mean_psf

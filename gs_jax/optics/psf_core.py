@@ -93,6 +93,8 @@ def trace_cores(
     the sharpest. The light of each spot in it is a least-squares fit. `ends` are outer radii of the rings, in field
     radii. Cores that are `oriented` have harmonics.
     """
+    imager, height = imager.level()
+    depths = depths - float(height)
     aperture = aperture_profile(imager.array, by_area=False)
     tables = map_in_threads(lambda depth: _cores_at_depth(imager, depth, aperture, reach, ends, oriented), depths)
     tracked = zip((progress or Progress()).track(depths, "Tracing cores"), tables, strict=True)
@@ -152,9 +154,11 @@ def _positive_spots(profile, harmonics):
 def core_magnification(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float64[np.ndarray, " depth"]:
     """Magnification of the core, by exact rays within the field radius; a constant to derivatives.
 
-    The chief ray's is `M_z = v/z'` (Eq. 3); the authors' lenses have 0.4 % less to 0.8 % more, by depth.
+    The chief ray's is `M_z = v/z'` (Eq. 3); the authors' lenses have 0.4 % less to 0.8 % more, by depth. It is that of
+    the lenses' mean height if the array is tilted.
     """
-    depths = np.asarray(depths, np.float64)
+    imager, height = imager.level()
+    depths = np.asarray(depths, np.float64) - float(height)
     if np.unique(depths).size > _MOST:
         # Imported here, as few depths are traced without SciPy, whose import takes long.
         from scipy.interpolate import CubicSpline
@@ -172,13 +176,17 @@ def core_distortion(imager: Imager, depths: Float[ArrayLike, " depth"]) -> Float
     The authors' lenses, focused on 20 mm, would show points 0.16 mm too near at 18 mm without it, and 0.09 mm too far
     at 22 mm.
     """
-    return core_magnification(imager, depths) / to_numpy(imager).magnification(np.asarray(depths, np.float64))
+    imager, height = imager.level()
+    depths = np.asarray(depths, np.float64) - float(height)
+    return core_magnification(imager, depths) / to_numpy(imager).magnification(depths)
 
 
 def ensquared_light(
     imager: Imager, depths: Float64[np.ndarray, " depth"], fields: Float64[np.ndarray, " field"], side: float
 ) -> Float64[np.ndarray, "depth field"]:
     """Fraction of a point's light that the mean lens brings into a square of this side (mm) about the core."""
+    imager, height = imager.level()
+    depths = depths - float(height)
     aperture = aperture_profile(imager.array, by_area=False)
 
     def share(depth):

@@ -11,9 +11,8 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..lenses import lenses_by_type
 from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
-from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type
+from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type, split_groups
 from ..optics.polar_grid import make_polar_grid
 from ..optics.psf import psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
@@ -52,7 +51,8 @@ def make_psf_model(
     Returns
     -------
     None, Array, FieldVaryingPsf or PerTypePsf
-        Tables for these depths in this order; per type if there are several types of lenses.
+        Tables for these depths in this order; per type if there are several types of lenses, or the array is tilted so
+        far that the blur differs from lens to lens.
 
     Raises
     ------
@@ -79,11 +79,10 @@ def make_psf_model(
         kernel = psf_of_depth(imager, depths, "geometric")
         return jnp.stack([kernel(z) for z in (progress or Progress()).track(depths, "Point spread functions")])
 
-    if imager.array.alike and fidelity == "full":
-        return field_varying_psf(imager, depths, progress=progress)
-    if imager.array.alike:
-        return field_constant_psf(imager)
-    types = split_by_type(imager, lenses := lenses_by_type(imager.array))
+    types, lenses = split_groups(imager)
+    if len(types) == 1:
+        full = fidelity == "full"
+        return field_varying_psf(imager, depths, progress=progress) if full else field_constant_psf(imager)
     if fidelity == "full":
         nodes = make_polar_grid(imager, depths)
         psfs = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in types]

@@ -227,11 +227,13 @@ def full_image_of_points(
     few = depths.size <= steps + 1
     fine = depths if few else np.linspace(depths[0], depths[-1], 2 * steps + 1)
     every = 1 if few else 2
-    grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
-    sharp = has_sharp_cores(imager, fine, grid)
-    tables = trace_cores(imager, fine, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
+    level, height = imager.level()
+    lower = fine - float(height)
+    grid = make_polar_grid(level, lower, extent=2 * float(np.abs(points[:, :2]).max()))
+    sharp = has_sharp_cores(level, lower, grid)
+    tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
-    stray_light = trace_stray_light(imager, coarse, grid, cores, _RINGS, progress)
+    stray_light = trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress)
     nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
     planes = jnp.asarray(coarse, nodes.dtype)
     image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))

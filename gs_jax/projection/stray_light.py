@@ -49,7 +49,8 @@ def stray_light_image(
     It turns with a tilted array: it is symmetric about the axes of the lenses and about their images.
     """
     dtype = nodes.dtype
-    polar_grid, v = optics.grid, (imager.reduced_sensor_distance / optics.sensor_distance).astype(dtype)
+    distance = imager.reduced_sensor_distance + imager.heights.mean()
+    polar_grid, v = optics.grid, (distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the coarse pixels with it.
     pixel = polar_grid.pixel * v
     to_polar, to_pixels = _to_polar_table(polar_grid), to_pixels_table(polar_grid)

@@ -14,9 +14,8 @@ from ..detection.background import background_tiles, interpolate_tiles
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
-from ..lenses import lenses_by_type
 from ..optics.field_varying import FieldVaryingPsf
-from ..optics.lens_types import PerTypePsf, split_by_type, type_weights
+from ..optics.lens_types import PerTypePsf, height_bands, split_groups, type_weights
 from ..optics.psf_core import core_distortion
 from ..projection.forward_model import PsfModel, make_psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
@@ -99,11 +98,12 @@ class LensTypeGeometry(NamedTuple):
 def lens_type_geometries(imager: Imager, grid: Grid) -> tuple[LensTypeGeometry, ...]:
     """Geometry of each type of lens, weighted by how bright and sharp its spots are at each depth."""
     depths = np.asarray(grid.depths, np.float64)
-    if imager.array.alike:
+    imagers, groups = split_groups(imager)
+    if len(imagers) == 1:
         return (LensTypeGeometry(imager, core_distortion(imager, depths)),)
-    imagers = split_by_type(imager, lenses_by_type(imager.array))
+    bands = height_bands(imager)[[lenses[0] for lenses in groups]]
     side = max(float(imager.magnification(depths).mean()) * grid.pitch, imager.sensor.pixel_pitch)
-    weights = type_weights(imagers, depths, side)[..., None, None].astype(np.float32)
+    weights = type_weights(imagers, depths, side, bands)[..., None, None].astype(np.float32)
     pairs = zip(imagers, weights, strict=True)
     return tuple(LensTypeGeometry(one, core_distortion(one, depths), weight) for one, weight in pairs)
 

@@ -20,9 +20,8 @@ from ..grid import Grid, Sensor
 from ..io.point_tables import read_points
 from ..io.volumes import read_volume
 from ..layers import object_index
-from ..lenses import lenses_by_type
 from ..optics.field_varying import field_varying_psf
-from ..optics.lens_types import relative_areas, split_by_type
+from ..optics.lens_types import relative_areas, split_groups
 from ..optics.polar_grid import make_polar_grid
 from ..optics.psf import PSFS, psf_of_depth
 from ..projection.forward_model import FIDELITIES, forward
@@ -113,9 +112,9 @@ def simulate(
             return simulate_points(np.asarray(scene, np.float64), imager, kind=kind, progress=progress)
         return simulate_volume(scene, imager, grid, kind=kind, progress=progress)
 
-    if imager.array.alike:
+    each, _ = split_groups(imager)
+    if len(each) == 1:
         return image_of(imager)
-    each = split_by_type(imager, lenses_by_type(imager.array))
     light = np.ones(len(each)) if optics == "full" else relative_areas(each)
     images = [image_of(one) * np.float32(share) for one, share in zip(each, light, strict=True)]
     return np.sum(images, 0)
