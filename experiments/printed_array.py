@@ -85,8 +85,8 @@ def ray_widths(imager: Imager, depth: float) -> np.ndarray:
     """Half-light radius of each lens's rays of a point on its axis, mm."""
     types, widths = lenses_by_type(imager.array), np.zeros(len(imager.array.centers))
     for which, lens in zip(types, split_by_type(imager, types), strict=True):
-        rays = sample_pupil(lens, depth, np.zeros(1), aperture_profile(lens.array), RAYS)
-        rays = add_diffraction(lens, rays)
+        aperture = aperture_profile(lens.array)
+        rays = add_diffraction(lens, sample_pupil(lens, depth, np.zeros(1), aperture, RAYS), aperture)
         distance = np.hypot(*rays.landing[0].T)
         order = np.argsort(distance)
         light = np.cumsum(rays.light[0][order])

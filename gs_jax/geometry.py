@@ -211,7 +211,11 @@ class Imager(eqx.Module):
         if self.tilt is None:
             return self, 0.0
         height = self.heights.mean()
-        return eqx.tree_at(lambda i: i.tilt, self, None)._lifted(height), height
+        return self.at_height(height), height
+
+    def at_height(self, height: Scalar) -> "Imager":
+        """An array without tilt that images as lenses at this height do, mm; depths from it are less by the height."""
+        return eqx.tree_at(lambda i: i.tilt, self._lifted(height), None, is_leaf=lambda leaf: leaf is None)
 
     def _lifted(self, height):
         """The imager farther from the sensor, and as much nearer to a sample with a surface of its own."""

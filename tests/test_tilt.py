@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from experiments.ray_tracer import bundles
-from gs_jax import Grid, Imager, Layers, MicrolensArray, Sample, Sensor, backproject, find_points, forward
+from gs_jax import Grid, Imager, Layers, MicrolensArray, Sample, Sensor, backproject, find_points, forward, objectives
+from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.projection.point_sources import forward_points, make_stamps
 
 from .helpers import backproject_loop, scene
@@ -164,3 +165,36 @@ def test_points_are_where_the_grid_has_them_and_are_found():
     away = np.linalg.norm(found[:, None, :2] - grid.to_mm(voxels)[None, :, :2], axis=-1)
     # A pixel is 0.041 mm wide at the object.
     assert len(found) == 12 and np.median(away.min(0)) < 0.01 and away.min(0).max() < 0.08
+
+
+def test_quantities_are_means_over_the_heights_of_the_lenses():
+    """Each lens by itself as one of a level array, which is farther from the sensor and nearer to the object."""
+    depths = np.array([18.0, 20.5, 23.0])
+    imager = dataclasses.replace(tilted((0.05, -0.03)), filters=Layers([2.0], [1.52]), sample=Sample(1.43, 17.5))
+    level = dataclasses.replace(imager, tilt=None)
+    one = []
+    for height in np.asarray(imager.heights):
+        alone = dataclasses.replace(
+            level, sensor_distance=level.sensor_distance + height, sample=Sample(1.43, 17.5 - height)
+        )
+        one.append(objectives.focus_distance(alone, depths - height))
+    # The rule of three heights is exact for polynomials: of 20 lenses at random, to a hundredth of the change.
+    expected, change = np.mean(one, 0), np.std(one, 0)
+    np.testing.assert_allclose(objectives.focus_distance(imager, depths), expected, atol=0.02 * change.max())
+    widths = [objectives.sensor_blur(one, depths) for one in (level, imager)]
+    assert (np.abs(widths[1] / widths[0] - 1) > 1e-3).all()
+    slope = jax.grad(lambda tilt: objectives.sensor_blur(tilted_by(tilt), [20.0])[0])(jnp.zeros(2))
+    assert np.isfinite(slope).all()
+
+
+def test_bounds_of_points_and_volumes_see_the_pose():
+    """Objects that turn and move with the array are seen as before; a tilt changes what is seen."""
+    level = Imager(MicrolensArray(PLACES, size=(8.0, 8.0)), Sensor((700, 720), 0.016), 5.8, 2.5)
+    at = objectives.Conditions([19.0, 21.0])
+    place = np.array([[0.4, -0.7]])
+    turned = dataclasses.replace(level, rotation=0.3, shift=(0.2, -0.1))
+    moved = place @ np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]) + np.array([0.2, -0.1])
+    bound = jax.jit(lambda imager, place: jnp.linalg.norm(crowded_bound(imager, at, place), axis=1))
+    np.testing.assert_allclose(bound(turned, jnp.asarray(moved)), bound(level, jnp.asarray(place)), rtol=1e-6)
+    tilted_bound = jnp.linalg.norm(crowded_bound(dataclasses.replace(level, tilt=(0.05, 0.0)), at, place), axis=1)
+    assert (jnp.abs(tilted_bound / bound(level, jnp.asarray(place)) - 1) > 1e-3).all()

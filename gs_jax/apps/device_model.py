@@ -193,9 +193,9 @@ def log_sharpness(
     heights = jnp.stack([jnp.stack(place) for place in ((x, y), (x, -y), (-x, y), (-x, -y))]) @ imager.tilt
 
     def at_height(height):
-        lifted = dataclasses.replace(imager, sensor_distance=imager.sensor_distance + height)
-        ratio = jax.vmap(lambda depth: axial_strehl(lifted, depth, radius=radius))(at.depths)
-        return spot_width(lifted, at), ratio
+        level, here = imager.at_height(height), dataclasses.replace(at, depths=at.depths - height)
+        ratio = jax.vmap(lambda depth: axial_strehl(level, depth, radius=radius))(here.depths)
+        return spot_width(level, here), ratio
 
     widths, ratios = jax.vmap(at_height)(heights)
     array = imager.array

@@ -227,17 +227,11 @@ def _spot(imager, at):
 def _information(imager, at, spot, place) -> Float[Array, "depth 3 3"]:
     """Fisher information about `x, y, z` of a point by all lenses."""
     energy, slope, noise = spot
-    beside = imager.array.centers - place[None]
-    weight = envelope(jnp.sum(beside**2, 1)[None], imager.reduced_depth(at.depths)[:, None], field_radius(imager, at))
+    points = jnp.concatenate([jnp.tile(place, (at.depths.size, 1)), at.depths[:, None]], 1)
+    views = imager.views_of_all(points)
+    weight = envelope(jnp.sum(views.offset**2, -1), views.reduced_depth, field_radius(imager, at)).T
     light = of_lenses(imager, lens_electrons(imager, at)).T * weight
     per_shift = light**2 * slope / (noise + light * energy)
-    along = imager.depth_in_medium(at.depths)
-    # Derivative of image positions by x, y, z, divided by the magnification.
-    shift = jnp.concatenate(
-        [
-            jnp.broadcast_to(jnp.eye(2, dtype=at.depths.dtype), (at.depths.size, len(beside), 2, 2)),
-            (beside[None] / along[:, None, None])[..., None],
-        ],
-        -1,
-    )
-    return jnp.einsum("dl,dlai,dlaj->dij", per_shift * imager.magnification(at.depths)[:, None] ** 2, shift, shift)
+    # Derivative of image positions by x, y, z.
+    shift = jax.vmap(jax.jacfwd(lambda point: imager.project(point[None])[:, 0]))(points)
+    return jnp.einsum("dl,dlai,dlaj->dij", per_shift, shift, shift)

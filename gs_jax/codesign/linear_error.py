@@ -95,10 +95,10 @@ def _amplitude(imager, at, frequency, spectrum) -> Float[Array, "lens depth freq
 
 def _view(imager, at, place, ways):
     """Weights of the lenses `(lens, depth)`, and their images' phase over frequency `(direction, lens, depth)`."""
-    beside = imager.array.centers - place[None]
-    squared = jnp.sum(beside**2, 1)[:, None]
-    weight = safe_sqrt(envelope(squared, imager.reduced_depth(at.depths)[None], field_radius(imager, at)))
-    return weight, 2 * jnp.pi * (beside @ ways).T[:, :, None] * imager.magnification(at.depths)[None, None]
+    points = jnp.concatenate([jnp.tile(place, (at.depths.size, 1)), at.depths[:, None]], 1)
+    views = imager.views_of_all(points)
+    weight = safe_sqrt(envelope(jnp.sum(views.offset**2, -1), views.reduced_depth, field_radius(imager, at)))
+    return weight, 2 * jnp.pi * jnp.moveaxis((views.spot - imager.centers[:, None]) @ ways, -1, 0)
 
 
 def noise_density(imager: Imager, at: Conditions) -> Float[Array, " lens"]:

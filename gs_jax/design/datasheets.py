@@ -14,7 +14,7 @@ from .. import objectives
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..layouts import check_positive, nearest_neighbour_distances
-from ..objectives.conditions import Conditions, per_type
+from ..objectives.conditions import Conditions, over_heights, per_type
 from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
@@ -178,8 +178,9 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
     return found
 
 
+@over_heights
 def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
-    """The columns of a datasheet by name, for lenses that are alike; may be traced."""
+    """The columns of a datasheet by name, for lenses that are alike, the mean if they are tilted; may be traced."""
     wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
     width, radius = _spot_sizes(imager, at)
     magnification = imager.magnification(at.depths)

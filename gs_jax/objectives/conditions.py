@@ -5,7 +5,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
-from typing import ParamSpec
+from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields
+from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields, safe_sqrt
 from ..geometry import Imager
 from ..lenses import lenses_by_type, type_of_lens
 from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
@@ -102,6 +102,7 @@ def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
 
 # The arguments of a quantity: an imager, depths or `Conditions`, and what is the same for all types.
 P = ParamSpec("P")
+Tree = TypeVar("Tree")
 
 
 def by_type(function: Callable[P, Array]) -> Callable[P, Array]:
@@ -125,6 +126,42 @@ def best_type(function: Callable[P, Array], *, best: Callable[..., Array] = jnp.
     return of_best
 
 
+# Heights of the lenses of a tilted array, in standard deviations, and their weights: exact for polynomials up to the
+# fifth power where heights are spread evenly.
+_HEIGHTS, _SHARES = np.array([-1, 0, 1]) * math.sqrt(9 / 5), np.array([5, 8, 5]) / 18
+
+
+def over_heights(function: Callable[[Imager, Conditions], Tree]) -> Callable[[Imager, Conditions], Tree]:
+    """Extend quantities of lenses that are alike to a tilted array: the mean over the heights of the lenses."""
+
+    @wraps(function)
+    def mean(imager: Imager, at: Conditions) -> Tree:
+        parts = _at_heights(imager, at)
+        return function(*parts[0]) if len(parts) == 1 else jax.tree.map(_mean_of_heights, _map(function, parts))
+
+    return mean
+
+
+def _at_heights(imager: Imager, at: Conditions) -> list[tuple[Imager, Conditions]]:
+    """Level imagers, and their conditions, at a few heights of the lenses of a tilted array."""
+    if imager.tilt is None:
+        return [(imager, at)]
+    own = imager.heights
+    spread = safe_sqrt(jnp.mean((own - jnp.mean(own)) ** 2))
+    heights = [jnp.mean(own) + spread * jnp.asarray(number, own.dtype) for number in _HEIGHTS]
+    return [(imager.at_height(h), dataclasses.replace(at, depths=at.depths - h)) for h in heights]
+
+
+def _map(function, parts):
+    """The function of imagers and conditions of one structure, as one program."""
+    return jax.vmap(function)(*jax.tree.map(lambda *each: jnp.stack(each), *parts))
+
+
+def _mean_of_heights(values):
+    """Mean over the first axis."""
+    return jnp.tensordot(jnp.asarray(_SHARES, values.dtype), values, 1)
+
+
 def _of_types(function, args, options) -> tuple[Array, bool]:
     """The value, and False; or a row for each of several types, and True."""
     # The wrapped function has the names and the defaults of the arguments.
@@ -132,12 +169,14 @@ def _of_types(function, args, options) -> tuple[Array, bool]:
     bound.apply_defaults()
     imager, depths, *others = bound.args
     parts = per_type(imager, depths)
+    of_type = lambda one, at: function(one, at, *others)
     if len(parts) == 1:
-        return function(*parts[0], *others), False
+        return over_heights(of_type)(*parts[0]), False
     # What is asked of a type does not depend on its lenses' places: one program serves any number of types.
-    alone = [(eqx.tree_at(lambda i: i.array, one, one.array.lens(0)), at) for one, at in parts]
-    stacked = jax.tree.map(lambda *each: jnp.stack(each), *alone)
-    return jax.vmap(lambda one, at: function(one, at, *others))(*stacked), True
+    at_heights = [part for one in parts for part in _at_heights(*one)]
+    values = _map(of_type, [(eqx.tree_at(lambda i: i.array, one, one.array.lens(0)), at) for one, at in at_heights])
+    values = values.reshape(len(parts), -1, *values.shape[1:])
+    return (values[:, 0] if imager.tilt is None else jax.vmap(_mean_of_heights)(values)), True
 
 
 def of_lenses(imager: Imager, values: Float[Array, "..."]) -> Float[Array, "lens ..."]:

@@ -242,7 +242,7 @@ def stray_light_table(
     the image counts from the direction opposite to the object's.
     """
     fields = grid.step * grid.nodes(grid.fields)
-    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
+    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS), aperture)
     chief = float(imager.magnification(float(depth)))
     table = np.zeros((2, grid.fields, grid.radii * grid.angles))
     binned = lambda landing, light: np.stack([_bin_polar(grid, *one) for one in zip(landing, light, strict=True)])

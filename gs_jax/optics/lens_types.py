@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Array, ArrayLike, Float, Float64, Int
 
 from ..base.errors import InputWarning
 from ..geometry import Imager
@@ -25,8 +25,8 @@ from .raytrace import to_numpy
 # over 18 to 22 mm, and 1 % with its sensor at 4 mm; its first lenses on pixels three times as wide have 6 % there, and
 # show one of three points.
 MIN_SHARPNESS = 0.08
-# Lenses of a tilted array are as one type where their height changes the blur by so many pixels or less; bands of height
-# at most, as each costs as much as an array without tilt.
+# Bands of height of a tilted array: within one the blur changes by so many pixels; so many at most, as each costs as
+# much as an array without tilt.
 _BLUR, _BANDS = 2.0, 5
 # Half the side of the square that collects a core's light, in pixels, and fields at which that is computed.
 HALF_SIDE, FIELDS = 3, 17
@@ -98,7 +98,7 @@ def relative_areas(imagers: Sequence[Imager]) -> Float64[np.ndarray, " type"]:
 
 
 def type_weights(
-    imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float, bands: Sequence[int] | None = None
+    imagers: Sequence[Imager], depths: Float64[np.ndarray, " depth"], side: float, bands: ArrayLike | None = None
 ) -> Float64[np.ndarray, "type depth"]:
     """Weights of the types in a sum over the lenses, at each depth; their mean over the lenses of each band is 1.
 

@@ -105,7 +105,7 @@ def _cores_at_depth(imager: Imager, depth: float, aperture: ApertureProfile, rea
     pitch = imager.sensor.pixel_pitch
     rings = ring_edges(imager, ends)
     fields = np.arange(0, rings[-1][1] * 1.06, imager.field_radius / _FIELDS)
-    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS))
+    rays = add_diffraction(imager, sample_pupil(imager, depth, fields, aperture, _RAYS), aperture)
     chief = float(imager.magnification(float(depth)))
     edges = np.arange(0, math.ceil(reach / pitch) * BINS + 1) * pitch / BINS
     parts = [_ring_core(rays, fields, chief, pitch, edges, oriented, *ring) for ring in rings]

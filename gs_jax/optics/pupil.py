@@ -4,6 +4,7 @@ How much of a point's light a ray carries follows from its solid angle, and from
 `emission_lines` has the imager at each wavelength of its emission band.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ class ApertureProfile(NamedTuple):
     radius: Float64[np.ndarray, " radius"]
     open: Float64[np.ndarray, " radius"]
     by_area: Float64[np.ndarray, " radius"]
+
+    @property
+    def diameter(self) -> float:
+        """Diameter of the disc with the mean clear area, mm."""
+        return 4 * math.sqrt(float(self.radius[0] * (self.open * self.radius).sum()))
 
 
 def aperture_profile(array: MicrolensArray, *, by_area: bool = True) -> ApertureProfile:
@@ -141,9 +147,9 @@ def trace_light(
     return ray.landing, np.where(ray.valid, light, 0)
 
 
-def add_diffraction(imager: Imager, rays: PupilSamples) -> PupilSamples:
-    """Move rays by Gaussian random numbers (fixed seed) as wide as the Airy disc."""
-    width = float(airy_sigma(imager.wavelength, imager.reduced_sensor_distance, imager.array.aperture_diameter))
+def add_diffraction(imager: Imager, rays: PupilSamples, aperture: ApertureProfile) -> PupilSamples:
+    """Move rays by Gaussian random numbers (fixed seed) as wide as the Airy disc of the clear aperture."""
+    width = float(airy_sigma(imager.wavelength, imager.reduced_sensor_distance, aperture.diameter))
     moves = np.random.default_rng(0).normal(0, width, rays.landing.shape[1:])
     return rays._replace(landing=rays.landing + moves)
 
