@@ -41,6 +41,7 @@ from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
+from gs_jax.layers import reduced_distance
 from gs_jax.lenses import lenses_by_type, type_of_lens
 from gs_jax.optics.lens_types import split_by_type
 
@@ -66,14 +67,22 @@ def render_spots(places, shape, seed=0, noise=2.0) -> np.ndarray:
 def traced_spots(imager: Imager, point) -> np.ndarray:
     """Trace the cores of a point's spots, `(row, column)`, nearest lenses first, without a tenth of them.
 
-    Computed in the plate's frame and rotated into the sensor's, so that the tilt is exact.
+    Computed in the plate's frame and rotated into the sensor's, so that the tilt is exact. Plate and filters are
+    optically thinner along its normal, and a sample with a surface of its own along the sensor's.
     """
+    array, sample = imager.array, imager.sample
+    thickness = float(array.substrate_thickness)
+    thinner = thickness * (1 - 1 / float(array.refractive_index))
+    in_front, behind = (thickness, 0.0) if array.orientation == "plano" else (0.0, thinner)
+    filters = 0.0 if imager.filters is None else float(imager.filters.shortening)
+    in_sample = 0.0 if sample is None else point[2] - float(reduced_distance(jnp.asarray(point[2]), None, sample))
     tilt = np.zeros(2) if imager.tilt is None else np.asarray(imager.tilt)
     steepest = np.append(tilt, 0) / max(np.linalg.norm(tilt), 1e-12)
     turn = Rotation.from_rotvec(np.arctan(np.linalg.norm(tilt)) * np.cross(steepest, [0, 0, 1]))
     level = eqx.tree_at(lambda i: i.tilt, imager, None, is_leaf=lambda leaf: leaf is None)
     v = float(imager.reduced_sensor_distance)
-    source = turn.inv().apply([*point[:2], float(imager.reduced_depth(point[2]))])
+    source = turn.inv().apply([*point[:2], point[2] - in_sample + in_front])
+    source[2] -= filters + (thinner if in_front else 0)
     centers = np.asarray(level.centers)
     beside = source[:2] - centers
     field = np.hypot(*beside.T)
@@ -88,7 +97,9 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     landing = centers - v / source[2] * beside + (offset / np.maximum(field, 1e-12))[:, None] * beside
     vertices = turn.apply(np.column_stack([centers, 0 * field]))
     onward = turn.apply(np.column_stack([landing, 0 * field - v])) - vertices
-    onward = onward[:, :2] * ((v + vertices[:, 2]) / -onward[:, 2])[:, None]
+    # Behind a plate the light goes on as from farther along its normal.
+    vertices = vertices - behind * turn.apply([0, 0, 1])
+    onward = onward[:, :2] * ((v + behind + vertices[:, 2]) / -onward[:, 2])[:, None]
     return np.asarray(imager.sensor.to_pixels(vertices[:, :2] + onward))
 
 

@@ -183,14 +183,18 @@ def test_wrong_distances_and_indices_have_closed_forms(design, pinholes):
 
 
 def lines(centers, point, v, tilt, rotation, shift, plate) -> np.ndarray:
-    """Straight lines in space, from a point through the vertices of a plate that is turned as a body, to the sensor."""
+    """Straight lines in space, from a point through the vertices of a plate that is turned as a body, to the sensor.
+
+    The plate, 1 mm thick and as `plate` of air, brings the point nearer along its normal.
+    """
     turned = Rotation.from_euler("z", rotation).apply(np.column_stack([centers, 0 * centers[:, 0]]))
     turned[:, :2] += shift
     axis = np.cross([*tilt, 0], [0, 0, 1])
     vertices = Rotation.from_rotvec(np.arctan(np.hypot(*tilt)) * axis / max(float(np.linalg.norm(axis)), 1e-300)).apply(
         turned
     ) + [0, 0, v]
-    source = np.array([*point[:2], point[2] + plate + v])
+    normal = np.array([*-np.asarray(tilt), 1]) / np.sqrt(1 + np.dot(tilt, tilt))
+    source = np.array([*point[:2], point[2] + 1 + v]) - (1 - plate) * normal
     along = vertices - source
     return (vertices - along * (vertices[:, 2:] / along[:, 2:]))[:, :2]
 
