@@ -129,6 +129,7 @@ DEVICES: dict[str, Callable[[], Design]] = {
     "odd": lambda: cropped("geomscope", shape=(601, 577)),
     "one lens": lambda: cropped("geomscope", lenses=1, array={"size_mm": (2.0, 2.0)}),
     "float64": lambda: cropped("geomscope"),
+    "tilted, layers": lambda: layered().replace(tilt_deg=(1.0, -0.6), bandwidth_nm=0.0),
 }
 # Numbers of pixels without a common divisor, as many as a camera has: binned or not, all methods must cope.
 LARGE = "3001 x 4093"
