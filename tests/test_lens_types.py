@@ -131,16 +131,12 @@ def test_only_kinds_that_are_sharp_read_points():
     light = DetectionImage(*np.ones((2, *scope.sensor.shape), np.float32))
     ends, flat = np.array([19.0, 21.0]), np.ones(2)
     one, other = split_by_type(scope, (tuple(range(20)), tuple(range(20, 49))))
-    types = [LensType(one, ends, ends, flat), LensType(other, ends, ends + 0.1, np.array([1.0, 0.0]))]
+    types = [LensType(one, ends, flat, flat), LensType(other, ends, 1.01 * flat, np.array([1.0, 0.0]))]
     points = np.array([[0.1, 0.2, 19.2], [0.1, 0.2, 20.8]])
-    seen, all_, late = (
-        sample_views_by_type(points, light, types),
-        sample_views(points, light, scope),
-        points + [0, 0, 0.1],
-    )
+    seen, all_ = sample_views_by_type(points, light, types), sample_views(points, light, scope)
     assert seen.seen.sum(1).tolist()[0] == all_.seen.sum(1)[0] > seen.seen.sum(1)[1] > 0
     assert seen.lens_type is not None and set(seen.lens_type[1][seen.seen[1]]) == {0}
-    second = sample_views(late, light, other)
+    second = sample_views(points, light, other, 1.01)
     np.testing.assert_allclose(
         seen.pixels[0][(seen.lens_type[0] == 1) & seen.seen[0]], second.pixels[0][second.seen[0]]
     )
