@@ -178,15 +178,17 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
     return found
 
 
-@over_heights
 def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
-    """The columns of a datasheet by name, for lenses that are alike, the mean if they are tilted; may be traced."""
+    """The columns of a datasheet by name, for lenses that are alike; may be traced."""
+    magnification = imager.magnification(at.depths)
+    return {"magnification": magnification, "scale": 1 + magnification, **_columns_of_lenses(imager, at)}
+
+
+@over_heights
+def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
     wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
     width, radius = _spot_sizes(imager, at)
-    magnification = imager.magnification(at.depths)
     return {
-        "magnification": magnification,
-        "scale": 1 + magnification,
         "lateral_resolution_um": objectives.lateral_resolution(imager, at) * 1000,
         "axial_resolution_um": objectives.axial_resolution(imager, at) * 1000,
         "depth_of_field_mm": objectives.depth_of_field(imager, at),
