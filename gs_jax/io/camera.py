@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, Num, Shaped
 from ..base.errors import InputError, errors_name_file, input_error
 from ..grid import Sensor
 from ..typing import PathLike
-from .captures import DTYPES, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
+from .captures import DTYPES, REPEATS, Selection, average, mosaic_channel, mosaic_sites, read_images, size_text
 from .pixel_defects import count_saturated, fill_bad_pixels, find_hot_in_capture, find_hot_in_dark
 
 # Pixels of the flat field below this share of its median are bad.
@@ -210,7 +210,7 @@ def prepare(
     dark, gain = correction.offset or None, None
 
     def read_like_capture(path: Path) -> np.ndarray:
-        images = read_images(path, Selection(shape, "mean", readout.channel, readout.bayer))
+        images = read_images(path, Selection(shape, REPEATS, readout.channel, readout.bayer))
         image, _, more = _average(path, images, readout)
         warnings.extend(more)
         _check_size(path, image, size)

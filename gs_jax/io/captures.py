@@ -18,9 +18,10 @@ from PIL.PngImagePlugin import PngInfo
 
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike
+from .axes import stack_axis, stack_error
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar
-from .tiff import decode_plane, mosaic_pattern, open_tiff
+from .tiff import Tiff, decode_plane, mosaic_pattern, open_tiff
 
 Capture = UInt8[np.ndarray, "row column"] | UInt16[np.ndarray, "row column"] | Float32[np.ndarray, "row column"]
 Images = Iterator[Shaped[np.ndarray, "row column"]]
@@ -29,6 +30,9 @@ CHANNELS = ("red", "green", "blue")
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 MAX_PIXELS = 10**9
 DTYPES = ("uint8", "uint16", "float32")
+# Pages that are chosen for files that go together: the one that a file has for itself, though it may be one of a set;
+# and all, if they are repeats of one image.
+OWN, REPEATS = "own", "repeats"
 # What files call colour, None if grey, by number in PNG and in TIFF.
 _RGB, _MOSAIC = "colour (RGB)", 32803
 _PNG_COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transparency", 6: _RGB}
@@ -202,11 +206,11 @@ def check_declared(path: Path, size: tuple[int, ...], dtype: str, selection: Sel
 
 def _pages(path: Path, count: int, page: int | str | None) -> range:
     """The selected pages, counted from 0."""
-    if page == "mean":
+    if page in ("mean", REPEATS):
         return range(count)
-    if page is None and count == 1:
+    if page in (None, OWN) and count == 1:
         return range(1)
-    if page is None:
+    if page in (None, OWN):
         choice = f"choose by --page 1 to {count}, or average repeated frames by --page mean"
         raise InputError(f"{path}: {count} pages; {choice}.")
     if not isinstance(page, int) or not 1 <= page <= count:
@@ -241,10 +245,11 @@ def _select_channel(pixels: np.ndarray, channel: str | None, axis: int = -1) -> 
     return pixels if pixels.ndim == 2 else np.take(pixels, CHANNELS.index(channel or ""), axis)
 
 
-def read_tiff_page(path: Path, tiff: tifffile.TiffFile, index: int, selection: Selection) -> np.ndarray:
+def read_tiff_page(tiff: Tiff, index: int, selection: Selection) -> np.ndarray:
     """The selected part of a page, counted from 0."""
+    path = tiff.path
     with decoding(path, "TIFF"):
-        page = tiff.pages[min(index, len(tiff.pages) - 1)].aspage()
+        page = tiff.file.pages[min(index, tiff.entries - 1)].aspage()
         photometric, samples = int(page.photometric), page.samplesperpixel
         size, dtype = tuple(page.shape), str(page.dtype)
         planar, declared = int(page.planarconfig) == 2, mosaic_pattern(page)
@@ -259,13 +264,31 @@ def read_tiff_page(path: Path, tiff: tifffile.TiffFile, index: int, selection: S
     else:
         check_colour(path, colour, selection)
     check_declared(path, size, dtype, selection)
-    return _select_channel(decode_plane(path, tiff, index), selection.channel, 0 if planar else -1)
+    return _select_channel(decode_plane(tiff, index), selection.channel, 0 if planar else -1)
 
 
 def _read_tiff(path: Path, selection: Selection) -> Iterator[np.ndarray]:
-    with open_tiff(path) as (tiff, count):
-        for index in _pages(path, count, selection.page):
-            yield read_tiff_page(path, tiff, index, selection)
+    with open_tiff(path) as tiff:
+        for number, image in enumerate(_chosen(tiff, selection.page)):
+            yield read_tiff_page(*tiff.at(image, number), selection)
+
+
+def _chosen(tiff: Tiff, page: int | str | None) -> list[tuple[Path, int] | None]:
+    """File and page of each selected image. A page by its number is one of the file, whatever this says of it."""
+    if isinstance(page, int) or (page == OWN and tiff.count == 1):
+        return [(tiff.path, index) for index in _pages(tiff.path, tiff.count, page)]
+    if page == REPEATS:
+        check_stack(tiff, "tz", "; its images are not repeats of one")
+    images = tiff.stack.images
+    return [images[index] for index in _pages(tiff.path, len(images), page)]
+
+
+def check_stack(tiff: Tiff, axes: str, advice: str) -> None:
+    """Raise `InputError` unless the images of a TIFF follow each other along one of some axes, as `stack_axis`."""
+    names, lengths = zip(*tiff.stack.axes, strict=True)
+    if stack_axis(tiff.stack.axes, axes) is None:
+        shape = (*lengths, tiff.first.imagelength, tiff.first.imagewidth)
+        raise stack_error(tiff.path, axes, shape, (*names, "y", "x"), advice)
 
 
 def _read_png(path: Path, selection: Selection) -> Iterator[np.ndarray]:

@@ -6,6 +6,7 @@ camera's program writes them.
 
 import contextlib
 import glob
+import itertools
 import os
 import queue
 import re
@@ -16,21 +17,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.errors import InputError, input_error, needs_extra
+from ..base.errors import InputError, needs_extra
 from ..typing import PathLike
+from .axes import UNNAMED, axis_letter, stack_axis, stack_error
 from .captures import (
     CAPTURE_SUFFIXES,
+    OWN,
     Images,
     Selection,
     check_colour,
     check_declared,
     check_images,
+    check_stack,
     read_images,
     read_tiff_page,
-    size_text,
 )
 from .files import check_input, decoding
-from .tiff import open_tiff
+from .names import natural_order
+from .tiff import Tiff, open_tiff
 
 _ZARR_ROOTS = (".zarray", ".zgroup", "zarr.json")
 
@@ -87,10 +91,21 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
         read = lambda index, selection: read_images(path, selection._replace(page=index + 1))
         yield _paged(path, shape[0], read) if len(shape) == 3 and shape[0] > 1 else None
     else:
-        with open_tiff(check_input(path)) as (tiff, count):
-            pages = lambda index, selection: (read_tiff_page(path, tiff, at, selection) for at in (index,))
-            read = lambda index, selection: check_images(path, pages(index, selection))
-            yield _paged(path, count, read) if count > 1 else None
+        with open_tiff(check_input(path)) as tiff:
+            yield _open_pages(tiff, axes) if len(tiff.stack.images) > 1 else None
+
+
+def _open_pages(tiff: Tiff, axes: str) -> Recording:
+    """The images of a TIFF, and of the further files of its set, in the order that it declares."""
+    check_stack(tiff, axes, "; --page takes one image")
+    images = tiff.stack.images
+
+    def read(index: int, selection: Selection) -> Images:
+        yield read_tiff_page(*tiff.at(images[index], index), selection)
+
+    names = [f"{image[0].name}, page {image[1] + 1}" if image else f"{tiff.path.name}, no page" for image in images]
+    files = list(dict.fromkeys([tiff.path, *(image[0] for image in images if image)]))
+    return Recording(names, lambda index, selection: check_images(tiff.path, read(index, selection)), files)
 
 
 def _paged(path: Path, count: int, read: Callable[[int, Selection], Images]) -> Recording:
@@ -102,27 +117,31 @@ def capture_files(path: Path) -> list[Path] | None:
     if path.is_dir():
         matches = [path / name for name in os.listdir(path)]
     elif re.search(r"[*?[]", str(path)) and not path.exists():
-        matches = [Path(name) for name in glob.glob(str(path), recursive=True)]
+        matches = [Path(name) for name in glob.glob(_pattern(path), recursive=True)]
     else:
         return None
     files = [each for each in matches if each.suffix.lower() in CAPTURE_SUFFIXES and not each.name.startswith(".")]
-    return sorted((each for each in files if not each.is_dir()), key=natural_key)
+    return natural_order(each for each in files if not each.is_dir())
+
+
+def _pattern(path: Path) -> str:
+    """A pattern for `glob`, in which the names of folders that exist stand for themselves, such as `run[1]`."""
+    folder = Path()
+    for place, part in enumerate(path.parts):
+        if not (folder / part).is_dir():
+            return str(Path(glob.escape(str(folder)), *path.parts[place:]))
+        folder /= part
+    return glob.escape(str(folder))
 
 
 def _open_files(path: Path, files: list[Path], page: int | str | None) -> Recording:
     if not files:
         raise InputError(f"{path}: no captures; their files end in {', '.join(CAPTURE_SUFFIXES)}.")
-    read = lambda index, selection: read_images(files[index], selection._replace(page=page))
+    read = lambda index, selection: read_images(files[index], selection._replace(page=OWN if page is None else page))
     return Recording([each.name for each in files], read, files)
 
 
-def natural_key(path: Path | str) -> list[Any]:
-    """Key of the natural order: texts and numbers alternate."""
-    parts = re.split(r"(\d+)", str(path))
-    return [int(part) if place % 2 else part for place, part in enumerate(parts)]
-
-
-def _open_zarr(path: Path, page: int | str | None, first: str) -> Recording:
+def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
     with needs_extra("zarr"):
         import zarr
         from zarr import open as open_zarr
@@ -130,43 +149,75 @@ def _open_zarr(path: Path, page: int | str | None, first: str) -> Recording:
     if page is not None:
         raise InputError(f"--page must not be given for a recording in Zarr, got --page {page} ({path}).")
     with decoding(path, "Zarr store"):
-        store = open_zarr(path, mode="r")
+        store = _only_series(open_zarr(path, mode="r"))
         array = store if isinstance(store, zarr.Array) else _image_array(store)
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: no image; must be a Zarr array (t, y, x), or OME-Zarr of one image.")
-    shape, axes = array.shape, _axes(store)
-    if len(shape) < 3 or any(n != 1 for n in shape[1:-2]) or not shape[0] or (axes and axes[0] not in first):
-        given = f"{size_text(shape)}{f' ({names})' if (names := ', '.join(axes)) else ''}"
-        allowed = f"({first[-1]}, y, x), with axes of 1 alone between {first[-1]} and y"
-        raise input_error("array", allowed, given, path)
+    shape, names = array.shape, _axes(store, array)
+    stack = list(zip(names, shape, strict=True))[:-2]
+    axis = stack_axis(stack, allowed) if stack else None
+    if axis is None or not shape[axis] or names[-2:] not in (["y", "x"], [UNNAMED] * 2):
+        raise stack_error(path, allowed, shape, names)
 
     def read(index, selection):
         check_colour(path, None, selection)
         check_declared(path, shape[-2:], array.dtype.name, selection)
+        place = tuple(index if number == axis else 0 for number in range(len(stack)))
         with decoding(path, "Zarr array"):
-            yield np.asarray(array[index]).reshape(shape[-2:])
+            missing = _missing_chunk(array, place)
+            image = None if missing else np.asarray(array[place])
+        if image is None:
+            advice = "if it is dark there, write it with write_empty_chunks=True"
+            raise InputError(f"{path}: frame {index + 1} is incomplete: there is no chunk {missing}; {advice}.")
+        yield image
 
-    names = [f"{path.name}, frame {frame}" for frame in range(1, shape[0] + 1)]
-    return Recording(names, lambda index, selection: check_images(path, read(index, selection)), [])
+    labels = [f"{path.name}, frame {frame}" for frame in range(1, shape[axis] + 1)]
+    return Recording(labels, lambda index, selection: check_images(path, read(index, selection)), [])
 
 
-def _multiscale(group) -> dict[str, Any]:
-    attributes = group.attrs.asdict()
-    return (attributes.get("ome", attributes).get("multiscales") or [{}])[0]
+def _missing_chunk(array, place: tuple[int, ...]) -> str | None:
+    """Key of a chunk of an image that is not in a local store; zarr would read its fill value."""
+    root = Path(array.store.root, array.path)
+    sizes = array.shards or array.chunks
+    counts = [range(at // size, at // size + 1) for at, size in zip(place, sizes, strict=False)]
+    counts += [range(-(-n // size)) for n, size in zip(array.shape[-2:], sizes[-2:], strict=True)]
+    keys = (array.metadata.encode_chunk_key(chunk) for chunk in itertools.product(*counts))
+    return next((key for key in keys if not (root / key).exists()), None)
+
+
+def _only_series(store):
+    """The image of a store that Bio-Formats wrote, whose root has a group for each."""
+    if "bioformats2raw.layout" in _attributes(store):
+        series = [group for name, group in store.groups() if name != "OME"]
+        return series[0] if len(series) == 1 else store
+    return store
+
+
+def _attributes(store) -> dict[str, Any]:
+    """NGFF's attributes, which version 0.5 has in `ome`."""
+    attributes = store.attrs.asdict()
+    return attributes.get("ome", attributes)
 
 
 def _image_array(group):
-    """The full-size array of OME-Zarr, or the only array of a group."""
-    if datasets := _multiscale(group).get("datasets"):
+    """The full-size array of OME-Zarr of one image, or the only array of a group."""
+    images = _attributes(group).get("multiscales") or [{}]
+    if len(images) == 1 and (datasets := images[0].get("datasets")):
         return group[datasets[0]["path"]]
     arrays = [array for _, array in group.arrays()]
     return arrays[0] if len(arrays) == 1 else None
 
 
-def _axes(store) -> list[str]:
-    with contextlib.suppress(KeyError, TypeError, AttributeError):
-        return [str(axis["name"]) for axis in _multiscale(store)["axes"]]
-    return []
+def _axes(store, array) -> list[str]:
+    """Names of the axes of an array: NGFF's, those of Zarr 3, or xarray's."""
+    count = array.ndim
+    with contextlib.suppress(KeyError, TypeError, AttributeError, IndexError):
+        axes = [axis_letter(axis["name"], axis.get("type")) for axis in _attributes(store)["multiscales"][0]["axes"]]
+        if len(axes) == count:
+            return axes
+    names = getattr(array.metadata, "dimension_names", None) or array.attrs.asdict().get("_ARRAY_DIMENSIONS")
+    names = [axis_letter("" if name is None else name) for name in names or ()]
+    return names if len(names) == count else [UNNAMED] * count
 
 
 # Milliseconds: between two looks of the watching library, and the longest time for which it gathers changes.
@@ -222,7 +273,7 @@ class WatchedFolder:
                     raise found
                 names += found
         except queue.Empty:
-            return sorted(dict.fromkeys(names), key=natural_key)
+            return natural_order(dict.fromkeys(names))
 
     def _run(self) -> None:
         how = {"step": _STEP, "debounce": _GATHER, "rust_timeout": _LISTED, "yield_on_timeout": True}

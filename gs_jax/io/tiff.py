@@ -1,30 +1,213 @@
-"""Opens TIFF files and decodes their pages; refuses damaged ones in words."""
+"""Opens TIFF files, with the order that they declare of their pages, and decodes these; refuses damaged ones in words.
+
+A page is numbered as in the file, from 0. The images of a stack are in the order of its axes, and may lie in further
+files of its set.
+"""
 
 import contextlib
 import math
+import re
+import warnings
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import tifffile
 from PIL import Image
 
-from ..base.errors import InputError, input_error
+from ..base.errors import InputError, InputWarning, input_error
+from .axes import UNNAMED, axis_letter
 from .files import decoding
+from .names import natural_order
+from .ome import OmePlanes, is_ome, read_ome
 
 # Tags of TIFF/EP: the size of a mosaic's cell and its colours, which are numbered as in "RGB".
 _CELL, _PATTERN = 33421, 33422
+# Keys of ImageJ and of Micro-Manager for axes t, z and c.
+_IMAGEJ, _MICRO_MANAGER = ("frames", "slices", "channels"), ("Frames", "Slices", "Channels")
+# Files of one recording that Micro-Manager continues under further names; the first has no number.
+_CONTINUED = re.compile(r"(.*(?:MMStack|NDTiffStack).*?)(_\d+)?((?:\.ome)?\.tiff?)", re.IGNORECASE)
+# The type of pixels as libtiff leaves them, in the machine's order of bytes, by Pillow's mode.
+_NATIVE = {"L": "L", "I;16": "I;16N", "I;16B": "I;16N", "F": "F;32NF"}
+
+
+class Stack(NamedTuple):
+    """Images of a TIFF in the order that it declares.
+
+    `axes` are names and lengths of its axes before y and x; `images` has file and page of each image, or None of one
+    that is missing between others.
+    """
+
+    axes: list[tuple[str, int]]
+    images: list[tuple[Path, int] | None]
+
+
+class Tiff:
+    """An open TIFF. `count` is the number of its pages, those of a stack with one entry for all included."""
+
+    def __init__(self, path: Path, exits: contextlib.ExitStack, kind: str):
+        self.path, self._exits, self._others = path, exits, {}
+        with decoding(path, kind):
+            # Without what tifffile makes of metadata that name further files: they may be anywhere.
+            flags = {"is_ome": False, "is_mmstack": False, "is_ndtiff": False}
+            self.file = exits.enter_context(tifffile.TiffFile(path, **flags))
+            self.first = self.file.pages.first
+            self.entries = self.count = len(self.file.pages)
+            self._axes = _declared_axes(self.file)
+            if self.entries == 1 and int(self.first.compression) == 1 and self.first.is_contiguous:
+                room = (path.stat().st_size - self.first.dataoffsets[0]) // max(self.first.nbytes, 1)
+                self.count = max(1, min(math.prod(length for _, length in self._axes), room))
+
+    @cached_property
+    def stack(self) -> Stack:
+        """The images that the file declares, in their order, with a warning if fewer are there.
+
+        Raises `InputError` if what it declares does not fit to its pages.
+        """
+        if is_ome(self.first.description) and (stack := self._ome_stack()):
+            return stack
+        pages = [page for page in range(self.count) if not self._is_reduced(page)]
+        declared = math.prod(length for _, length in self._axes)
+        if declared == 1:
+            self._warn_if_cut(len(pages))
+            return self._continued(Stack([(UNNAMED, len(pages))], [(self.path, page) for page in pages]))
+        if declared < len(pages):
+            raise input_error("pages", f"{declared}, as the file declares; choose by --page", len(pages), self.path)
+        return self._continued(self._without_missing(self._axes, [(self.path, page) for page in pages], declared))
+
+    def at(self, image: tuple[Path, int] | None, number: int) -> tuple["Tiff", int]:
+        """The open file of an image of the stack, and its page; `InputError` if it is missing."""
+        if image is None:
+            raise InputError(f"{self.path}: image {number + 1} is not in the file, which declares it.")
+        path, page = image
+        if path == self.path:
+            return self, page
+        if path not in self._others:
+            self._others[path] = self._exits.enter_context(open_tiff(path))
+        return self._others[path], page
+
+    def _ome_stack(self) -> Stack | None:
+        try:
+            images = read_ome(self.path, self.first.description, self.count)
+        except InputError:
+            # Of a single page nothing has to be known, unless it is one of a set.
+            if self.count > 1 or "BinaryOnly" in self.first.description:
+                raise
+            return None
+        if not images and self.count > 1:
+            raise input_error("OME-XML", f"about the file's {self.count} pages", "none of them", self.path)
+        if len(images) > 1:
+            every = [image for each in images for image in each.planes]
+            return Stack([("image", len(images)), *images[0].lengths.items()], every)
+        return self._of_ome(images[0]) if images else None
+
+    def _of_ome(self, ome: OmePlanes) -> Stack:
+        size = self.first.imagelength, self.first.imagewidth
+        if ome.size != size:
+            given = "{} x {} pixels in OME-XML".format(*ome.size)
+            raise input_error("image", "{} x {} pixels, as its page".format(*size), given, self.path)
+        counts = {self.path: self.count}
+        for file in {image[0] for image in ome.planes if image} - {self.path}:
+            if file.is_file():
+                with open_tiff(file) as other:
+                    counts[file] = other.count
+        there = [image if image and image[1] < counts.get(image[0], 0) else None for image in ome.planes]
+        lost = sorted({image[0].name for image in ome.planes if image and image[0] not in counts})
+        return self._continued(self._without_missing(list(ome.lengths.items()), there, len(there), lost))
+
+    def _without_missing(self, axes, images: list, declared: int, lost: list[str] | None = None) -> Stack:
+        """A stack without the missing images at its end, about which it warns."""
+        while images and images[-1] is None:
+            images = images[:-1]
+        if len(images) < declared:
+            where = f"; {', '.join(lost)} is missing" if lost else ""
+            text = f"{self.path}: declares {declared} images and holds {len(images)} whole ones, which are used{where}."
+            warnings.warn(InputWarning(text), stacklevel=2)
+            if len([length for _, length in axes if length != 1]) == 1:
+                axes = [(name, length if length == 1 else len(images)) for name, length in axes]
+        return Stack(axes, images)
+
+    def _continued(self, stack: Stack) -> Stack:
+        """A stack with the images of files that continue this one by their names alone."""
+        match = _CONTINUED.fullmatch(self.path.name)
+        if not match:
+            return stack
+        begin, number, end = match.groups()
+        first = self.path.with_name(f"{begin}{end}")
+        if number and first.is_file():
+            raise InputError(f"{self.path}: is a part of a set of files; give the first, {first.name}.")
+        known = {image[0] for image in stack.images if image}
+        pattern = re.compile(rf"{re.escape(begin)}_\d+{re.escape(end)}", re.IGNORECASE)
+        others = [path for path in self.path.parent.iterdir() if pattern.fullmatch(path.name) and path not in known]
+        if number or not others:
+            return stack
+        long = [place for place, (_, length) in enumerate(stack.axes) if length != 1] or [0]
+        images = list(stack.images)
+        for path in natural_order(others):
+            with open_tiff(path) as other:
+                images += [(path, page) for page in range(other.count)]
+        if len(long) == 1:
+            axes = [(name, len(images) if place == long[0] else n) for place, (name, n) in enumerate(stack.axes)]
+        else:
+            axes = [("file", 1 + len(others)), *stack.axes]
+        return Stack(axes, images)
+
+    def _is_reduced(self, page: int) -> bool:
+        """Whether a page is a smaller copy of another, or its mask; the second tells whether there are any."""
+        if self.entries == 1 or not self._has_reduced:
+            return False
+        with decoding(self.path, "TIFF"):
+            return page > 0 and bool(self.file.pages[page].aspage().subfiletype & 0b101)
+
+    @cached_property
+    def _has_reduced(self) -> bool:
+        with decoding(self.path, "TIFF"):
+            return bool(self.file.pages[1].aspage().subfiletype & 0b101)
+
+    def _warn_if_cut(self, count: int) -> None:
+        """Warn if the entry of a next page is beyond the end of the file."""
+        with decoding(self.path, "TIFF"):
+            place, handle = self.file.pages.next_page_offset, self.file.filehandle
+            handle.seek(place or 0)
+            is_cut = place is not None and any(handle.read(self.file.tiff.offsetsize))
+        if is_cut:
+            whole = "a page that is" if count == 1 else f"{count} pages, which are"
+            warnings.warn(InputWarning(f"{self.path}: is cut off; it still has {whole} used."), stacklevel=2)
 
 
 @contextlib.contextmanager
-def open_tiff(path: Path) -> Iterator[tuple[tifffile.TiffFile, int]]:
-    """Open a TIFF, and count its pages, those of a stack with one entry for all too, as ImageJ writes large ones."""
-    with contextlib.ExitStack() as stack:
-        with decoding(path, "TIFF"):
-            # Without OME, whose metadata may name further files.
-            tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
-            count = max(len(tiff.pages), tiff.series[0].size // max(tiff.pages.first.size, 1))
-        yield tiff, count
+def open_tiff(path: Path, kind: str = "TIFF") -> Iterator[Tiff]:
+    """Open a TIFF, and when they are asked for, the other files of its set; errors call it `kind`."""
+    with contextlib.ExitStack() as exits:
+        yield Tiff(path, exits, kind)
+
+
+def _declared_axes(tiff: tifffile.TiffFile) -> list[tuple[str, int]]:
+    """Names and lengths of the axes before y and x that a file without OME-XML declares; none if it says nothing."""
+    first = tiff.pages.first
+    if imagej := tiff.imagej_metadata:
+        lengths = [int(imagej.get(key, 1)) for key in _IMAGEJ]
+        if lengths[2] == first.samplesperpixel:
+            lengths[2] = 1
+        # Unless it is a hyperstack, ImageJ calls any stack slices.
+        names = "tzc" if imagej.get("hyperstack") or lengths[0] > 1 or lengths[2] > 1 else UNNAMED * 3
+        declared = math.prod(lengths)
+        return list(zip(names, lengths, strict=True)) if declared > 1 else [(UNNAMED, int(imagej.get("images", 1)))]
+    if tiff.is_micromanager:
+        summary = (tiff.micromanager_metadata or {}).get("Summary", {})
+        lengths = [int(summary.get(key) or 1) for key in _MICRO_MANAGER]
+        return list(zip("tzc", lengths, strict=True))
+    series = tiff.series
+    axes = [
+        (axis_letter(name), length)
+        for name, length in zip(series[0].axes, series[0].shape, strict=True)
+        if name not in "YXS"
+    ]
+    if len({(each.axes, each.shape) for each in series}) > 1 or not series:
+        return []
+    return [(UNNAMED, len(series)), *axes] if len(series) > 1 else axes
 
 
 def mosaic_pattern(page: tifffile.TiffPage) -> str | None:
@@ -35,15 +218,15 @@ def mosaic_pattern(page: tifffile.TiffPage) -> str | None:
     return "".join("RGB"[number] for number in bytes(pattern.value))
 
 
-def decode_plane(path: Path, tiff: tifffile.TiffFile, index: int) -> np.ndarray:
-    """Pixels of a page of `open_tiff`, counted from 0, whose declared size has been checked."""
-    if index < len(tiff.pages):
-        return decode_page(path, tiff.pages[index].aspage())
-    first = tiff.pages.first
-    _check_segments(path, first)
-    with decoding(path, "TIFF"):
-        dtype = np.dtype(first.dtype).newbyteorder(tiff.byteorder)
-        return np.array(np.memmap(path, dtype, "r", first.dataoffsets[0] + index * first.nbytes, first.shape))
+def decode_plane(tiff: Tiff, index: int) -> np.ndarray:
+    """Pixels of a page, whose declared size has been checked."""
+    if index < tiff.entries:
+        return decode_page(tiff.path, tiff.file.pages[index].aspage())
+    first = tiff.first
+    _check_segments(tiff.path, first)
+    with decoding(tiff.path, "TIFF"):
+        dtype = np.dtype(first.dtype).newbyteorder(tiff.file.byteorder)
+        return np.array(np.memmap(tiff.path, dtype, "r", first.dataoffsets[0] + index * first.nbytes, first.shape))
 
 
 def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
@@ -57,7 +240,8 @@ def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
         with decoding(path, "TIFF"):
             return page.asarray()
     except InputError as error:
-        if "imagecodecs" not in str(error):
+        # Decoders that are not installed are imported, or looked for in imagecodecs, when they are called.
+        if "imagecodecs" not in str(error) and not isinstance(error.__cause__, ImportError):
             raise
         if (pixels := _decode_by_pillow(path, page)) is not None:
             return pixels
@@ -71,6 +255,9 @@ def _decode_by_pillow(path: Path, page: tifffile.TiffPage) -> np.ndarray | None:
     """Pixels as Pillow's libtiff decodes them (LZW, packed 12 bits), unless it changes their type."""
     with contextlib.suppress(InputError), decoding(path, "TIFF"), Image.open(path, formats=["TIFF"]) as image:
         image.seek(page.index)
+        # Pillow takes float32 for big-endian where the file is, though libtiff has turned it.
+        if image.mode in _NATIVE and all(tile.codec_name == "libtiff" for tile in image.tile):
+            image.tile = [tile._replace(args=(_NATIVE[image.mode], *tile.args[1:])) for tile in image.tile]
         pixels = np.array(image)
         if pixels.shape == page.shape and pixels.dtype.newbyteorder("=") == page.dtype:
             return pixels

@@ -12,12 +12,11 @@ bioformats2raw and ome-zarr-py.
 To add a format, add its suffix to `_FORMATS` with a function that reads it and one that writes it.
 """
 
-import contextlib
 import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -30,7 +29,7 @@ from ..typing import PathLike, Volume
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
 from .provenance import NAMESPACE, Provenance, moved, surface_of
-from .tiff import decode_page
+from .tiff import decode_page, open_tiff
 
 MAX_VOXELS = 10**10
 
@@ -209,14 +208,11 @@ def _imagej_description(voxels: np.ndarray, pitch_um: float, step_um: float, fir
 
 
 def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
-    check_input(path)
-    with contextlib.ExitStack() as stack:
+    with open_tiff(check_input(path), "OME-TIFF") as tiff:
         with decoding(path, "OME-TIFF"):
-            # Pages of this file in their order; tifffile's view of OME may open further files.
-            tiff = stack.enter_context(tifffile.TiffFile(path, is_ome=False))
-            pages = cast(list[tifffile.TiffPage], list(tiff.pages))
+            pages = [page.aspage() for page in tiff.file.pages]
             kinds = {(tuple(page.shape), page.dtype) for page in pages}
-            root = ElementTree.fromstring(tiff.pages.first.description)
+            root = ElementTree.fromstring(tiff.first.description)
         if len(kinds) != 1:
             raise input_error("pages", "of one size and type", f"{len(kinds)} sizes or types", path)
         size, dtype = kinds.pop()
@@ -224,8 +220,9 @@ def _read_tiff(path: Path) -> tuple[np.ndarray, Grid]:
         _check_declared(path, shape, np.dtype(dtype))
         grid = _grid_of_ome(path, root, (len(pages), size[0], size[1]))
         voxels = np.empty(shape, np.float32)
-        for index, page in enumerate(pages):
-            voxels[index] = decode_page(path, page)
+        for index, image in enumerate(tiff.stack.images):
+            file, page = tiff.at(image, index)
+            voxels[index] = decode_page(path, pages[page] if file is tiff else file.file.pages[page].aspage())
     return voxels, grid
 
 

@@ -1,0 +1,112 @@
+"""Names of files as data: their natural order, gaps in numbered series, and names as text of any file format."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import PurePath
+from typing import NamedTuple, TypeVar
+
+Name = TypeVar("Name", str, PurePath)
+
+# A unit after a number, in um. Lengths alone: other units are compared by their letters.
+_UNITS = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
+_UNIT = re.compile(rf"({'|'.join(_UNITS)})(?![a-z])", re.IGNORECASE)
+_SIGNS = {"-": -1, "−": -1, "+": 1}
+# Characters that XML 1.0 cannot hold, and bytes of a name that are not UTF-8, which Python reads as surrogates.
+_NOT_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
+
+
+def plain_text(text: str) -> str:
+    r"""Write characters that no XML or UTF-8 can hold as escapes: the byte E9 as `\xe9`."""
+    return _NOT_TEXT.sub(lambda match: _escaped(ord(match[0])), text)
+
+
+def _escaped(code: int) -> str:
+    # Python's surrogate of a byte that it cannot decode.
+    code = code - 0xDC00 if 0xDC80 <= code <= 0xDCFF else code
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+class _Piece(NamedTuple):
+    """The digits of a number, those of its decimals if it may have any, and the text before and after it."""
+
+    is_first: bool
+    before: str
+    whole: str
+    decimals: str
+    after: str
+
+
+def natural_order(names: Iterable[Name]) -> list[Name]:
+    """Sort names by the numbers in them: `z2` before `z10`, and `z10.25` before `z10.5`.
+
+    Numbers may have decimals and signs, and different units of length. A hyphen is a sign at the beginning, after
+    anything but a letter or digit, or if other names have none in its place. A point divides two numbers, and not
+    decimals, if these decimals end in zeros and are not all of one length (`run1.9`, `run1.10`).
+    """
+    names = list(names)
+    pieces = [_pieces(str(name)) for name in names]
+    decimals, texts, units = defaultdict(set), set(), set()
+    for piece in (piece for each in pieces for piece in each[0]):
+        texts.add(piece.before)
+        if piece.decimals:
+            decimals[piece.before].add(piece.decimals)
+        if unit := _UNIT.match(piece.after):
+            units.add(unit[1].lower())
+    counted = {before for before, digits in decimals.items() if not _are_decimals(digits)}
+    keys = [
+        [*(part for piece in each for part in _key(piece, texts, counted, len(units) > 1)), rest]
+        for each, rest in pieces
+    ]
+    order = sorted(range(len(names)), key=lambda i: (keys[i], str(names[i])))
+    return [names[i] for i in order]
+
+
+def _pieces(name: str) -> tuple[list[_Piece], str]:
+    """The numbers of a name, and the text after the last."""
+    suffix = PurePath(name).suffix
+    stem = name.removesuffix(suffix) if not suffix[1:].isdigit() else name
+    # Numbers with two points are versions or dates.
+    found = list(re.finditer(r"(?<![\d.,])(\d+)[.,](\d+)(?![.,]?\d)|(\d+)", stem))
+    pieces, end = [], 0
+    for number, match in enumerate(found):
+        following = found[number + 1].start() if number + 1 < len(found) else len(stem)
+        whole, decimals = match[1] or match[3], match[2] or ""
+        pieces.append(_Piece(not pieces, stem[end : match.start()], whole, decimals, stem[match.end() : following]))
+        end = match.end()
+    return pieces, name[end:]
+
+
+def _are_decimals(digits: set[str]) -> bool:
+    return len({len(each) for each in digits}) == 1 or not any(each.endswith("0") and each != "0" for each in digits)
+
+
+def _key(piece: _Piece, texts: set[str], counted: set[str], has_units: bool) -> list:
+    before, sign = piece.before, 1
+    # A hyphen alone stands between two numbers, as in dates, or begins the name.
+    can_be = before[-1:] in _SIGNS if before[:-1] else piece.is_first and before in _SIGNS
+    if can_be and (not before[-2:-1].isalnum() or before[:-1] in texts):
+        before, sign = before[:-1], _SIGNS[before[-1]]
+    unit = _UNIT.match(piece.after) if has_units else None
+    scale = sign * (_UNITS[unit[1].lower()] if unit else 1)
+    if piece.decimals and piece.before in counted:
+        return [before, scale * int(piece.whole), ".", int(piece.decimals)]
+    return [before, scale * (float(f"{piece.whole}.{piece.decimals}") if piece.decimals else int(piece.whole))]
+
+
+def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
+    """The two names of a numbered series between which numbers are missing; None without a gap.
+
+    In the series all but one whole number is the same in each name.
+    """
+    split = [re.split(r"(\d+)", name) for name in names]
+    if len({len(each) for each in split}) != 1 or len(names) < 3:
+        return None
+    varying = [place for place, parts in enumerate(zip(*split, strict=True)) if len(set(parts)) > 1]
+    if len(varying) != 1 or varying[0] % 2 == 0:
+        return None
+    numbers = [int(each[varying[0]]) for each in split]
+    steps = [after - before for before, after in zip(numbers[:-1], numbers[1:], strict=True)]
+    # Times in names differ a little from step to step.
+    gap = next((place for place, step in enumerate(steps) if step >= 1.75 * min(steps)), None)
+    return None if gap is None or min(steps) < 1 else (names[gap], names[gap + 1])
