@@ -4,6 +4,7 @@ The exit status is 0 on success; 2 on wrong input, 1 if a file cannot be read or
 SIGTERM, each with one line and no traceback; 1, with a traceback, on faults of the program.
 """
 
+import io
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -46,6 +47,9 @@ COMMANDS = {
 def main(leave: Callable[[int], object] = sys.exit) -> None:
     """Run the command line and exit, after an interrupt by `leave`."""
     partial_outputs.clear()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names of files may hold bytes that are not UTF-8.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         status = commands.main(standalone_mode=False, prog_name="gs-jax")
     except InputError as error:

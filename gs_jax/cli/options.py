@@ -262,7 +262,9 @@ class CaptureOptions:
 
     def recorded(self, provenance: dict[str, str]) -> dict[str, str]:
         """Add the corrections to a provenance."""
-        return provenance | ({"correction": "; ".join(self._lines())} if self.done else {})
+        from ..io.names import plain_text
+
+        return provenance | ({"correction": plain_text("; ".join(self._lines()))} if self.done else {})
 
     def print_corrections(self) -> None:
         """Print what was corrected, a line each, and warnings on standard error."""

@@ -149,6 +149,8 @@ def reconstruct_recording(
     frame,
 ) -> int:
     """Make and write all frames, print a summary, and return the exit status: 1 if a frame failed."""
+    from ..io.names import plain_text
+    from ..io.provenance import input_key
     from ..io.volume_series import VolumeSeries
     from ..io.volumes import plain_depths
     from ..reconstruction.recording import reconstruct_frames, reconstruct_frames_by
@@ -162,7 +164,7 @@ def reconstruct_recording(
     names = recording.names
     provenance = provenance_of(plan.weights, *camera.files, design=design_text)
     request = request_of(provenance, names)
-    provenance[f"input {capture.name}"] = f"{len(names)} frames, {names[0]} to {names[-1]}"
+    provenance[input_key(capture)] = plain_text(f"{len(names)} frames, {names[0]} to {names[-1]}")
     provenance = camera.recorded(provenance)
     provenance |= frame.note if plan.imager.sample is not None else {}
     grid = frame.grid(plan.grid)
@@ -222,7 +224,7 @@ def request_of(provenance: dict[str, str], names: list[str] | None = None) -> di
     request |= {name: text for name, text in provenance.items() if name.startswith(("input ", "design"))}
     request["points"] = str(bool(options.get("points")))
     if names is not None:
-        request["names of frames"] = hashlib.sha256("\n".join(names).encode()).hexdigest()
+        request["names of frames"] = hashlib.sha256("\n".join(names).encode("utf-8", "surrogateescape")).hexdigest()
     return request
 
 

@@ -54,6 +54,7 @@ def watch_folder(
 ) -> None:
     """Make a volume of each capture that comes, until an interrupt, and print a summary."""
     from ..io.captures import read_images
+    from ..io.provenance import input_key
     from ..io.recordings import Recording, WatchedFolder
     from ..io.volume_series import VolumeSeries
     from ..reconstruction.recording import reconstruct_live
@@ -62,7 +63,7 @@ def watch_folder(
     images = lambda index, selection: read_images(folder / series.names[index], selection._replace(page=page))
     provenance = provenance_of(plan.weights, *camera.files, design=design_text)
     request = request_of(provenance)
-    provenance = camera.recorded(provenance | {f"input {folder.name}": "a folder, as captures came"})
+    provenance = camera.recorded(provenance | {input_key(folder): "a folder, as captures came"})
     provenance |= frame.note if plan.imager.sample is not None else {}
     described = {"interval": interval, "request": request, "provenance": provenance}
     series = VolumeSeries(output, None, frame.grid(plan.grid), **described, resume=resume)

@@ -24,6 +24,7 @@ PathLike = str | os.PathLike[str]
 MAX_TEXT_BYTES = 2**26
 # Attempts to remove a folder, and the seconds between them.
 _ATTEMPTS, _PAUSE = 30, 0.05
+_WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 # Files that are being written.
 _TEMPORARY: set[Path] = set()
 # Metadata of a Zarr image, and the journal of `VolumeSeries`. A store with anything else in its root (labels, a plate,
@@ -72,11 +73,13 @@ def check_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
 def check_output(path: PathLike, suffixes: Sequence[str]) -> Path:
     """Return a path that can be written; for calls before a long computation.
 
-    Raises `InputError` if the suffix is none of `suffixes`, the folder is missing or not writable, or the path is a
-    device or a folder, other than a Zarr image that `.zarr` would replace.
+    Raises `InputError` if the suffix is none of `suffixes`, the folder is missing or not writable, the path or the
+    provenance beside it is write-protected, or the path is a device or a folder, other than a Zarr image that `.zarr`
+    would replace.
     """
     check_suffix(path, suffixes)
     _check_target(Path(path))
+    _check_protection(Path(f"{path}.json"))
     return Path(path)
 
 
@@ -102,11 +105,21 @@ def _check_target(path: Path) -> None:
         return
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be written: {_reason(error)}.") from error
+    _check_protection(path)
     is_zarr = path.suffix.lower() == ".zarr"
     if stat.S_ISDIR(mode) and not (is_zarr and _is_only_an_image(path)):
         raise InputError(f"{path}: cannot be written: a folder is replaced only if it is a Zarr image.")
     if not stat.S_ISDIR(mode) and (is_zarr or not stat.S_ISREG(mode)):
         raise InputError(f"{path}: cannot be written: a file or device of another kind has this name.")
+
+
+def _check_protection(path: Path) -> None:
+    """Raise `InputError` if a file or folder is write-protected: for a rename, that of its folder alone would count."""
+    with contextlib.suppress(OSError):
+        # Also where the system lets the superuser write.
+        if not os.stat(path).st_mode & _WRITABLE or not os.access(path, os.W_OK):
+            advice = "choose another name, or allow it by chmod u+w; --force does not"
+            raise InputError(f"{path}: cannot be written: it is write-protected; {advice}.")
 
 
 def _is_only_an_image(folder: Path) -> bool:
@@ -134,6 +147,7 @@ def atomic_write(path: PathLike) -> Iterator[Path]:
             if not temporary.is_dir():
                 with open(temporary, "r+b") as file:
                     os.fsync(file.fileno())
+            _keep_mode(target, temporary)
             _replace(temporary, target)
     finally:
         _remove(temporary)
@@ -164,6 +178,12 @@ def remove_temporaries() -> None:
 def _temporary_beside(path: Path) -> Path:
     # Not by `tempfile`, whose files only their owner can read: the user's umask decides that.
     return path.with_name(f".gs-jax-{uuid.uuid4().hex[:12]}{path.suffix}")
+
+
+def _keep_mode(old: Path, new: Path) -> None:
+    """Give a file, or a folder, the permissions of the one that it replaces."""
+    with contextlib.suppress(FileNotFoundError):
+        os.chmod(new, stat.S_IMODE(os.stat(old).st_mode))
 
 
 def _replace(temporary: Path, path: Path) -> None:
@@ -220,9 +240,9 @@ def write_json(path: PathLike, data: Any) -> None:
 
 
 def write_text(path: PathLike, text: str, suffixes: Sequence[str]) -> None:
-    """Write UTF-8 text; `InputError` as `check_output`."""
+    """Write UTF-8 text, with names that are not UTF-8 as escapes; `InputError` as `check_output`."""
     with atomic_write(check_output(path, suffixes)) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(text, encoding="utf-8", newline="\n", errors="backslashreplace")
 
 
 def _plain(data: Any) -> Any:

@@ -13,6 +13,7 @@ import numpy as np
 from ..base.errors import input_error, needs_extra
 from ..grid import Grid
 from ..typing import Volume
+from .names import plain_text
 from .provenance import KEY, Provenance
 
 CHUNK = 1024
@@ -48,7 +49,7 @@ def _step(path: Path, depths: list[float], pitch: float) -> float:
 
 def title(path: Path) -> str:
     """Name of a volume in its file."""
-    return path.name.removesuffix(path.suffix).removesuffix(".ome")
+    return plain_text(path.name.removesuffix(path.suffix).removesuffix(".ome"))
 
 
 def display_range(voxels: np.ndarray) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from ..base.errors import input_error
 from ..grid import Grid
 from ..typing import PathLike
 from .files import check_input, check_suffix, decoding, read_text, write_json
+from .names import plain_text
 
 Provenance = Mapping[str, str]
 
@@ -34,14 +35,19 @@ SCORE = "score"
 
 def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> dict[str, str]:
     """Provenance of what `command` makes of input files, with their SHA-256, and of the text of a design."""
-    table = {"software": f"gs_jax {__version__}", "command": command}
+    table = {"software": f"gs_jax {__version__}", "command": plain_text(command)}
     for path in map(Path, inputs):
         if path.is_file():
             with path.open("rb") as file:
-                table[f"input {path.name}"] = f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()}"
+                table[input_key(path)] = f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()}"
         else:
-            table[f"input {path.name}"] = "a folder"
+            table[input_key(path)] = "a folder"
     return table | ({"design": design} if design else {})
+
+
+def input_key(path: Path) -> str:
+    """The key under which provenance has an input file."""
+    return f"input {plain_text(path.name)}"
 
 
 def sidecar(path: PathLike) -> Path:

@@ -125,7 +125,7 @@ class VolumeSeries:
     def _append(self, *notes: Note) -> None:
         journal = self.path / JOURNAL
         with disk_errors_name(self.path, journal), open(journal, "a", encoding="utf-8", newline="\n") as file:
-            file.write("".join(json.dumps(note, ensure_ascii=False) + "\n" for note in notes))
+            file.write("".join(json.dumps(note) + "\n" for note in notes))
 
     def _grow(self) -> None:
         """Make room for the frames that were added, and write their names."""
@@ -153,7 +153,7 @@ class VolumeSeries:
                 group.create_array(str(level), shape=size, dtype=volume.dtype, **frame_shards(size))
             lines = [{"request": self.request, "frames": self._declared}]
             lines += [{"frame": frame, "error": reason} for frame, reason in self.failed.items()]
-            text = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
+            text = "".join(json.dumps(line) + "\n" for line in lines)
             (temporary / JOURNAL).write_text(text, encoding="utf-8", newline="\n")
         self._levels = open_levels(self.path, self.grid)
 
