@@ -1,6 +1,5 @@
 """Lens centres on disk: the file that a design names, in whatever unit, order and frame it is."""
 
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, ValidationError
 
-from ..base.errors import InputError
+from ..base.errors import InputError, errors_name_file
 from ..io.files import write_text
+from ..io.lengths import PIXELS, in_mm, unit_of_name
 from ..io.point_tables import read_columns
 from ..io.provenance import Provenance, write_sidecar
 from ..io.toml import Table, one_line
@@ -17,11 +17,8 @@ from ..typing import PathLike
 
 CENTERS_HEADER = "x_mm,y_mm"
 MAX_LENSES = 100_000
-UNITS = ("mm", "um", "px")
 # Keys of `[lens]` that may have a number for each lens, and columns of these names in the file of the centres.
 LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant")
-# As headers write them; both letters that look like a Greek mu.
-_UNIT = {"mm": r"mm|millimet(?:er|re)s?", "um": "[uµμ]m|microns?|micromet(?:er|re)s?", "px": "px|pix|pixels?"}
 
 
 class CentersTable(Table):
@@ -144,11 +141,11 @@ def read_centers(
     """
     path = Path(path)
     numbers, names, _ = read_columns(path, columns, most=MAX_LENSES)
-    unit = _unit(path, names, unit)
-    # A division is exact to the last digit, which a product with 0.001 is not.
-    centers = numbers / {"mm": 1.0, "um": 1000.0, "px": 1 / pixel_pitch}[unit]
-    if (origin or ("corner" if unit == "px" else "center")) == "corner":
-        if unit == "px":
+    units = _units(path, names, unit)
+    in_pixels = units == [PIXELS] * 2
+    centers = numbers / (1 / pixel_pitch) if in_pixels else np.stack(list(map(in_mm, numbers.T, units)), 1)
+    if (origin or ("corner" if in_pixels else "center")) == "corner":
+        if in_pixels:
             middle = np.array([(n - 1) / 2 * pixel_pitch for n in shape[::-1]])
         else:
             middle = np.array(size) / 2 if size else (centers.min(axis=0) + centers.max(axis=0)) / 2
@@ -157,15 +154,14 @@ def read_centers(
 
 
 def unit_of_file(path: PathLike, columns: tuple[str, str] | None = None) -> str | None:
-    """The unit that a file's header says of x and y; None if it says none. `InputError` as `read_columns`."""
-    return _unit_in(read_columns(Path(path), columns, most=MAX_LENSES).names)
+    """The unit that a file's header says of x, or of y alone; None if it says none. `InputError` as `read_columns`."""
+    names = read_columns(Path(path), columns, most=MAX_LENSES).names
+    return _units(Path(path), names, None)[0] if any(_units_in(Path(path), names)) else None
 
 
-def _unit_in(names: tuple[str, str] | None) -> str | None:
-    """The unit that names of columns end in or have in brackets; None if they say none or two."""
-    says = lambda name, unit: re.search(rf"(?<![a-z])(?:{_UNIT[unit]})(?![a-z])", name.lower())
-    found = {unit for name in names or () for unit in UNITS if says(name, unit)}
-    return found.pop() if len(found) == 1 else None
+def _units_in(path: Path, names: tuple[str, str] | None) -> list[str | None]:
+    with errors_name_file(path):
+        return [unit_of_name(name) for name in names or ()]
 
 
 def other_reading(centers: np.ndarray, half: np.ndarray) -> str:
@@ -191,12 +187,16 @@ def write_centers(path: PathLike, centers: Float[np.ndarray, "lens 2"], provenan
     write_sidecar(path, provenance)
 
 
-def _unit(path: Path, names: tuple[str, str] | None, unit: str | None) -> str:
-    found = _unit_in(names)
-    if unit and found and unit != found:
-        header = ",".join(names or ())
+def _units(path: Path, names: tuple[str, str] | None, unit: str | None) -> list[str]:
+    """The units of x and y: those of the header, and where it says none, the given one, the other's, or mm."""
+    found = _units_in(path, names)
+    said = [each for each in found if each]
+    header = ",".join(names or ())
+    if unit and set(said) - {unit}:
         raise InputError(f"{path}: the unit must be that of the header {header:.120}, got {unit}.")
-    return unit or found or "mm"
+    if PIXELS in said and len(set(said)) > 1:
+        raise InputError(f"{path}: both columns must be in pixels, or none, got {header:.120}.")
+    return [each or unit or next(iter(said), "mm") for each in found or (None, None)]
 
 
 def _mirrored(rows: Any) -> Any:

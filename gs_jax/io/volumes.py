@@ -27,14 +27,13 @@ from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
 from .files import atomic_write, check_input, check_output, check_suffix, decoding
+from .lengths import mm_per
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
 from .provenance import NAMESPACE, Provenance, moved, surface_of
 from .tiff import decode_page, open_tiff
 
 MAX_VOXELS = 10**10
 
-_MM_PER_UNIT = {"nm": 1e-6, "µm": 1e-3, "μm": 1e-3, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
-_MM_PER_NAME = {"nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 # Tags of TIFF: a description, and the tag after it, in whose place a second description is written.
 _DESCRIPTION, _AFTER = 270, 271
 
@@ -250,7 +249,7 @@ def ome_length(path: Path, element: ElementTree.Element, name: str, default_unit
     """An attribute of OME-XML in mm; `default_unit` is the schema's, where the attribute `...Unit` is missing."""
     text, unit = element.get(name), element.get(f"{name}Unit", default_unit)
     try:
-        return _mm(float(text or ""), _MM_PER_UNIT[unit])
+        return _mm(float(text or ""), mm_per(unit))
     except (ValueError, KeyError) as error:
         given = "nothing" if text is None else f"{short_repr(text)} in {short_repr(unit)}"
         raise input_error(f"OME-XML `{name}`", "a length in µm", given, path) from error
@@ -298,7 +297,7 @@ def _parse_multiscales(path: Path, attributes: dict[str, Any]) -> tuple[str, lis
     """Name of the full-size array, scale and translation `(z, y, x)` in mm, of NGFF 0.4, or 0.5 (in `ome`)."""
     try:
         (multiscale,) = attributes.get("ome", attributes)["multiscales"]
-        axes = [(axis["name"], _MM_PER_NAME[axis["unit"]]) for axis in multiscale["axes"]]
+        axes = [(axis["name"], mm_per(axis["unit"])) for axis in multiscale["axes"]]
         if [name for name, _ in axes] != ["z", "y", "x"] or "coordinateTransformations" in multiscale:
             raise ValueError("not three axes with one scale each")
         dataset = multiscale["datasets"][0]
