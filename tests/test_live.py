@@ -135,6 +135,36 @@ def test_a_capture_that_is_written_again_replaces_its_volume(tmp_path):
     np.testing.assert_array_equal(level(tmp_path / "v.zarr")[:, 0, 0, 0], [7])
 
 
+@pytest.mark.parametrize("how", ["renamed over it", "later", "again and again"])
+def test_a_name_that_is_overwritten_is_a_new_frame(tmp_path, how):
+    """As by programs that always write the newest capture to one name."""
+    series, path = series_in(tmp_path), tmp_path / "run" / "f1.npy"
+
+    def overwritten(number, before):
+        def step():
+            written = path.with_name(".f.npy") if how == "renamed over it" else path
+            np.save(written, image_of(number))
+            written.replace(path)
+            # A minute after the last one, or at once.
+            at = before.get("at", time.time()) + (60 if how == "later" else 1e-3)
+            os.utime(path, (at, at))
+            before["at"] = at
+            return ["f1.npy"]
+
+        return step
+
+    times = {}
+    Camera(tmp_path, [1], *(overwritten(number, times) for number in (2, 3, 4))).run(series)
+    # One that is written in place at once may be a file that is filled after it is made.
+    expected = [2, 3, 4] if how == "again and again" else [1, 2, 3, 4]
+    np.testing.assert_array_equal(level(tmp_path / "v.zarr")[:, 0, 0, 0], expected)
+    assert series.names == ["f1.npy"] * len(expected)
+    # A later run takes what is written while it lasts.
+    resumed = series_in(tmp_path, resume=True)
+    Camera(tmp_path, lambda: ["f1.npy"], overwritten(5, {"at": times["at"] + 60})).run(resumed)
+    np.testing.assert_array_equal(level(tmp_path / "v.zarr")[:, 0, 0, 0], [*expected, 5])
+
+
 def test_a_bad_capture_over_a_good_one_keeps_its_volume(tmp_path):
     series = series_in(tmp_path)
 

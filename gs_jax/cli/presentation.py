@@ -41,7 +41,7 @@ def report_command(
     from ..apps.report.page import write_report
     from ..apps.report.report_tables import read_tolerance
     from ..design.design import design_text, read_design
-    from ..io.point_tables import read_points
+    from ..io.point_tables import read_scene_points
     from ..io.provenance import SCORE, read_provenance
     from ..io.surfaces import read_surface
     from ..io.volumes import read_volume
@@ -60,7 +60,7 @@ def report_command(
     if surface:
         results["surface"] = read_surface(surface)
     if points:
-        results["points"] = read_points(points)
+        results["points"] = read_scene_points(points)
     if capture:
         camera.imager(microscope.imager())
         results["image"] = camera.read(capture)

@@ -17,6 +17,7 @@ from .pixel_defects import count_saturated, fill_bad_pixels, find_hot_in_capture
 _MIN_GAIN = 0.05
 # Pixels binned by more hold whole spots of a well corrected lens, which look like hot pixels.
 _MAX_SHARP_BINNING = 2
+MAX_LIGHT = 1e15
 _MASK_DTYPES = (*DTYPES, "bool")
 
 
@@ -284,6 +285,9 @@ def _average(name: PathLike, images, readout: Readout) -> tuple[np.ndarray, list
     sizes, saturated = [], []
 
     def inspect(image):
+        # Float32 holds the squares of such pixels, and their sums, in the solvers.
+        if image.dtype.kind == "f" and image.size and (most := float(np.abs(image).max())) > MAX_LIGHT:
+            raise input_error("pixels", f"at most {MAX_LIGHT:g} in size", f"{most:g}", name)
         sizes.append(image.size)
         saturated.append(count_saturated(image))
         return image

@@ -6,11 +6,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 from typing import NamedTuple, TypeVar
 
+from .lengths import mm_per
+
 Name = TypeVar("Name", str, PurePath)
 
-# A unit after a number, in um. Lengths alone: other units are compared by their letters.
-_UNITS = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4}
-_UNIT = re.compile(rf"({'|'.join(_UNITS)})(?![a-z])", re.IGNORECASE)
+# A unit after a number. Lengths alone: other units are compared by their letters.
+_UNIT = re.compile(r"([nmcuµμ]m)(?![a-z])", re.IGNORECASE)
 _SIGNS = {"-": -1, "−": -1, "+": 1}
 # Characters that XML 1.0 cannot hold, and bytes of a name that are not UTF-8, which Python reads as surrogates.
 _NOT_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
@@ -88,7 +89,7 @@ def _key(piece: _Piece, texts: set[str], counted: set[str], has_units: bool) -> 
     if can_be and (not before[-2:-1].isalnum() or before[:-1] in texts):
         before, sign = before[:-1], _SIGNS[before[-1]]
     unit = _UNIT.match(piece.after) if has_units else None
-    scale = sign * (_UNITS[unit[1].lower()] if unit else 1)
+    scale = sign * (mm_per(unit[1].lower()) if unit else 1)
     if piece.decimals and piece.before in counted:
         return [before, scale * int(piece.whole), ".", int(piece.decimals)]
     return [before, scale * (float(f"{piece.whole}.{piece.decimals}") if piece.decimals else int(piece.whole))]

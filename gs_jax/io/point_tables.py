@@ -49,10 +49,24 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
     >>> gs.read_points("points.csv")
     array([[ 0.5, -0.4, 19.5,  1. ]])
     """
+    return _read_points(path)[0]
+
+
+def read_scene_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
+    """Points of one scene, as `read_points`; `InputError` if a column `frame` has those of several."""
+    points, more = _read_points(path)
+    if (count := len(np.unique(more.get("frame", [])))) > 1:
+        raise input_error("column frame", "of one frame, which is one scene", f"{count} frames", path)
+    return points
+
+
+def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[str, Float64[np.ndarray, " point"]]]:
+    """Points with depths from the array, and further columns by name."""
     with check_input(path).open("rb") as file:
         first = file.readline(_MAX_HEADER).decode("utf-8-sig", "replace").rstrip("\r\n")
-    header = first if first.startswith(f"{POINTS_HEADER},") else POINTS_HEADER
-    table, names = read_table(path, header, MAX_POINTS), header.split(",")
+    names = [name.strip() for name in next(csv.reader([first], delimiter=_separator(first)), [])]
+    names = names if names[:4] == POINTS_HEADER.split(",") else POINTS_HEADER.split(",")
+    table = read_table(path, ",".join(names), MAX_POINTS)
     points = np.ascontiguousarray(table[:, :4])
     if SURFACE in names:
         points[:, 2] += table[:, names.index(SURFACE)]
@@ -63,7 +77,7 @@ def read_points(path: PathLike) -> Float64[np.ndarray, "point 4"]:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise input_error(f"point {row + 1}, {name}", allowed, float(points[row, column]), path)
-    return points
+    return points, dict(zip(names[4:], table[:, 4:].T, strict=True))
 
 
 def write_points(
@@ -137,12 +151,16 @@ def read_positions(
 
     The header has some of `x_mm`, `y_mm`, `z_mm`, and `capture` if captures have several sources: the number of the
     capture from 1, or the name of its file. Without that column there is a line per capture, in their order. An empty
-    cell and a missing column are unknown.
+    cell and a missing column are unknown. Values are separated as in `read_table`.
 
     Raises `InputError` if the file cannot be read, the header has other columns, or a cell is neither empty nor
     allowed.
     """
-    lines = csv.DictReader(io.StringIO(read_text(path), newline=""), skipinitialspace=True, restkey="", restval="")
+    text = read_text(path)
+    separator = _separator(text.partition("\n")[0])
+    lines = csv.DictReader(
+        io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, restkey="", restval=""
+    )
     names = [name.strip() for name in lines.fieldnames or []]
     if not names or set(names) - {*_POSITION, _CAPTURE} or len(set(names)) < len(names):
         raise input_error("header", f"some of {_CAPTURE},{','.join(_POSITION)}", short_repr(",".join(names)), path)
@@ -152,7 +170,7 @@ def read_positions(
         place = f"line {lines.line_num}"
         if "" in line:
             raise input_error(place, f"{','.join(names)}", "more values", path)
-        cells = [(name, (line.get(name) or "").strip()) for name in _POSITION]
+        cells = [(name, _decimal((line.get(name) or "").strip(), separator)) for name in _POSITION]
         allowed = "a number of mm, or nothing if it is not known"
         points.append([_number(path, f"{place}, {name}", cell, allowed) if cell else math.nan for name, cell in cells])
         capture = len(sources)
@@ -175,6 +193,8 @@ def _capture(path: PathLike, place: str, cell: str, captures: Sequence[PathLike]
 def read_table(path: PathLike, header: str, max_rows: int) -> Float64[np.ndarray, "row column"]:
     """Read the numbers of a CSV file whose first line is `header`; without rows the shape is `(0, column)`.
 
+    A semicolon or a tab in the first line separates values, in place of commas, which are then decimal ones.
+
     Raises `InputError` if it cannot be read, has another header, a line with too many or too few values, a value that
     is not a finite number, or more than `max_rows` rows.
     """
@@ -182,15 +202,18 @@ def read_table(path: PathLike, header: str, max_rows: int) -> Float64[np.ndarray
     text = read_text(path, max(MAX_TEXT_BYTES, max_rows * len(names) * _NUMBER_BYTES))
     if (table := _plain_table(text, header, max_rows)) is not None:
         return table
-    lines = csv.reader(io.StringIO(text, newline=""))
+    separator = _separator(text.partition("\n")[0])
+    lines = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     numbers = []
     try:
         first = next(lines, [])
-        if first != names:
+        if (first if separator == "," else [name.strip() for name in first]) != names:
             raise input_error("header", header, short_repr(",".join(first)), path)
         for line in lines:
             if line:
-                numbers.append(_numbers(path, f"line {lines.line_num}", names, line))
+                numbers.append(
+                    _numbers(path, f"line {lines.line_num}", names, [_decimal(cell, separator) for cell in line])
+                )
             if len(numbers) > max_rows:
                 raise input_error("table", f"at most {max_rows} rows below {header}", "more", path)
     except csv.Error as error:
@@ -274,6 +297,10 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
         if (plain := _load_numbers((line for _, line in body), delimiter, 2)) is not None:
             return Columns(plain[:, at], names, {})
     further = {name: header.index(name) for name in also if header and name in header}
+    for name in header or ():
+        stem = f"{name.rpartition('_')[0]}_mm"
+        if name not in also and stem in also:
+            raise input_error(f"column {short_repr(name)}", stem, "another unit", path)
     if twice := next((name for name in further if (header or []).count(name) > 1), None):
         raise input_error(f"column {short_repr(twice)}", "in the header once", "several", path)
     called, places = [*(names or "xy"), *further], [*at, *further.values()]
@@ -286,6 +313,11 @@ def read_columns(path: Path, wanted: Sequence[str] | None = None, *, most: int, 
         rows.append(_numbers(path, f"line {number}", called, [_decimal(cells[i], separator) for i in places]))
     table = np.array(rows, dtype=float).reshape(-1, len(places))
     return Columns(table[:, :2], names, dict(zip(further, table[:, 2:].T, strict=True)))
+
+
+def _separator(first: str) -> str:
+    """The separator of a table by its first line, which has names: a comma unless it has a semicolon or a tab."""
+    return next((mark for mark in _SEPARATORS if mark in first), ",")
 
 
 def _text(path: Path) -> str:

@@ -247,10 +247,11 @@ class _NotWhole(Exception):
 
 
 class _Stamp(NamedTuple):
-    """Size of a file and time of its last change, by which it is seen whether it was written to."""
+    """Size of a file, time of its last change, and its number, by which it is seen whether it was written to."""
 
     size: int
     changed: float
+    inode: int
 
 
 class _Queue:
@@ -259,27 +260,45 @@ class _Queue:
     def __init__(self, series: VolumeSeries, folder: Path):
         self.series, self.folder = series, folder
         self.numbers = {name: number for number, name in enumerate(series.names)}
-        self.waiting: dict[int, None] = dict.fromkeys(series.unfinished)
+        # Of captures that came under one name, the file has the last.
+        last = set(self.numbers.values())
+        self.waiting: dict[int, None] = dict.fromkeys(frame for frame in series.unfinished if frame in last)
         # What was read of each frame, and the times at which frames that are not whole are read for the last time.
         self.stamps: dict[int, _Stamp | None] = {}
         self.deadlines: dict[int, float] = {}
+        # Names that were written to after a volume was made.
+        self.rewritten: set[str] = set()
 
     def add(self, name: str) -> None:
-        """Take a new capture, or one that was written to since it was read."""
+        """Take a new capture, or one that was written to since it was read.
+
+        A program may make a file and fill it later; what it then writes under that name is another capture.
+        """
         frame = self.numbers.get(name)
+        if frame is not None and frame not in self.waiting:
+            # Of a capture of an earlier run, only what is written from now on counts.
+            before = self.stamps.setdefault(frame, now := self.stamp(frame))
+            if before == now:
+                return
+            if frame in self.series.finished:
+                if before and now and self._is_another(name, before, now):
+                    frame = None
+                self.rewritten.add(name)
         if frame is None:
             frame = self.numbers[name] = self.series.add(name)
-        elif frame not in self.stamps or self.stamps[frame] == self.stamp(frame):
-            return
         self.deadlines.pop(frame, None)
         self.waiting[frame] = None
+
+    def _is_another(self, name: str, before: _Stamp, now: _Stamp) -> bool:
+        is_later = now.changed > before.changed + SETTLED
+        return name in self.rewritten or now.inode != before.inode or is_later
 
     def stamp(self, frame: int) -> _Stamp | None:
         try:
             found = os.stat(self.folder / self.series.names[frame])
         except OSError:
             return None
-        return _Stamp(found.st_size, found.st_mtime)
+        return _Stamp(found.st_size, found.st_mtime, found.st_ino)
 
     @property
     def patience(self) -> float:

@@ -12,12 +12,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
 from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite
-from ..base.errors import InputError, short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid, Sensor
-from ..io.point_tables import read_points
+from ..io.point_tables import read_scene_points
 from ..io.volumes import read_volume
 from ..layers import object_index
 from ..optics.field_varying import field_varying_psf
@@ -35,6 +35,8 @@ OPTICS = tuple(level for level in FIDELITIES if level != "pinhole")
 # Spacing of the reduced depths at which the PSF of points is computed, mm: between, it changes by less than a pixel's
 # width; and the number of these depths held in memory at once.
 _STEP, _SLAB = 0.1, 48
+# Largest intensity, such that float32 holds sums of many.
+MAX_LIGHT = 1e30
 # Mean from which `poisson` uses an expansion. The first term of the sum below is larger than `_poisson_by_sum` needs.
 EXPANDED = 16.0
 # Rows exposed at once: their data stay in the cache.
@@ -44,7 +46,7 @@ _ROWS = 16
 def read_scene(path: PathLike) -> tuple[np.ndarray, Grid | None]:
     """Read a scene: points `(point, 4)` from a CSV file, else a volume with its grid."""
     if Path(path).suffix.lower() == ".csv":
-        return read_points(path), None
+        return read_scene_points(path), None
     return read_volume(path)
 
 
@@ -82,9 +84,9 @@ def simulate(
     Raises
     ------
     InputError
-        If an option does not exist, a voxel is negative, a number is not finite, a point's depth is not positive, a
-        depth is before the object's medium, the work does not fit into the memory, or a depth is blurred over more than
-        128 pixels each way ("near").
+        If an option does not exist, a voxel is negative, an intensity is above 1e30, a number is not finite, a point's
+        depth is not positive, a depth is before the object's medium, the work does not fit into the memory, or a depth
+        is blurred over more than 128 pixels each way ("near").
 
     Examples
     --------
@@ -105,6 +107,9 @@ def simulate(
     if psf not in (None, *PSFS):
         raise InputError(f"`psf` must be one of {', '.join(PSFS)}, got {short_repr(psf)}.")
     check_beyond(imager, np.asarray(scene)[:, 2] if grid is None else np.asarray(grid.depths), "scene: depths")
+    light = np.asarray(scene)[:, 3] if grid is None else np.asarray(scene)
+    if light.size and (most := float(np.max(light))) > MAX_LIGHT:
+        raise input_error("scene: intensity", f"at most {MAX_LIGHT:g}", f"{most:g}")
     kind = "full" if optics == "full" else psf or "diffraction"
 
     def image_of(imager):

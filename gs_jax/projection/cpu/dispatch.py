@@ -3,6 +3,8 @@
 import ctypes
 import os
 import sys
+import warnings
+from contextlib import suppress
 from functools import cache
 from inspect import unwrap
 from pathlib import Path
@@ -14,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import ShapeDtypeStruct
 from numba import cfunc, types
+from numba.core.caching import FunctionCache
 
 from ...geometry import FALLOFF, field_limit
 from ..convolution import spectrum
@@ -78,7 +81,26 @@ def _compile(function, result, arguments) -> Any:
     """A C function, compiled or read from numba's cache."""
     # Numba checks only the function's own file for changes; the hash of all files is part of the signature instead.
     signature = result(*[types.int64] * arguments, types.literal(_sources_hash()))
-    return cfunc(signature, cache=True, **FAST)(unwrap(function))
+    compile_it = lambda cache: cfunc(signature, cache=cache, **FAST)(unwrap(function))
+    try:
+        return compile_it(True)
+    except Exception as error:
+        # Of any type, where files in the cache are damaged.
+        folder = _cache_folder(function)
+        if folder is None or not folder.is_dir():
+            raise
+        compiled = compile_it(False)
+        reason = f"{type(error).__name__}: {error}"
+        text = f"numba's cache is damaged, and kernels are compiled anew each time; delete {folder} ({reason:.100})"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
+        return compiled
+
+
+def _cache_folder(function) -> Path | None:
+    """Where numba keeps the machine code of a function; None if it finds no folder."""
+    with suppress(RuntimeError):
+        return Path(FunctionCache(unwrap(function)).cache_path)
+    return None
 
 
 @cache
