@@ -111,7 +111,7 @@ def deconvolve_command(
 
     from ..io.captures import write_capture
     from ..io.files import check_output
-    from ..io.plane_stacks import STACK_SUFFIXES, write_planes
+    from ..io.plane_stacks import STACK_SUFFIXES, spot_names, write_planes
     from ..reconstruction.deconvolution import bin_pixels, deconvolve, make_solver
     from ..reconstruction.field_fit import fit_field
 
@@ -130,6 +130,7 @@ def deconvolve_command(
         raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
     if depths and depths[0] <= 0 and voxel_um and output.suffix.lower() != ".npy":
         raise input_error("z_mm", "positive with --voxel-um", f"{depths[0]:g}", psf_places)
+    names = spot_names(psf, psf_page)
     solver = make_solver(method, steps, weights)
     with Progress() as progress:
         with progress.step("Reading"):
@@ -151,6 +152,9 @@ def deconvolve_command(
             else:
                 write_planes(output, planes, depths, voxel_um and voxel_um * binning / 1000, provenance)
     camera.print_corrections()
+    if len(names) > 1 and not fit:
+        at = [f"at {depth:g} mm" for depth in depths] if depths else [f"is plane {n + 1}" for n in range(len(names))]
+        click.echo(f"PSFs: {', '.join(f'{name} {place}' for name, place in zip(names, at, strict=True))}")
     if fit:
         click.echo(
             f"{psf_places}: {fit.rank} components explain {len(spots)} PSFs to {fit.error:.2g} of their RMS, those at "

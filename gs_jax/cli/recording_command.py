@@ -3,6 +3,7 @@
 import atexit
 import hashlib
 import time
+import warnings
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import click
 
-from ..base.errors import InputError
+from ..base.errors import InputError, InputWarning
 from ..base.machine import Workers
 from ..base.progress import Progress
 from .options import UM, CaptureOptions, Number, depth_range
@@ -59,6 +60,7 @@ def recording_options(command):
 
 def check_recording(capture: Path, recording, output: Path, *, resume: bool, given: dict[str, Any], force: bool):
     """Raise `InputError` if the output cannot hold a recording, or `given` are options of recordings without one."""
+    from ..io.names import first_gap
     from ..io.volume_series import check_replaceable
 
     if recording is None:
@@ -75,6 +77,11 @@ def check_recording(capture: Path, recording, output: Path, *, resume: bool, giv
         raise InputError(f"-o must be VOLUME.zarr, which has a time axis, for {count} frames, got {output}.")
     if not (resume or force):
         check_replaceable(output)
+    if (given["--frame-interval"] or given["--track"]) and (gap := first_gap(recording.names)):
+        text = (
+            f"{capture}: captures are missing between {gap[0]} and {gap[1]}; frames are taken as evenly spaced in time"
+        )
+        warnings.warn(InputWarning(f"{text}."), stacklevel=2)
 
 
 def open_frames(capture: Path, camera: CaptureOptions, plan):

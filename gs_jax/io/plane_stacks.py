@@ -1,5 +1,6 @@
 """Stacks of planes: measured PSFs, read from pages and files, and volumes of which not all lengths are known."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,12 @@ import numpy as np
 import tifffile
 from jaxtyping import Float32
 
-from ..base.errors import input_error
+from ..base.errors import InputWarning, input_error
 from ..grid import Grid
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
 from .captures import Selection, read_images, size_text
 from .files import atomic_write, check_output
+from .names import natural_order
 from .ngff import title, um
 from .provenance import NAMESPACE, Provenance, write_sidecar
 from .recordings import Recording, open_recording
@@ -59,6 +61,24 @@ def read_spots(
                     raise input_error("image", allowed, size_text(images[0].shape), path.parent / name)
                 prepared = prepared or _prepare(size, readout, correction)
                 yield path, read_frame(name, iter(images), prepared, readout)
+
+
+def spot_names(paths: Sequence[Path], page: int | str | None = None) -> list[str]:
+    """Names of the images of `read_spots`, in their order; warns where files are in the order of texts, not numbers.
+
+    Raises `InputError` as `open_recording`.
+    """
+    names = [path.name for path in paths]
+    if names == sorted(names) and names != (ordered := natural_order(names)):
+        text = f"{names[0]} to {names[-1]} are taken in this order; by their numbers {ordered[0]} is the first"
+        warnings.warn(
+            InputWarning(f"{text}, and {ordered[-1]} the last: give their folder to sort them so."), stacklevel=2
+        )
+    names = []
+    for path in paths:
+        with open_recording(path, page=page, axes="tz") as several:
+            names += several.names if several else [path.name]
+    return names
 
 
 def _prepare(size: tuple[int, int], readout: Readout, correction: Correction) -> Prepared:
