@@ -715,16 +715,40 @@ def test_only_an_image_in_zarr_is_replaced(tmp_path):
     assert (path / "thesis.tex").read_text() == "years of work"
 
 
+def mode_of(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
 def test_mode_and_links(tmp_path):
+    """A file that is replaced keeps its mode, a new one has what the umask leaves; so have Zarr folders."""
     (tmp_path / "real.json").write_text("old")
     (tmp_path / "link.json").symlink_to("real.json")
+    write_volume(tmp_path / "a.zarr", VOLUME, GRID)
+    (tmp_path / "real.json").chmod(0o604)
+    (tmp_path / "a.zarr").chmod(0o710)
     old = os.umask(0o027)
     try:
         write_json(tmp_path / "link.json", {"a": 1})
+        write_json(tmp_path / "new.json", {"a": 1})
+        write_volume(tmp_path / "a.zarr", VOLUME, GRID)
     finally:
         os.umask(old)
     assert (tmp_path / "link.json").is_symlink() and json.loads((tmp_path / "real.json").read_text()) == {"a": 1}
-    assert stat.S_IMODE((tmp_path / "real.json").stat().st_mode) == 0o640  # what the umask leaves
+    assert [mode_of(tmp_path / name) for name in ("real.json", "new.json", "a.zarr")] == [0o604, 0o640, 0o710]
+
+
+@pytest.mark.parametrize("name", ["a.ome.tif", "a.zarr", "a.csv", "a.csv.json"])
+def test_write_protection_is_respected(tmp_path, name):
+    """By the mode, which the superuser could ignore; also of the provenance beside a file."""
+    path, output = tmp_path / name, tmp_path / name.removesuffix(".json")
+    if name == "a.zarr":
+        write_volume(path, VOLUME, GRID)
+    else:
+        path.write_text("{}")
+    path.chmod(mode := 0o555 if name == "a.zarr" else 0o444)
+    write = (lambda path: write_points(path, np.ones((1, 4)))) if output.suffix == ".csv" else None
+    refusal(write or (lambda path: write_volume(path, VOLUME, GRID)), output, words=["write-protected", "chmod u+w"])
+    assert mode_of(path) == mode and path.is_dir() == (name == "a.zarr")
 
 
 def test_a_bare_name_is_in_the_working_folder(tmp_path, monkeypatch):

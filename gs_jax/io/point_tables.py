@@ -64,7 +64,7 @@ def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[s
     """Points with depths from the array, and further columns by name."""
     with check_input(path).open("rb") as file:
         first = file.readline(_MAX_HEADER).decode("utf-8-sig", "replace").rstrip("\r\n")
-    names = [name.strip() for name in next(csv.reader([first], delimiter=_separator(first)), [])]
+    names = [name.strip(' "') for name in first.split(_separator(first))]
     names = names if names[:4] == POINTS_HEADER.split(",") else POINTS_HEADER.split(",")
     table = read_table(path, ",".join(names), MAX_POINTS)
     points = np.ascontiguousarray(table[:, :4])
