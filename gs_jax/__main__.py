@@ -47,9 +47,10 @@ COMMANDS = {
 def main(leave: Callable[[int], object] = sys.exit) -> None:
     """Run the command line and exit, after an interrupt by `leave`."""
     partial_outputs.clear()
-    if isinstance(sys.stdout, io.TextIOWrapper):
+    for stream in (sys.stdout, sys.stderr):
         # Names of files may hold bytes that are not UTF-8.
-        sys.stdout.reconfigure(errors="backslashreplace")
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         status = commands.main(standalone_mode=False, prog_name="gs-jax")
     except InputError as error:

@@ -1,12 +1,13 @@
 """Captures as cameras and their programs deliver them, and what is said of those that need a choice."""
 
 import struct
+import sys
 import zlib
 
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from gs_jax import read_capture
 from gs_jax.base.errors import InputError
@@ -54,6 +55,79 @@ def test_lzw(tmp_path, dtype, differences):
     found = read_capture(tmp_path / "a.tif")
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, pixels)
+
+
+def lzw(data):
+    """LZW of codes of 9 bits alone: the table is cleared before it grows beyond them."""
+    codes = [code for at in range(0, len(data), 200) for code in (256, *data[at : at + 200])]
+    bits = "".join(f"{code:09b}" for code in (*codes, 257))
+    return int(bits.ljust(-(-len(bits) // 8) * 8, "0"), 2).to_bytes(-(-len(bits) // 8), "big")
+
+
+def differences(pixels, predictor, order):
+    """Bytes of rows, as they are (1), of differences of neighbours (2), or of differences of bytes of floats (3)."""
+    rows = pixels.astype(pixels.dtype.newbyteorder(order))
+    if predictor == 2:
+        rows[:, 1:] = np.diff(pixels, axis=1)
+    elif predictor == 3:
+        # The highest bytes of a row first.
+        high_first = pixels.astype(">f4").view(np.uint8).reshape(*pixels.shape, 4)
+        rows = np.moveaxis(high_first, -1, 1).reshape(len(pixels), -1)
+        rows[:, 1:] = np.diff(rows.copy(), axis=1)
+    return rows.tobytes()
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "old deflate", "packbits"])
+@pytest.mark.parametrize(
+    ("dtype", "predictor"),
+    [("uint8", 1), ("uint16", 1), ("float32", 1), ("uint8", 2), ("uint16", 2), ("float32", 3)],
+)
+def test_bytes_in_either_order(tmp_path, order, compression, dtype, predictor):
+    """Whichever of the two libraries decodes them."""
+    pixels = (GREY >> 8).astype(dtype) / (dtype == "float32" and 3 or 1)
+    pixels = pixels.astype(dtype)
+    if compression in ("none", "packbits") and predictor > 1:
+        return
+    data = differences(pixels, predictor, order)
+    runs = b"".join(bytes([len(part) - 1]) + part for part in (data[at : at + 128] for at in range(0, len(data), 128)))
+    codes = {"none": 1, "lzw": 5, "deflate": 8, "old deflate": 32946, "packbits": 32773}
+    coded = {"none": data, "lzw": lzw(data), "packbits": runs}.get(compression, zlib.compress(data))
+    rows, columns = pixels.shape
+    tags = {256: columns, 257: rows, 258: 8 * pixels.itemsize, 259: codes[compression], 262: 1, 273: 0, 277: 1}
+    tags |= {278: rows, 279: len(coded), 317: predictor, 339: 3 if dtype == "float32" else 1}
+    tags[273] = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
+    (tmp_path / "a.tif").write_bytes(head + entries + bytes(4) + coded)
+    found = read_capture(tmp_path / "a.tif")
+    assert found.dtype == dtype and found.dtype.isnative
+    np.testing.assert_array_equal(found, pixels)
+
+
+@pytest.mark.parametrize("bigtiff", [False, True])
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_big_endian_stacks_of_one_entry(tmp_path, dtype, bigtiff):
+    stack = STACK.astype(dtype)
+    options = {"bigtiff": bigtiff, "photometric": "minisblack", "metadata": {"axes": "TYX", "truncate": True}}
+    tifffile.imwrite(tmp_path / "a.tif", stack, byteorder=">", **options)
+    for page in (1, 5):
+        found = read_capture(tmp_path / "a.tif", page=page)
+        assert found.dtype.isnative
+        np.testing.assert_array_equal(found, stack[page - 1])
+
+
+def test_a_missing_decoder_is_named_whatever_fails_first(tmp_path, monkeypatch):
+    """As a module, or in tifffile's words. Pillow always has LZW: what it cannot decode is damaged."""
+    monkeypatch.setitem(sys.modules, "compression.zstd", None)
+    monkeypatch.setattr("gs_jax.io.tiff.Image.open", lambda *_, **__: (_ for _ in ()).throw(UnidentifiedImageError()))
+    for code, name in {50000: "ZSTD", 34712: "JPEG2000", 34887: "LERC", 50001: "WEBP", 5: "LZW"}.items():
+        tifffile.imwrite(tmp_path / "a.tif", GREY, compression="zlib")
+        with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as file:
+            file.pages.first.tags[259].overwrite(code)
+        refused(tmp_path / "a.tif", [f"no decoder for {name} compression is installed", "pip install imagecodecs"])
+    monkeypatch.undo()
+    refused(tmp_path / "a.tif", ["not a whole and valid TIFF"])
 
 
 def packed(pixels, bits):

@@ -1,5 +1,6 @@
 """Names of files as data: their natural order, gaps in numbered series, and names as text of any file format."""
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -56,17 +57,19 @@ def natural_order(names: Iterable[Name]) -> list[Name]:
             units.add(unit[1].lower())
     counted = {before for before, digits in decimals.items() if not _are_decimals(digits)}
     keys = [
-        [*(part for piece in each for part in _key(piece, texts, counted, len(units) > 1)), rest]
-        for each, rest in pieces
+        # Text and numbers alternate, also where a name ends and another goes on.
+        [*(part for piece in each for part in _key(piece, texts, counted, len(units) > 1)), rest, -math.inf, suffix]
+        for each, rest, suffix in pieces
     ]
     order = sorted(range(len(names)), key=lambda i: (keys[i], str(names[i])))
     return [names[i] for i in order]
 
 
-def _pieces(name: str) -> tuple[list[_Piece], str]:
-    """The numbers of a name, and the text after the last."""
+def _pieces(name: str) -> tuple[list[_Piece], str, str]:
+    """The numbers of a name, the text after the last, and the suffix."""
     suffix = PurePath(name).suffix
-    stem = name.removesuffix(suffix) if not suffix[1:].isdigit() else name
+    suffix = "" if suffix[1:].isdigit() else suffix
+    stem = name.removesuffix(suffix)
     # Numbers with two points are versions or dates.
     found = list(re.finditer(r"(?<![\d.,])(\d+)[.,](\d+)(?![.,]?\d)|(\d+)", stem))
     pieces, end = [], 0
@@ -75,7 +78,7 @@ def _pieces(name: str) -> tuple[list[_Piece], str]:
         whole, decimals = match[1] or match[3], match[2] or ""
         pieces.append(_Piece(not pieces, stem[end : match.start()], whole, decimals, stem[match.end() : following]))
         end = match.end()
-    return pieces, name[end:]
+    return pieces, stem[end:], suffix
 
 
 def _are_decimals(digits: set[str]) -> bool:

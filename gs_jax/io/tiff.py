@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import tifffile
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from ..base.errors import InputError, InputWarning, input_error
 from .axes import UNNAMED, axis_letter
@@ -25,6 +25,8 @@ from .ome import OmePlanes, is_ome, read_ome
 
 # Tags of TIFF/EP: the size of a mosaic's cell and its colours, which are numbered as in "RGB".
 _CELL, _PATTERN = 33421, 33422
+# Its number among compressions.
+_LZW = 5
 # Keys of ImageJ and of Micro-Manager for axes t, z and c.
 _IMAGEJ, _MICRO_MANAGER = ("frames", "slices", "channels"), ("Frames", "Slices", "Channels")
 # Files of one recording that Micro-Manager continues under further names; the first has no number.
@@ -252,16 +254,25 @@ def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
 
 
 def _decode_by_pillow(path: Path, page: tifffile.TiffPage) -> np.ndarray | None:
-    """Pixels as Pillow's libtiff decodes them (LZW, packed 12 bits), unless it changes their type."""
-    with contextlib.suppress(InputError), decoding(path, "TIFF"), Image.open(path, formats=["TIFF"]) as image:
-        image.seek(page.index)
-        # Pillow takes float32 for big-endian where the file is, though libtiff has turned it.
-        if image.mode in _NATIVE and all(tile.codec_name == "libtiff" for tile in image.tile):
-            image.tile = [tile._replace(args=(_NATIVE[image.mode], *tile.args[1:])) for tile in image.tile]
-        pixels = np.array(image)
-        if pixels.shape == page.shape and pixels.dtype.newbyteorder("=") == page.dtype:
-            return pixels
-    return None
+    """Pixels as Pillow's libtiff decodes them (LZW, packed 12 bits), unless it does not, or changes their type."""
+    try:
+        with decoding(path, "TIFF"), Image.open(path, formats=["TIFF"]) as image:
+            image.seek(page.index)
+            # Pillow takes float32 for big-endian where the file is, though libtiff has turned it.
+            if image.mode in _NATIVE and all(tile.codec_name == "libtiff" for tile in image.tile):
+                image.tile = [tile._replace(args=(_NATIVE[image.mode], *tile.args[1:])) for tile in image.tile]
+            pixels = np.array(image)
+    except InputError as error:
+        # Every libtiff has LZW: what it cannot decode is damaged, unless Pillow has no such pixels.
+        cause = error.__cause__
+        if (
+            int(page.compression) == _LZW
+            and isinstance(cause, OSError)
+            and not isinstance(cause, UnidentifiedImageError)
+        ):
+            raise
+        return None
+    return pixels if pixels.shape == page.shape and pixels.dtype.newbyteorder("=") == page.dtype else None
 
 
 def _check_segments(path: Path, page: tifffile.TiffPage) -> None:
