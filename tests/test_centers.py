@@ -60,6 +60,48 @@ def test_columns_by_name_and_unit_by_key(tmp_path):
     message_of(with_file(tmp_path, "1,2\n", centers_columns=["c", "d"]), "no header", "'c' and 'd'")
 
 
+@pytest.mark.parametrize(
+    ("header", "factors"),
+    [
+        ("x_cm,y_cm", (10, 10)),
+        ("x_m,y_m", (1000, 1000)),
+        ("x_inch,y_inch", (25.4, 25.4)),
+        ("X [in],Y [in]", (25.4, 25.4)),
+        ('X ("),Y (")', (25.4, 25.4)),
+        ("x_nm,y_nm", (1e-6, 1e-6)),
+        ("x (mil),y (mil)", (0.0254, 0.0254)),
+        ("x (foot),y (foot)", (304.8, 304.8)),
+        ("center x in micrometers,center y in micrometers", (1e-3, 1e-3)),
+        # One alone is that of both, two are each its own.
+        ("x_cm,y", (10, 10)),
+        ("x_mm,y_um", (1, 1e-3)),
+        ("x_pos,y_pos", (1, 1)),
+        ("x_m,y_m,radius_of_curvature_mm", (1000, 1000)),
+    ],
+)
+def test_units_of_headers(tmp_path, header, factors):
+    rows = "\n".join(",".join(map(repr, [*(np.array(row) / factors).tolist(), 2.0])) for row in CENTERS)
+    rows = rows if header.count(",") == 2 else rows.replace(",2.0", "")
+    changes = {"lens.radius_of_curvature_mm": MISSING, "array.centers_mm": MISSING, "array.centers_file": "c.csv"}
+    (tmp_path / "c.csv").write_text(f"{header}\n{rows}\n", encoding="utf-8")
+    changes = changes if header.count(",") == 2 else {**changes, "lens.radius_of_curvature_mm": 2.0}
+    np.testing.assert_allclose(read_design(written(tmp_path, changes)).array.centers_mm, CENTERS, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("x_furlong,y_furlong", ["c.csv", "column 'x_furlong'", "nm, um, mm, cm", "got 'furlong'"]),
+        ("x (deg),y (deg)", ["column 'x (deg)'", "got 'deg'"]),
+        ("x_px,y_mm", ["both columns must be in pixels, or none", "x_px,y_mm"]),
+        ("x_mm,y_mm,radius_of_curvature_um", ["column 'radius_of_curvature_um' must be radius_of_curvature_mm"]),
+    ],
+)
+def test_other_units_are_refused_by_name(tmp_path, header, words):
+    rows = "".join(f"{x},{y}{',2' * (header.count(',') - 1)}\n" for x, y in CENTERS)
+    message_of(with_file(tmp_path, f"{header}\n{rows}"), *words)
+
+
 def test_pixels_are_those_of_a_capture(tmp_path):
     """As the contract has it: x = (column - (columns - 1) / 2) pitch; the sensor has 400 rows of 300 pixels."""
     middle, pitch = np.array([299, 399]) / 2, 0.0045

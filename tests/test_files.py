@@ -24,8 +24,9 @@ from gs_jax import Grid
 from gs_jax.base.errors import InputError
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, check_output, write_json
-from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_table, write_points
+from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_positions, read_table, write_points
 from gs_jax.io.volumes import read_volume, write_volume
+from gs_jax.simulation.synthetic import read_scene
 
 from .helpers import examples, needs
 
@@ -315,6 +316,40 @@ def test_plain_tables_are_read_as_all_others(tmp_path, header, lines, end):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gs_jax.io.point_tables._plain_table", lambda *_: None)
         assert read_or_refusal(path) == found
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_points_of_european_spreadsheets(tmp_path, separator):
+    """With decimal commas, further columns and quoted names; and as fast a table as any, with points."""
+    path, header = tmp_path / "a.csv", POINTS_HEADER.replace(",", separator)
+    path.write_text(
+        f"\ufeff{header}\r\n0,5{separator}-0.25{separator} 18,75{separator}1e3\r\n", encoding="utf-8", newline=""
+    )
+    np.testing.assert_array_equal(read_points(path), [[0.5, -0.25, 18.75, 1000]])
+    path.write_text(f"{header}{separator}frame\n0,5{separator}1{separator}20{separator}1{separator}7\n")
+    np.testing.assert_array_equal(read_points(path), [[0.5, 1, 20, 1]])
+    path.write_text(f"{header}\n0,5{separator}1{separator}20\n")
+    refusal(read_points, path, words=["line 2", "got 3 values"])
+    path.write_text(f"{header}\n1,5,5{separator}1{separator}20{separator}1\n")
+    refusal(read_points, path, words=["line 2, x_mm"])
+
+
+def test_positions_of_european_spreadsheets(tmp_path):
+    (tmp_path / "a.csv").write_text("capture;x_mm;z_mm\nb.tif;0,5;18\n1;;20,25\n")
+    points, captures = read_positions(tmp_path / "a.csv", ["a.tif", "b.tif"])
+    np.testing.assert_array_equal(points, [[0.5, np.nan, 18], [np.nan, np.nan, 20.25]])
+    assert captures.tolist() == [1, 0]
+    (tmp_path / "a.csv").write_text("x_cm;z_mm\n1;2\n")
+    with pytest.raises(InputError, match="header must be .*x_mm,y_mm,z_mm, got 'x_cm,z_mm'"):
+        read_positions(tmp_path / "a.csv", [])
+
+
+def test_points_of_several_frames_are_no_scene(tmp_path):
+    write_points(tmp_path / "a.csv", np.ones((2, 4)), {"frame": np.array([3, 3])})
+    assert len(read_scene(tmp_path / "a.csv")[0]) == 2
+    write_points(tmp_path / "a.csv", np.ones((2, 4)), {"frame": np.array([0, 3])})
+    refusal(read_scene, tmp_path / "a.csv", words=["column frame must be of one frame", "got 2 frames"])
+    assert len(read_points(tmp_path / "a.csv")) == 2
 
 
 def test_a_million_points_with_all_their_digits(tmp_path):
