@@ -146,6 +146,14 @@ def test_what_is_cut_off(top, count, dtype, is_cut):
         assert found == (count, top)
 
 
+@pytest.mark.parametrize("light", [3e38, -3e38])
+def test_light_whose_squares_float32_cannot_hold_is_refused(tmp_path, light):
+    """Volumes of it would have infinities."""
+    path = saved(tmp_path / "a.tif", np.full((1, 8, 8), light), np.float32)
+    with pytest.raises(InputError, match=r"pixels must be at most 1e\+15 in size, got 3e\+38 \(.*a.tif\)"):
+        read_corrected(path)
+
+
 def test_what_was_done_is_said(tmp_path):
     """A mosaic's region, pages averaged, cut off in places, with a mask."""
     rng = np.random.default_rng(4)

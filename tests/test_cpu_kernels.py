@@ -24,6 +24,7 @@ from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpol
 from .helpers import scene
 
 NumbaError = pytest.importorskip("numba.core.errors").NumbaError
+config, types = import_module("numba.core.config"), import_module("numba.types")
 dispatch, ffi, simd = (import_module(f"gs_jax.projection.cpu.{name}") for name in ("dispatch", "ffi", "simd"))
 ROOT = Path(__file__).parents[1]
 
@@ -275,3 +276,15 @@ def test_the_layout_is_that_of_the_header():
     assert places("ThreadPool_NumThreads_Args", "num_threads") == places("Buffer", "data")
     assert places("Error_Destroy_Args", "error") == (2,)
     assert places("Metadata", "api_version") == (1,)
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:60], lambda data: b"", lambda data: b"no index"])
+def test_a_damaged_cache_of_numba_is_named_and_left_aside(tmp_path, monkeypatch, damage):
+    """The smallest function stands for all kernels."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    function = lambda: dispatch._compile.__wrapped__(ffi.task, types.int64, 1).address
+    assert function()
+    (index,) = tmp_path.rglob("*.nbi")
+    index.write_bytes(damage(index.read_bytes()))
+    with pytest.warns(RuntimeWarning, match=f"cache is damaged.*delete {index.parent}"):
+        assert function()

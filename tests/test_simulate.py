@@ -99,6 +99,9 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(InputError, match="voxels must not be negative, got -1"):
         simulate_volume(-np.ones((1, 3, 3), np.float32), imager(), Grid([20.0], (3, 3), 0.05), **options)
     for scene, grid, message in (
+        # More than float32 holds.
+        (np.array([[0.0, 0.0, 20.0, 1e39]]), None, r"scene: intensity must be at most 1e\+30, got 1e\+39"),
+        (np.full((1, 3, 3), 3e38), Grid([20.0], (3, 3), 0.05), r"scene: intensity must be at most 1e\+30, got 3e\+38"),
         (np.full((1, 3, 3), np.nan), Grid([20.0], (3, 3), 0.05), "scene must be finite, got 9 of 9 voxels NaN"),
         (np.array([[0.0, np.nan, 20.0, 1.0]]), None, "scene must be finite, got 1 of 4 numbers NaN"),
         (
