@@ -4,6 +4,7 @@ A volume in time has a file per frame, a shard of Zarr 3; a single volume has on
 read too.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,20 @@ def _transforms(scale: list[float], first: list[float], side: int) -> list[dict[
     wider = [step * factor for step, factor in zip(scale, factors, strict=True)]
     inner = [at + step * (factor - 1) / 2 for at, step, factor in zip(first, scale, factors, strict=True)]
     return [{"type": "scale", "scale": wider}, {"type": "translation", "translation": inner}]
+
+
+def missing_chunk(array, place: tuple[int, ...] = ()) -> str | None:
+    """Key of a chunk of an array in a local store, or of the part `array[place]`, that is missing there.
+
+    Zarr reads its fill value instead, as it does for what a program left out because it is dark.
+    """
+    root = Path(array.store.root, array.path)
+    sizes = array.shards or array.chunks
+    counts = [range(at // size, at // size + 1) for at, size in zip(place, sizes, strict=False)]
+    rest = zip(array.shape[len(place) :], sizes[len(place) :], strict=True)
+    counts += [range(-(-length // size)) for length, size in rest]
+    keys = (array.metadata.encode_chunk_key(chunk) for chunk in itertools.product(*counts))
+    return next((key for key in keys if not (root / key).exists()), None)
 
 
 def plane_chunks(shape: tuple[int, int, int]) -> dict[str, Any]:

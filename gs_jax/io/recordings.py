@@ -6,7 +6,6 @@ camera's program writes them.
 
 import contextlib
 import glob
-import itertools
 import os
 import queue
 import re
@@ -34,6 +33,7 @@ from .captures import (
 )
 from .files import check_input, decoding
 from .names import natural_order
+from .ngff import missing_chunk
 from .tiff import Tiff, open_tiff
 
 _ZARR_ROOTS = (".zarray", ".zgroup", "zarr.json")
@@ -164,7 +164,7 @@ def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
         check_declared(path, shape[-2:], array.dtype.name, selection)
         place = tuple(index if number == axis else 0 for number in range(len(stack)))
         with decoding(path, "Zarr array"):
-            missing = _missing_chunk(array, place)
+            missing = missing_chunk(array, place)
             image = None if missing else np.asarray(array[place])
         if image is None:
             advice = "if it is dark there, write it with write_empty_chunks=True"
@@ -173,16 +173,6 @@ def _open_zarr(path: Path, page: int | str | None, allowed: str) -> Recording:
 
     labels = [f"{path.name}, frame {frame}" for frame in range(1, shape[axis] + 1)]
     return Recording(labels, lambda index, selection: check_images(path, read(index, selection)), [])
-
-
-def _missing_chunk(array, place: tuple[int, ...]) -> str | None:
-    """Key of a chunk of an image that is not in a local store; zarr would read its fill value."""
-    root = Path(array.store.root, array.path)
-    sizes = array.shards or array.chunks
-    counts = [range(at // size, at // size + 1) for at, size in zip(place, sizes, strict=False)]
-    counts += [range(-(-n // size)) for n, size in zip(array.shape[-2:], sizes[-2:], strict=True)]
-    keys = (array.metadata.encode_chunk_key(chunk) for chunk in itertools.product(*counts))
-    return next((key for key in keys if not (root / key).exists()), None)
 
 
 def _only_series(store):
