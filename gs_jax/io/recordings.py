@@ -65,17 +65,22 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
     ----------
     path
         A folder, or a pattern with `*`, `?` or `[...]`, whose captures are the frames, in natural order (`f2` before
-        `f10`); a TIFF or an .npy of several pages; a Zarr array `(t, y, x)` or `(t, 1, 1, y, x)`, or the OME-Zarr image
-        of one.
+        `f10`); a TIFF, with the other files of its set, or an .npy of several pages; a Zarr array `(t, y, x)` or
+        `(t, 1, 1, y, x)`, or the OME-Zarr image of one.
     page
         As for `read_capture`: each file is then one frame, and a single file no recording.
     axes
-        What the first axis of OME-Zarr may be: "t", or "tz" for stacks.
+        The axes that may hold the images, if the file names them: "t", or "tz" for stacks.
 
     Raises
     ------
     InputError
-        If nothing matches, or a file or store cannot be read.
+        If nothing matches, a file or store cannot be read, or it declares other axes.
+
+    Warns
+    -----
+    InputWarning
+        If a TIFF declares more images than it holds.
     """
     path = Path(path)
     suffix = path.suffix.lower()
