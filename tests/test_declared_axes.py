@@ -2,6 +2,7 @@
 
 import shutil
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -260,7 +261,7 @@ def test_another_number_of_pages_than_imagej_says(tmp_path):
 def test_a_stack_that_is_cut_off(tmp_path, writer):
     """Entries of pages come after all pixels, and are the first to be lost."""
     path = tmp_path / "a.tif"
-    options = {"imagej": {"imagej": True}, "ome": {"ome": True}, "bigtiff": {"bigtiff": True}}.get(writer, {})
+    options: Any = {"imagej": {"imagej": True}, "ome": {"ome": True}, "bigtiff": {"bigtiff": True}}.get(writer, {})
     metadata = None if writer in ("pages", "bigtiff") else {"axes": "TYX"}
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=metadata, **options)
     size = STACK[0].nbytes
@@ -308,7 +309,7 @@ def test_psfs_are_in_the_order_of_their_depths(tmp_path):
 def test_a_missing_chunk_is_named(tmp_path, version, shards):
     if shards and version == 2:
         return
-    size = {"chunks": (1, 12, 7), "shards": shards} if shards else {"chunks": (2, 12, 7)}
+    size: Any = {"chunks": (1, 12, 7), "shards": shards} if shards else {"chunks": (2, 12, 7)}
     array = zarr.create_array(tmp_path / "a.zarr", data=STACK, zarr_format=version, **size)
     key = array.metadata.encode_chunk_key((2, 0, 0))
     (tmp_path / "a.zarr" / key).unlink()

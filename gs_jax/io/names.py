@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from .lengths import mm_per
 
-Name = TypeVar("Name", str, PurePath)
+Name = TypeVar("Name", bound=str | PurePath)
 
 # A unit after a number. Lengths alone: other units are compared by their letters.
 _UNIT = re.compile(r"([nmcuµμ]m)(?![a-z])", re.IGNORECASE)

@@ -53,8 +53,8 @@ class Tiff:
         self.path, self._exits, self._others = path, exits, {}
         with decoding(path, kind):
             # Without what tifffile makes of metadata that name further files: they may be anywhere.
-            flags = {"is_ome": False, "is_mmstack": False, "is_ndtiff": False}
-            self.file = exits.enter_context(tifffile.TiffFile(path, **flags))
+            file = tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False)
+            self.file = exits.enter_context(file)
             self.first = self.file.pages.first
             self.entries = self.count = len(self.file.pages)
             self._axes = _declared_axes(self.file)
@@ -260,7 +260,7 @@ def _decode_by_pillow(path: Path, page: tifffile.TiffPage) -> np.ndarray | None:
             image.seek(page.index)
             # Pillow takes float32 for big-endian where the file is, though libtiff has turned it.
             if image.mode in _NATIVE and all(tile.codec_name == "libtiff" for tile in image.tile):
-                image.tile = [tile._replace(args=(_NATIVE[image.mode], *tile.args[1:])) for tile in image.tile]
+                image.tile = [tile._replace(args=(_NATIVE[image.mode], *(tile.args or ())[1:])) for tile in image.tile]
             pixels = np.array(image)
     except InputError as error:
         # Every libtiff has LZW: what it cannot decode is damaged, unless Pillow has no such pixels.
