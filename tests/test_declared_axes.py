@@ -1,6 +1,8 @@
 """What files declare of their images beside what is in them: axes, order, number, sister files, missing chunks."""
 
+import json
 import shutil
+import struct
 import warnings
 from typing import Any
 
@@ -185,6 +187,44 @@ def test_frames_go_on_in_sister_files(tmp_path, declared):
     with pytest.raises(InputError, match=f"is a part of a set of files; give the first, {first.name}"):
         frames(second)
     np.testing.assert_array_equal(read_capture(second, page=2), STACK[4])
+
+
+def ndtiff(folder, places, counts=(5,)):
+    """A data set of Micro-Manager: images at these places, in files of so many, and an index."""
+    index, first = b"", 0
+    for number, count in enumerate(counts):
+        name = f"run_NDTiffStack{f'_{number}' if number else ''}.tif"
+        planes = STACK[first : first + count]
+        tifffile.imwrite(folder / name, planes, photometric="minisblack", metadata=None)
+        for at in places[first : first + count]:
+            words = [json.dumps(at).encode(), name.encode()]
+            index += b"".join(struct.pack("<I", len(word)) + word for word in words) + bytes(32)
+        first += count
+    (folder / "NDTiff.index").write_bytes(index)
+    return folder / "run_NDTiffStack.tif"
+
+
+def test_the_index_of_ndtiff_is_what_counts(tmp_path):
+    assert frames(ndtiff(tmp_path, [{"time": 4 - t} for t in range(5)])) == [4, 3, 2, 1, 0]
+    path = ndtiff(tmp_path, [{"time": t, "channel": "a"} for t in range(5)], counts=(3, 2))
+    assert frames(path) == [0, 1, 2, 3, 4]
+    with pytest.raises(InputError, match="give the first, run_NDTiffStack.tif"):
+        frames(tmp_path / "run_NDTiffStack_1.tif")
+    (tmp_path / "run_NDTiffStack_1.tif").unlink()
+    with pytest.warns(InputWarning, match="declares 5 images and holds 3.*run_NDTiffStack_1.tif is missing"):
+        assert frames(path) == [0, 1, 2]
+    path = ndtiff(tmp_path, [{"z": z} for z in range(5)])
+    assert frames(path, "tz") == [0, 1, 2, 3, 4]
+    for places, words in (
+        ([{"z": z} for z in range(5)], r"got 5 x 12 x 14 \(z, y, x\)"),
+        ([{"time": t // 2, "channel": "ab"[t % 2]} for t in range(4)], r"got 2 x 2 x 12 x 14 \(t, c, y, x\)"),
+    ):
+        with pytest.raises(InputError, match=words):
+            frames(ndtiff(tmp_path, places))
+    with open_recording(ndtiff(tmp_path, [{"time": t} for t in (0, 1, 3)])) as recording:
+        assert recording is not None and len(recording.names) == 4
+        with pytest.raises(InputError, match="image 3 is not in the file"):
+            next(recording.images(2, Selection()))
 
 
 def test_a_sister_file_that_is_missing_is_told(tmp_path):

@@ -21,12 +21,15 @@ from ..base.errors import InputError, InputWarning, input_error
 from .axes import UNNAMED, axis_letter
 from .files import decoding
 from .names import natural_order
+from .ndtiff import read_ndtiff
 from .ome import OmePlanes, is_ome, read_ome
 
 # Tags of TIFF/EP: the size of a mosaic's cell and its colours, which are numbered as in "RGB".
 _CELL, _PATTERN = 33421, 33422
 # Its number among compressions.
 _LZW = 5
+# Those of which libtiff knows that they are of differences: LZW, Deflate, LZMA, Zstandard. With others it ignores it.
+_WITH_DIFFERENCES = (_LZW, 8, 32946, 34925, 50000)
 # Keys of ImageJ and of Micro-Manager for axes t, z and c.
 _IMAGEJ, _MICRO_MANAGER = ("frames", "slices", "channels"), ("Frames", "Slices", "Channels")
 # Files of one recording that Micro-Manager continues under further names; the first has no number.
@@ -55,6 +58,8 @@ class Tiff:
             # Without what tifffile makes of metadata that name further files: they may be anywhere.
             file = tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False)
             self.file = exits.enter_context(file)
+            if not len(self.file.pages):
+                raise ValueError("it has no page")
             self.first = self.file.pages.first
             self.entries = self.count = len(self.file.pages)
             self._axes = _declared_axes(self.file)
@@ -70,6 +75,8 @@ class Tiff:
         """
         if is_ome(self.first.description) and (stack := self._ome_stack()):
             return stack
+        if indexed := read_ndtiff(self.path):
+            return self._of_set(*indexed)
         pages = [page for page in range(self.count) if not self._is_reduced(page)]
         declared = math.prod(length for _, length in self._axes)
         if declared == 1:
@@ -110,14 +117,18 @@ class Tiff:
         if ome.size != size:
             given = "{} x {} pixels in OME-XML".format(*ome.size)
             raise input_error("image", "{} x {} pixels, as its page".format(*size), given, self.path)
+        return self._of_set(list(ome.lengths.items()), ome.planes)
+
+    def _of_set(self, axes, images: list[tuple[Path, int] | None]) -> Stack:
+        """A stack of images in this file and others, some of which may not be there."""
         counts = {self.path: self.count}
-        for file in {image[0] for image in ome.planes if image} - {self.path}:
+        for file in {image[0] for image in images if image} - {self.path}:
             if file.is_file():
                 with open_tiff(file) as other:
                     counts[file] = other.count
-        there = [image if image and image[1] < counts.get(image[0], 0) else None for image in ome.planes]
-        lost = sorted({image[0].name for image in ome.planes if image and image[0] not in counts})
-        return self._continued(self._without_missing(list(ome.lengths.items()), there, len(there), lost))
+        there = [image if image and image[1] < counts.get(image[0], 0) else None for image in images]
+        lost = sorted({image[0].name for image in images if image and image[0] not in counts})
+        return self._continued(self._without_missing(axes, there, len(there), lost))
 
     def _without_missing(self, axes, images: list, declared: int, lost: list[str] | None = None) -> Stack:
         """A stack without the missing images at its end, about which it warns."""
@@ -198,7 +209,10 @@ def _declared_axes(tiff: tifffile.TiffFile) -> list[tuple[str, int]]:
         declared = math.prod(lengths)
         return list(zip(names, lengths, strict=True)) if declared > 1 else [(UNNAMED, int(imagej.get("images", 1)))]
     if tiff.is_micromanager:
-        summary = (tiff.micromanager_metadata or {}).get("Summary", {})
+        summary = {}
+        # Single images have the tag without the metadata.
+        with contextlib.suppress(ValueError, KeyError, IndexError):
+            summary = (tiff.micromanager_metadata or {}).get("Summary", {})
         lengths = [int(summary.get(key) or 1) for key in _MICRO_MANAGER]
         return list(zip("tzc", lengths, strict=True))
     series = tiff.series
@@ -255,6 +269,8 @@ def decode_page(path: Path, page: tifffile.TiffPage) -> np.ndarray:
 
 def _decode_by_pillow(path: Path, page: tifffile.TiffPage) -> np.ndarray | None:
     """Pixels as Pillow's libtiff decodes them (LZW, packed 12 bits), unless it does not, or changes their type."""
+    if page.predictor != 1 and int(page.compression) not in _WITH_DIFFERENCES:
+        return None
     try:
         with decoding(path, "TIFF"), Image.open(path, formats=["TIFF"]) as image:
             image.seek(page.index)
