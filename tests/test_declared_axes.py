@@ -306,6 +306,17 @@ def test_a_stack_that_is_cut_off(tmp_path, writer):
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=metadata, **options)
     size = STACK[0].nbytes
     path.write_bytes(path.read_bytes()[: int(3.5 * size) + 400])
+    path.rename(tmp_path / "b.tif")
+    tifffile.imwrite(tmp_path / "c.tif", STACK[1])
+    with open_recording(tmp_path) as recording:
+        # As one of a folder it would be a frame alone.
+        assert recording is not None
+        with pytest.raises(InputError, match="3 pages; choose" if metadata and writer != "ome" else "is cut off"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", InputWarning)
+                next(recording.images(0, Selection()))
+        np.testing.assert_array_equal(next(recording.images(1, Selection())), STACK[1])
+    (tmp_path / "b.tif").rename(path)
     if metadata and writer != "ome":
         with pytest.warns(InputWarning, match="declares 5 images and holds 3 whole ones, which are used"):
             assert frames(path) == [0, 1, 2]

@@ -275,7 +275,10 @@ def _read_tiff(path: Path, selection: Selection) -> Iterator[np.ndarray]:
 
 def _chosen(tiff: Tiff, page: int | str | None) -> list[tuple[Path, int] | None]:
     """File and page of each selected image. A page by its number is one of the file, whatever this says of it."""
-    if isinstance(page, int) or (page == OWN and tiff.count == 1):
+    if page == OWN and tiff.count == 1:
+        tiff.check_alone()
+        return [(tiff.path, 0)]
+    if isinstance(page, int):
         return [(tiff.path, index) for index in _pages(tiff.path, tiff.count, page)]
     if page == REPEATS:
         check_stack(tiff, "tz", "; its images are not repeats of one")

@@ -179,13 +179,21 @@ class Tiff:
         with decoding(self.path, "TIFF"):
             return bool(self.file.pages[1].aspage().subfiletype & 0b101)
 
-    def _warn_if_cut(self, count: int) -> None:
-        """Warn if the entry of a next page is beyond the end of the file."""
+    def check_alone(self) -> None:
+        """Raise `InputError` if a file of one page had more, and is cut off; other files of its set do not matter."""
+        if (declared := math.prod(length for _, length in self._axes)) > self.count or self._is_cut():
+            number = f"declares {declared} images and " if declared > 1 else ""
+            raise InputError(f"{self.path}: {number}is cut off after its first.")
+
+    def _is_cut(self) -> bool:
+        """Whether the entry of a next page is beyond the end of the file."""
         with decoding(self.path, "TIFF"):
             place, handle = self.file.pages.next_page_offset, self.file.filehandle
             handle.seek(place or 0)
-            is_cut = place is not None and any(handle.read(self.file.tiff.offsetsize))
-        if is_cut:
+            return place is not None and any(handle.read(self.file.tiff.offsetsize))
+
+    def _warn_if_cut(self, count: int) -> None:
+        if self._is_cut():
             whole = "a page that is" if count == 1 else f"{count} pages, which are"
             warnings.warn(InputWarning(f"{self.path}: is cut off; it still has {whole} used."), stacklevel=2)
 
