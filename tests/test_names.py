@@ -34,6 +34,7 @@ __all__ = ["folder"]
         ["z-200um", "z-100um", "z0um", "z+50um", "z100um"],
         ["-3", "-2.5", "0", "+1", "2"],
         ["z10,25", "z10,5", "z11"],
+        ["z10p25mm", "z10p5mm", "z11mm"],
         ["z=0.25", "z=0.5", "z=1.0", "z=9.75", "z=10.0"],
         ["z500um", "z0.9mm", "z1mm", "z0.2cm"],
         # A hyphen that joins, a point between two counts, dates and versions.

@@ -71,7 +71,7 @@ def _pieces(name: str) -> tuple[list[_Piece], str, str]:
     suffix = "" if suffix[1:].isdigit() else suffix
     stem = name.removesuffix(suffix)
     # Numbers with two points are versions or dates.
-    found = list(re.finditer(r"(?<![\d.,])(\d+)[.,](\d+)(?![.,]?\d)|(\d+)", stem))
+    found = list(re.finditer(r"(?<![\d.,])(\d+)(?:[.,]|p(?=\d+[nmcuµμ]m))(\d+)(?![.,]?\d)|(\d+)", stem))
     pieces, end = [], 0
     for number, match in enumerate(found):
         following = found[number + 1].start() if number + 1 < len(found) else len(stem)

@@ -37,7 +37,9 @@ def read_ome(path: Path, description: str, pages: int) -> list[OmePlanes]:
     with decoding(path, "OME-XML"):
         root = ElementTree.fromstring(description)
     if (elsewhere := root.find("{*}BinaryOnly")) is not None:
-        raise InputError(f"{path}: is a part of a set of files; give the first, {elsewhere.get('MetadataFile')}.")
+        file = str(elsewhere.get("MetadataFile"))
+        advice = f"give the first, {file}" if Path(file).suffix in (".tif", ".tiff") else "choose by --page"
+        raise InputError(f"{path}: is a part of a set of files, which {file} describes; {advice}.")
     own = root.get("UUID")
     images = []
     for pixels in root.iterfind("{*}Image/{*}Pixels"):

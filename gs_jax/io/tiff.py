@@ -79,8 +79,9 @@ class Tiff:
             return self._of_set(*indexed)
         pages = [page for page in range(self.count) if not self._is_reduced(page)]
         declared = math.prod(length for _, length in self._axes)
-        if declared == 1:
+        if declared <= len(pages):
             self._warn_if_cut(len(pages))
+        if declared == 1:
             return self._continued(Stack([(UNNAMED, len(pages))], [(self.path, page) for page in pages]))
         if declared < len(pages):
             raise input_error("pages", f"{declared}, as the file declares; choose by --page", len(pages), self.path)
@@ -136,7 +137,7 @@ class Tiff:
             images = images[:-1]
         if len(images) < declared:
             where = f"; {', '.join(lost)} is missing" if lost else ""
-            text = f"{self.path}: declares {declared} images and holds {len(images)} whole ones, which are used{where}."
+            text = f"{self.path}: declares {declared} images and holds {len(images)}, which are used{where}."
             warnings.warn(InputWarning(text), stacklevel=2)
             if len([length for _, length in axes if length != 1]) == 1:
                 axes = [(name, length if length == 1 else len(images)) for name, length in axes]
@@ -194,8 +195,8 @@ class Tiff:
 
     def _warn_if_cut(self, count: int) -> None:
         if self._is_cut():
-            whole = "a page that is" if count == 1 else f"{count} pages, which are"
-            warnings.warn(InputWarning(f"{self.path}: is cut off; it still has {whole} used."), stacklevel=2)
+            rest = "page, which is" if count == 1 else f"{count} pages, which are"
+            warnings.warn(InputWarning(f"{self.path}: is cut off after its first {rest} used."), stacklevel=2)
 
 
 @contextlib.contextmanager
