@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike
 from .axes import stack_axis, stack_error
-from .files import atomic_write, check_input, check_output, check_suffix, decoding
+from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .provenance import KEY, Provenance, write_sidecar
 from .tiff import Tiff, decode_plane, mosaic_pattern, open_tiff
 
@@ -359,5 +359,5 @@ class _Format(NamedTuple):
 
 _TIFF = _Format(_read_tiff, _write_tiff)
 _PNG = _Format(_read_png, _write_png, ("uint8", "uint16"))
-_FORMATS = {".tif": _TIFF, ".tiff": _TIFF, ".png": _PNG, ".npy": _Format(_read_npy, _write_npy)}
+_FORMATS = {**dict.fromkeys(TIFF_SUFFIXES, _TIFF), ".png": _PNG, ".npy": _Format(_read_npy, _write_npy)}
 CAPTURE_SUFFIXES = tuple(_FORMATS)

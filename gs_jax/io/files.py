@@ -21,6 +21,7 @@ from ..base.errors import InputError, input_error, short_repr
 # Not from `gs_jax.typing`, which imports JAX: the help of commands does without.
 PathLike = str | os.PathLike[str]
 
+TIFF_SUFFIXES = (".tif", ".tiff")
 MAX_TEXT_BYTES = 2**26
 # Attempts to remove a folder, and the seconds between them.
 _ATTEMPTS, _PAUSE = 30, 0.05

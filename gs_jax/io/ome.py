@@ -6,7 +6,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 from ..base.errors import InputError, input_error
-from .files import decoding
+from .files import TIFF_SUFFIXES, decoding
 
 MAX_PLANES = 10**7
 _AXES = "TCZ"
@@ -38,7 +38,7 @@ def read_ome(path: Path, description: str, pages: int) -> list[OmePlanes]:
         root = ElementTree.fromstring(description)
     if (elsewhere := root.find("{*}BinaryOnly")) is not None:
         file = str(elsewhere.get("MetadataFile"))
-        advice = f"give the first, {file}" if Path(file).suffix in (".tif", ".tiff") else "choose by --page"
+        advice = f"give the first, {file}" if Path(file).suffix in TIFF_SUFFIXES else "choose by --page"
         raise InputError(f"{path}: is a part of a set of files, which {file} describes; {advice}.")
     own = root.get("UUID")
     images = []

@@ -22,7 +22,7 @@ from .._version import __version__
 from ..base.errors import input_error
 from ..grid import Grid
 from ..typing import PathLike
-from .files import check_input, check_suffix, decoding, read_text, write_json
+from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, write_json
 from .names import plain_text
 
 Provenance = Mapping[str, str]
@@ -125,8 +125,7 @@ def _from_3mf(path: Path) -> dict:
 
 
 _READERS: dict[str, Callable[[Path], dict]] = {
-    ".tif": _from_tiff,
-    ".tiff": _from_tiff,
+    **dict.fromkeys(TIFF_SUFFIXES, _from_tiff),
     ".png": _from_png,
     ".zarr": _from_zarr,
     ".toml": lambda path: tomllib.loads(read_text(path)).get(KEY, {}),

@@ -31,7 +31,7 @@ from .captures import (
     read_images,
     read_tiff_page,
 )
-from .files import check_input, decoding
+from .files import TIFF_SUFFIXES, check_input, decoding
 from .names import natural_order
 from .ngff import missing_chunk
 from .tiff import Tiff, open_tiff
@@ -88,7 +88,7 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
         yield _open_zarr(path, page, axes)
     elif (files := capture_files(path)) is not None:
         yield _open_files(path, files, page)
-    elif page is not None or suffix not in (".tif", ".tiff", ".npy"):
+    elif page is not None or suffix not in (*TIFF_SUFFIXES, ".npy"):
         yield None
     elif suffix == ".npy":
         with decoding(check_input(path), ".npy of numbers"):

@@ -10,12 +10,13 @@ from jaxtyping import Float, Int
 from ..base.errors import input_error
 from ..grid import Grid
 from ..typing import PathLike
-from .files import atomic_write, check_input, check_output, check_suffix, decoding
+from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .ngff import first_um, title, um
 from .provenance import NAMESPACE, Provenance, surface_of, write_sidecar
+from .tiff import decode_plane, open_tiff
 from .volumes import checked_grid, ome_length
 
-SURFACE_SUFFIXES = (".tif", ".tiff", ".ply")
+SURFACE_SUFFIXES = (*TIFF_SUFFIXES, ".ply")
 # Neighbours whose depths differ by more voxels than this lie on different parts of the scene.
 _STEEP = 4
 
@@ -100,13 +101,16 @@ def read_surface(path: PathLike) -> SurfaceMaps:
 
     Raises `InputError` if it cannot be read, or holds no sheets.
     """
-    check_suffix(path, SURFACE_SUFFIXES[:2])
+    check_suffix(path, TIFF_SUFFIXES)
     path = check_input(path)
-    with decoding(path, "OME-TIFF"), tifffile.TiffFile(path, is_ome=False) as tiff:
-        words = tiff.pages.first.description
-        pixels = ElementTree.fromstring(words).find("{*}Image/{*}Pixels") if words.startswith("<?xml") else None
+    with open_tiff(path, "OME-TIFF") as tiff:
+        with decoding(path, "OME-TIFF"):
+            words = tiff.first.description
+            pixels = ElementTree.fromstring(words).find("{*}Image/{*}Pixels") if words.startswith("<?xml") else None
         names = [] if pixels is None else [each.get("Name", "") for each in pixels.findall("{*}Channel")]
-        maps = np.stack([page.asarray() for page in tiff.pages])
+        planes = [decode_plane(*tiff.at(image, number)) for number, image in enumerate(tiff.stack.images)]
+        with decoding(path, "OME-TIFF"):
+            maps = np.stack(planes)
     count = len(maps) // len(_CHANNELS)
     kinds = [name.split(" ")[0] for name in names]
     if pixels is None or kinds != [*_CHANNELS] * count or len(kinds) != len(maps) or maps.dtype != np.float32:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Shaped
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
-from .files import atomic_write, check_input, check_output, check_suffix, decoding
+from .files import TIFF_SUFFIXES, atomic_write, check_input, check_output, check_suffix, decoding
 from .lengths import mm_per
 from .ngff import display_range, first_um, image_attributes, plain_depths, plane_chunks, title, um
 from .provenance import NAMESPACE, Provenance, moved, surface_of
@@ -320,5 +320,5 @@ class _Format(NamedTuple):
 
 
 _TIFF, _ZARR = _Format(_read_tiff, _write_tiff), _Format(_read_zarr, _write_zarr)
-_FORMATS = {".tif": _TIFF, ".tiff": _TIFF, ".zarr": _ZARR}
+_FORMATS = {**dict.fromkeys(TIFF_SUFFIXES, _TIFF), ".zarr": _ZARR}
 VOLUME_SUFFIXES = tuple(_FORMATS)
