@@ -34,6 +34,8 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
         Image of a point on the axis at each depth, `(depth, high, wide)`, the point being at `(high // 2, wide // 2)`.
     image_shape
         `(rows, columns)` of the sensor; by default those of the PSFs.
+    kept
+        1 for pixels that count, 0 for those that are left out, where images are zero. None keeps all.
 
     Attributes
     ----------
@@ -60,9 +62,13 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
     spectra: Complex[Array, "depth tall half"]
     image_shape: tuple[int, int] = eqx.field(static=True)
     scene_shape: tuple[int, int, int] = eqx.field(static=True)
+    kept: Float[Array, "row column"] | None
 
     def __init__(
-        self, psf_stack: Num[Array | np.ndarray, "depth high wide"], image_shape: tuple[int, int] | None = None
+        self,
+        psf_stack: Num[Array | np.ndarray, "depth high wide"],
+        image_shape: tuple[int, int] | None = None,
+        kept: Float[Array | np.ndarray, "row column"] | None = None,
     ):
         psf = jnp.asarray(psf_stack)
         if psf.ndim != 3 or min(psf.shape) < 1:
@@ -72,6 +78,7 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
         tall, wide = scene_size(self.image_shape, psf.shape[1:])
         self.scene_shape = (len(psf), tall, wide)
         self.spectra = lax.map(lambda plane: centred_spectrum(plane, (tall, wide)), psf)
+        self.kept = None if kept is None else jnp.asarray(kept, self.spectra.real.dtype)
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -81,7 +88,8 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
     def mv(self, vector: Float[Array | np.ndarray, "depth tall wide"]) -> Float[Array, "row column"]:
         """The image of a scene."""
         sizes = _Sizes(self.image_shape, self.scene_shape[1:])
-        return _convolution(sizes, self.spectra, jnp.asarray(vector, self.spectra.real.dtype))
+        image = _convolution(sizes, self.spectra, jnp.asarray(vector, self.spectra.real.dtype))
+        return image if self.kept is None else self.kept * image
 
     def in_structure(self) -> ShapeDtypeStruct:
         return ShapeDtypeStruct(self.scene_shape, self.spectra.real.dtype)
@@ -174,6 +182,11 @@ class FieldConvolutionOperator(lx.AbstractLinearOperator):
     def image_shape(self) -> tuple[int, int]:
         """`(rows, columns)` of the sensor."""
         return self.components.image_shape
+
+    @property
+    def kept(self) -> Float[Array, "row column"] | None:
+        """1 for pixels that count, 0 for those that are left out; None if all count."""
+        return self.components.kept
 
     @property
     def scene_shape(self) -> tuple[int, int, int]:

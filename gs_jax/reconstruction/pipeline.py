@@ -301,10 +301,11 @@ def _wider_voxels(grid):
     return f"--voxel-um {2000 * grid.pitch:.4g}"
 
 
-def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, start=None):
+def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, start=None, residuals=None):
     """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target.
 
-    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or what `read` returns.
+    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or what `read` returns. Appends
+    the residual of each step to the list `residuals`, if given.
     """
     # Decided here and not in compiled code: another number of steps compiles nothing.
     compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
@@ -314,6 +315,8 @@ def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, sta
     with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
         for _ in range(solver.steps):
             state, cost, residual = _step(state, compiled, light, problem)
+            if residuals is not None:
+                residuals.append(float(residual))
             # Reading the numbers waits for the step: progress is true, and Ctrl-C ends it here.
             if float(residual) < solver.tolerance or float(cost) < target_cost:
                 break

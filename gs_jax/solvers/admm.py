@@ -10,6 +10,7 @@ variables are the differences `D x` and a non-negative copy of `x`. The x-step i
 would slow convergence.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -190,6 +191,11 @@ class ADMM(eqx.Module):
 
     def estimate(self, state: State) -> Float[Array, "..."]:
         return state.splitting.z[-1]
+
+    def smoother(self, state: State, factor: float) -> State:
+        """The state to continue from with `factor` times the weight of total variation."""
+        regularizer = dataclasses.replace(state.regularizer, tv=factor * state.regularizer.tv)
+        return state._replace(regularizer=regularizer)
 
 
 def advance(

@@ -63,7 +63,7 @@ Operator = lx.AbstractLinearOperator | UnmatchedAdjointOperator
 
 def kept_pixels(A: Operator) -> Float[Array, "..."] | None:
     """The pixels that an operator does not leave out; None if it keeps all."""
-    return A.kept if isinstance(A, UnmatchedAdjointOperator) else None
+    return getattr(A, "kept", None)
 
 
 @runtime_checkable

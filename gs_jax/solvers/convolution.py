@@ -162,6 +162,12 @@ class ConvolutionADMM(eqx.Module):
     def estimate(self, state: State) -> Float[Array, "depth tall wide"]:
         return state.best
 
+    def smoother(self, state: State, factor: float) -> State:
+        """The state to continue from with `factor` times the weight of total variation."""
+        system = state.system._replace(tv=factor * state.system.tv)
+        # Costs of another weight do not compare.
+        return state._replace(system=system, cost=jnp.full_like(state.cost, jnp.inf))
+
     def _axes(self, A):
         """Number of axes along which there are differences."""
         return 3 if self.tv_z and A.scene_shape[0] > 1 else 2
@@ -177,7 +183,8 @@ class ConvolutionADMM(eqx.Module):
         window, gain = A.window, system.gain
 
         def measured(v):
-            return v.at[window].set((rho * v[window] + gain * image) / (rho + gain**2))
+            seen = (rho * v[window] + gain * image) / (rho + gain**2)
+            return v.at[window].set(seen if A.kept is None else jnp.where(A.kept > 0, seen, v[window]))
 
         def sparse(w):
             if self.nonnegative:
@@ -274,6 +281,7 @@ class ConvolutionADMM(eqx.Module):
         if along_z:
             spectra = _solve_along_z(system.smooth, spectra, system.splits * self.tv_z**2)
         seen = jnp.fft.irfft2(seen, A.scene_shape[1:])[A.window]
+        seen = seen if A.kept is None else A.kept * seen
         # The exact minimum along the ray of the sparse scene, as the penalties are homogeneous.
         scale = divide(jnp.maximum(jnp.vdot(seen, image) - cost, 0), jnp.vdot(seen, seen))
         residual = scale * seen - image
