@@ -7,10 +7,12 @@ import click
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
-from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, picture_options
+from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, given_options, picture_options
 from .outputs import check_may_write, provenance_of
 
-_METHODS = ("admm", "fista", "richardson-lucy")
+_METHODS = ("admm", "fista", "richardson-lucy", "wiener")
+# Options of the methods that take steps.
+_ITERATIVE = ("steps", "stop_at_noise", "psf_places", "tv", "tv_z", "sparsity")
 
 
 @click.command("deconvolve", epilog="Example: gs-jax deconvolve capture.tif psf_stack.tif -o volume.ome.tif")
@@ -19,8 +21,8 @@ _METHODS = ("admm", "fista", "richardson-lucy")
 @click.option(
     "--depths",
     type=Depths(),
-    help="START:STOP:STEP in mm, STOP included: depths of the planes, in the order of the PSFs.  "
-    "[default: planes are numbered]",
+    help="START:STOP:STEP in mm, STOP included, or a list such as 10,12,40: depths of the planes, in the order of the "
+    "PSFs.  [default: planes are numbered]",
 )
 @click.option("--voxel-um", type=UM, help="What a pixel of CAPTURE is wide in the scene, for scale bars.")
 @click.option(
@@ -29,13 +31,14 @@ _METHODS = ("admm", "fista", "richardson-lucy")
     default="admm",
     show_default=True,
     help="admm: smooth areas with edges, best for most scenes; fista: separate points; richardson-lucy: dim light, "
-    "where photons are few.",
+    "where photons are few; wiener: a preview in a second, of one plane.",
 )
 @click.option("--steps", type=click.IntRange(1, 100_000), default=100, show_default=True, help="At most so many steps.")
 @click.option(
     "--tv",
     type=Number(0.0, 10.0),
-    help="Weight of total variation (admm, richardson-lucy): the more, the smoother.  [default: 0.001 of admm]",
+    help="Weight of total variation (admm, richardson-lucy): the more, the smoother.  [default: admm "
+    "takes the weight that predicts parts of CAPTURE best which are held out]",
 )
 @click.option(
     "--tv-z",
@@ -97,7 +100,8 @@ def deconvolve_command(
     sources is free; scale and orientation need not be known.
 
     All files may be TIFF, PNG or .npy, in the same pixels; a PSF may be smaller than CAPTURE, its source then being in
-    the PSF's middle. --dark, --flat, --bad-pixels and --offset correct all of them.
+    the PSF's middle. --dark, --flat, --bad-pixels and --offset correct all of them; --channel is taken of those in
+    colour.
 
     \b
     One plane:
@@ -112,13 +116,17 @@ def deconvolve_command(
     from ..io.captures import write_capture
     from ..io.files import check_output
     from ..io.plane_stacks import STACK_SUFFIXES, spot_names, write_planes
-    from ..reconstruction.deconvolution import bin_pixels, deconvolve, make_solver
+    from ..reconstruction.deconvolution import bin_pixels, filter_image, make_solver, pad_to_largest, run_deconvolution
     from ..reconstruction.field_fit import fit_field
 
     check_output(output, STACK_SUFFIXES)
     files = [path for path in (*psf, psf_places, *camera.files) if path]
     check_may_write(output, inputs=(capture, *files))
-    places = None
+    places, solver = None, None
+    if method != "wiener":
+        solver = make_solver(method, steps, weights)
+    elif given := given_options(_ITERATIVE):
+        raise InputError(f"{', '.join(given)} must not be given with --method wiener, which takes no steps.")
     if psf_places:
         if depths:
             raise InputError("--depths must not be given with --psf-places, whose z_mm are the depths, got both.")
@@ -126,43 +134,90 @@ def deconvolve_command(
             raise InputError("--tv-z must not be given with --psf-places, got both.")
         places = _read_places(psf_places, psf)
         depths = None if np.isnan(places[:, 2]).any() else np.unique(places[:, 2]).tolist()
-    if output.suffix.lower() == ".zarr" and not (depths and voxel_um):
-        raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
+    if output.suffix.lower() == ".zarr":
+        if not (depths and voxel_um):
+            raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
+        if np.ptp(np.diff(depths)) > 1e-6 * max(depths):
+            raise input_error("depths", "in even steps for OME-Zarr", "uneven ones; use .ome.tif", output)
     if depths and depths[0] <= 0 and voxel_um and output.suffix.lower() != ".npy":
         raise input_error("z_mm", "positive with --voxel-um", f"{depths[0]:g}", psf_places)
-    names = spot_names(psf, psf_page)
-    solver = make_solver(method, steps, weights)
+    names, fit, result = spot_names(psf, psf_page), None, None
     with Progress() as progress:
         with progress.step("Reading"):
             image = bin_pixels(camera.read(capture), binning)
-            spots = np.stack([bin_pixels(spot, binning) for spot in camera.read_spots(psf, psf_page)])
-        fit = None
+            planes = [bin_pixels(spot, binning) for spot in camera.read_spots(psf, psf_page)]
+            spots = pad_to_largest(planes)
+        if depths and places is None and len(depths) != len(spots):
+            raise InputError(f"--depths must be one for each PSF, {len(spots)} in all, got {len(depths)} depths.")
         if places is not None:
             with progress.step("Fitting the PSFs"):
                 fit = fit_field(spots, places, image.shape)
-        elif depths and len(depths) != len(spots):
-            raise InputError(f"--depths must be one for each PSF, {len(spots)} in all, got {len(depths)} depths.")
-        planes = deconvolve(
-            image, fit.operator if fit else spots, solver, stop_at_discrepancy=stop_at_noise, progress=progress
-        )
+        if solver is None:
+            with progress.step("Filtering"):
+                volume = filter_image(image, spots)[None]
+        else:
+            choose = method == "admm" and weights["tv"] is None
+            system = fit.operator if fit else spots
+            result = run_deconvolution(
+                image, system, solver, choose=choose, stop_at_discrepancy=stop_at_noise, progress=progress
+            )
+            volume = result.scene
         with progress.step("Writing"):
             provenance = camera.recorded(provenance_of(capture, *files))
-            if len(planes) == 1 and not depths:
-                write_capture(output, planes[0], provenance)
+            if result and result.smoothness:
+                provenance |= {"tv": f"{result.smoothness.tv:.3g}, chosen from the capture"}
+            if len(volume) == 1 and not depths:
+                write_capture(output, volume[0], provenance)
             else:
-                write_planes(output, planes, depths, voxel_um and voxel_um * binning / 1000, provenance)
+                write_planes(output, volume, depths, voxel_um and voxel_um * binning / 1000, provenance)
     camera.print_corrections()
     if len(names) > 1 and not fit:
         at = [f"at {depth:g} mm" for depth in depths] if depths else [f"is plane {n + 1}" for n in range(len(names))]
         click.echo(f"PSFs: {', '.join(f'{name} {place}' for name, place in zip(names, at, strict=True))}")
+    _warn_of_cut_psfs(planes)
     if fit:
         click.echo(
             f"{psf_places}: {fit.rank} components explain {len(spots)} PSFs to {fit.error:.2g} of their RMS, those at "
             f"other places predict one to {fit.left_out_error:.2g}; places fit to {fit.place_error:.2g} pixels"
         )
-    z, rows, columns = planes.shape
+    z, rows, columns = volume.shape
     of = "" if z == 1 and not depths else f"{depth_range(depths)}, " if depths else f"{z} planes, "
-    click.echo(f"{output}: {of}{rows} x {columns} pixels, {method}, at most {steps} steps")
+    taken = f", {result.steps} steps" if result else ""
+    click.echo(f"{output}: {of}{rows} x {columns} pixels, {method}{taken}")
+    if result:
+        _print_quality(result)
+
+
+def _print_quality(result):
+    """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
+    if chosen := result.smoothness:
+        error = min(chosen.errors, default=0)
+        click.echo(
+            f"smoothness: --tv {chosen.tv:.1g}, of {len(chosen.tried)} weights the smoothest that predicts held-out "
+            f"pixels as well as the best (to {error:.2g} of their RMS)"
+        )
+    if result.reached_noise:
+        end = "stopped where only noise is left"
+    elif result.converged:
+        end = f"converged, the last step changed {result.change:.1g} of it"
+    else:
+        end = f"not converged, the last step changed {result.change:.1g} of it; more --steps refine the scene"
+    click.echo(f"residual: {result.residual:.2g} of the capture's RMS; {end}")
+
+
+def _warn_of_cut_psfs(spots):
+    """Warn of PSFs that are cut by the edge of their image."""
+    from ..reconstruction.deconvolution import cut_sides
+
+    cut = {number: sides for number, spot in enumerate(spots, 1) if (sides := cut_sides(spot))}
+    if cut:
+        number, sides = next(iter(cut.items()))
+        which = "the PSF" if len(spots) == 1 else f"PSF {number}" if len(cut) == 1 else f"{len(cut)} of the PSFs"
+        click.echo(
+            f"gs-jax: warning: {which} is cut at the {' and '.join(sides)} of its image: expect bright lines or false "
+            "light in the scene, measure it with a smaller source distance or mask, or on a larger sensor.",
+            err=True,
+        )
 
 
 def _read_places(path, psf):

@@ -91,7 +91,10 @@ def _calibration(provenance) -> str:
 @click.argument("file", type=Path, required=False)
 @click.option("--designs", is_flag=True, help="List the names of the designs that come with the package.")
 def info_command(file: Path | None, designs: bool):
-    """Show versions, devices and memory; with FILE, which gs-jax command made this file, and from what."""
+    """Show versions, devices and memory; with FILE, which gs-jax command made it, and from what.
+
+    Of an image that another program made: its size, type and axes, and what commands take it for.
+    """
     if designs:
         from ..design.design import read_design
 
@@ -99,8 +102,9 @@ def info_command(file: Path | None, designs: bool):
         lines = {path.stem: repr(read_design(path)).splitlines()[1].strip() for path in shipped_designs()}
     elif file:
         from ..io.provenance import read_provenance
+        from ..io.summary import summarise
 
-        lines = read_provenance(file) or {"provenance": f"{file} has no provenance."}
+        lines = read_provenance(file) or summarise(file) | {"provenance": f"{file} has no provenance."}
     else:
         from ..base.machine import describe
 

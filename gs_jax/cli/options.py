@@ -5,6 +5,7 @@ repeated here.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -50,9 +51,9 @@ class Number(click.ParamType):
 
 
 class Depths(click.ParamType):
-    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step; or one depth."""
+    """START:STOP:STEP in mm, inclusive of STOP when it falls on the step; or a list, `10,40`; or one depth."""
 
-    name = "start:stop:step"
+    name = "start:stop:step|z,z,..."
 
     def __init__(self, least: float = NEAREST):
         self.least = least
@@ -61,9 +62,12 @@ class Depths(click.ParamType):
         if isinstance(value, list):
             return value
         try:
-            start, stop, step = map(float, value.split(":") if ":" in value else (value, value, 1))
+            if ":" not in value:
+                return self._list(value, [float(depth) for depth in value.split(",")], param, ctx)
+            start, stop, step = map(float, value.split(":"))
         except ValueError:
-            self.fail(f"must be START:STOP:STEP in mm, such as 18:22:0.25, or one depth, got {value!r}.", param, ctx)
+            allowed = "START:STOP:STEP in mm, such as 18:22:0.25, or a list such as 10,40, or one depth"
+            self.fail(f"must be {allowed}, got {value!r}.", param, ctx)
         if not all(map(math.isfinite, (start, stop, step))) or not self.least <= start <= stop or not step > 0:
             self.fail(f"must have {self.least:g} <= START <= STOP and STEP > 0, in mm, got {value!r}.", param, ctx)
         # A step that misses STOP by rounding alone falls on it.
@@ -71,6 +75,14 @@ class Depths(click.ParamType):
         if count > _MAX_DEPTHS + 1:
             self.fail(f"must have at most {_MAX_DEPTHS} depths, got {value!r}, {count:.3g} depths.", param, ctx)
         return [round(start + i * step, 9) for i in range(int(count))]
+
+    def _list(self, value, depths, param, ctx):
+        """Depths of a list, which ascend."""
+        if not all(self.least <= depth < math.inf for depth in depths):
+            self.fail(f"must be depths of {self.least:g} mm or more, got {value!r}.", param, ctx)
+        if any(after <= before for before, after in itertools.pairwise(depths)):
+            self.fail(f"must be depths in ascending order, got {value!r}.", param, ctx)
+        return depths
 
 
 class DesignFile(click.ParamType):
@@ -216,16 +228,15 @@ class CaptureOptions:
         )
 
     def read_spots(self, paths: tuple[Path, ...], page: int | str | None):
-        """Read and correct images of a point as a stack, a plane for each page; or for each file with `page`.
+        """Read and correct images of a point as planes, one for each page; or for each file with `page`.
 
-        Single sharp pixels are kept.
+        Single sharp pixels are kept. A colour capture and grey images of the point may be combined. Returns a list, as
+        the planes may differ in size.
         """
-        import numpy as np
-
         from ..io.plane_stacks import read_spots
 
         spots = read_spots(paths, page=page, readout=self.readout, correction=self.correction)
-        return np.stack([self._note(path, capture) for path, capture in spots])
+        return [self._note(path, capture) for path, capture in spots]
 
     def _note(self, path, capture):
         for line in capture.done:
@@ -309,4 +320,6 @@ def depth_range(depths: list[float]) -> str:
     """The depths in words."""
     if len(depths) == 1:
         return f"at {depths[0]:g} mm"
+    if len(depths) == 2:
+        return f"2 depths, {depths[0]:g} and {depths[1]:g} mm"
     return f"{len(depths)} depths from {depths[0]:g} to {depths[-1]:g} mm"

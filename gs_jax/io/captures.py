@@ -39,6 +39,10 @@ _PNG_COLOURS = {0: None, 2: _RGB, 3: "a colour palette", 4: "grey with transpare
 _TIFF_COLOURS = {0: "grey with 0 as white", 1: None, 2: _RGB, 3: "a colour palette"}
 
 
+class GreyError(InputError):
+    """A channel was selected of an image that is grey."""
+
+
 class Selection(NamedTuple):
     """The part of a file to read, as the arguments of `read_capture`, and the types of pixels that are allowed."""
 
@@ -228,7 +232,8 @@ def check_colour(path: Path, colour: str | None, selection: Selection) -> None:
     if colour and not channel:
         raise input_error("image", f"greyscale, or --channel {channels} of it", colour, path)
     if not colour and channel and not bayer:
-        raise input_error("image", f"colour for --channel {channel}, or a mosaic with --bayer", "greyscale", path)
+        error = input_error("image", f"colour for --channel {channel}, or a mosaic with --bayer", "greyscale", path)
+        raise GreyError(str(error))
     if channel and channel not in CHANNELS:
         raise input_error("--channel", channels, channel, path)
 

@@ -33,6 +33,15 @@ _TEMPORARY: set[Path] = set()
 _ZARR_METADATA, JOURNAL = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}, "frames.jsonl"
 
 
+# What to do about files of other suffixes.
+_JPEG = "JPEG is lossy, and its values are not linear in light: save captures as TIFF or PNG"
+_HINTS = {
+    ".jpg": _JPEG,
+    ".jpeg": _JPEG,
+    ".mat": "convert it: numpy.save('a.npy', scipy.io.loadmat('a.mat')['NAME'].astype('float32')) (v7.3: h5py)",
+}
+
+
 def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
@@ -67,7 +76,8 @@ def check_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
     """Return the suffix of a path in lower case; `InputError` if it is none of these."""
     suffix = Path(path).suffix
     if suffix.lower() not in suffixes:
-        raise input_error("suffix", ", ".join(suffixes), short_repr(suffix), path)
+        hint = f"; {_HINTS[suffix.lower()]}" if suffix.lower() in _HINTS else ""
+        raise input_error("suffix", ", ".join(suffixes), f"{short_repr(suffix)}{hint}", path)
     return suffix.lower()
 
 

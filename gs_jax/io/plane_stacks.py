@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from ..base.errors import InputWarning, input_error
 from ..grid import Grid
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
-from .captures import Selection, read_images, size_text
+from .captures import GreyError, Selection, read_images, size_text
 from .files import atomic_write, check_output
 from .names import natural_order
 from .ngff import title, um
@@ -39,28 +39,37 @@ def read_spots(
     page
         None: a plane for each page. A page, or "mean" of all: a plane for each file.
     readout, correction
-        As for `read_corrected`. With `bad_pixels="auto"` no pixel is taken for a hot one: a spot may be as sharp.
+        As for `read_corrected`. With `bad_pixels="auto"` no pixel is taken for a hot one: a spot may be as sharp. A
+        channel is selected of images in colour alone.
 
     Raises
     ------
     InputError
-        As `open_recording` and `read_corrected`, or if the planes differ in size.
+        As `open_recording` and `read_corrected`, or if the planes differ in size and are to be corrected by pixels.
     """
     if correction.bad_pixels == "auto":
         correction = correction._replace(bad_pixels="none")
     wanted = Selection(None, page, readout.channel, readout.bayer)
-    size, prepared = None, None
+    by_pixels = any(isinstance(file, Path) for file in correction[:3])
+    size, prepared = None, {}
     for path in paths:
         with open_recording(path, page=page, axes="tz") as several:
             stack = several or Recording([path.name], lambda _, wanted, path=path: read_images(path, wanted), [path])
             for plane, name in enumerate(stack.names):
-                images = list(stack.images(plane, wanted))
-                size = size or images[0].shape
-                if images[0].shape != size:
-                    allowed = f"{size_text(size)} pixels, as the first plane"
-                    raise input_error("image", allowed, size_text(images[0].shape), path.parent / name)
-                prepared = prepared or _prepare(size, readout, correction)
-                yield path, read_frame(name, iter(images), prepared, readout)
+                selected = readout
+                try:
+                    images = list(stack.images(plane, wanted))
+                except GreyError:
+                    selected = readout._replace(channel=None)
+                    images = list(stack.images(plane, wanted._replace(channel=None)))
+                shape = images[0].shape
+                size = size or shape
+                if shape != size and by_pixels:
+                    allowed = f"{size_text(size)} pixels, as the first plane, with --dark, --flat or --bad-pixels"
+                    raise input_error("image", allowed, size_text(shape), path.parent / name)
+                if (key := (shape, selected)) not in prepared:
+                    prepared[key] = _prepare(shape, selected, correction)
+                yield path, read_frame(name, iter(images), prepared[key], selected)
 
 
 def spot_names(paths: Sequence[Path], page: int | str | None = None) -> list[str]:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float32, Num
@@ -20,9 +21,13 @@ from ..typing import Image
 from .inverse_problem import subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR, run_solver
 from .residual import discrepancy_target
+from .smoothness import Smoothness, choose_smoothness, image_of
+from .wiener import wiener
 
-# Default weight of ADMM's total variation.
-TV = 1e-3
+# Relative change of the last step below which a solver has converged.
+CONVERGED = 1e-3
+# Light at the edge of a PSF, relative to its brightest pixels, above which it is cut there, and how wide the edge is.
+_CUT, _EDGE = 0.1, 3
 # Arrays of the scene's size that a solver allocates, and for each component of the field. The peaks of 16 to 30 planes
 # of 960 x 960 voxels were 13.7 arrays with ConvolutionADMM, 8.2 with FISTA and 8.6 with Richardson-Lucy; with one
 # component and three, 22.0 and 22.3 with ADMM, 6.9 and 9.4 with FISTA, 7.2 and 13.8 with Richardson-Lucy.
@@ -31,16 +36,49 @@ _ARRAYS, _EACH_COMPONENT = {ConvolutionADMM: 16, ADMM: 18, FISTA: 9, RichardsonL
 Deconvolver = ConvolutionADMM | ADMM | FISTA | RichardsonLucy
 # Solvers by the names of the command line, as functions of the number of steps.
 SOLVERS: dict[str, Callable[[int], Deconvolver]] = {
-    "admm": lambda steps: ConvolutionADMM(steps, sparsity=0.0, tv=TV),
+    "admm": lambda steps: ConvolutionADMM(steps, sparsity=0.0),
     "fista": FISTA,
     "richardson-lucy": lambda steps: RichardsonLucy(steps, accelerate=True),
 }
+_DEFAULT = SOLVERS["admm"](100)
+
+
+class Deconvolution(NamedTuple):
+    """A scene, and how well it was found.
+
+    Parameters
+    ----------
+    scene
+        As `deconvolve` returns it.
+    smoothness
+        The choice of the weight of total variation; None if it was not chosen.
+    residual
+        RMS of what the scene does not explain, relative to that of the capture above its offset.
+    steps
+        Number of steps taken.
+    change
+        Relative change of the last step, as the solver defines it.
+    reached_noise
+        Whether the steps ended because all but noise is explained.
+    """
+
+    scene: Float32[np.ndarray, "*depth row column"]
+    smoothness: Smoothness | None
+    residual: float
+    steps: int
+    change: float
+    reached_noise: bool
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step changed little, or the steps ended at the noise."""
+        return self.reached_noise or self.change < CONVERGED
 
 
 def deconvolve(
     image: Image,
     psf: Num[Array | np.ndarray, "*depth high wide"] | FieldConvolutionOperator,
-    solver: Deconvolver = ConvolutionADMM(steps=100, sparsity=0.0, tv=TV),
+    solver: Deconvolver | None = None,
     *,
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
@@ -62,7 +100,8 @@ def deconvolve(
         operator of PSFs that were measured over the field, by `gs_jax.reconstruction.field_fit.fit_field`.
     solver
         Solver that inverts the convolutions. For PSFs over the field `ADMM`, which takes the weights of
-        `ConvolutionADMM` if that is given.
+        `ConvolutionADMM` if that is given. None: 100 steps of `ConvolutionADMM`, with the weight of total variation
+        that predicts parts of the image best which are held out (`gs_jax.reconstruction.smoothness`).
     stop_at_discrepancy
         Stop early where the cost is no larger than the image's noise leaves (Morozov's discrepancy principle).
     progress
@@ -96,25 +135,73 @@ def deconvolve(
     >>> print(volume.shape, volume.sum((1, 2)).argmax())
     (2, 64, 64) 1
     """
+    return run_deconvolution(
+        image, psf, solver, choose=solver is None, stop_at_discrepancy=stop_at_discrepancy, progress=progress
+    ).scene
+
+
+def run_deconvolution(
+    image: Image,
+    psf: Num[Array | np.ndarray, "*depth high wide"] | FieldConvolutionOperator,
+    solver: Deconvolver | None = None,
+    *,
+    choose: bool = False,
+    stop_at_discrepancy: bool = False,
+    progress: Progress | None = None,
+) -> Deconvolution:
+    """As `deconvolve`, with how well the scene was found; `choose` chooses the weight of total variation."""
+    solver, progress = _DEFAULT if solver is None else solver, progress or Progress()
     if not isinstance(solver, Deconvolver):
         raise InputError(f"solver must be an object such as ConvolutionADMM() or FISTA(), got {short_repr(solver)}.")
-    check_finite("image", image)
-    light = subtract_offset(np.asarray(image, np.float32))
-    system = psf if isinstance(psf, FieldConvolutionOperator) else _stack_operator(psf, light.shape)
+    light, unit = _light(image)
+    spots = psf if isinstance(psf, FieldConvolutionOperator) else normalise_spots(psf, light.shape)
+    system = spots if isinstance(spots, FieldConvolutionOperator) else ConvolutionOperator(spots, light.shape)
     if isinstance(system, FieldConvolutionOperator):
         solver = _of_any_operator(solver)
     elif isinstance(solver, ADMM):
         raise InputError("solver must be ConvolutionADMM() for PSFs that do not vary over the field, got ADMM.")
     _check_memory(solver, system)
-    # Weights of priors suit images of the order of 1.
-    unit = np.float32(np.abs(light).max() or 1.0)
+    smoothness = None
+    if choose:
+        if not isinstance(solver, ConvolutionADMM | ADMM):
+            raise InputError("solver must be ConvolutionADMM() or ADMM(), whose smoothness can be chosen.")
+        smoothness = choose_smoothness(light, spots, solver, progress)
+        solver = dataclasses.replace(solver, tv=smoothness.tv)
     target = 0.0
     if stop_at_discrepancy:
         counts = isinstance(solver, RichardsonLucy)
-        target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light / unit, counts=counts)
-    scene = run_solver(solver, light / unit, system, progress or Progress(), target)
+        target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light, counts=counts)
+    changes = []
+    read = lambda solver, state, cost: (np.asarray(solver.estimate(state), np.float32), cost < target)
+    scene, reached_noise = run_solver(solver, light, system, progress, target, read, residuals=changes)
+    difference = np.asarray(image_of(system, scene)) - light
+    residual = float(np.linalg.norm(difference) / (np.linalg.norm(light) or 1))
     scene = unit * scene[:, *system.window]
-    return scene[0] if isinstance(psf, Array | np.ndarray) and psf.ndim == 2 else scene
+    scene = scene[0] if isinstance(psf, Array | np.ndarray) and psf.ndim == 2 else scene
+    return Deconvolution(scene, smoothness, residual, len(changes), changes[-1], reached_noise)
+
+
+def filter_image(image: Image, psf: Num[Array | np.ndarray, "*depth high wide"]) -> Float32[np.ndarray, "row column"]:
+    """Deconvolve an image by the Wiener filter: one plane in about a second, as a preview.
+
+    Offsets are subtracted, and values are in the image's unit, as by `deconvolve`. `InputError` as there, and for a
+    stack of PSFs.
+    """
+    light, unit = _light(image)
+    spots = normalise_spots(psf, light.shape)
+    if len(spots) > 1:
+        raise InputError(
+            f"--method wiener must be used with one PSF, for one plane, got {len(spots)}; admm takes a stack."
+        )
+    return unit * wiener(light, spots[0])[0]
+
+
+def _light(image):
+    """An image above its offset, of the order of 1, which suits the weights of priors; and its unit."""
+    check_finite("image", image)
+    light = subtract_offset(np.asarray(image, np.float32))
+    unit = np.float32(np.abs(light).max() or 1.0)
+    return light / unit, unit
 
 
 def make_solver(method: str, steps: int, weights: dict[str, float | None]) -> Deconvolver:
@@ -139,8 +226,33 @@ def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarra
     return sum_pixels(np.asarray(image, np.float32), side)
 
 
-def _stack_operator(psf, image_shape) -> ConvolutionOperator:
-    """Operator of PSFs above their offsets, each with the sum 1."""
+def pad_to_largest(spots: list[Num[np.ndarray, "high wide"]]) -> Num[np.ndarray, "plane tall wide"]:
+    """Stack images of points that may differ in size; smaller ones are in the middle, in their own offset."""
+    size = np.max([spot.shape for spot in spots], axis=0)
+
+    def padded(spot):
+        if spot.shape == tuple(size):
+            return spot
+        # The point is at n // 2 of n pixels.
+        before = [n // 2 - k // 2 for n, k in zip(size, spot.shape, strict=True)]
+        margins = [(b, n - k - b) for b, n, k in zip(before, size, spot.shape, strict=True)]
+        return np.pad(
+            np.asarray(spot, np.float32), margins, constant_values=float((spot - subtract_offset(spot)).max())
+        )
+
+    return np.stack([padded(spot) for spot in spots])
+
+
+def cut_sides(spot: Num[np.ndarray, "high wide"]) -> list[str]:
+    """The sides at which a PSF is cut by the edge of its image, where it leaves bright lines in the scene."""
+    light = subtract_offset(np.asarray(spot, np.float32))
+    edges = {"top": light[:_EDGE], "bottom": light[-_EDGE:], "left": light[:, :_EDGE], "right": light[:, -_EDGE:]}
+    bright = _CUT * np.percentile(light, 99.9)
+    return [side for side, edge in edges.items() if np.percentile(edge, 99) > bright > 0]
+
+
+def normalise_spots(psf, image_shape) -> Float32[np.ndarray, "depth high wide"]:
+    """PSFs above their offsets, each with the sum 1."""
     if psf.ndim not in (2, 3) or min(psf.shape) < 1:
         raise input_error("psf", "an image or a stack of images", f"the shape {psf.shape}")
     check_finite("psf", psf)
@@ -153,7 +265,7 @@ def _stack_operator(psf, image_shape) -> ConvolutionOperator:
             where = f" in plane {plane + 1}" if len(spots) > 1 else ""
             raise InputError(f"psf must be the image of a point, got no light above the darkest percent{where}.")
         spots[plane] = spot / total
-    return ConvolutionOperator(spots, image_shape)
+    return spots
 
 
 def _of_any_operator(solver: Deconvolver) -> Deconvolver:

@@ -18,14 +18,16 @@ from .inverse_problem import sum_pixels
 from .pipeline import run_solver
 from .residual import binned_variance
 
-# Weights that are tried, from the strongest on, each from the solution of the one before.
-WEIGHTS = tuple(float(f"{weight:.1g}") for weight in np.geomspace(3e-2, 1e-6, 10))
+# Weights that are tried: from the first on, weaker and weaker ones, and then stronger and stronger ones, each from the
+# solution of the one before. From nothing, a scene builds up too slowly with a strong weight, and a weak one fits noise
+# before detail.
+_FIRST, _WEAKER, _STRONGER = 1e-3, (3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6), (3e-3, 1e-2, 3e-2)
 # Steps with the first weight and with each other.
-_FIRST_STEPS, _STEPS = 30, 15
-# Weights without improvement after which no weaker one is tried.
-_PATIENCE = 2
+_FIRST_STEPS, _STEPS = 60, 15
+# Mean log error above the least at which no weight further on is tried.
+_WORSE = 0.25
 # Voxels of the scene beyond which pixels are binned for the trials.
-_VOXELS = 2**21
+_VOXELS = 2**20
 # Side of the squares that are held out, pixels, and their distance, in sides. Single pixels are told by their
 # neighbours, also where the PSF is wrong: they choose weights that are too weak. In small images squares are smaller.
 _SIDE, _DISTANCE, _LEAST_SQUARES = 8, 4, 16
@@ -64,12 +66,12 @@ def choose_smoothness(
     A square of 8 x 8 pixels of every 32 x 32 is left out of the fit. Each point casts light all over its PSF, so the
     rest of the capture tells what is in the squares. A weight that is too weak fits noise, and errors of the PSF, which
     the squares do not share; one that is too strong predicts too little detail. So the choice needs to know neither the
-    noise nor the errors of the PSF (cross-validation: Stone, J. R. Stat. Soc. B 36, 111, 1974). The mean of the squares'
-    log errors decides, so that a few bright ones do not outvote the others; of weights whose mean is within one standard
+    noise nor the errors of the PSF (cross-validation: Stone, J. R. Stat. Soc. B 36, 111, 1974). The squares' mean log
+    error decides, so that a few bright ones do not outvote the others; of weights whose mean is within one standard
     error of the least, the largest is taken (Breiman et al., Classification and Regression Trees, 1984).
 
-    The weights are tried one after the other, from strong to weak, each from the solution of the last one, in a few
-    steps. Large captures are binned; noise is then added again, so that it is that of single pixels.
+    The weights are tried in a few steps each, from the solution of a weight nearby. Large captures are binned; noise is
+    then added again, so that it is that of single pixels.
 
     Parameters
     ----------
@@ -91,20 +93,35 @@ def choose_smoothness(
     kept = held_out_squares(light.shape)
     components = lambda a: (a.components if isinstance(a, FieldConvolutionOperator) else a).kept
     system = eqx.tree_at(components, whole, jnp.asarray(kept), is_leaf=lambda leaf: leaf is None)
-    trial = dataclasses.replace(solver, steps=_FIRST_STEPS, tolerance=0.0, tv=WEIGHTS[0])
-    errors, state = [], None
-    for number, weight in enumerate((progress or Progress()).track(WEIGHTS, "Choosing the smoothness")):
-        if state is not None:
-            trial = dataclasses.replace(trial, steps=_STEPS)
-            state = trial.smoother(state, weight / WEIGHTS[number - 1])
-        state = run_solver(trial, kept * light, system, Progress(), read=lambda _, state, __: state, start=state)
-        errors.append(_squares((1 - kept) * (np.asarray(_image(whole, trial.estimate(state))) - light)))
-        if number - int(_mean_logs(errors).argmin()) >= _PATIENCE:
-            break
-    best = _largest_within_an_error(errors)
-    rms = np.sqrt(np.mean(errors, axis=1) / max(float(np.mean(_squares((1 - kept) * light))), _TINY))
+    trial = dataclasses.replace(solver, steps=_FIRST_STEPS, tolerance=0.0, tv=_FIRST)
+    errors = {}
+
+    def error_of(weight, state=None, before=_FIRST):
+        """Take the steps of a weight from the state of another; keep the error and return the state."""
+        some = trial if state is None else dataclasses.replace(trial, steps=_STEPS)
+        start = None if state is None else trial.smoother(state, weight / before)
+        state = run_solver(some, kept * light, system, Progress(), read=lambda _, state, __: state, start=start)
+        errors[weight] = _squares((1 - kept) * (np.asarray(image_of(whole, trial.estimate(state))) - light))
+        return state
+
+    with (progress or Progress()).counter("Choosing the smoothness", 1 + len(_WEAKER) + len(_STRONGER)) as advance:
+        first = error_of(_FIRST)
+        advance()
+        for weights in (_WEAKER, _STRONGER):
+            # A copy, as steps overwrite their state.
+            state, before = jax.tree.map(jnp.copy, first), _FIRST
+            for weight in weights:
+                state, before = error_of(weight, state, before), weight
+                advance()
+                means = _logs(list(errors.values())).mean(axis=1)
+                if means[-1] > means.min() + _WORSE:
+                    break
+    tried = sorted(errors)
+    errors = np.array([errors[weight] for weight in tried])
+    rms = np.sqrt(errors.mean(axis=1) / max(float(np.mean(_squares((1 - kept) * light))), _TINY))
     # An edge has 1 / side as many binned pixels, an area 1 / side^2.
-    return Smoothness(side * WEIGHTS[best], WEIGHTS[: len(errors)], tuple(rms.tolist()))
+    scaled = tuple(side * weight for weight in tried)
+    return Smoothness(scaled[_largest_within_an_error(errors)], scaled, tuple(rms.tolist()))
 
 
 def held_out_squares(shape: tuple[int, ...]) -> Float32[np.ndarray, "row column"]:
@@ -134,15 +151,11 @@ def _logs(errors):
     return np.log(np.array(errors) + max(floor, _TINY))
 
 
-def _mean_logs(errors):
-    return _logs(errors).mean(axis=1)
-
-
 def _largest_within_an_error(errors):
-    """The first weight whose mean is within a standard error of the least; differences are taken in each cell."""
+    """The last weight whose mean is within a standard error of the least; differences are taken in each cell."""
     logs = _logs(errors)
     excess = logs - logs[logs.mean(axis=1).argmin()]
-    return int(np.argmax(excess.mean(axis=1) <= excess.std(axis=1) / math.sqrt(excess.shape[1])))
+    return int(np.flatnonzero(excess.mean(axis=1) <= excess.std(axis=1) / math.sqrt(excess.shape[1]))[-1])
 
 
 def _binning(image_shape, psf_shape):
@@ -163,5 +176,6 @@ def _binned(light, side):
 
 
 @jax.jit
-def _image(system, scene):
+def image_of(system, scene):
+    """The image of a scene."""
     return system.mv(scene)
