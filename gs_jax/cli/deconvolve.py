@@ -193,8 +193,8 @@ def _print_quality(result):
     if chosen := result.smoothness:
         error = min(chosen.errors, default=0)
         click.echo(
-            f"smoothness: --tv {chosen.tv:.1g}, of {len(chosen.tried)} weights the smoothest that predicts held-out "
-            f"pixels as well as the best (to {error:.2g} of their RMS)"
+            f"smoothness: --tv {chosen.tv:.1g}, which predicts held-out pixels best of {len(chosen.tried)} weights, to "
+            f"{error:.2g} of their RMS"
         )
     if result.reached_noise:
         end = "stopped where only noise is left"

@@ -21,7 +21,7 @@ from .residual import binned_variance
 # Weights that are tried: from the first on, weaker and weaker ones, and then stronger and stronger ones, each from the
 # solution of the one before. From nothing, a scene builds up too slowly with a strong weight, and a weak one fits noise
 # before detail.
-_FIRST, _WEAKER, _STRONGER = 1e-3, (3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6), (3e-3, 1e-2, 3e-2)
+_FIRST, _WEAKER, _STRONGER = 1e-3, (3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6), (3e-3, 1e-2)
 # Steps with the first weight and with each other.
 _FIRST_STEPS, _STEPS = 60, 15
 # Mean log error above the least at which no weight further on is tried.
@@ -67,8 +67,7 @@ def choose_smoothness(
     rest of the capture tells what is in the squares. A weight that is too weak fits noise, and errors of the PSF, which
     the squares do not share; one that is too strong predicts too little detail. So the choice needs to know neither the
     noise nor the errors of the PSF (cross-validation: Stone, J. R. Stat. Soc. B 36, 111, 1974). The squares' mean log
-    error decides, so that a few bright ones do not outvote the others; of weights whose mean is within one standard
-    error of the least, the largest is taken (Breiman et al., Classification and Regression Trees, 1984).
+    error decides, so that a few bright ones do not outvote the others.
 
     The weights are tried in a few steps each, from the solution of a weight nearby. Large captures are binned; noise is
     then added again, so that it is that of single pixels.
@@ -113,7 +112,7 @@ def choose_smoothness(
             for weight in weights:
                 state, before = error_of(weight, state, before), weight
                 advance()
-                means = _logs(list(errors.values())).mean(axis=1)
+                means = _mean_logs(list(errors.values()))
                 if means[-1] > means.min() + _WORSE:
                     break
     tried = sorted(errors)
@@ -121,7 +120,8 @@ def choose_smoothness(
     rms = np.sqrt(errors.mean(axis=1) / max(float(np.mean(_squares((1 - kept) * light))), _TINY))
     # An edge has 1 / side as many binned pixels, an area 1 / side^2.
     scaled = tuple(side * weight for weight in tried)
-    return Smoothness(scaled[_largest_within_an_error(errors)], scaled, tuple(rms.tolist()))
+    best = int(_mean_logs(errors).argmin())
+    return Smoothness(scaled[best], scaled, tuple(rms.tolist()))
 
 
 def held_out_squares(shape: tuple[int, ...]) -> Float32[np.ndarray, "row column"]:
@@ -145,17 +145,11 @@ def _squares(error):
     return np.add.reduceat(np.add.reduceat(error.astype(np.float64) ** 2, rows, 0), columns, 1).ravel()
 
 
-def _logs(errors):
-    """Logarithms of the errors, of each weight in each cell; a cell without light has no tiny ones."""
-    floor = _FLOOR * np.mean(errors, axis=1).min()
-    return np.log(np.array(errors) + max(floor, _TINY))
-
-
-def _largest_within_an_error(errors):
-    """The last weight whose mean is within a standard error of the least; differences are taken in each cell."""
-    logs = _logs(errors)
-    excess = logs - logs[logs.mean(axis=1).argmin()]
-    return int(np.flatnonzero(excess.mean(axis=1) <= excess.std(axis=1) / math.sqrt(excess.shape[1]))[-1])
+def _mean_logs(errors):
+    """Mean logarithm of the cells' errors with each weight; cells without light have no tiny ones."""
+    errors = np.asarray(errors)
+    floor = _FLOOR * errors.mean(axis=1).min()
+    return np.log(errors + max(floor, _TINY)).mean(axis=1)
 
 
 def _binning(image_shape, psf_shape):
