@@ -274,3 +274,25 @@ def test_the_deconvolve_command(tmp_path):
     assert {"input c.tif", "input psf.npy"} < set(read_provenance(tmp_path / "s.tif"))
     wrong = CliRunner().invoke(commands, [*arguments, "--method", "fista", "--tv", "0.1", *output]).exception
     assert isinstance(wrong, InputError) and "--method admm or richardson-lucy" in str(wrong)
+
+
+def test_the_command_says_how_well_the_scene_was_found(tmp_path):
+    scene, psf, image = bars()
+    write_capture(tmp_path / "c.tif", image.astype(np.float32))
+    write_capture(tmp_path / "psf.tif", psf.astype(np.float32))
+
+    def run(*options):
+        paths = [str(tmp_path / name) for name in ("c.tif", "psf.tif", "s.tif")]
+        return CliRunner().invoke(commands, ["deconvolve", *paths[:2], "-o", paths[2], *options])
+
+    chosen = run("--steps", "5").stdout
+    assert "smoothness: --tv " in chosen and "predicts held-out pixels best of" in chosen
+    assert "chosen from the capture" in read_provenance(tmp_path / "s.tif")["tv"]
+    assert "of the capture's RMS; not converged, the last step changed" in chosen and "more --steps" in chosen
+    given = run("--steps", "5", "--tv", "1e-4").stdout
+    assert "smoothness" not in given and "residual: " in given and "tv" not in read_provenance(tmp_path / "s.tif")
+    assert "not converged" in run("--method", "fista", "--steps", "5").stdout
+    assert "residual" not in (preview := run("--method", "wiener")).stdout and not preview.exception
+    assert read_capture(tmp_path / "s.tif").shape == scene.shape
+    wrong = run("--method", "wiener", "--steps", "5", "--tv", "0.1").exception
+    assert isinstance(wrong, InputError) and "--steps, --tv must not be given with --method wiener" in str(wrong)

@@ -30,7 +30,7 @@ from gs_jax.mold.export import Mask, Mesh, write_mask, write_mesh
 from gs_jax.mold.height_files import HEIGHT_SUFFIXES, write_heights
 from gs_jax.optics.psf import PSFS
 from gs_jax.projection.forward_model import FIDELITIES
-from gs_jax.reconstruction.deconvolution import TV
+from gs_jax.reconstruction.deconvolution import SOLVERS
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.simulation.synthetic import OPTICS
 
@@ -42,8 +42,8 @@ ROOT = Path(__file__).parents[1]
 
 def test_names_are_those_of_the_library():
     assert options.METHODS == tuple(METHODS) and options.FIDELITIES == FIDELITIES
-    (tv,) = (option for option in deconvolve_command.params if option.name == "tv")
-    assert isinstance(tv, click.Option) and f"[default: {TV:g} of admm]" in (tv.help or "")
+    (method,) = (option for option in deconvolve_command.params if option.name == "method")
+    assert isinstance(method.type, click.Choice) and tuple(method.type.choices) == (*SOLVERS, "wiener")
     assert options.SIMULATED == OPTICS and options.PSFS == tuple(PSFS)
 
 

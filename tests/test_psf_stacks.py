@@ -96,11 +96,57 @@ def test_the_volume_has_the_lengths_that_are_known(folder):
     assert tifffile.imread("plane.tif").shape == SHAPE
 
 
+def test_planes_may_be_uneven_and_psfs_of_unlike_size(folder):
+    first, second, third = spots()
+    psfs = [np.pad(first, ((4, 4), (0, 0)), constant_values=7), second[2:-2, 1:-1], third]
+    names = [f"p{number}.tif" for number in range(PLANES)]
+    for name, psf in zip(names, psfs, strict=True):
+        write_capture(name, psf)
+    unlike = ("--method", "fista", "--steps", "20", "--depths", "10,12.5,40")
+    result = deconvolved(*names, *unlike)
+    assert not result.exception and "3 depths from 10 to 40 mm, 40 x 48 pixels" in result.stdout
+    assert not deconvolved(*save(folder, "pages"), *unlike, output="same.ome.tif").exception
+    # The scene is larger, and its FFTs round otherwise.
+    volume, same = tifffile.imread("v.ome.tif"), tifffile.imread("same.ome.tif")
+    np.testing.assert_allclose(volume, same, atol=0.02 * same.max())
+
+
+@pytest.mark.parametrize("grey", [True, False])
+def test_a_channel_of_a_capture_goes_with_a_grey_psf(folder, grey):
+    colours = np.stack([capture(), capture() // 2, capture() // 4], -1)
+    tifffile.imwrite("c.tif", colours, photometric="rgb")
+    psf = spots()[1]
+    tifffile.imwrite("psf.tif", psf if grey else np.stack([psf // 9, psf, psf // 9], -1), photometric=None)
+    result = deconvolved("psf.tif", "--channel", "green", "--method", "fista", "--steps", "5", output="v.tif")
+    assert not result.exception, result.exception
+    assert f"{'c.tif' if grey else '2 captures'}: green of a colour image" in result.stdout
+    green = tifffile.imread("v.tif")
+    write_capture("c.tif", capture() // 2)
+    write_capture("psf.tif", psf)
+    assert not deconvolved("psf.tif", "--method", "fista", "--steps", "5", output="v.tif").exception
+    np.testing.assert_array_equal(green, tifffile.imread("v.tif"))
+
+
+def test_a_psf_that_is_cut_by_its_edge_gets_a_warning(folder):
+    write_capture("psf.tif", spots()[1])
+    fista = ("psf.tif", "--method", "fista", "--steps", "2")
+    assert "is cut" not in deconvolved(*fista).stderr
+    write_capture("psf.tif", spots()[1][4:, :22])
+    result = deconvolved(*fista)
+    assert not result.exception and "gs-jax: warning: the PSF is cut at the top and right" in result.stderr
+
+
 WRONG = {
     "depths": (("psf.tif", "--depths", "10:13:1"), "--depths must be one for each PSF, 3 in all, got 4 depths."),
     "zarr": (("psf.tif", "--depths", "10:12:1"), "OME-Zarr needs --depths and --voxel-um, got not both"),
     "large": (("large.tif",), "psf must be at most the image's 40 x 48 pixels, got 50 x 20."),
-    "sizes": (("psf.tif", "large.tif"), "image must be 25 x 27 pixels, as the first plane, got 50 x 20 (large.tif)."),
+    "uneven": (
+        ("psf.tif", "--depths", "10,11,40", "--voxel-um", "9"),
+        "depths must be in even steps for OME-Zarr, got uneven ones; use .ome.tif (v.zarr).",
+    ),
+    "jpeg": (("psf.jpg",), "got '.jpg'; JPEG is lossy, and its values are not linear in light: save captures as TIFF"),
+    "mat": (("psf.mat",), "got '.mat'; convert it: numpy.save('a.npy', scipy.io.loadmat('a.mat')['NAME']"),
+    "wiener": (("psf.tif", "--method", "wiener"), "wiener must be used with one PSF, for one plane, got 3; admm takes"),
     "dark": (("dark.npy",), "got no light above the darkest percent in plane 2."),
     "weight": (("psf.tif", "--method", "fista", "--tv-z", "2"), "--tv-z must be used with --method admm, got fista."),
     "page": (("psf.tif", "--psf-page", "4"), "must be 1 to 3, or mean, got --page 4 of 3 pages"),
@@ -122,10 +168,12 @@ def test_no_file_of_a_stack_is_replaced(folder, psf):
 def test_what_does_not_fit_is_refused_in_one_line(folder, case):
     save(folder, "pages")
     write_capture("large.tif", np.eye(50, 20, dtype=np.float32))
+    for name in ("psf.jpg", "psf.mat"):
+        (folder / name).write_bytes(b"?")
     np.save("dark.npy", np.stack([spots()[0], spots()[0] * 0]))
     arguments, words = WRONG[case]
     before = sorted(path.name for path in folder.iterdir())
-    result = deconvolved(*arguments, output="v.zarr" if case == "zarr" else "v.ome.tif")
+    result = deconvolved(*arguments, output="v.zarr" if case in ("zarr", "uneven") else "v.ome.tif")
     assert isinstance(result.exception, InputError) and words in str(result.exception)
     assert sorted(path.name for path in folder.iterdir()) == before
 

@@ -45,13 +45,12 @@ def read_spots(
     Raises
     ------
     InputError
-        As `open_recording` and `read_corrected`, or if the planes differ in size and are to be corrected by pixels.
+        As `open_recording` and `read_corrected`.
     """
     if correction.bad_pixels == "auto":
         correction = correction._replace(bad_pixels="none")
     wanted = Selection(None, page, readout.channel, readout.bayer)
-    by_pixels = any(isinstance(file, Path) for file in correction[:3])
-    size, prepared = None, {}
+    prepared = {}
     for path in paths:
         with open_recording(path, page=page, axes="tz") as several:
             stack = several or Recording([path.name], lambda _, wanted, path=path: read_images(path, wanted), [path])
@@ -63,10 +62,6 @@ def read_spots(
                     selected = readout._replace(channel=None)
                     images = list(stack.images(plane, wanted._replace(channel=None)))
                 shape = images[0].shape
-                size = size or shape
-                if shape != size and by_pixels:
-                    allowed = f"{size_text(size)} pixels, as the first plane, with --dark, --flat or --bad-pixels"
-                    raise input_error("image", allowed, size_text(shape), path.parent / name)
                 if (key := (shape, selected)) not in prepared:
                     prepared[key] = _prepare(shape, selected, correction)
                 yield path, read_frame(name, iter(images), prepared[key], selected)

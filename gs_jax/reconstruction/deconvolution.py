@@ -27,7 +27,7 @@ from .wiener import wiener
 # Relative change of the last step below which a solver has converged.
 CONVERGED = 1e-3
 # Light at the edge of a PSF, relative to its brightest pixels, above which it is cut there, and how wide the edge is.
-_CUT, _EDGE = 0.1, 3
+_CUT, _EDGE = 0.1, 2
 # Arrays of the scene's size that a solver allocates, and for each component of the field. The peaks of 16 to 30 planes
 # of 960 x 960 voxels were 13.7 arrays with ConvolutionADMM, 8.2 with FISTA and 8.6 with Richardson-Lucy; with one
 # component and three, 22.0 and 22.3 with ADMM, 6.9 and 9.4 with FISTA, 7.2 and 13.8 with Richardson-Lucy.
