@@ -269,6 +269,9 @@ def test_the_command(tmp_path, monkeypatch, capsys, table1):
     [
         (["--json", "sheet.txt"], "sheet.txt"),
         (["--depths", "20:22"], "must be START:STOP:STEP"),
+        (["--depths", "20,abc"], "or a list such as 10,40, or one depth, got '20,abc'"),
+        (["--depths", "20,19"], "must be depths in ascending order, got '20,19'"),
+        (["--depths", "-1,19"], "must be depths of 1e-06 mm or more, got '-1,19'"),
         (["--confusion-um", "0"], "must be 0.01 to 1e"),
     ],
 )

@@ -14,7 +14,7 @@ from scipy.signal import convolve2d
 from gs_jax import FISTA, ConvolutionADMM, InputError, write_capture
 from gs_jax.__main__ import commands
 from gs_jax.projection.measured_psf import FieldConvolutionOperator
-from gs_jax.reconstruction.deconvolution import deconvolve
+from gs_jax.reconstruction.deconvolution import deconvolve, run_deconvolution
 from gs_jax.reconstruction.field_fit import fit_field
 
 SHAPE = (48, 56)
@@ -150,3 +150,15 @@ def test_solvers_that_the_field_does_not_allow_are_refused():
     for solver in (ConvolutionADMM(tv_z=0.0), ConvolutionADMM(nonnegative=False)):
         with pytest.raises(InputError, match="solver must be with tv_z=1 and nonnegative=True"):
             deconvolve(np.ones(SHAPE), fit.operator, solver)
+
+
+@pytest.mark.integration
+def test_the_smoothness_is_chosen_also_with_psfs_over_the_field():
+    psfs, places = measured()
+    operator = fit_field(psfs, places, SHAPE).operator
+    image = spots_at(-7, 5) + spots_at(-6, 5)
+    result = run_deconvolution(image, operator, choose=True)
+    assert result.smoothness and 1e-6 <= result.smoothness.tv <= 1e-2
+    assert result.residual < 0.1
+    row, column = np.unravel_index(result.scene[0].argmax(), SHAPE)
+    assert abs(row - (MIDDLE[0] - 6.5)) < 1.5 and abs(column - (MIDDLE[1] + 5)) < 1.5

@@ -1,5 +1,6 @@
 """Where files say that they come from, and what other programs read in them."""
 
+import functools
 import json
 
 import numpy as np
@@ -46,6 +47,30 @@ def test_a_file_says_where_it_comes_from(tmp_path, name):
     WRITE[name](path)
     assert read_provenance(path) == {}
     assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+FOREIGN = {
+    "stack.tif": (np.zeros((4, 6, 5), np.uint16), {}, ["6 x 5", "uint16", "4", "QYX, 4 x 6 x 5", "a stack of PSFs"]),
+    "colour.tif": (
+        np.zeros((6, 5, 3), np.uint8),
+        {"photometric": "rgb"},
+        ["YXS, 6 x 5 x 3", "or --channel red, green"],
+    ),
+    "wide.tif": (np.zeros((6, 5)), {}, ["float64", "pixels must be uint8, uint16, float32, got float64"]),
+    "plain.npy": (np.zeros((6, 5), np.uint8), {}, ["6 x 5", "uint8", "a capture, or a PSF for `gs-jax deconvolve`"]),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_info_says_what_an_image_of_another_program_is_good_for(tmp_path, name):
+    pixels, options, expected = FOREIGN[name]
+    save = np.save if name.endswith(".npy") else functools.partial(tifffile.imwrite, **options)
+    save(tmp_path / name, pixels)
+    shown = CliRunner().invoke(commands, ["info", str(tmp_path / name)])
+    assert shown.exit_code == 0 and f"{tmp_path / name} has no provenance." in shown.stdout
+    assert [words for words in expected if words not in shown.stdout] == []
+    use = next(line for line in shown.stdout.splitlines() if line.startswith("use"))
+    assert str(tmp_path) not in use
 
 
 @pytest.mark.parametrize("name", WRITE)

@@ -64,7 +64,7 @@ def test_pixels_that_are_left_out_do_not_matter():
     kept = held_out_squares((12, 10))
     A = ConvolutionOperator(jax.random.uniform(jax.random.key(0), (1, 5, 4)), (12, 10), kept)
     scene = jnp.zeros(A.scene_shape).at[0, 5:8, 4:7].set(1.0)
-    image = A.mv(scene) + 0.2 * A.kept * jax.random.normal(jax.random.key(1), (12, 10))
+    image = A.mv(scene) + 0.2 * jnp.asarray(kept, float) * jax.random.normal(jax.random.key(1), (12, 10))
     assert not A.mv(scene)[kept == 0].any()
     solvers = ConvolutionADMM(2000, sparsity=0.05), FISTA(1000, sparsity=0.05)
     costs = [jax.jit(lambda b, s=s: solve(A, b, s))(image).costs[-1] for s in solvers]

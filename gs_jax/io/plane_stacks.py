@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from ..base.errors import InputWarning, input_error
 from ..grid import Grid
 from .camera import Corrected, Correction, Prepared, Readout, prepare, read_frame
-from .captures import GreyError, Selection, read_images, size_text
+from .captures import GreyError, Selection, read_images
 from .files import atomic_write, check_output
 from .names import natural_order
 from .ngff import title, um

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -95,11 +95,12 @@ def choose_smoothness(
     trial = dataclasses.replace(solver, steps=_FIRST_STEPS, tolerance=0.0, tv=_FIRST)
     errors = {}
 
-    def error_of(weight, state=None, before=_FIRST):
-        """Take the steps of a weight from the state of another; keep the error and return the state."""
-        some = trial if state is None else dataclasses.replace(trial, steps=_STEPS)
-        start = None if state is None else trial.smoother(state, weight / before)
-        state = run_solver(some, kept * light, system, Progress(), read=lambda _, state, __: state, start=start)
+    def error_of(weight, last=None, before=_FIRST):
+        """Take the steps of a weight from the last state, of another weight; keep the error and return the state."""
+        some = trial if last is None else dataclasses.replace(trial, steps=_STEPS)
+        start = None if last is None else trial.smoother(last, weight / before)
+        read = lambda _, state, __: state
+        state: Any = run_solver(some, kept * light, system, Progress(), read=read, start=start)
         errors[weight] = _squares((1 - kept) * (np.asarray(image_of(whole, trial.estimate(state))) - light))
         return state
 

@@ -27,7 +27,7 @@ def wiener(
     image[middle(light.shape, size)] = light
     spot[: psf.shape[0], : psf.shape[1]] = psf
     spot = np.roll(spot, [-(k // 2) for k in psf.shape], (0, 1))
-    seen, transfer = fft.rfft2(image, workers=-1), fft.rfft2(spot, workers=-1)
+    seen, transfer = (np.asarray(fft.rfft2(a, workers=-1)) for a in (image, spot))
     power = np.abs(transfer) ** 2
     energy, peak = np.abs(seen) ** 2, power.max()
 
@@ -37,7 +37,7 @@ def wiener(
         return float(np.mean(left**2 * energy) / np.mean(left) ** 2)
 
     ratio = min(_RATIOS, key=score)
-    scene = fft.irfft2(seen * transfer.conj() / (power + ratio * peak), size, workers=-1)
+    scene = np.asarray(fft.irfft2(seen * transfer.conj() / (power + ratio * peak), size, workers=-1))
     return np.maximum(scene[middle(light.shape, size)], 0).astype(np.float32), float(ratio)
 
 
