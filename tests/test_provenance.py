@@ -56,15 +56,15 @@ FOREIGN = {
         {"photometric": "rgb"},
         ["YXS, 6 x 5 x 3", "or --channel red, green"],
     ),
-    "wide.tif": (np.zeros((6, 5)), {}, ["float64", "pixels must be uint8, uint16, float32, got float64"]),
-    "plain.npy": (np.zeros((6, 5), np.uint8), {}, ["6 x 5", "uint8", "a capture, or a PSF for `gs-jax deconvolve`"]),
+    "wide.tif": (np.zeros((6, 5)), "minisblack", ["float64", "pixels must be uint8, uint16, float32, got float64"]),
+    "plain.npy": (np.zeros((6, 5), np.uint8), None, ["6 x 5", "uint8", "a capture, or a PSF for `gs-jax deconvolve`"]),
 }
 
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_info_says_what_an_image_of_another_program_is_good_for(tmp_path, name):
-    pixels, options, expected = FOREIGN[name]
-    save = np.save if name.endswith(".npy") else functools.partial(tifffile.imwrite, **options)
+    pixels, photometric, expected = FOREIGN[name]
+    save = functools.partial(tifffile.imwrite, photometric=photometric) if photometric else np.save
     save(tmp_path / name, pixels)
     shown = CliRunner().invoke(commands, ["info", str(tmp_path / name)])
     assert shown.exit_code == 0 and f"{tmp_path / name} has no provenance." in shown.stdout

@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
 from .options import UM, CaptureOptions, Depths, Number, Page, depth_range, given_options, picture_options
-from .outputs import check_may_write, provenance_of
+from .outputs import check_even, check_may_write, provenance_of
 
 _METHODS = ("admm", "fista", "richardson-lucy", "wiener")
 # Options of the methods that take steps.
@@ -134,11 +134,9 @@ def deconvolve_command(
             raise InputError("--tv-z must not be given with --psf-places, got both.")
         places = _read_places(psf_places, psf)
         depths = None if np.isnan(places[:, 2]).any() else np.unique(places[:, 2]).tolist()
-    if output.suffix.lower() == ".zarr":
-        if not (depths and voxel_um):
-            raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
-        if np.ptp(np.diff(depths)) > 1e-6 * max(depths):
-            raise input_error("depths", "in even steps for OME-Zarr", "uneven ones; use .ome.tif", output)
+    if output.suffix.lower() == ".zarr" and not (depths and voxel_um):
+        raise InputError(f"{output}: OME-Zarr needs --depths and --voxel-um, got not both; use .ome.tif or .npy.")
+    check_even(output, depths)
     if depths and depths[0] <= 0 and voxel_um and output.suffix.lower() != ".npy":
         raise input_error("z_mm", "positive with --voxel-um", f"{depths[0]:g}", psf_places)
     names, fit, result = spot_names(psf, psf_page), None, None

@@ -3,6 +3,7 @@
 A signal ends a command soon, even within compiled code, and leaves no half-written file.
 """
 
+import itertools
 import multiprocessing
 import os
 import shlex
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import click
 
-from ..base.errors import InputError
+from ..base.errors import InputError, input_error
 from ..base.progress import QUIET, verbosity
 from ..io.files import remove_temporaries
 
@@ -53,6 +54,15 @@ def check_may_write(*outputs: Path | None, inputs: Iterable[Path | None], force:
             raise InputError(f"{path}: the output must be a new file, got an existing one; --force replaces it.")
     names, quiet = ", ".join(map(str, existing)), verbosity.get() == QUIET
     click.get_current_context().call_on_close(lambda: _report_replaced(names, quiet))
+
+
+def check_even(output: Path, depths: list[float] | None) -> None:
+    """Raise `InputError` before the work if a file has one step for all depths, and they are uneven."""
+    if output.suffix.lower() != ".zarr" or not depths or len(depths) < 3:
+        return
+    steps = [after - before for before, after in itertools.pairwise(depths)]
+    if max(steps) - min(steps) > 1e-6 * max(depths):
+        raise input_error("depths", "in even steps for OME-Zarr", "uneven ones; use .ome.tif", output)
 
 
 def provenance_of(*inputs: Path | None, design: str = "") -> dict[str, str]:

@@ -25,7 +25,7 @@ from .options import (
     depth_range,
     worker_options,
 )
-from .outputs import check_may_write, force_option, provenance_of
+from .outputs import check_even, check_may_write, force_option, provenance_of
 from .recording_command import check_recording, reconstruct_recording, recording_options, residual_in_words
 from .watch_command import check_watched, watch_folder
 
@@ -150,6 +150,7 @@ def reconstruct_command(
     from ..reconstruction.plan import Plan
 
     check_output(output, VOLUME_SUFFIXES)
+    check_even(output, depths)
     if surface:
         check_output(surface, SURFACE_SUFFIXES)
         if method_options["method"] != "surface":

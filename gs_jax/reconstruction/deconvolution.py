@@ -22,7 +22,7 @@ from .inverse_problem import subtract_offset, sum_pixels
 from .pipeline import DISCREPANCY_FACTOR, run_solver
 from .residual import discrepancy_target
 from .smoothness import Smoothness, choose_smoothness, image_of
-from .wiener import wiener
+from .wiener import filter_by_wiener
 
 # Relative change of the last step below which a solver has converged.
 CONVERGED = 1e-3
@@ -193,7 +193,7 @@ def filter_image(image: Image, psf: Num[Array | np.ndarray, "*depth high wide"])
         raise InputError(
             f"--method wiener must be used with one PSF, for one plane, got {len(spots)}; admm takes a stack."
         )
-    return unit * wiener(light, spots[0])[0]
+    return unit * filter_by_wiener(light, spots[0])[0]
 
 
 def _light(image):

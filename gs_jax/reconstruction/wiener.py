@@ -11,7 +11,7 @@ _TAPER = 0.05
 _RATIOS = np.geomspace(1e-7, 1e-1, 25)
 
 
-def wiener(
+def filter_by_wiener(
     light: Float32[np.ndarray, "row column"], psf: Float[np.ndarray, "high wide"]
 ) -> tuple[Float32[np.ndarray, "row column"], float]:
     """Deconvolve a capture by one PSF with a Wiener filter; return the scene, and the ratio of noise to signal.
