@@ -50,12 +50,8 @@ def test_a_file_says_where_it_comes_from(tmp_path, name):
 
 
 FOREIGN = {
-    "stack.tif": (np.zeros((4, 6, 5), np.uint16), {}, ["6 x 5", "uint16", "4", "QYX, 4 x 6 x 5", "a stack of PSFs"]),
-    "colour.tif": (
-        np.zeros((6, 5, 3), np.uint8),
-        {"photometric": "rgb"},
-        ["YXS, 6 x 5 x 3", "or --channel red, green"],
-    ),
+    "stack.tif": (np.zeros((4, 6, 5), np.uint16), "minisblack", ["6 x 5", "uint16", "QYX, 4 x 6 x 5", "stack of PSFs"]),
+    "colour.tif": (np.zeros((6, 5, 3), np.uint8), "rgb", ["YXS, 6 x 5 x 3", "or --channel red, green"]),
     "wide.tif": (np.zeros((6, 5)), "minisblack", ["float64", "pixels must be uint8, uint16, float32, got float64"]),
     "plain.npy": (np.zeros((6, 5), np.uint8), None, ["6 x 5", "uint8", "a capture, or a PSF for `gs-jax deconvolve`"]),
 }
