@@ -212,8 +212,8 @@ def _warn_of_cut_psfs(spots):
         number, sides = next(iter(cut.items()))
         which = "the PSF" if len(spots) == 1 else f"PSF {number}" if len(cut) == 1 else f"{len(cut)} of the PSFs"
         click.echo(
-            f"gs-jax: warning: {which} is cut at the {' and '.join(sides)} of its image: expect bright lines or false "
-            "light in the scene, measure it with a smaller source distance or mask, or on a larger sensor.",
+            f"gs-jax: warning: {which} is cut at the {' and '.join(sides)} by the edge of its image: expect bright "
+            "lines and false light in the scene; measure it with the whole pattern on the sensor.",
             err=True,
         )
 
