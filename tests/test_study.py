@@ -1,15 +1,17 @@
+import sys
 import tomllib
 from pathlib import Path
 from typing import get_args
 
+import cloudpickle
 import pytest
 
+import gs_jax as gs
 from gs_jax.base.errors import InputError
 from gs_jax.codesign import terms
 from gs_jax.codesign.parameters import NAMES
 from gs_jax.codesign.study import KINDS, Solver, Study, TermTable, parent_path, read_study
-from gs_jax.codesign.terms import TERMS, Term
-from gs_jax.objectives import spot_width
+from gs_jax.codesign.terms import TERMS, Term, add_terms
 
 ROOT = Path(__file__).parents[1]
 STUDIES = sorted(p for folder in ("design", "experiments/designs") for p in (ROOT / folder / "studies").glob("*.toml"))
@@ -120,11 +122,58 @@ def test_terms_of_other_packages_are_found(monkeypatch):
         TermTable(name="other_mm", at_most=3.0)
 
 
-def test_terms_of_a_module_are_imported(monkeypatch):
+def test_a_study_imports_nothing(read, tmp_path, monkeypatch):
+    """A study may come from anybody: reading it executes no code, whatever it names."""
+    (tmp_path / "payload.py").write_text("raise SystemExit('executed')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("payload:cost", "gs_jax.objectives:spot_width", "os:getcwd"):
+        with pytest.raises(InputError, match=f"got '{name}'; a study imports no code, --terms FILE.py"):
+            read(STUDY.replace('"occupancy"', f'"{name}"'))
+        with pytest.raises(InputError, match="imports no code"):
+            read(f'{STUDY}[[pareto]]\nname = "{name}"\nat_most = [1.0]')
+    assert "payload" not in sys.modules
+
+
+OWN = """
+from gs_jax.codesign.terms import Term
+
+TERMS = {"twice_mm": Term("twice the sensor's distance", lambda imager, at: 2 * imager.sensor_distance)}
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
     monkeypatch.setattr(terms, "TERMS", dict(TERMS))
-    assert TermTable(name="gs_jax.objectives:spot_width", minimise=0.1).is_goal
-    term = terms.TERMS["gs_jax.objectives:spot_width"]
-    assert term.function is spot_width and term.meaning.startswith("Width of the spot")
-    for name in ("no_such_module:cost", "gs_jax.objectives:no_such", "gs_jax.objectives:__doc__"):
-        with pytest.raises(ValueError, match="`module:name`"):
-            TermTable(name=name, minimise=1.0)
+    (tmp_path / "own.py").write_text(OWN)
+    return tmp_path / "own.py"
+
+
+def test_terms_of_a_file_that_a_person_names(read, own):
+    add_terms(own)
+    assert read(STUDY.replace("occupancy", "twice_mm")).terms[0].name == "twice_mm"
+    scope = gs.geomscope().imager()
+    assert terms.TERMS["twice_mm"].function(scope, None) == 2 * scope.sensor_distance
+    first = terms.TERMS["twice_mm"].source
+    add_terms(own)  # again, as a search that is resumed does
+    assert terms.TERMS["twice_mm"].source == first and len(first) == 64
+    # A worker gets the function by value: it has no such file.
+    assert "own" not in sys.modules and cloudpickle.loads(cloudpickle.dumps(terms.TERMS["twice_mm"])).source == first
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 / 0", "own.py: cannot be run: ZeroDivisionError: division by zero"),
+        ("def (", "own.py: cannot be run: SyntaxError: "),
+        ("x = 1", r"TERMS must be a dictionary from names to .*Term`, got None \(.*own.py\)"),
+        ("TERMS = {'a': len}", r"TERMS must be a dictionary .*got {'a': <built-in function len>}"),
+        (OWN.replace("twice_mm", "occupancy"), "TERMS must be names that are no terms yet, got occupancy"),
+    ],
+)
+def test_a_wrong_file_of_terms(own, text, message):
+    own.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        add_terms(own)
+    assert "\n" not in str(error.value) and terms.TERMS == TERMS
+    with pytest.raises(InputError, match=r"suffix must be .py"):
+        add_terms(own.with_suffix(".txt"))

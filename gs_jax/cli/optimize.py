@@ -11,15 +11,24 @@ from ..io.files import check_output, make_folder, write_json
 from .options import DESIGN, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
+terms_option = click.option(
+    "--terms",
+    type=Path,
+    help="FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.",
+)
+
 
 @click.command("optimize", epilog="Example: gs-jax optimize design/geomscope.toml --study study.toml -o new.toml")
 @click.argument("design", type=DESIGN)
 @click.option("--study", type=Path, required=True, help="STUDY.toml: free parameters, goals and solvers.")
+@terms_option
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint of an interrupted run beside NEW.toml.")
 @click.option("-o", "--output", type=Path, required=True, help="NEW.toml; numbers and a picture are written beside it.")
 @worker_options
 @force_option
-def optimize_command(design: Path, study: Path, resume: bool, output: Path, force: bool, workers: Workers):
+def optimize_command(
+    design: Path, study: Path, terms: Path | None, resume: bool, output: Path, force: bool, workers: Workers
+):
     """Search for a better microscope than that of the file DESIGN, and compare both.
 
     NEW.json (the terms, every start and step) and NEW.png (layout and history) are written beside NEW.toml. Workers run
@@ -31,20 +40,23 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
     from ..codesign import search
     from ..codesign.search_report import before_and_after, check_outputs, write_outcome
     from ..codesign.solve import checkpoint_path
+    from ..codesign.terms import add_terms
 
     check_outputs(output)
     beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))
-    check_may_write(output, *beside, inputs=(design, study), force=force)
+    check_may_write(output, *beside, inputs=(design, study, terms), force=force)
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
     checkpoint = checkpoint_path(output)
     if resume and not checkpoint.exists():
         raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
+    if terms is not None:
+        add_terms(terms)
     partial_outputs[checkpoint] = RESUMABLE
     with Progress() as progress, workers:
         how = {"progress": progress, "checkpoint": checkpoint, "resume": resume, "workers": workers}
         outcome = search.run_study(design, study, **how)
-    write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study))
+    write_outcome(output, outcome, parent=design, source=study, provenance=provenance_of(design, study, terms))
     checkpoint.unlink(missing_ok=True)
     Console().print(before_and_after(outcome))
     for end in outcome.log.ends:
@@ -55,8 +67,9 @@ def optimize_command(design: Path, study: Path, resume: bool, output: Path, forc
 @click.command("pareto", epilog="Example: gs-jax pareto design/studies/geomscope-sharpness.toml --out front")
 @click.argument("study", type=Path)
 @click.option("--out", type=Path, default=Path("gs-jax-pareto"), help="Folder to write to.")
+@terms_option
 @worker_options
-def pareto_command(study: Path, out: Path, workers: Workers):
+def pareto_command(study: Path, out: Path, terms: Path | None, workers: Workers):
     """Compute the trade-off of the file STUDY: its one goal against one or two moving limits.
 
     The folder gets pareto.json, to which each design is added when it is found, and pareto.png.
@@ -68,12 +81,15 @@ def pareto_command(study: Path, out: Path, workers: Workers):
     from ..base.errors import errors_name_file
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
     from ..codesign.study import parent_path, read_study
+    from ..codesign.terms import add_terms
     from ..design.design import design_text, read_design
     from ..io.files import write_figure
     from ..io.provenance import KEY
 
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
+    if terms is not None:
+        add_terms(terms)
     question = read_study(study)
     start = parent_path(study, question)
     parent = read_design(start)
@@ -81,8 +97,8 @@ def pareto_command(study: Path, out: Path, workers: Workers):
         sweep_of(parent, question)
     make_folder(out)
     numbers, drawing = check_output(out / "pareto.json", [".json"]), check_output(out / "pareto.png", [".png"])
-    check_may_write(numbers, drawing, inputs=(study, start))
-    provenance = provenance_of(study, start, design=design_text(parent))
+    check_may_write(numbers, drawing, inputs=(study, start, terms))
+    provenance = provenance_of(study, start, terms, design=design_text(parent))
 
     def each(front):
         write_json(numbers, {KEY: provenance} | as_json(front))

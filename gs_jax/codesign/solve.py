@@ -31,6 +31,7 @@ from ..design.design import Design
 from ..io.files import atomic_write, check_input, decoding
 from ..typing import PathLike
 from .study import StageTable, Study
+from .terms import TERMS
 
 # Residuals of free parameters, of arguments that do not change within a run, and of a key that is new in every step.
 Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
@@ -291,7 +292,7 @@ def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, 
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not a checkpoint of `gs-jax optimize`.") from error
     if owner != _digest(study, design):
-        raise InputError(f"{path}: the checkpoint is of another study or design.")
+        raise InputError(f"{path}: the checkpoint is of another study or design, or of other --terms.")
     return log, state
 
 
@@ -310,4 +311,5 @@ def checkpoint_path(output: Path) -> Path:
 
 
 def _digest(study: Study, design: Design) -> str:
-    return hashlib.sha256((study.model_dump_json() + design.model_dump_json()).encode()).hexdigest()
+    own = "".join(TERMS[term.name].source for term in study.terms)
+    return hashlib.sha256((study.model_dump_json() + design.model_dump_json() + own).encode()).hexdigest()

@@ -1,7 +1,8 @@
 """Terms of a study: objectives by name, in the unit that the name ends in.
 
 A term's function takes an imager and its `Conditions` and gives a number or an array of them (over depths, lens types,
-lenses, points). A term of your own is a callable of both, or `"module:name"` of one; see `Term`.
+lenses, points). Terms of your own are added by a package's entry point, by `add_terms`, or to `TERMS`; see `Term`. A
+study names terms, it never imports code.
 
 Terms that judge the layout, and those at equal exposure, apply `array_psf`, `fisher`, `linear_error` and `end_to_end`
 at points, depths and frequencies that follow from the imager and its conditions. Points lie where they see a whole
@@ -10,12 +11,13 @@ field of lenses. Random terms draw new ones for each key.
 
 import dataclasses
 import difflib
-import importlib
+import hashlib
 import math
+import runpy
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.metadata import entry_points
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +25,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import objectives
-from ..base.errors import short_repr
+from ..base.errors import InputError, input_error, short_repr
 from ..geometry import Imager, field_limit
 from ..grid import Grid
+from ..io.files import check_input, check_suffix
 from ..objectives.conditions import Conditions, finite_plate, per_type
+from ..typing import PathLike
 from .array_psf import array_spectrum, condition_number, mean_inverse_views, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
 from .fisher import crowded_bound, localization_bound
@@ -181,13 +185,15 @@ def places_of(imager: Imager) -> Float[Array, "place 2"]:
 class Term(NamedTuple):
     """A term: its meaning in words, and its function of an imager and `Conditions`.
 
-    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument.
+    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument. `source`: hash
+    of the file that `add_terms` read it from, by which a checkpoint knows whether its terms have changed.
     """
 
     meaning: str
     function: Callable[..., Float[Array, "..."]]
     log: bool = False
     random: bool = False
+    source: str = ""
 
 
 def _scaled(unit, function):
@@ -251,36 +257,40 @@ _UNITS = {"um": "um", "mm": "mm", "deg": "degrees", "percent": "%", "waves": "wa
 
 
 def check_term(name: str) -> None:
-    """Whether there is a term of this name; those of other installed packages are looked up when they are asked for.
+    """Raise `ValueError` unless `name` is a registered term; load it from an entry point if needed.
 
-    A package has its own as entry points of the group `gs_jax.terms`, whose names are the terms' and whose objects are
-    `Term`s. Python callers may also put theirs into `TERMS`; workers of a search get them. A name `"module:name"` is
-    that of a `Term`, or of a callable of an imager and `Conditions`, in a module that Python can import.
-
-    Raises `ValueError` if there is none.
+    An installed package registers its terms as entry points of the group `gs_jax.terms`, whose names are those of the
+    terms and whose objects are `Term`s.
     """
-    if name not in TERMS and ":" in name:
-        TERMS[name] = _imported(name)
     if name not in TERMS:
         TERMS.update({point.name: point.load() for point in entry_points(group=_GROUP, name=name)})
     if name not in TERMS:
         near = difflib.get_close_matches(name, TERMS, n=3) or list(TERMS)[:3]
         others = len(TERMS) - len(near)
-        raise ValueError(f"name must be {', '.join(near)} or one of {others} others, got {short_repr(name)}")
+        own = "; a study imports no code, --terms FILE.py adds terms of your own" if ":" in name else ""
+        raise ValueError(f"name must be {', '.join(near)} or one of {others} others, got {short_repr(name)}{own}")
 
 
-def _imported(name: str) -> Term:
-    module, _, attribute = name.partition(":")
+def add_terms(path: PathLike) -> None:
+    """Run a Python file and add its terms to `TERMS`.
+
+    The file defines a dictionary `TERMS` from names to `Term`s. Workers of a search get the terms, not the file.
+
+    Raises `InputError` if the file cannot be read or run, has no such dictionary, or redefines a term.
+    """
+    check_suffix(path, (".py",))
+    source = hashlib.sha256(check_input(path).read_bytes()).hexdigest()
     try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"must be a term or `module:name` of one, got {short_repr(name)}: {error}") from error
-    if isinstance(found, Term):
-        return found
-    if not callable(found):
-        raise ValueError(f"`module:name` must name a callable or a `Term`, got {short_repr(found)}")
-    words = (found.__doc__ or attribute).strip().splitlines()[0].rstrip(".")
-    return Term(words, cast(Callable[..., Float[Array, "..."]], found))
+        own = runpy.run_path(str(path), run_name="gs_jax_terms").get("TERMS")
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{path}: cannot be run: {reason.rstrip('.')}.") from error
+    terms = own.items() if isinstance(own, dict) else ()
+    if not terms or not all(isinstance(name, str) and isinstance(term, Term) for name, term in terms):
+        raise input_error("TERMS", "a dictionary from names to `gs_jax.codesign.terms.Term`", short_repr(own), path)
+    if twice := [name for name, term in terms if name in TERMS and TERMS[name].source != source]:
+        raise input_error("TERMS", "names that are no terms yet", twice[0], path)
+    TERMS.update({name: term._replace(source=source) for name, term in terms})
 
 
 def with_terms(build: Callable[[], Built], names: Iterable[str]) -> Callable[[], Built]:
