@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .base.arrays import FINITE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields
+from .base.arrays import FINITE, POSITIVE, Rule, array_namespace, as_float, as_float_or_none, check_fields, native
 from .base.errors import input_error
 from .grid import Sensor
 from .layers import (
@@ -244,7 +244,7 @@ class Imager(eqx.Module):
         It is `z + t/n` with the plate in front, and `z` with the curved side in front; filters and the sample change
         it as `gs_jax.layers` says. An imager of NumPy's numbers (`gs_jax.optics.raytrace.to_numpy`) gives NumPy's.
         """
-        depth = array_namespace(self.sensor_distance).asarray(depth)
+        depth = array_namespace(self.sensor_distance).asarray(native(depth))
         return reduced_distance(depth, self.filters, self.sample) + self.array.reduced_thickness_front
 
     def depth_in_medium(self, depth: Float[ArrayLike, "*batch"]) -> Scalars:

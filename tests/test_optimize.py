@@ -6,8 +6,8 @@ import pytest
 from click.testing import CliRunner
 
 from gs_jax.base.errors import InputError
-from gs_jax.codesign import terms
 from gs_jax.cli.optimize import optimize_command as optimize, pareto_command as pareto
+from gs_jax.codesign import terms
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.provenance import read_provenance
@@ -52,7 +52,9 @@ def test_optimize(folder, monkeypatch):
     """The thinnest with that resolution: v = 4.5 um / 40 um of the farthest z', by hand, within the margin of 0.5 %."""
     monkeypatch.setattr(terms, "TERMS", terms.TERMS.copy())
     (folder / "own.py").write_text(OWN)
-    (folder / "study.toml").write_text(STUDY.replace("[[stages]]", '[[terms]]\nname = "own_mm"\nat_most = 9.0\n[[stages]]'))
+    (folder / "study.toml").write_text(
+        STUDY.replace("[[stages]]", '[[terms]]\nname = "own_mm"\nat_most = 9.0\n[[stages]]')
+    )
     result = run(optimize, "table1.toml", "--study", "study.toml", "--terms", "own.py", "-o", "new.toml")
     assert result.exit_code == 0 and "thickness_mm" in result.output and "from geomscope in" in result.output
     distance = read_design("new.toml").imaging.sensor_distance_mm

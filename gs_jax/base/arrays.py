@@ -1,5 +1,6 @@
-"""Helpers for arrays of JAX and NumPy: converters and checks of fields, safe arithmetic, precision."""
+"""Helpers for arrays of JAX and NumPy: byte order, converters and checks of fields, safe arithmetic, precision."""
 
+import functools
 import operator
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -20,6 +21,33 @@ Rule = tuple[str, Callable[[np.ndarray], Any]]
 FINITE: Rule = ("finite", np.isfinite)
 POSITIVE: Rule = ("positive and finite", lambda x: (x > 0) & (x < np.inf))
 NOT_NEGATIVE: Rule = ("finite and not negative", lambda x: (x >= 0) & (x < np.inf))
+
+
+def native(tree: Tree) -> Tree:
+    """Convert the NumPy arrays of a pytree whose byte order is not the machine's, which JAX does not take."""
+    return jax.tree.map(lambda leaf: leaf.astype(leaf.dtype.newbyteorder("=")) if _is_foreign(leaf) else leaf, tree)
+
+
+def _is_foreign(leaf: Any) -> bool:
+    return isinstance(leaf, np.ndarray) and not leaf.dtype.isnative
+
+
+def jit(function: Callable, **options: Any) -> Any:
+    """`jax.jit` for arrays of any byte order.
+
+    JAX refuses arrays of the other byte order, but a compiled function that has seen the native type takes their bytes
+    as they are, so that 1 is read as 256.
+    """
+    compiled = jax.jit(function, **options)
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        if any(map(_is_foreign, jax.tree.leaves((args, kwargs)))):
+            args, kwargs = native((args, kwargs))
+        return compiled(*args, **kwargs)
+
+    call.lower = compiled.lower  # pyright: ignore[reportAttributeAccessIssue]
+    return call
 
 
 def array_namespace(x: Any) -> Any:

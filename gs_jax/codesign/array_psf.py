@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..base.arrays import jit
 from ..geometry import Imager
 from ..typing import Real
 
@@ -30,7 +31,7 @@ class Sidelobes(NamedTuple):
     rms: Float[Array, ""]
 
 
-@jax.jit
+@jit
 def crosstalk(
     imager: Imager,
     sources: Float[Array | np.ndarray, "source 3"],
@@ -76,7 +77,7 @@ def crosstalk(
     return lax.map(one, sources)
 
 
-@jax.jit
+@jit
 def sidelobes(
     imager: Imager,
     sources: Float[Array | np.ndarray, "source 3"],
@@ -110,7 +111,7 @@ def sidelobes(
     return Sidelobes(largest * _root(mean, power), largest * _root(jnp.mean((counted / largest) ** 2), 2))
 
 
-@jax.jit
+@jit
 def mean_inverse_views(
     imager: Imager, points: Float[Array | np.ndarray, "point 3"], *, floor: Real = 0.5
 ) -> Float[Array, ""]:
@@ -132,7 +133,7 @@ def mean_inverse_views(
     return jnp.mean(1 / (jnp.sum(weights, axis=0) + floor))
 
 
-@jax.jit
+@jit
 def array_spectrum(
     imager: Imager, points: Float[Array | np.ndarray, "point 3"], frequencies: Float[Array | np.ndarray, "frequency 2"]
 ) -> Float[Array, "point frequency"]:

@@ -30,6 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..base.arrays import jit
 from ..geometry import Imager, envelope
 from ..objectives.conditions import Conditions, field_radius, of_lenses
 from ..typing import Real
@@ -87,7 +88,7 @@ def windows(
     return corners, (inside[0][:, :, None] & inside[1][:, None, :]).astype(corners.dtype)
 
 
-@partial(jax.jit, static_argnames="size")
+@partial(jit, static_argnames="size")
 def fisher_information(
     point: Float[Array | np.ndarray, "3"],
     imager: Imager,
@@ -137,7 +138,7 @@ def fisher_information(
     return jnp.einsum("lrci,lrcj,lrc->ij", slopes, slopes, weight)
 
 
-@partial(jax.jit, static_argnames="size")
+@partial(jit, static_argnames="size")
 def cramer_rao(
     points: Float[Array | np.ndarray, "point 3"],
     imager: Imager,

@@ -185,8 +185,8 @@ def places_of(imager: Imager) -> Float[Array, "place 2"]:
 class Term(NamedTuple):
     """A term: its meaning in words, and its function of an imager and `Conditions`.
 
-    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument. `source`: hash
-    of the file that `add_terms` read it from, by which a checkpoint knows whether its terms have changed.
+    With `log` the function gives the value's logarithm; with `random` it takes a key as a third argument. `source` is
+    the hash of the file that `add_terms` read it from, by which a checkpoint knows whether its terms have changed.
     """
 
     meaning: str

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.arrays import safe_quotient, safe_sqrt
+from ..base.arrays import jit, safe_quotient, safe_sqrt
 from ..geometry import Imager
 from ..lenses import MicrolensArray
 from ..typing import Real, Result, ScalarLike
@@ -62,7 +62,7 @@ class RmsTerms(eqx.Module):
     defocus: Float[Array, "..."]
 
 
-@jax.jit
+@jit
 def wavefront(
     imager: Imager, depth: ScalarLike, pupil_points: Float[Array | np.ndarray, "*batch 2"], field: Point = (0.0, 0.0)
 ) -> Float[Array, "*batch"]:
@@ -83,7 +83,7 @@ def wavefront(
     return jnp.where(rays.valid, rays.path - past, jnp.nan)
 
 
-@jax.jit
+@jit
 def wavefront_rms(
     imager: Imager, depth: ScalarLike, *, field: Point = (0.0, 0.0), radius: ScalarLike | None = None
 ) -> Float[Array, ""]:
@@ -95,7 +95,7 @@ def wavefront_rms(
     return safe_sqrt(jnp.sum(weights * _remove_tilt(wavefront(imager, depth, points, field), points, weights) ** 2))
 
 
-@jax.jit
+@jit
 def best_focus(
     imager: Imager, depth: ScalarLike, *, field: Point = (0.0, 0.0), radius: ScalarLike | None = None
 ) -> Float[Array, ""]:

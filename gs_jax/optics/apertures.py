@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ..base.arrays import safe_sqrt
+from ..base.arrays import jit, safe_sqrt
 from ..lenses import EACH, MicrolensArray, sag
 
 # Lenses computed at once, and neighbours that may bound a lens. A cell of a random layout has six on average.
@@ -30,7 +30,7 @@ _COINCIDENT = 1e-5
 _NEAREST, _BRACKETS, _BISECTIONS = 32, 24, 20
 
 
-@partial(jax.jit, static_argnames="directions")
+@partial(jit, static_argnames="directions")
 def aperture_area(array: MicrolensArray, *, directions: int = 512) -> Float[Array, " lens"]:
     """Area of each lens's clear aperture, `1/2 int r^2 dphi` over its edge `r(phi)`, mm^2.
 
@@ -232,7 +232,7 @@ def _total_cell_area(array: MicrolensArray, cells: VoronoiCells):
     )
 
 
-@jax.jit
+@jit
 def pitch(centers: Float[Array | np.ndarray, "lens 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean (the paper's "average pitch size") and standard deviation of the distances to the nearest neighbours, mm.
 

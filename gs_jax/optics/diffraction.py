@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
+from ..base.arrays import jit
 from ..geometry import Imager
 from ..typing import ScalarLike
 from .pupil import pupil_quadrature, pupil_radius
@@ -140,7 +141,7 @@ def abs2(field: Array) -> Array:
     return field.real**2 + field.imag**2
 
 
-@partial(jax.jit, static_argnames=("samples",))
+@partial(jit, static_argnames=("samples",))
 def strehl(
     imager: Imager,
     depth: ScalarLike,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..base.arrays import jit
 from ..base.errors import InputError
 from ..geometry import Imager, chief_ray
 from ..typing import Scalar, ScalarLike
@@ -31,7 +32,7 @@ _RAYS, _QUANTILE, _SMOOTH = 2**15, 0.98, 1.0
 _WINDOW_MARGIN, _FARTHEST, _FAN = 16, 128, 65
 
 
-@partial(jax.jit, static_argnames=("size", "samples"))
+@partial(jit, static_argnames=("size", "samples"))
 def diffraction_psf(
     imager: Imager,
     depth: ScalarLike,
@@ -80,7 +81,7 @@ def diffraction_psf(
     return pixels / jnp.sum(pixels)
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(jit, static_argnames=("size",))
 def geometric_psf(
     imager: Imager,
     depth: ScalarLike,
@@ -115,7 +116,7 @@ def geometric_psf(
     return image / jnp.where(total > 0, total, 1)
 
 
-@partial(jax.jit, static_argnames=("size",))
+@partial(jit, static_argnames=("size",))
 def gaussian_psf(
     imager: Imager,
     depth: ScalarLike,
@@ -235,7 +236,7 @@ def psf_of_depth(
     return mean_psf
 
 
-@jax.jit
+@jit
 def _even_rays(imager: Imager, depth, field, radius):
     """Points evenly over the pupil, where their rays land from the chief ray's spot, mm, and whether they do."""
     order = np.arange(_RAYS) + 0.5
@@ -244,7 +245,7 @@ def _even_rays(imager: Imager, depth, field, radius):
     return points, rays.landing - _chief_landing(imager, depth, field, rays.landing.dtype)[None], rays.valid
 
 
-@partial(jax.jit, static_argnames=("size", "samples"))
+@partial(jit, static_argnames=("size", "samples"))
 def _pixel_energy(imager, depth, size, field, offset, radius, edges, samples) -> Float[Array, "row column"]:
     """Energy on the pixels, as fractions of the energy through the pupil."""
     _check_size(size)

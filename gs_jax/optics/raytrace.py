@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..base.arrays import array_namespace
+from ..base.arrays import array_namespace, jit
 from ..geometry import Imager, chief_ray
 from ..layers import object_slabs
 from ..lenses import MicrolensArray
@@ -248,7 +248,7 @@ def slope_in_glass(n: Scalars, slope: Coordinates) -> Coordinates:
     return slope / array_namespace(slope).sqrt(n**2 + (n**2 - 1) * dot(slope, slope))
 
 
-@jax.jit
+@jit
 def trace_lenslet(
     imager: Imager, depth: ScalarLike, pupil_points: Float[Array | np.ndarray, "*batch 2"], field: Point = (0.0, 0.0)
 ) -> LensletRay:

@@ -2,12 +2,12 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Num
 
+from ..base.arrays import jit
 from ..geometry import Imager
 from ..grid import Grid
 from ..typing import Image
@@ -18,7 +18,7 @@ from .rays import Envelope, Rays, trace
 _DEPTHS = 16
 
 
-@partial(jax.jit, static_argnames=("method", "normalize"))
+@partial(jit, static_argnames=("method", "normalize"))
 def backproject(
     image: Image,
     imager: Imager,
@@ -93,7 +93,7 @@ def backproject(
     return volume.reshape(-1, *grid.shape)[: grid.depths.size]
 
 
-@partial(jax.jit, static_argnames=("method",))
+@partial(jit, static_argnames=("method",))
 def backproject_adjoint(
     volume: Num[Array | np.ndarray, "depth y x"], imager: Imager, grid: Grid, *, method: str = "linear"
 ) -> Float[Array, "row column"]:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from ..base.arrays import jit
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -91,7 +92,7 @@ def make_psf_model(
     return PerTypePsf(lenses, tuple(psfs))
 
 
-@jax.jit
+@jit
 def forward(
     volume: Num[Array | np.ndarray, "depth y x"],
     imager: Imager,

@@ -21,6 +21,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
+from ..base.arrays import native
+
 # Kernels read sixteen pixels of a row at once.
 _LEAST_COLUMNS = 16
 
@@ -109,7 +111,9 @@ _run = jax.jit(lambda call, *arrays: _linear.bind(*arrays, call=call), static_ar
 
 @_linear.def_impl
 def _run_eagerly(*arrays, call):
-    return _run(call, *arrays)
+    # As JAX's own primitives, also with `JAX_DISABLE_JIT`: not compiled, it would call itself.
+    with jax.disable_jit(False):
+        return _run(call, *native(arrays))
 
 
 @_linear.def_abstract_eval

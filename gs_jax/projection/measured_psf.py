@@ -15,7 +15,7 @@ import numpy as np
 from jax import ShapeDtypeStruct, lax
 from jaxtyping import Array, Complex, Float, Num
 
-from ..base.arrays import as_float, as_shape
+from ..base.arrays import as_float, as_shape, native
 from ..base.errors import InputError
 from .linear_map import LinearMap
 from .operators import as_matrix, no_structure, transpose
@@ -70,7 +70,7 @@ class ConvolutionOperator(lx.AbstractLinearOperator):
         image_shape: tuple[int, int] | None = None,
         kept: Float[Array | np.ndarray, "row column"] | None = None,
     ):
-        psf = jnp.asarray(psf_stack)
+        psf = jnp.asarray(native(psf_stack))
         if psf.ndim != 3 or min(psf.shape) < 1:
             raise InputError(f"psf_stack must be (depth, row, column) and not empty, got the shape {psf.shape}.")
         psf = psf if jnp.issubdtype(psf.dtype, jnp.floating) else psf.astype(float)

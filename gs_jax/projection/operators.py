@@ -6,6 +6,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..base.arrays import native
 from ..geometry import Imager
 from ..grid import Grid
 from .backprojection import backproject
@@ -114,7 +115,7 @@ class Transposed(lx.AbstractLinearOperator):
     operator: lx.AbstractLinearOperator
 
     def mv(self, vector: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(vector)[0]
+        return jax.linear_transpose(self.operator.mv, self.operator.in_structure())(native(vector))[0]
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.operator.out_structure()

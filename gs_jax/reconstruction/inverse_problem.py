@@ -8,7 +8,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.arrays import check_finite
+from ..base.arrays import check_finite, native
 from ..base.progress import Progress
 from ..detection.background import background_tiles, interpolate_tiles
 from ..geometry import Imager
@@ -53,7 +53,7 @@ class ImageModel(NamedTuple):
 def prepare_model(imager: Imager, grid: Grid, optics: PsfModel | str, progress: Progress) -> ImageModel:
     """Make the forward model of a microscope for a grid; `optics` as for `reconstruct`."""
     if not isinstance(optics, str):
-        return ImageModel(imager, jnp.asarray(optics) if isinstance(optics, np.ndarray) else optics)
+        return ImageModel(imager, jnp.asarray(native(optics)) if isinstance(optics, np.ndarray) else optics)
     # At least two binned pixels must remain along each side; what fills no square is left out.
     voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
     binning = max(int(voxel + _ROUNDING), 1)

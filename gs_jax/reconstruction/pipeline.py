@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from ..base.arrays import check_finite
+from ..base.arrays import check_finite, jit, native
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -267,7 +267,7 @@ def _backproject(image, view, grid, method, progress):
     distortion = np.ones(grid.depths.size) if view.distortion is None else view.distortion
     if grid.depths.size <= planes:
         return np.asarray(project(image, view.imager, grid, distortion=distortion, **options), np.float32)
-    image, depths = jnp.asarray(image), np.asarray(grid.depths)
+    image, depths = jnp.asarray(native(image)), np.asarray(grid.depths)
     volume = np.empty(grid.volume_shape, np.float32)
     for first in progress.track(range(0, depths.size, planes), "Back-projecting", quarter=_wider_voxels(grid)):
         part = slice(first, first + planes)
@@ -284,7 +284,7 @@ def backproject_on_all_devices(
     return _backproject_sharded(image, imager, grid, *planes, **options)[: grid.depths.size]
 
 
-@partial(jax.jit, static_argnames=("method", "normalize"))
+@partial(jit, static_argnames=("method", "normalize"))
 def _backproject_sharded(image, imager, grid, depths, distortion, **options):
     mesh, replicated, sharded = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec(), PartitionSpec("depth")
 

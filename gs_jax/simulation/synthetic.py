@@ -11,7 +11,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite
+from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, native
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -278,7 +278,7 @@ def expose(
     >>> print(counts.dtype, round(float(np.median(counts))))  # dark pixels: the offset
     uint16 16
     """
-    image = jnp.asarray(image)
+    image = jnp.asarray(native(image))
     peak = jnp.asarray(peak_electrons, image.dtype)
     _check_value("peak_electrons", peak, (peak > 0) & jnp.isfinite(peak), "positive and finite")
     # Not `min` and `max`: they pass over a NaN on some devices.
@@ -306,7 +306,7 @@ def _expose(image, camera, key, peak):
 def electrons(counts: Counts, camera: Camera) -> Float32[Array, "row column"]:
     """Convert counts to electrons, `gain (counts - offset)`; dark pixels are on both sides of zero."""
     gain, offset = camera.gain.astype(jnp.float32), camera.offset.astype(jnp.float32)
-    return gain * (jnp.asarray(counts).astype(jnp.float32) - offset)
+    return gain * (jnp.asarray(native(counts)).astype(jnp.float32) - offset)
 
 
 def poisson(key: PRNGKeyArray, mean: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
