@@ -1,5 +1,7 @@
 """The kernels that numba compiles: the same numbers as XLA's, from any thread, and only where numba works."""
 
+import ctypes
+import mmap
 import os
 import re
 import subprocess
@@ -18,14 +20,18 @@ import pytest
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
 from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
+from gs_jax.projection.convolution import Sizes, sum_of_convolutions
 from gs_jax.projection.rays import Envelope, RingLight, trace
 from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpolate_windows, times_table
 
 from .helpers import scene
 
+numba = pytest.importorskip("numba")
 NumbaError = pytest.importorskip("numba.core.errors").NumbaError
 config, types = import_module("numba.core.config"), import_module("numba.types")
-dispatch, ffi, simd = (import_module(f"gs_jax.projection.cpu.{name}") for name in ("dispatch", "ffi", "simd"))
+dispatch, ffi, rows, simd = (
+    import_module(f"gs_jax.projection.cpu.{name}") for name in ("dispatch", "ffi", "rows", "simd")
+)
 ROOT = Path(__file__).parents[1]
 
 # Voxels of all sizes, whose rays are 0.4 to 14 pixels apart: sixteen meet up to 32, 48, 64 or more pixels, and a pixel
@@ -72,7 +78,7 @@ def compare(*calls):
 
 def test_windows_and_sparse_tables_are_those_of_xla():
     rng = np.random.default_rng(0)
-    windows, lenses = Windows((61, 75), 19), 32
+    windows, lenses = Windows((61, 75), 19), 29  # no multiple of sixteen, as the columns of the tables below
     # Some end beyond the image.
     start = jnp.asarray(rng.integers(-4, 30, (lenses, 2)), jnp.int32)
     places = start, jnp.asarray(rng.random((lenses, 2)), jnp.float32)
@@ -82,7 +88,7 @@ def test_windows_and_sparse_tables_are_those_of_xla():
     row[:60] = 7
     entries = by_row(row, column, share, 50), by_row(column, row, share, 90)
     table = SparseTable(0, *entries)
-    x, y = (jnp.asarray(rng.random((n, 80)), jnp.float32) for n in (90, 50))
+    x, y = (jnp.asarray(rng.random((n, 75)), jnp.float32) for n in (90, 50))
     read, _, product, transposed = compare(
         (interpolate_windows, windows, places, image),
         (interpolate_windows.T, windows, places, values),
@@ -124,6 +130,145 @@ def test_pixels_of_other_types(dtype):
     shapes, rays, image, volume = problem(WEIGHTS[0])
     image = (200 * image).astype(dtype)
     compare((image_to_volume, shapes, rays, image), (rays_vjp, shapes, rays, image, volume))
+
+
+class GuardedMemory:
+    """Arrays between pages that no one may touch: after the end of the one half, before the begin of the other."""
+
+    def __init__(self):
+        self.maps = []
+
+    def copy(self, array, at_end: bool) -> np.ndarray:
+        page, size = mmap.PAGESIZE, max(array.nbytes, 1)
+        inner = -(-size // page) * page
+        memory = mmap.mmap(-1, inner + 2 * page)
+        start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+        for guard in (start, start + page + inner):
+            assert ctypes.CDLL(None, use_errno=True).mprotect(ctypes.c_void_p(guard), page, 0) == 0
+        offset = page + (inner - array.nbytes if at_end else 0)
+        own = np.frombuffer(memory, array.dtype, array.size, offset).reshape(array.shape)
+        own[...] = array
+        self.maps.append((memory, own))
+        return own
+
+
+def run_guarded(kernel, results, *buffers, at_end: bool):
+    """`dispatch._call` without XLA, part by part: whatever is read or written beyond an array ends the process."""
+    memory, many = GuardedMemory(), isinstance(results, list | tuple)
+    given = [np.asarray(dispatch._as_buffer(kernel, buffer)) for buffer in buffers]
+    empty = [np.full(result.shape, np.nan, np.float32) for result in (results if many else [results])]
+    arrays = [memory.copy(array, at_end) for array in (*given, *empty)]
+    job = np.zeros(rows.BUFFERS + rows.PER_BUFFER * len(arrays), np.int64)
+    job[rows.PARTS], job[rows.LENGTH] = 5, len(job)
+    kinds = {"bool": simd.BOOL, "uint8": simd.UINT8, "uint16": simd.UINT16}
+    for number, array in enumerate(arrays):
+        sizes = (*array.shape, 1, 1, 1)[:3]
+        place = rows.BUFFERS + rows.PER_BUFFER * number
+        job[place : place + rows.PER_BUFFER] = array.ctypes.data, kinds.get(array.dtype.name, 0), *sizes
+    compiled = dispatch._compile(dispatch.KERNELS[kernel], numba.types.int64, 2)
+    run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(compiled.address)
+    assert all(run(job.ctypes.data, part) == rows.DONE for part in range(5)), kernel
+    found = [jnp.asarray(array.copy()) for array in arrays[len(given) :]]
+    return found if many else found[0]
+
+
+def wild(rays, seed):
+    """Rays of no geometry: patches beyond the volume, pixels in any order, distances that are NaN."""
+    rng = np.random.default_rng(seed)
+
+    def axis(some):
+        start = rng.integers(-3000, 3000, some.start.shape).astype(np.int32)
+        pixel = rng.integers(*((-200, 300), (0, 80))[seed % 2], some.pixel.shape).astype(np.int32)
+        if seed % 3 == 0:
+            pixel.sort(-1)  # they rise, as behind the lenses
+        distance2 = np.where(rng.random(some.distance2.shape) < 0.1, np.nan, some.distance2)
+        return some._replace(start=start, pixel=pixel, distance2=distance2.astype(np.float32))
+
+    return rays._replace(y=axis(rays.y), x=axis(rays.x))
+
+
+def run_all_guarded():
+    """Every kernel, over sizes that fill no vector, beside pages that end the process when they are touched."""
+    rng = np.random.default_rng(0)
+    some = lambda *shape: rng.random(shape).astype(np.float32)
+    grids = (WEIGHTS[0], GRIDS[0]), (WEIGHTS[0], GRIDS[3]), (WEIGHTS[2], GRIDS[4])
+    problems = [problem(weight, grid, lenses=2) for weight, grid in grids]
+    for at_end in (True, False):
+        dispatch._call = partial(run_guarded, at_end=at_end)
+        for seed, (shapes, rays, image, volume) in enumerate(problems):
+            for own in (rays, *(wild(rays, 6 * seed + n) for n in range(6))):
+                for pixels in (image, (255 * image).astype(np.uint8), None):
+                    dispatch.gather(shapes, own, pixels)
+                    dispatch.rays_vjp(shapes, (own, pixels), volume)
+                dispatch.scatter(shapes, own, volume)
+        for lenses in (1, 16, 35):
+            windows = Windows((61, 75), 19)
+            places = rng.integers(-50, 90, (lenses, 2)).astype(np.int32), some(lenses, 2)
+            dispatch.read_windows(windows, places, some(*windows.shape))
+            dispatch.add_windows(windows, places, some(19, 19, lenses))
+            row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), some(400)
+            table = SparseTable(0, by_row(row, column, share, 50), by_row(column, row, share, 90))
+            dispatch.times_rows(table, (), some(90, lenses))
+            dispatch.times_columns(table, (), some(50, lenses))
+        for size, shape in ((9, (61, 75)), (41, (150, 333))):
+            for whole in (False, True):
+                change = size - 1 if whole else -size - 1
+                sizes = Sizes((shape[0] + size + 1 + change, shape[1] + size + 1 + change), *[None] * 3)
+                sizes = sizes._replace(sharp=(shape[0] + size + 1, shape[1] + size + 1), whole=whole, symmetric=False)
+                sharp = [some(*sizes.sharp) for _ in range(2)]
+                dispatch.convolve(sizes, some(2, size, size), sharp)
+                dispatch.correlate(sizes, some(2, size, size), some(*sizes.image))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pages are protected by mprotect")
+def test_no_kernel_reads_or_writes_beyond_an_array():
+    """In a process of its own, which a fault ends."""
+    code = "from tests.test_cpu_kernels import run_all_guarded; run_all_guarded(); print('whole')"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "whole"), done.stderr[-3000:]
+
+
+def test_sizes_that_do_not_fit_are_refused():
+    shapes, rays, image, volume = problem(WEIGHTS[0])
+    table = by_row(np.array([0, 1]), np.array([0, 9]), np.ones(2), 2)
+    for call in (
+        lambda: dispatch.gather(shapes, rays, image[:-1]),
+        lambda: dispatch.scatter(shapes, rays, volume[:, :-1]),
+        lambda: dispatch.rays_vjp(shapes, (rays, image), volume[:2]),
+        lambda: dispatch.gather(shapes._replace(volume=(3, 5, 5)), rays, image),
+        lambda: dispatch.gather(shapes, rays._replace(parameters=rays.parameters[:2]), image),
+        lambda: dispatch.times_rows(SparseTable(0, table, table), (), jnp.ones((9, 16))),
+        lambda: dispatch.read_windows(Windows((61, 75), 19), (jnp.zeros((3, 2)), jnp.zeros((2, 2))), image),
+    ):
+        with pytest.raises(ValueError, match="must fit each other"):
+            call()
+
+
+def test_a_job_of_many_images():
+    """More buffers than a job had room for: 60 images, each with its kernel."""
+    rng = np.random.default_rng(0)
+    sharp = [jnp.asarray(rng.random((20, 21)), jnp.float32) for _ in range(60)]
+    kernels = jnp.asarray(rng.random((60, 3, 3)), jnp.float32)
+    found = jax.jit(sum_of_convolutions)(sharp, kernels)
+    one = [sum_of_convolutions([image], kernel[None]) for image, kernel in zip(sharp, kernels, strict=True)]
+    np.testing.assert_allclose(found, sum(one[1:], one[0]), rtol=1e-5)
+
+
+def test_memory_that_is_not_there_is_an_error():
+    """Of the job, and of a kernel's scratch: numba's exception ends the kernel, which then returns 0."""
+    shapes, rays, image, _ = problem(WEIGHTS[0])
+    gather = jax.jit(lambda image: image_to_volume(shapes, rays, image))
+    expected = gather(image)
+    nothing = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(lambda _: 0)
+    address = ctypes.cast(nothing, ctypes.c_void_p).value
+    for place in (ffi.ALLOCATE, ffi.FIRST_KERNEL + dispatch._number("gather")):
+        before, dispatch._table[place] = dispatch._table[place], address
+        try:
+            with pytest.raises(Exception, match="no memory for a kernel"):
+                gather(image).block_until_ready()
+        finally:
+            dispatch._table[place] = before
+    np.testing.assert_array_equal(gather(image), expected)
 
 
 def test_nothing_is_seen():

@@ -41,6 +41,12 @@ KERNELS = {
     "times_columns": windows.times_rows,
 }
 _table = np.zeros(ffi.FIRST_KERNEL + len(KERNELS), np.int64)
+_NO_MEMORY = ctypes.create_string_buffer(b"gs_jax: no memory for a kernel of back-projection or the forward model")
+# XLA's arguments of an error: their size, no extension, the message and its kind.
+_no_memory = np.array([32, 0, ctypes.addressof(_NO_MEMORY), ffi.RESOURCE_EXHAUSTED], np.int64)
+# What kernels read, besides float32.
+_TYPES = (jnp.bool_, jnp.uint8, jnp.uint16, jnp.int32)
+_MOST_AXES = 3
 
 
 def load(name: str):
@@ -52,7 +58,7 @@ def load(name: str):
         If XLA does not support the handler's version.
     """
     _register()
-    _table[ffi.FIRST_KERNEL + _number(name)] = _compile(KERNELS[name], types.void, 2).address
+    _table[ffi.FIRST_KERNEL + _number(name)] = _compile(KERNELS[name], types.int64, 2).address
     return globals()[name]
 
 
@@ -68,6 +74,7 @@ def _register():
         _table[place] = ctypes.cast(function, ctypes.c_void_p).value or 0
     if sys.platform == "linux":
         _table[ffi.ADVISE] = ctypes.cast(ctypes.CDLL(None).madvise, ctypes.c_void_p).value or 0
+    _table[ffi.NO_MEMORY] = _no_memory.ctypes.data
     (_table[ffi.MAJOR], _table[ffi.MINOR]), _table[ffi.TASK] = VERSION, _compile(ffi.task, types.int64, 1).address
     handler = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(_compile(ffi.handle, types.int64, 1).address)
     extension, frame = np.array([32, ffi.TABLE, 0, _table.ctypes.data], np.int64), np.zeros(21, np.int64)
@@ -109,37 +116,62 @@ def _sources_hash() -> int:
 
 
 def _call(kernel: str, results, *buffers):
-    """A kernel's results. Buffers and results have at most three axes."""
+    """A kernel's results, float32, of buffers as it reads them."""
+    buffers = [_as_buffer(kernel, buffer) for buffer in buffers]
     attributes = {"kernel": np.int64(_number(kernel)), "parts": np.int64(_PARTS)}
     return jax.ffi.ffi_call(TARGET, results)(*buffers, **attributes)
 
 
+def _as_buffer(kernel, array):
+    array = jnp.asarray(array)
+    array = array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
+    _require(kernel, array.ndim <= _MOST_AXES and array.dtype in (jnp.float32, *_TYPES), array)
+    return array
+
+
+def _require(kernel, holds, *arrays):
+    """A kernel does not look at sizes again: others would make it read and write beyond arrays."""
+    if not holds:
+        given = ", ".join(f"{array.dtype.name}{list(array.shape)}" for array in arrays)
+        raise ValueError(f"kernel {kernel}: arrays must fit each other, got {given}.")
+
+
 def gather(shapes, rays: Rays, image):
-    return _call("gather", ShapeDtypeStruct(shapes.volume, jnp.float32), *_tables(shapes, rays), _pixels(image))
+    return _call("gather", ShapeDtypeStruct(shapes.volume, jnp.float32), *_tables(shapes, rays), _pixels(shapes, image))
 
 
 def scatter(shapes, rays: Rays, volume):
+    _require("scatter", volume.shape == shapes.volume, volume)
     return _call("scatter", ShapeDtypeStruct(shapes.image, jnp.float32), *_tables(shapes, rays), volume)
 
 
 def rays_vjp(shapes, constants, volume):
     rays, image = constants
+    _require("rays_vjp", volume.shape == shapes.volume, volume)
     like = lambda *shape: ShapeDtypeStruct(shape, jnp.float32)
     y, x, of_lens = rays.y.pixel.shape, rays.x.pixel.shape, (len(rays.y.start), *rays.parameters.shape)
     results = [like(*y), like(*y), like(*x), like(*x), like(*of_lens)]
-    *by_axes, by_parameters = _call("rays_vjp", results, *_tables(shapes, rays), _pixels(image), volume)
+    *by_axes, by_parameters = _call("rays_vjp", results, *_tables(shapes, rays), _pixels(shapes, image), volume)
     return *by_axes, by_parameters.sum(0)
 
 
 def _tables(shapes, rays: Rays):
     axes = [part for axis in (rays.y, rays.x) for part in (axis.start, axis.pixel, axis.fraction, axis.distance2)]
+    lenses, depths, _ = rays.y.pixel.shape
+    for axis, voxels in zip((rays.y, rays.x), shapes.volume[1:], strict=True):
+        of_rays = {axis.pixel.shape, axis.fraction.shape, axis.distance2.shape, (lenses, depths, axis.pixel.shape[2])}
+        fit = len(of_rays) == 1 and 0 < axis.pixel.shape[2] <= voxels
+        _require("of rays", fit and axis.start.shape in ((lenses, 1), (lenses, depths)), *axes)
+    enough = len(rays.parameters) == depths == shapes.volume[0] and rays.parameters.shape[1] > 0
+    _require("of rays", enough and min(shapes.image) >= 2 and shapes.image[1] >= WIDTH, rays.parameters)
     return weight_numbers(shapes.weight), rays.parameters, *axes
 
 
-def _pixels(image):
+def _pixels(shapes, image):
     """Pixels of a type that the kernels read; a single bool is an image of ones."""
     if image is None:
         return jnp.ones((), bool)
+    _require("of rays", image.shape == shapes.image, image)
     return image if image.dtype in (jnp.uint8, jnp.uint16) else image.astype(jnp.float32)
 
 
@@ -182,12 +214,30 @@ def _overlap_save(name, kernels, images, shapes, shift):
 
 
 def read_windows(windows, places, image):
-    shape = windows.side, windows.side, len(places[0])
-    return _call("read_windows", ShapeDtypeStruct(shape, jnp.float32), *places, image)
+    start, fraction = _whole_places(places)
+    _require("read_windows", image.shape == windows.shape, image)
+    shape = windows.side, windows.side, len(start)
+    return _call("read_windows", ShapeDtypeStruct(shape, jnp.float32), start, fraction, image)[..., : len(places[0])]
 
 
 def add_windows(windows, places, values):
-    return _call("add_windows", ShapeDtypeStruct(windows.shape, jnp.float32), *places, values)
+    _require("add_windows", values.shape == (windows.side, windows.side, len(places[0])), values)
+    return _call(
+        "add_windows", ShapeDtypeStruct(windows.shape, jnp.float32), *_whole_places(places), _whole_last_axis(values)
+    )
+
+
+def _whole_places(places):
+    """Places of windows, of sixteen lenses, or several times as many: the last ones are beyond every image."""
+    start, fraction = places
+    _require("of windows", start.ndim == 2 and start.shape == fraction.shape == (len(start), 2), start, fraction)
+    missing = [(0, -len(start) % WIDTH), (0, 0)]
+    return jnp.pad(start, missing, constant_values=-1), jnp.pad(fraction, missing)
+
+
+def _whole_last_axis(array):
+    """An array with zeros at its end, so that its last axis is a multiple of sixteen."""
+    return jnp.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, -array.shape[-1] % WIDTH)])
 
 
 def times_rows(matrix, _, x):
@@ -199,8 +249,13 @@ def times_columns(matrix, _, x):
 
 
 def _times(kernel, entries, x):
-    result = ShapeDtypeStruct((len(entries.start) - 1, x.shape[1]), jnp.float32)
-    return _call(kernel, result, entries.start, entries.place, entries.share.astype(np.float32), x)
+    start, place, share = entries
+    inside = start[0] >= 0 and (np.diff(start) >= 0).all() and start[-1] <= len(place) == len(share)
+    inside = inside and x.ndim == 2 and (place.size == 0 or 0 <= place.min() <= place.max() < len(x))
+    _require(kernel, inside, start, place, share, x)
+    whole = _whole_last_axis(x)
+    result = ShapeDtypeStruct((len(start) - 1, whole.shape[1]), jnp.float32)
+    return _call(kernel, result, start, place, share, whole)[:, : x.shape[1]]
 
 
 @cache

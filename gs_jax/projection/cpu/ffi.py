@@ -9,18 +9,19 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from .rows import BUFFERS, JOB_LENGTH, PARTS, PER_BUFFER
+from .rows import BUFFERS, DONE, LENGTH, OWN, PARTS, PER_BUFFER
 from .simd import I64, carray, inline, instruction, pointer
 
 # Places in structures, in units of 8 bytes.
 EXTENSION, API, CONTEXT, ARGUMENTS, RESULTS, ATTRIBUTES = 1, 2, 3, 5, 10, 20  # of the frame
 COUNT, ITEMS = 2, 4  # of its arguments and results
-ERROR_DESTROY, SCHEDULE, THREADS = 8, 17, 18  # of the API
+ERROR_CREATE, ERROR_DESTROY, SCHEDULE, THREADS = 6, 8, 17, 18  # of the API
+RESOURCE_EXHAUSTED = 8  # XLA's number of this error
 METADATA, TABLE = 1, 77  # types of extensions: XLA's, and our own, which tells the handler the table's address
-# Places in the table: addresses of functions, the version, and the addresses of the kernels.
-TASK, ALLOCATE, FREE, YIELD, ADVISE, MAJOR, MINOR, FIRST_KERNEL = range(8)
-# Places in a job, besides its parts and buffers.
-_REFERENCES, _NEXT, _DONE, _KERNEL, _FREE, _SCRATCH = 0, 1, 2, 4, 5, 240
+# Places in the table: addresses of functions, the version, addresses of an error's arguments and of the kernels.
+TASK, ALLOCATE, FREE, YIELD, ADVISE, MAJOR, MINOR, NO_MEMORY, FIRST_KERNEL = range(9)
+# Places in a job, besides its parts, length and buffers.
+_REFERENCES, _NEXT, _DONE, _KERNEL, _FREE, _FAILED = 0, 1, 2, 4, 5, 7
 
 
 @instruction(types.int64)
@@ -54,19 +55,20 @@ def _at(address, length):
 @inline
 def _work(address):
     """Take parts until none is left."""
-    job = _at(address, JOB_LENGTH)
+    job = _at(address, OWN)
     while True:
         part = _fetch_add(address + 8 * _NEXT, 1)
         if part >= job[PARTS]:
             return
-        _call(job[_KERNEL], address, part, 0)
+        if _call(job[_KERNEL], address, part, 0) != DONE:
+            _fetch_add(address + 8 * _FAILED, 1)
         _fetch_add(address + 8 * _DONE, 1)
 
 
 @inline
 def _release(address):
     if _fetch_add(address + 8 * _REFERENCES, -1) == 1:
-        _call(_at(address, JOB_LENGTH)[_FREE], address, 0, 0)
+        _call(_at(address, OWN)[_FREE], address, 0, 0)
 
 
 def task(address, _):
@@ -100,7 +102,8 @@ def _use_large_pages(job, place, advise):
 
 def handle(frame_address, _):
     """The handler that XLA calls."""
-    frame, table = _at(frame_address, 21), _at(_at(_global(), 1)[0], 16)
+    frame, at_table = _at(frame_address, 21), _at(_global(), 1)[0]
+    table = _at(at_table, FIRST_KERNEL)
     if frame[EXTENSION] != 0:
         extension = _at(frame[EXTENSION], 4)
         if extension[1] & 0xFFFFFFFF == METADATA:
@@ -110,18 +113,21 @@ def handle(frame_address, _):
         if extension[1] & 0xFFFFFFFF == TABLE:
             _at(_global(), 1)[0] = extension[3]
             return 0
-    address = _call(table[ALLOCATE], 8 * JOB_LENGTH, 0, 0)
-    job = _at(address, JOB_LENGTH)
+    api = _at(frame[API], 19)
+    length = BUFFERS + PER_BUFFER * (frame[ARGUMENTS + COUNT] + frame[RESULTS + COUNT])
+    address = _call(table[ALLOCATE], 8 * length, 0, 0)
+    if address == 0:
+        return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0)
+    job = _at(address, length)
     attributes = _at(frame[ATTRIBUTES], 2)
     which, parts = _at(_at(attributes[0], 2)[1], 1)[0], _at(_at(attributes[1], 2)[1], 1)[0]
-    job[_REFERENCES], job[_NEXT], job[_DONE], job[PARTS] = 1, 0, 0, parts
-    job[_KERNEL], job[_FREE] = table[FIRST_KERNEL + which], table[FREE]
+    job[_REFERENCES], job[_NEXT], job[_DONE], job[PARTS], job[LENGTH], job[_FAILED] = 1, 0, 0, parts, length, 0
+    job[_KERNEL], job[_FREE] = _at(at_table + 8 * FIRST_KERNEL, which + 1)[which], table[FREE]
     arguments = _list_buffers(job, 0, frame[ARGUMENTS : ARGUMENTS + 5])
     for result in range(arguments, _list_buffers(job, arguments, frame[RESULTS : RESULTS + 5])):
         _use_large_pages(job, BUFFERS + PER_BUFFER * result, table[ADVISE])
     # XLA reads and writes the structures of its functions here.
-    api, scratch, at_scratch = _at(frame[API], 19), job[_SCRATCH:], address + 8 * _SCRATCH
-    threads = address + 8 * (_SCRATCH + 8)
+    scratch, at_scratch, threads = job[OWN:BUFFERS], address + 8 * OWN, address + 8 * (OWN + 8)
     scratch[0], scratch[1], scratch[2], scratch[3], scratch[8] = 32, 0, frame[CONTEXT], threads, 1
     error = _call(api[THREADS], at_scratch, 0, 0)
     for _ in range(min(scratch[8], parts) - 1):
@@ -138,5 +144,6 @@ def handle(frame_address, _):
     _work(address)
     while _fetch_add(address + 8 * _DONE, 0) < parts:
         _call(table[YIELD], 0, 0, 0)
+    failed = job[_FAILED] > 0
     _release(address)
-    return 0
+    return _call(api[ERROR_CREATE], table[NO_MEMORY], 0, 0) if failed else 0

@@ -70,7 +70,7 @@ def overlap_save(job_address, part, _):
                     _transform_back(at_last + strip * s, side, turns)
             _write(job, place, row1, column1, at_last, side, kept, fresh, at_edge)
             _write(job, place, row2, column2, at_last + _plane(side), side, kept, fresh, at_edge)
-    rows.keep_alive((scratch, edge))
+    return rows.keep_alive((scratch, edge))
 
 
 @inline

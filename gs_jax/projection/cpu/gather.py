@@ -191,7 +191,8 @@ def _fill_two_taps(taps, columns, begin, end, start, size):
     block, last = size, size + 1
     for c in range(begin, end):
         pixel = np.int64(low[c]) - start
-        if pixel >= last:
+        # Pixels rise, or are beyond the first and the last ray's, behind a lens or where the geometry is NaN.
+        if pixel < 0 or pixel >= last or pixel + 1 >= size:
             return 0
         # The pixel above may be the one below the last ray.
         if pixel + 1 == last:
@@ -221,6 +222,8 @@ def _fill_more_taps(taps, columns, begin, end, start, size):
     for c in range(begin, end):
         for beside in range(2):
             pixel = np.int64(low[c]) + 1 - beside - start
+            if pixel < 0 or pixel >= size:
+                return 0
             others = np.int64(number[pixel])
             if others == 0:
                 voxel[pixel] = c

@@ -1,7 +1,9 @@
 """The three derivatives of the bilinear form as numba kernels, with the arithmetic of `bilinear` in another order.
 
-A kernel `(job, part)` computes one part of a result from the buffers of a job. Parts share nothing, so any thread may
-take any of them, in any order, and the sums are the same. Arrays are float32 (an image may be of integers).
+A kernel `(job, part)` computes one part of a result from the buffers of a job and returns `rows.DONE`. Parts share
+nothing, so any thread may take any of them, in any order, and the sums are the same. Arrays are float32 (an image may
+be of integers). `dispatch` has checked their sizes; indices in tables are kept within them here, so that no kernel
+writes elsewhere, whatever geometry the tables are of.
 
 Sixteen voxels are computed at once; those beyond a lens's field are skipped. Along a row of voxels all rays of a lens
 meet the same two rows of the image, and sixteen of them a short piece of these, from which AVX-512 gathers the pixel
@@ -66,7 +68,7 @@ def gather(job_address, part, _):
         floats(at_pairs, 2 * here.length)[:] = ONE
     for lens in range(lenses):
         for d in range(depths):
-            y_start, x_start = rows.patch(tables, lens, d)
+            y_start, x_start = rows.patch(tables, lens, d, height, width)
             first, last = max(top - y_start, 0), min(bottom - y_start, ny)
             if first >= last:
                 continue
@@ -104,7 +106,7 @@ def gather(job_address, part, _):
     for d in range(depths):
         for k in range(bottom - top):
             volume[d, top + k] = floats(at_sums + 4 * (d * (bottom - top) + k) * stride, width)
-    rows.keep_alive((sums, lines))
+    return rows.keep_alive((sums, lines))
 
 
 def scatter(job_address, part, _):
@@ -132,7 +134,7 @@ def scatter(job_address, part, _):
     low, x2 = integers(here.pixel, here.length), floats(here.distance2, here.length)
     for lens in range(lenses):
         for d in range(depths):
-            y_start, x_start = rows.patch(tables, lens, d)
+            y_start, x_start = rows.patch(tables, lens, d, height, width)
             shift = x_start % WIDTH
             y_pixel = tables.y_pixel[lens, d]
             first, last = rows.first_below(y_pixel, bottom), rows.first_below(y_pixel, top - 1)
@@ -154,8 +156,8 @@ def scatter(job_address, part, _):
                     continue
                 i, down = rows.pixel_row(tables, lens, d, k, tall)
                 at_upper = rows.address(job, FIRST + 1) + 4 * i * wide
-                at_lower = at_upper + 4 * wide if i + 1 < bottom else at_spare
-                at_upper = at_upper if i >= top else at_spare
+                at_lower = at_upper + 4 * wide if i + 1 >= top and i + 1 < bottom else at_spare
+                at_upper = at_upper if i >= top and i < bottom else at_spare
                 at_row = rows.address(job, FIRST) + 4 * ((d * height + y_start + k) * width + x_start - shift)
                 for c in range(begin // WIDTH * WIDTH, end, WIDTH):
                     simd.prefetch(at_row + 4 * (AHEAD * width + c))
@@ -183,7 +185,7 @@ def scatter(job_address, part, _):
                     spread = take_sum(at_lines + j, many, 4 * length)
                     simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * spread)
                     simd.store(at_lower + j, simd.load(at_lower + j) + down * spread)
-    rows.keep_alive((lines,))
+    return rows.keep_alive((lines,))
 
 
 def rays_vjp(job_address, part, _):
@@ -217,7 +219,7 @@ def rays_vjp(job_address, part, _):
         floats(at_pairs, 2 * space)[:] = ONE
     for lens in range(part * lenses // job[PARTS], (part + 1) * lenses // job[PARTS]):
         for d in range(depths):
-            y_start, x_start = rows.patch(tables, lens, d)
+            y_start, x_start = rows.patch(tables, lens, d, height, width)
             shift = x_start % WIDTH
             fill_columns(here, job, tables, lens, d, shift, wide)
             size = set_windows(here, shift, nx, wide) if has_image else 0
@@ -271,4 +273,4 @@ def rays_vjp(job_address, part, _):
                 x_distance2_sums[lens, d, c] = x_sums[space + shift + c]
             for number in range(many):
                 parameters_sums[lens, d, number] = sums[WIDTH * number : WIDTH * number + WIDTH].sum()
-    rows.keep_alive((lines,))
+    return rows.keep_alive((lines,))

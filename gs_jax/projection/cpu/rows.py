@@ -7,10 +7,13 @@ import numpy as np
 from . import simd
 from .simd import WIDTH, carray, inline
 
-# A job is a list of 64-bit numbers: eight of its own, then address, type and three sizes of each buffer.
-PARTS, BUFFERS, PER_BUFFER, JOB_LENGTH = 3, 8, 5, 256
+# A job is a list of 64-bit numbers: eight of its own, sixteen for arguments of XLA's functions, then address, type and
+# three sizes of each buffer.
+PARTS, LENGTH, OWN, BUFFERS, PER_BUFFER = 3, 6, 8, 24, 5
 # Buffers: numbers of the weight, its parameters, start, pixel, fraction and distance2 of y and of x, and what follows.
 FIRST = 10
+# What kernels return. One that fails, because there is no memory for its scratch, returns 0.
+DONE = 1
 ZERO, HALF, ONE, TWO, THREE, SIX, FAR = (np.float32(n) for n in (0, 0.5, 1, 2, 3, 6, 1e8))
 
 
@@ -29,7 +32,6 @@ class Tables(NamedTuple):
     x_distance2: np.ndarray
 
 
-job_at = inline(lambda address: carray(simd.pointer(address), JOB_LENGTH, np.int64))
 address = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer])
 pixel_type = inline(lambda job, buffer: job[BUFFERS + PER_BUFFER * buffer + 1])
 size = inline(lambda job, buffer, axis: job[BUFFERS + PER_BUFFER * buffer + 2 + axis])
@@ -38,6 +40,12 @@ floats = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), s
 integers = inline(lambda job, buffer: carray(simd.pointer(address(job, buffer)), shape(job, buffer), np.int32))
 padded = inline(lambda count: (count + WIDTH - 1) // WIDTH * WIDTH)
 pixel_bytes = inline(lambda kind: 1 if kind == simd.UINT8 else 2 if kind == simd.UINT16 else 4)
+
+
+@inline
+def job_at(address):
+    own = carray(simd.pointer(address), OWN, np.int64)
+    return carray(simd.pointer(address), own[LENGTH], np.int64)
 
 
 @inline
@@ -50,10 +58,12 @@ def read_tables(job):
 
 
 @inline
-def patch(tables, lens, d):
-    """First row and column of the voxels that a lens may see at a depth."""
+def patch(tables, lens, d, height, width):
+    """First row and column of the voxels that a lens may see at a depth; all of them are in the volume."""
     d = min(d, tables.y_start.shape[1] - 1)
-    return tables.y_start[lens, d], tables.x_start[lens, d]
+    last_row, last_column = height - tables.y_pixel.shape[2], width - tables.x_pixel.shape[2]
+    row, column = np.int64(tables.y_start[lens, d]), np.int64(tables.x_start[lens, d])
+    return min(max(row, 0), last_row), min(max(column, 0), last_column)
 
 
 # These test `numbers[0]` before a ring's hole, so that LLVM makes a loop without branches for Eq. (2).
@@ -214,6 +224,7 @@ def first_below(pixel, limit):
 
 @inline
 def keep_alive(arrays):
-    """Numba frees an array after its last use, and does not count the use of its address."""
+    """Numba frees an array after its last use, and does not count the use of its address. Returns `DONE`."""
     for array in arrays:
         array[0] = ZERO
+    return DONE

@@ -1,6 +1,7 @@
 """Windows of an image about lenses, and sparse matrices times columns of lenses, as numba kernels.
 
-A kernel `(job, part)` as in `kernels`. The number of lenses, the last axis, is a multiple of sixteen.
+A kernel `(job, part)` as in `kernels`. The number of lenses, the last axis, is a multiple of sixteen: `dispatch` adds
+some that are beyond the image.
 """
 
 import numpy as np
@@ -46,7 +47,7 @@ def read_windows(job_address, part, _):
                 simd.transpose(at_rows, at_columns)
                 for m in range(min(WIDTH, side - j)):
                     simd.store(at_result + 4 * (j + m) * lenses, simd.load(at_columns + _STEP * m))
-    rows.keep_alive((tiles,))
+    return rows.keep_alive((tiles,))
 
 
 def add_windows(job_address, part, _):
@@ -93,7 +94,7 @@ def add_windows(job_address, part, _):
                         simd.store(at_upper + j, simd.load(at_upper + j) + (ONE - down) * value)
                     if row + 1 < bottom:
                         simd.store(at_lower + j, simd.load(at_lower + j) + down * value)
-    rows.keep_alive((lines,))
+    return rows.keep_alive((lines,))
 
 
 def times_rows(job_address, part, _):
@@ -121,3 +122,4 @@ def times_rows(job_address, part, _):
             for entry in range(begin, end):
                 a = a + share[entry] * simd.load(rows.address(job, 3) + 4 * (np.int64(column[entry]) * lenses + lens))
             simd.store(at_result + 4 * lens, a)
+    return rows.DONE
