@@ -106,11 +106,13 @@ def test_points_of_a_capture(folder, monkeypatch, capsys):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("how", [("--method", "list-rl"), ("--method", "richardson-lucy"), ("--suppress", "unet")])
+@pytest.mark.parametrize(
+    "how", [("list-rl", "--steps", "2"), ("richardson-lucy", "--steps", "2"), ("backproject", "--suppress", "unet")]
+)
 def test_other_ways_to_reconstruct(folder, monkeypatch, capsys, how):
     tifffile.imwrite(folder / "capture.tif", np.full((96, 80), 7, np.uint16) + np.eye(96, 80, dtype=np.uint16))
     # Quiet: a busy machine would show its progress.
-    command = (*RECONSTRUCT[:4], "18:22:1", "--voxel-um", "50", "--steps", "2", *how, "-o", "v.tif", "-q")
+    command = (*RECONSTRUCT[:4], "18:22:1", "--voxel-um", "50", "--method", *how, "-o", "v.tif", "-q")
     status, out, err = run(monkeypatch, capsys, *command)
     assert (status, err) == (0, "") and out.startswith("v.tif: 5 x 39 x 33 voxels")
     volume, _ = read_volume(folder / "v.tif")
@@ -282,6 +284,23 @@ WRONG_ARGUMENTS = [
     (("simulate", "missing.csv", "design.toml", "-o", "c.png", "--no-noise"), ".tif, .tiff or .npy with --no-noise"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--psf", "round"), "'round' is not"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),
+    # Options that would do nothing.
+    *(
+        ((*RECONSTRUCT, "--method", method, *option, "-o", "v.tif"), f"{option[0]} must be used with list-rl, ")
+        for method in ("backproject", "unrolled", "surface")
+        for option in (("--steps", "9"), ("--stop-at-noise",))
+    ),
+    *(
+        (("simulate", "p.csv", "design.toml", "-o", "c.tif", "--no-noise", option, "1"), f"{option} must be used with")
+        for option in ("--seed", "--peak-electrons", "--gain", "--offset", "--read-noise", "--full-well", "--bits")
+    ),
+    (("heights", "design.toml", "--step-um", "10", "-o", "l.csv"), "--step-um must be used with heights"),
+    (("mold", "design.toml", "--positive", "--draft-deg", "1", "-o", "m.stl"), "--draft-deg must be used without"),
+    (("report", "design.toml", "--dark", "d.tif", "-o", "r.html"), "--dark must be used with --capture"),
+    (("info", "design.toml", "--designs"), "--designs must be used without a FILE"),
+    (("new-design", "--centers", "c.csv", "--seed", "1", "-o", "n.toml"), "--seed must be used without --centers"),
+    (("train", "--network", "paper", "--workers", "2", "-o", "w.npz"), "--workers must be used with multislice"),
+    (("train", "--wavelength-nm", "600", "-o", "w.npz"), "--wavelength-nm must be used with --from-captures"),
 ]  # fmt: skip
 
 

@@ -47,6 +47,19 @@ def test_neighbours_are_left_out_in_turn():
     np.testing.assert_array_equal(sum(1 - each for each in kept), 1)
 
 
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_back_projection_is_scored_as_it_is(scene, normalize):
+    """With all pixels it is the volume that is asked for, divided by the weights or not; the scores differ."""
+    _, psf, clean = scene
+    volume_of = reconstructor(scope(), GRID, gs.BackProjection(normalize=normalize), optics=psf)
+    whole = volume_of(clean, Progress())
+    np.testing.assert_allclose(volume_of(clean, Progress(), kept=np.ones_like(clean)), whole, rtol=1e-6, atol=1e-7)
+    weights = gs.backproject(np.ones_like(clean), scope(), GRID)
+    other = reconstructor(scope(), GRID, gs.BackProjection(normalize=not normalize), optics=psf)(clean, Progress())
+    factor = 1 / np.maximum(weights, 1e-6) if normalize else np.asarray(weights)
+    np.testing.assert_allclose(whole, other * factor, rtol=1e-4, atol=1e-5)
+
+
 SLOW = [pytest.param(name, marks=pytest.mark.integration) for name in ("list-rl", "fista", "admm", "unrolled")]
 
 

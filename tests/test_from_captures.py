@@ -64,9 +64,10 @@ def test_the_design_with_the_fitted_radii_is_written_beside_the_weights(tmp_path
     (tmp_path / "run").mkdir()
     command = ["--from-captures", str(tmp_path / "run"), "--design", str(tmp_path / "my.toml"), "--depths", "19:21:1"]
     command += ["-o", str(tmp_path / "tuned.npz")]
-    factor = 1.02
+    factor, wavelengths = 1.02, []
 
     def fitted(images, imager, grid, networks, progress):
+        wavelengths.append(round(1e6 * float(imager.wavelength)))
         return RadiusFit(with_radii(imager, factor), factor, [(1.0, 0.2), (1.02, 0.15)])
 
     def trained(images, imager, grid, networks, **how):
@@ -93,6 +94,12 @@ def test_the_design_with_the_fitted_radii_is_written_beside_the_weights(tmp_path
     done = CliRunner().invoke(train_command, [*command, "--force"], catch_exceptions=False)
     kept = gs.read_design(tmp_path / "tuned.toml")
     assert "tuned.toml: radii +0.0%" in done.output and kept.lens == mine.lens
+    # Of another wavelength, in a gel: the captures' own, which the written design has too.
+    gel = ["--wavelength-nm", "600", "--sample-index", "1.43", "--sample-at", "17"]
+    CliRunner().invoke(train_command, [*command, *gel, "--force"], catch_exceptions=False)
+    seen = gs.read_design(tmp_path / "tuned.toml")
+    assert wavelengths[0] == mine.imaging.wavelength_nm and wavelengths[-1] == seen.imaging.wavelength_nm == 600
+    assert seen.sample is not None and seen.sample.refractive_index == 1.43
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The commands, apart from the list of commands."""
 
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -48,10 +49,18 @@ TERMS = {"own_mm": Term("the sensor's distance", lambda imager, at: imager.senso
 """
 
 
-def test_optimize(folder, monkeypatch):
+@pytest.fixture
+def own_terms():
+    """A file of terms; what it adds is taken away at the end."""
+    before = terms.TERMS.copy()
+    Path("own.py").write_text(OWN)
+    yield
+    terms.TERMS.clear()
+    terms.TERMS.update(before)
+
+
+def test_optimize(folder, own_terms):
     """The thinnest with that resolution: v = 4.5 um / 40 um of the farthest z', by hand, within the margin of 0.5 %."""
-    monkeypatch.setattr(terms, "TERMS", terms.TERMS.copy())
-    (folder / "own.py").write_text(OWN)
     (folder / "study.toml").write_text(
         STUDY.replace("[[stages]]", '[[terms]]\nname = "own_mm"\nat_most = 9.0\n[[stages]]')
     )

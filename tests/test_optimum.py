@@ -16,6 +16,7 @@ from jax.test_util import check_grads
 
 import gs_jax as gs
 from gs_jax import InputError, objectives
+from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.solve import LBFGSB
 from gs_jax.objectives.conditions import per_type
 
@@ -195,14 +196,10 @@ def test_an_objective_of_ones_own_to_a_file(tmp_path):
     scope, depths = gs.geomscope(sensor_distance_mm=4.5).replace(centers_mm=small().array.centers).imager(), DEPTHS
     my_cost = lambda scope: (scope.sensor_distance - 5.0) ** 2
     loss = lambda scope: gs.objectives.spot_width(scope, depths).max() + 0.001 * my_cost(scope)
-    found = gs.optimize(
-        loss,
-        scope,
-        free=gs.free("sensor_distance", "radius_of_curvature", "aperture_diameter"),
-        bounds={"sensor_distance": (4.0, 7.0), "radius_of_curvature": (1.5, 3.0), "aperture_diameter": (0.6, 2.0)},
-        solver=optx.BFGS(1e-6, 1e-6),
-        steps=12,
-    )
+    limits = {"sensor_distance": (4.0, 7.0), "radius_of_curvature": (1.5, 3.0), "aperture_diameter": (0.6, 2.0)}
+    options = {"free": gs.free(*limits), "bounds": limits, "solver": optx.BFGS(1e-6, 1e-6), "steps": 12}
+    with pytest.warns(InputWarning, match="aperture_diameter starts at 1.986 instead of 2, to begin within its bounds"):
+        found = gs.optimize(loss, scope, **options)
     assert found.value < 0.5 * loss(scope)
     gs.write_design(tmp_path / "mine.toml", gs.Design.from_imager(found.imager, name="mine"))
     assert gs.read_design(tmp_path / "mine.toml").imager().sensor_distance == found.imager.sensor_distance

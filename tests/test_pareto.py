@@ -7,7 +7,7 @@ import tomli_w
 from click.testing import CliRunner
 
 from gs_jax.__main__ import commands
-from gs_jax.base.errors import InputError
+from gs_jax.base.errors import InputError, InputWarning
 from gs_jax.codesign import stages
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
 from gs_jax.codesign.search import run_study
@@ -41,7 +41,8 @@ def test_equal_points_do_not_beat_each_other():
 
 @pytest.fixture(scope="module")
 def front():
-    return trade_off(geomscope(), Study.model_validate(STUDY))
+    with pytest.warns(InputWarning, match="aperture_diameter_mm starts at 1.486 instead of 2, to begin within"):
+        return trade_off(geomscope(), Study.model_validate(STUDY))
 
 
 @pytest.mark.integration
@@ -74,7 +75,7 @@ def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
         return run(steps, state, *arguments, **options)
 
     monkeypatch.setattr(stages, "run", first_lost)
-    found = trade_off(geomscope(), Study.model_validate(STUDY))
+    found = trade_off(geomscope(aperture_diameter_mm=1.4), Study.model_validate(STUDY))
     assert np.isfinite(found.values).all() and found.best[1:].all()
 
 
@@ -100,7 +101,7 @@ SPLIT = STUDY | {
 @pytest.mark.integration
 def test_stages_keep_what_the_one_before_found():
     """Stages that free different parameters; each search ends where `run_study` does with the same limit."""
-    start = geomscope(sensor_distance_mm=4.0)
+    start = geomscope(sensor_distance_mm=4.0, aperture_diameter_mm=1.4)
     sizes = []
     found = trade_off(start, Study.model_validate(SPLIT), each=lambda front: sizes.append(len(front.points)))
     assert sizes == list(range(1, len(found.points) + 1))  # what is done is shown as it is found

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import gs_jax as gs
 from experiments.solver_options import glow
 from gs_jax import Grid, ImagingOperator, backproject, forward, make_psf_model
 from gs_jax.apps.method_benchmark import skip_reason
@@ -257,6 +258,14 @@ def test_solvers_end_where_noise_is_left(solver):
         reconstruct(capture, imager, grid, solver, optics=None, stop_at_discrepancy=True, progress=log)
         steps[name] = len(log.parts)
     assert steps["noisy"] < 60 < steps["clean"] == 100
+
+
+@pytest.mark.parametrize("method", [gs.BackProjection(), gs.Surface(), gs.Unrolled.pretrained()])
+def test_methods_that_cannot_stop_at_the_noise(method):
+    imager, grid = scene()
+    for function in (gs.reconstruct, gs.cross_validated):
+        with pytest.raises(InputError, match=rf"must be used with .*, got {type(method).__name__}\(\)"):
+            function(np.ones(imager.sensor.shape), imager, grid, method, stop_at_discrepancy=True)
 
 
 def test_the_glow_is_as_bright_as_it_says():

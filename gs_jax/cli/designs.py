@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from ..base.errors import InputError
 from ..io.files import check_output, write_json
 from .light import Light, check_beyond, sample_options
 from .options import DESIGN, MM, UM, Depths, shipped_designs
@@ -95,6 +96,8 @@ def info_command(file: Path | None, designs: bool):
 
     Of an image that another program made: its size, type and axes, and what commands take it for.
     """
+    if designs and file:
+        raise InputError(f"--designs must be used without a FILE, got {file}.")
     if designs:
         from ..design.design import read_design
 

@@ -11,7 +11,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
 from .light import Light, check_beyond, sample_options
-from .options import DESIGN, UM, Depths, Number
+from .options import DESIGN, UM, Depths, Number, given_options
 from .outputs import check_may_write, force_option, provenance_of
 
 SMALL_UM, FEATURE_UM = Number(1e-3, 1e3, "um"), Number(1e-2, 1e3, "um")
@@ -43,6 +43,8 @@ def mold_command(design: Path, output: Path, positive: bool, label: bool, layer_
 
     beside = [check_output(output.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt")]
     check_output(output, MESH_SUFFIXES)
+    if positive and (given := given_options(("draft_deg", "headroom_mm"))):
+        raise InputError(f"{given[0]} must be used without --positive: it is of the mold's walls.")
     check_may_write(output, *beside, inputs=(design,))
     microscope = read_design(design)
     shape = MoldShape(
@@ -107,6 +109,8 @@ def heights_command(design: Path, output: Path, step_um: float, force: bool):
     from ..mold.height_files import HEIGHT_SUFFIXES, write_heights
 
     check_output(output, HEIGHT_SUFFIXES)
+    if output.suffix.lower() == ".csv" and given_options(["step_um"]):
+        raise InputError(f"--step-um must be used with heights, got the list of lenses {output}.")
     check_may_write(output, sidecar(output), inputs=(design,), force=force)
     microscope = read_design(design)
     provenance = provenance_of(design, design=design_text(microscope))

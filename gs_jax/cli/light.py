@@ -89,6 +89,8 @@ def sample_options(command):
     return wrapper
 
 
+# Names of the options of `sample_options`.
+LIGHT_OPTIONS = ("sample", "sample_index", "sample_at", "wavelength_nm")
 _SAMPLE_OPTIONS = (
     click.option("--sample", help="NAME of one of [samples] in DESIGN, or air.  [default: DESIGN's [sample]]"),
     click.option("--sample-index", type=Number(1.0, 5.0), help="Refractive index of the object's medium."),

@@ -10,6 +10,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..io.files import check_output
+from .options import given_options
 from .outputs import check_may_write, force_option, provenance_of
 
 # Table of each option that is a key of the file, in the order of the questions.
@@ -146,6 +147,8 @@ def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -
         raise InputError("--radius-of-curvature-mm must be used without --focal-length-mm.")
     if centers and "count" in known:
         raise InputError("--count must be used without --centers.")
+    if centers and given_options(["seed"]):
+        raise InputError("--seed must be used without --centers: it is of a random layout.")
     about = [key for key in ("centers_unit", "centers_columns", "centers_origin", "mirror") if known.get(key)]
     if about and not centers and not (asking and "count" not in known):
         raise InputError(f"{_option(about[0])} must be used with --centers.")

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import click
 
-from ..base.errors import errors_name_file, input_error, needs_extra
+from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
 from .light import Light, sample_options
-from .options import DESIGN, CaptureOptions, capture_options
+from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options
 from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 
 
@@ -49,6 +49,8 @@ def report_command(
     points, surface, capture, tolerance = (files[name] for name in ("points", "surface", "capture", "tolerance"))
     inputs = (design, volume, points, surface, capture, tolerance)
     check_output(output, [".html"])
+    if not capture and (given := given_options(CAPTURE_OPTIONS)):
+        raise InputError(f"{given[0]} must be used with --capture.")
     with needs_extra("report"):
         import_module("jinja2")
     check_may_write(output, inputs=(*inputs, *camera.files))

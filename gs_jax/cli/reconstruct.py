@@ -53,8 +53,7 @@ from .watch_command import check_watched, watch_folder
 @click.option(
     "--steps",
     type=click.IntRange(1, 100_000),
-    default=20,
-    help="Steps of list-rl, richardson-lucy, fista and admm; unrolled and surface have their own.",
+    help="Steps of list-rl, richardson-lucy, fista and admm; unrolled and surface have their own.  [default: 20]",
 )
 @click.option(
     "--optics",

@@ -9,7 +9,7 @@ from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
 from .light import Light, check_beyond, light_options
-from .options import DESIGN, PSFS, SIMULATED, Number
+from .options import DESIGN, PSFS, SIMULATED, Number, given_options
 from .outputs import check_may_write, provenance_of
 
 PEAK = Number(1.0, 1e6, "electrons")
@@ -17,6 +17,8 @@ ELECTRONS = Number(0.0, 1e9, "electrons")
 GAIN = Number(1e-3, 1e6, "electrons")
 WELL = Number(1.0, 1e9, "electrons")
 COUNTS = Number(0.0, 65535.0, "counts")
+# Options of the exposure.
+_CAMERA = ("peak_electrons", "gain", "offset", "read_noise", "full_well", "bits", "seed")
 
 
 @click.command("simulate", epilog="Example: gs-jax simulate points.csv design/geomscope.toml -o capture.tif")
@@ -72,6 +74,8 @@ def simulate_command(
         raise InputError(f"{output}: the suffix must be .tif, .tiff or .npy with --no-noise: PNG holds no float32.")
     if scene.suffix.lower() == ".toml":
         raise InputError(f"{scene}: SCENE must be points or a volume, got a design: SCENE comes first, then DESIGN.")
+    if not noise and (given := given_options(_CAMERA)):
+        raise InputError(f"{given[0]} must be used with noise: --no-noise writes the light itself, without a camera.")
     if psf and optics == "full":
         raise InputError(f"--psf {psf} must be used with --optics near, which has one PSF for all lenses.")
     microscope = read_design(design)

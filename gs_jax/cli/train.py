@@ -10,6 +10,7 @@ from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
+from .light import LIGHT_OPTIONS, Light, check_beyond, sample_options
 from .options import (
     CAPTURE_OPTIONS,
     DESIGN,
@@ -51,6 +52,7 @@ _DEFAULTS = ", ".join(f"{steps} for {name}" for name, steps in STEPS.items())
 @click.option("--depths", type=Depths(), help="START:STOP:STEP in mm of the volumes, as in `gs-jax reconstruct`.")
 @click.option("--voxel-um", type=UM, help="Lateral voxel pitch.  [default: 4 pixels as seen at the middle depth]")
 @click.option("--weights", type=Path, help="WEIGHTS.npz to begin with.  [default: ours]")
+@sample_options
 @worker_options
 @capture_options
 @force_option
@@ -62,6 +64,7 @@ def train_command(
     output: Path,
     workers: Workers,
     camera: CaptureOptions,
+    light: Light,
     from_captures: Path | None,
     **mine: Any,
 ):
@@ -83,10 +86,14 @@ def train_command(
         alone = () if network == "unrolled" else ("network",)
         if given := given_options((*alone, "resume", "workers", "scheduler")):
             raise InputError(f"--from-captures trains the unrolled networks in this process, got {given[0]}.")
-        return _from_captures(from_captures, output, steps or FINE_STEPS, seed, camera, **mine)
-    if given := given_options((*mine, *CAPTURE_OPTIONS)):
+        return _from_captures(from_captures, output, steps or FINE_STEPS, seed, camera, light, **mine)
+    if given := given_options((*mine, *CAPTURE_OPTIONS, *LIGHT_OPTIONS)):
         raise InputError(f"{given[0]} must be used with --from-captures.")
     network = network or "multislice"
+    if network == "paper" and (given := given_options(("workers", "scheduler"))):
+        raise InputError(
+            f"{given[0]} must be used with multislice or unrolled, got paper, which simulates no captures."
+        )
     import numpy as np
 
     from ..apps.training.training_loop import (
@@ -146,6 +153,7 @@ def _from_captures(
     steps: int,
     seed: int,
     camera: CaptureOptions,
+    light: Light,
     *,
     design: Path | None,
     depths: list[float] | None,
@@ -174,8 +182,9 @@ def _from_captures(
             f"-o must have another name than {design}: the fitted design is written beside WEIGHTS, got {output}."
         )
     check_may_write(output, history, made, inputs=(*files, design, weights, *camera.files), force=force)
-    microscope = read_design(design)
+    microscope = light.design(read_design(design))
     imager = camera.imager(microscope.imager())
+    check_beyond(imager, depths, "--depths")
     grid = voxel_grid(imager, depths, voxel_um and voxel_um / 1000, pixels=PIXELS_PER_VOXEL)
     start = read_unrolled(weights) if weights else Unrolled.pretrained()
     record = camera.recorded(provenance_of(folder, design, weights, *camera.files))

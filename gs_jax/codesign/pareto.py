@@ -25,7 +25,7 @@ from ..typing import PathLike
 from .parameters import NAMES, Values, significant, start_values
 from .search import load
 from .solve import Log
-from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages
+from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages, warn_of_start
 from .study import Study, TermTable
 from .targets import Row, worst_entry
 from .terms import unit_of, with_terms
@@ -89,6 +89,11 @@ def trade_off(
     ------
     InputError
         If a file cannot be read, the study does not fit the design or moves no limit.
+
+    Warns
+    -----
+    InputWarning
+        If a parameter starts at a bound or beyond it, and is moved inside by 1 % of the range.
     """
     with load(design, study) as (parent, question):
         return _trade_off(sweep_of(parent, question), each, progress or Progress(), workers or Workers())
@@ -122,6 +127,7 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
     front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
     with progress.counter("Trade-off", len(combinations)) as advance:
         values = start_values(problem.imager, problem.at)
+        warn_of_start(problem, values)
         for some in (combinations[:1], combinations[1:]):
             first = len(points)
             for (number, *_), result in stream((first + i, limits, values) for i, limits in enumerate(some)):

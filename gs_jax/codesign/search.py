@@ -42,9 +42,10 @@ from .solve import (
     read_checkpoint,
     run,
     stepper,
+    warn_if_moved,
     write_checkpoint,
 )
-from .stages import entries_of, make_stage, problem_of, rows_of, run_stages
+from .stages import entries_of, make_stage, problem_of, rows_of, run_stages, warn_of_start
 from .study import Study, read_study
 from .targets import Row
 
@@ -120,7 +121,12 @@ def run_study(
     ------
     InputError
         If a file cannot be read, the study does not fit the design, the checkpoint is missing or another study's, or
-        nothing was found.
+        nothing was found; or if there are workers for a study of one start.
+
+    Warns
+    -----
+    InputWarning
+        If a parameter starts at a bound or beyond it, and is moved inside by 1 % of the range.
 
     Examples
     --------
@@ -155,6 +161,8 @@ def _run_study(
     every: float,
     workers: Workers | None,
 ) -> Outcome:
+    if workers and workers.remote and study.starts == 1:
+        raise InputError("--workers and --scheduler must be used with a study of several `starts`, got 1.")
     began = time.monotonic()
     log, saved = Log(), None
     if resume and checkpoint:
@@ -162,6 +170,7 @@ def _run_study(
         saved = (checkpoint, state) if state else None
     problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.imager, problem.at)
+    warn_of_start(problem, values)
     before = rows_of(study.terms, entries_of(problem, study.terms), values)
     # Built when they are needed, so that compilation shows in the progress.
     stages = (make_stage(problem, index) for index in range(len(study.stages)))
@@ -266,7 +275,7 @@ def optimize(
         `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
     bounds
         Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
-        beyond it is moved inside.
+        beyond it is moved inside, by 1 % of the range, with a warning.
     steps
         The most to take.
     callback
@@ -294,6 +303,7 @@ def optimize(
     }
     values = free.values(imager)
     start = {name: maps[name].free(value) for name, value in values.items()}
+    warn_if_moved(values, {name: maps[name].value(free) for name, free in start.items()})
     at = lambda moved: free.replaced(imager, {name: maps[name].value(moved[name]) for name in free.names})
     steps_of = stepper(lambda moved, given, key: loss(at(moved)), start, None, solver, jax.random.key(0))
     losses = []

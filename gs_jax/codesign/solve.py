@@ -12,7 +12,7 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..base.arrays import as_float
-from ..base.errors import InputError
+from ..base.errors import InputError, InputWarning
 from ..design.design import Design
 from ..io.files import atomic_write, check_input, decoding
 from ..typing import PathLike
@@ -251,6 +251,16 @@ class Box(eqx.Module):
     def free(self, value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """The inverse of `value`. Values beyond a bound are first clipped."""
         return jnp.clip((value - self.low) / (self.high - self.low), 0, 1)
+
+
+def warn_if_moved(given: Mapping[str, Any], inside: Mapping[str, Any]) -> None:
+    """Warn of each parameter that does not start where it was given, because it was at a bound, near it or beyond."""
+    for name, value in given.items():
+        old, new = np.broadcast_arrays(np.asarray(value, float), np.asarray(inside[name], float))
+        moved = ~np.isclose(old, new, rtol=1e-4, atol=1e-6)
+        if moved.any():
+            text = f"{name} starts at {new[moved][0]:.6g} instead of {old[moved][0]:.6g}, to begin within its bounds."
+            warnings.warn(text, InputWarning, stacklevel=2)
 
 
 _FORMAT = "gs-jax checkpoint 3"

@@ -23,7 +23,19 @@ from ..geometry import Imager
 from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
 from .parameters import Values, candidate, evaluated, start_values
-from .solve import NOT_FINITE, Bounds, Box, Log, State, Stepper, restore_state, run, solver_of, stepper
+from .solve import (
+    NOT_FINITE,
+    Bounds,
+    Box,
+    Log,
+    State,
+    Stepper,
+    restore_state,
+    run,
+    solver_of,
+    stepper,
+    warn_if_moved,
+)
 from .study import StageTable, Study, TermTable, labels
 from .targets import Row, assess, evaluate, residual, worst_entry
 from .terms import with_terms
@@ -103,9 +115,7 @@ def _check_room(design: Design, study: Study) -> None:
 def make_stage(problem: Problem, index: int) -> Stage:
     """The solver of a stage."""
     imager, at, study = problem
-    table = study.stages[index]
-    between = Box if table.solver == "lbfgsb" else Bounds
-    bounds = {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
+    table, bounds = study.stages[index], _bounds_of(study, index)
     terms = terms_of(table, study.terms)
     to_free = lambda values: {name: bound.free(values[name]) for name, bound in bounds.items()}
     to_values = lambda free, values: values | {name: bound.value(free[name]) for name, bound in bounds.items()}
@@ -132,6 +142,19 @@ def make_stage(problem: Problem, index: int) -> Stage:
         watch=jax.jit(watch),
         enough=_enough(problem, terms),
     )
+
+
+def _bounds_of(study: Study, index: int) -> dict[str, Bounds | Box]:
+    table = study.stages[index]
+    between = Box if table.solver == "lbfgsb" else Bounds
+    return {name: between(*study.free[name]) for name in (study.free if table.free is None else table.free)}
+
+
+def warn_of_start(problem: Problem, values: Values) -> None:
+    """Warn of each parameter of a design that the first stage moves inside its bounds; `InputWarning`."""
+    bounds = _bounds_of(problem.study, 0)
+    inside = {name: bound.value(bound.free(values[name])) for name, bound in bounds.items()}
+    warn_if_moved({name: values[name] for name in bounds}, inside)
 
 
 def terms_of(stage: StageTable, terms: Sequence[TermTable]) -> list[TermTable]:

@@ -16,7 +16,7 @@ from ..projection.forward_model import PsfModel, forward
 from ..solvers.surface import Surface
 from ..typing import Image, Volume
 from .inverse_problem import ImageModel, InverseProblem, num_detrend_modes, prepare_data, prepare_model
-from .methods import BackProjection, Method
+from .methods import BackProjection, Method, check_stop
 from .pipeline import check_call, reconstructor
 from .residual import binned_variance, rms_of_regions
 
@@ -108,6 +108,7 @@ def cross_validated(
     >>> print(found.error < 1, found.folds.shape)
     True (3,)
     """
+    check_stop(method, stop_at_discrepancy)
     check_scored(image, imager, grid, method, optics)
     progress = progress or Progress()
     model = prepare_model(imager, grid, optics, progress)

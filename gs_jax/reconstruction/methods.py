@@ -96,8 +96,9 @@ _LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitiv
 
 Method = BackProjection | PinholeRichardsonLucy | Solver
 
-# Methods by the names of the command line and the benchmark, as functions of the number of steps; the unrolled solver
-# has as many as were trained, and sheets as many as they need.
+# Methods by the names of the command line and the benchmark, as functions of the number of steps. Those that are not in
+# `STEPPED` take none: the unrolled solver has as many as were trained, and sheets as many as they need.
+STEPPED = ("list-rl", "richardson-lucy", "fista", "admm")
 METHODS: dict[str, Callable[[int], Method]] = {
     "backproject": lambda steps: BackProjection(),
     "list-rl": lambda steps: PinholeRichardsonLucy(steps, **_LUCY),
@@ -107,3 +108,10 @@ METHODS: dict[str, Callable[[int], Method]] = {
     "unrolled": lambda steps: Unrolled.pretrained(),
     "surface": lambda steps: Surface(),
 }
+
+
+def check_stop(method: Method, stop_at_discrepancy: bool) -> None:
+    """Raise `InputError` if a method cannot stop at the noise: it has no steps, or steps that belong together."""
+    if stop_at_discrepancy and isinstance(method, BackProjection | Unrolled | Surface):
+        allowed = "RichardsonLucy(), PinholeRichardsonLucy(), FISTA() or ADMM()"
+        raise InputError(f"stop_at_discrepancy must be used with {allowed}, got {type(method).__name__}().")

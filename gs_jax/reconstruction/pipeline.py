@@ -35,7 +35,7 @@ from .inverse_problem import (
     prepare_data,
     prepare_model,
 )
-from .methods import BackProjection, Method, PinholeRichardsonLucy
+from .methods import BackProjection, Method, PinholeRichardsonLucy, check_stop
 from .residual import discrepancy_target
 
 # Planes that each device back-projects between two updates of the progress bar.
@@ -113,17 +113,17 @@ def reconstruct(
         As for `forward`, or a `fidelity` of `make_psf_model`. With "full" and "near", back-projection reads the bright
         cores of the spots; otherwise it follows the chief rays, as the paper does.
     stop_at_discrepancy
-        Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle).
-        `BackProjection`, `Unrolled` and `Surface` ignore it.
+        Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle). Not with
+        `BackProjection`, which has no steps, nor `Unrolled` and `Surface`, whose steps belong together.
     progress
         Shows progress; by default nothing is shown.
 
     Raises
     ------
     InputError
-        If `method` is no method, the image is not `sensor.shape` or not finite, the optics do not exist, a depth of the
-        grid is blurred over more than 128 pixels ("near"), or JAX traces a value: `solve` can be differentiated and
-        compiled.
+        If `method` is no method or cannot stop at the discrepancy, the image is not `sensor.shape` or not finite, the
+        optics do not exist, a depth of the grid is blurred over more than 128 pixels ("near"), or JAX traces a value:
+        `solve` can be differentiated and compiled.
 
     Examples
     --------
@@ -177,6 +177,7 @@ def reconstructor(
     """
     by_name = isinstance(optics, str)
     _check(method, optics, imager, grid)
+    check_stop(method, stop_at_discrepancy)
     check_beyond(imager, np.asarray(grid.depths), "grid: depths")
     on_cores = by_name and optics != "pinhole"
     views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
@@ -199,8 +200,7 @@ def reconstructor(
     def volume_of(image, progress, method=method, start=None, kept=None, enough=0.0):
         light, background = prepare_data(image, model)
         target = enough
-        # The steps of `Unrolled` were trained together, those of `Surface` have different tasks.
-        if stop_at_discrepancy and not isinstance(method, Unrolled | Surface):
+        if stop_at_discrepancy:
             noise = discrepancy_target(np.asarray(image), light, counts=is_poisson)
             target = max(enough, DISCREPANCY_FACTOR * noise)
         solver = method

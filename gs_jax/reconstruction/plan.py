@@ -17,11 +17,14 @@ from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
 from .cross_validation import CrossValidation, cross_validated
-from .methods import METHODS, Method
+from .methods import METHODS, STEPPED, Method
 from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
 from .surface_fit import SurfaceFit, surface_fitter
 from .warm_start import following_reconstructor
+
+# Steps of an iterative method.
+_STEPS = 20
 
 
 class Result(NamedTuple):
@@ -56,7 +59,7 @@ class Plan:
         pitch: float | None = None,
         *,
         method: str,
-        steps: int = 20,
+        steps: int | None = None,
         optics: str = "full",
         stop_at_noise: bool = False,
         suppress: str = "none",
@@ -66,6 +69,8 @@ class Plan:
         **method_options: float | None,
     ) -> "Plan":
         """The plan of some options; `method_options` are those of some methods, `tv` and `sparsity`.
+
+        `steps`: 20 by default, for methods that take steps.
 
         Raises `InputError` if options exclude each other, or the volume would not fit into memory.
         """
@@ -78,13 +83,12 @@ class Plan:
                 "--weights must be used with --method unrolled or --suppress unet, "
                 f"got --method {method} and --suppress {suppress}."
             )
-        if stop_at_noise and method in ("backproject", "unrolled", "surface"):
-            raise InputError(
-                f"--stop-at-noise must be used with list-rl, richardson-lucy, fista or admm, got --method {method}."
-            )
+        for option, given in {"--steps": steps is not None, "--stop-at-noise": stop_at_noise}.items():
+            if given and method not in STEPPED:
+                raise InputError(f"{option} must be used with {', '.join(STEPPED)}, got --method {method}.")
         if warm_start and method not in ("list-rl", "richardson-lucy"):
             raise InputError(f"--warm-start must be used with list-rl or richardson-lucy, got --method {method}.")
-        solver = _method(method, steps, weights, method_options)
+        solver = _method(method, _STEPS if steps is None else steps, weights, method_options)
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
