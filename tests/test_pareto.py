@@ -75,7 +75,7 @@ def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
         return run(steps, state, *arguments, **options)
 
     monkeypatch.setattr(stages, "run", first_lost)
-    found = trade_off(geomscope(aperture_diameter_mm=1.4), Study.model_validate(STUDY))
+    found = trade_off(geomscope().replace(aperture_diameter_mm=1.4), Study.model_validate(STUDY))
     assert np.isfinite(found.values).all() and found.best[1:].all()
 
 
@@ -101,7 +101,7 @@ SPLIT = STUDY | {
 @pytest.mark.integration
 def test_stages_keep_what_the_one_before_found():
     """Stages that free different parameters; each search ends where `run_study` does with the same limit."""
-    start = geomscope(sensor_distance_mm=4.0, aperture_diameter_mm=1.4)
+    start = geomscope(sensor_distance_mm=4.0).replace(aperture_diameter_mm=1.4)
     sizes = []
     found = trade_off(start, Study.model_validate(SPLIT), each=lambda front: sizes.append(len(front.points)))
     assert sizes == list(range(1, len(found.points) + 1))  # what is done is shown as it is found
