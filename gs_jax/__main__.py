@@ -9,7 +9,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from importlib import import_module
+from typing import Any
 
 import click
 
@@ -96,7 +98,21 @@ class _Commands(click.Group):
         command = getattr(module, f"{cmd_name.replace('-', '_')}_command")
         if not any(param.name == "quiet" for param in command.params):
             command.params += _LEVELS
+            command.callback = _with_platforms(command.callback)
         return command
+
+
+def _with_platforms(callback: Any) -> Any:
+    """A command that first looks whether JAX can run; its help does without JAX."""
+
+    @wraps(callback)
+    def call(*arguments, **options):
+        from .base.machine import check_platforms
+
+        check_platforms()
+        return callback(*arguments, **options)
+
+    return call
 
 
 def _set_level(context: click.Context, param: click.Parameter, value: bool) -> None:

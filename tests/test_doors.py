@@ -1,17 +1,22 @@
-"""What enters the library: arrays of any byte order are read right, and nothing from a file is executed."""
+"""What enters the library: arrays of any byte order, files, which execute nothing, and variables of JAX."""
 
 import json
+import os
 import pickle
+import subprocess
+import sys
 
 import jax
 import numpy as np
 import pytest
+from jax import disable_jit
 
 import gs_jax as gs
 from gs_jax.base.errors import InputError
 from gs_jax.interop import as_scipy
 from gs_jax.io.recordings import open_recording
 from gs_jax.optics.aberrations import wavefront_rms
+from gs_jax.simulation.synthetic import simulate_points
 
 SCOPE = gs.Imager(gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]]), gs.Sensor((64, 64), 0.06), 5.8, 3.0)
 GRID = gs.Grid.over(SCOPE.sensor, depths=[18.0, 22.0], pitch=0.4)
@@ -110,3 +115,40 @@ def test_a_zarr_of_pickles_is_refused(where, dtype, tmp_path, capsys):
     with pytest.raises(InputError, match="image.zarr"), open_recording(image, axes="tz") as recording:
         assert recording
     assert "executed" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("platform", ["cuda", pytest.param("nonsense", marks=pytest.mark.integration)])
+def test_a_platform_that_jax_does_not_have(platform):
+    """JAX itself fails by a bare AssertionError, or by several lines."""
+    if any(device.platform == "gpu" for device in jax.devices()):
+        pytest.skip("JAX has a GPU here")
+    command, environment = [sys.executable, "-m", "gs_jax", "info"], os.environ | {"JAX_PLATFORMS": platform}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("gs-jax: JAX_PLATFORMS must be ") and done.stderr.endswith(f"got {platform}.\n")
+    assert done.stderr.count("\n") == 1
+
+
+def test_points_without_a_processor_among_the_devices(monkeypatch):
+    """As with `JAX_PLATFORMS=cuda`, which leaves the processor out."""
+    asked, devices = [], jax.devices
+
+    def without_processor(platform=None):
+        asked.append(platform)
+        if platform == "cpu":
+            raise RuntimeError("Unknown backend cpu")
+        return devices()
+
+    expected = simulate_points(POINTS, SCOPE, kind="gaussian")
+    monkeypatch.setattr(jax, "devices", without_processor)
+    np.testing.assert_array_equal(simulate_points(POINTS, SCOPE, kind="gaussian"), expected)
+    assert "cpu" in asked
+
+
+def test_without_compilation():
+    """`JAX_DISABLE_JIT`: a primitive that calls itself would never end."""
+    with jax.numpy_dtype_promotion("standard"):
+        expected = gs.backproject(IMAGE, SCOPE, GRID)
+        with disable_jit():
+            found = gs.backproject(IMAGE, SCOPE, GRID)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.max()))

@@ -48,6 +48,30 @@ def describe() -> dict[str, str]:
     }
 
 
+def check_platforms() -> None:
+    """Raise `InputError` unless JAX has the platforms of the variable `JAX_PLATFORMS`, for which it has no words."""
+    names = os.environ.get("JAX_PLATFORMS", "")
+    if names in ("", "cpu"):
+        return
+    import jax
+
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError) as error:
+        allowed = "platforms that JAX has on this machine, such as cpu, or not be set"
+        raise input_error("JAX_PLATFORMS", allowed, names) from error
+
+
+def cpu_device() -> Any:
+    """The processor as a device of JAX; the default device where `JAX_PLATFORMS` leaves the processor out."""
+    import jax
+
+    try:
+        return jax.devices("cpu")[0]
+    except RuntimeError:
+        return jax.devices()[0]
+
+
 def available_memory() -> int:
     """Bytes that this process can take without swapping."""
     return psutil.virtual_memory().available

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
 
+from ..base.machine import cpu_device
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
@@ -109,7 +110,7 @@ def forward_points(
     points = np.asarray(points, np.float64)
     points = points[np.argsort(points[:, 2])]
     # Spots are added one after the other, which suits a CPU, also beside a GPU.
-    imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), jax.devices("cpu")[0])
+    imager, depths, kernels = jax.device_put((imager, stamps.depths, stamps.kernels), cpu_device())
     size = kernels.shape[-1]
     rows, columns = _tiles(imager.sensor.shape, size)
     side = _TILE + size - 1
