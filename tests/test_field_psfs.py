@@ -62,6 +62,18 @@ def test_the_operator_is_the_sum_of_weighted_convolutions_with_an_exact_adjoint(
     check_grads(jax.jit(norm), (kernels, A.weights, scene), order=1, modes=["rev"], eps=1e-5, rtol=1e-6)
 
 
+def test_a_place_beside_a_line_counts_among_those_left_out():
+    """Three equal PSFs on a line and another beside it: the three are predicted exactly, the fourth by the nearest."""
+    places = np.array([(-2.0, 0.0), (0.0, 0.0), (2.0, 0.0), (0.0, 2.0)])
+    y, x = np.indices(SHAPE) - MIDDLE[:, None, None]
+    spot = lambda width: np.exp(-(x**2 + y**2) / (2 * width**2)) / width**2
+    moved = [np.roll(spot(3.0 if at[1] else 1.5), SCALE * at[::-1].astype(int), (0, 1)) for at in places]
+    fit = fit_field(np.array(moved), np.column_stack([places, np.full(4, 12.0)]), SHAPE, max_error=1e-3)
+    narrow, wide = spot(1.5), spot(3.0)
+    apart = np.linalg.norm(wide - narrow) / np.sqrt(3 * (narrow**2).sum() + (wide**2).sum())
+    assert fit.left_out_error == pytest.approx(apart, rel=0.02) and apart > 0.3
+
+
 def test_a_source_between_the_measured_places_is_predicted():
     fit = fit_field(*measured(), SHAPE)
     assert fit.error <= 0.05 and 2 <= fit.rank <= 6 and fit.place_error < 1

@@ -6,7 +6,8 @@ import pytest
 from click.testing import CliRunner
 
 import gs_jax as gs
-from gs_jax.apps.training.from_captures import FineTuned, fine_tune
+from gs_jax.apps.training.from_captures import FineTuned, _split, fine_tune
+from gs_jax.base.progress import Progress
 from gs_jax.cli.train import train_command
 from gs_jax.io.captures import write_capture
 from gs_jax.reconstruction.radius_fit import RadiusFit, with_radii
@@ -29,6 +30,9 @@ def test_lenses_that_were_left_out_are_predicted_better():
     losses = dict(found.held_out)
     assert len(found.losses) == 10 and np.isfinite(found.losses).all()
     assert min(losses.values()) < losses[0] and better
+    # What is reported is of lenses that chose nothing.
+    _, held_out, scored = _split(images, scope(), GRID, start, psf, 0, Progress())
+    assert all((one.system.kept + other.system.kept >= 1).all() for one, other in zip(held_out, scored, strict=True))
     assert found.after < found.before and not np.array_equal(found.networks.power, start.power)
 
 

@@ -10,7 +10,9 @@ from gs_jax.apps.training import simulated_captures, training_slices
 from gs_jax.apps.training.simulated_captures import CaptureSpec
 from gs_jax.apps.training.training_loop import Recipe, init, read_checkpoint, slices_loss, train, write_checkpoint
 from gs_jax.apps.training.training_slices import (
+    SPECS,
     Stack,
+    _path,
     sample_paper_batch,
     sample_patches,
     simulate_stack,
@@ -166,9 +168,20 @@ def test_stacks_are_kept(tmp_path):
     made = simulate_stacks(folder, 2, 5, specs=TINY)
     for a, b in zip(simulate_stacks(folder, 2, 5, specs=TINY), made, strict=True):
         assert_equal(a, b)
-    (folder / "5-1.npz").write_bytes(b"garbage")
-    with pytest.raises(InputError, match=r"5-1\.npz"):
+    (second,) = folder.glob("5-1-*.npz")
+    second.write_bytes(b"garbage")
+    with pytest.raises(InputError, match=second.name):
         simulate_stacks(folder, 2, 5, specs=TINY)
+
+
+def test_stacks_of_other_specs_are_not_read(tmp_path, monkeypatch):
+    """Nor of another seed, number or version of the package."""
+    names = {_path(tmp_path, *key).name for key in ((5, 1, TINY), (5, 2, TINY), (6, 1, TINY), (5, 1, SPECS))}
+    monkeypatch.setattr("gs_jax.base.disk_cache._source", lambda: b"another version")
+    assert len(names | {_path(tmp_path, 5, 1, TINY).name}) == 5
+    # Of two specs in turn the second stack is of the same one as alone.
+    two = _path(tmp_path, 5, 1, (*TINY, *SPECS)).name
+    assert two == _path(tmp_path, 5, 1, TINY).name
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def cached_on_disk(key: Iterable[bytes], compute: Callable[[], dict[str, np.ndar
         Returns the arrays by name.
     """
     try:
-        path = cache_folder() / f"{_digest(key)}.npz"
+        path = cache_folder() / f"{digest_of(key)}.npz"
     except RuntimeError:  # no home folder
         return compute()
     try:
@@ -58,7 +58,8 @@ def cache_folder() -> Path:
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "gs_jax"
 
 
-def _digest(key: Iterable[bytes]) -> str:
+def digest_of(key: Iterable[bytes]) -> str:
+    """A name for what depends on a key and on the package's source."""
     digest = hashlib.sha256(_source())
     for part in key:
         digest.update(hashlib.sha256(part).digest())

@@ -218,4 +218,6 @@ def _from_captures(
     click.echo(f"{made}: {words} ({errors[1.0]:.1%} with the radii of {design}, RMS)")
     error = f"{found.before**0.5:.1%} before, {found.after**0.5:.1%} after (RMS)"
     words = f"{len(files)} captures, {len(found.losses)} steps"
-    click.echo(f"{output}: {words}; of captures held out, lenses left out are predicted with an error of {error}")
+    click.echo(
+        f"{output}: {words}; of captures held out, lenses that chose nothing are predicted with an error of {error}"
+    )

@@ -36,7 +36,8 @@ class FieldFit(NamedTuple):
     error
         RMS error of the components, relative to the PSFs.
     left_out_error
-        The same of each PSF, predicted from those at other places: what to expect between places.
+        The same of each PSF, predicted from those at other places, or from the nearest where these are on a line: what
+        to expect between places.
     place_error
         RMS distance between the images of the sources and the affine map of their places, pixels.
     """
@@ -118,14 +119,20 @@ class _Plane:
         self.left_out_error = self._left_out()
 
     def _left_out(self):
-        """Error of each PSF's coefficients by those of the others, relative to all."""
+        """Error of each PSF's coefficients by those of the others, relative to all.
+
+        Others on a line do not tell how the PSF changes across it: the nearest of them then stands for it.
+        """
         count, total = len(self.positions), 0.0
         for one in range(count):
             others = np.arange(count) != one
-            if _spans(self.positions[others]):
-                at = np.clip(self.positions[one], self.positions[others].min(0), self.positions[others].max(0))
-                found = _interpolate(self.positions[others], self.coefficients[others, : self.rank], at[None])[0]
-                total += np.sum((found - self.coefficients[one, : self.rank]) ** 2)
+            positions, values = self.positions[others], self.coefficients[others, : self.rank]
+            if _spans(positions):
+                at = np.clip(self.positions[one], positions.min(0), positions.max(0))
+                found = _interpolate(positions, values, at[None])[0]
+            else:
+                found = values[np.argmin(((positions - self.positions[one]) ** 2).sum(1))]
+            total += np.sum((found - self.coefficients[one, : self.rank]) ** 2)
         return float(np.hypot(np.sqrt(total / np.sum(self.coefficients**2)), self.error))
 
     def components(self, rank):

@@ -59,7 +59,8 @@ class FineTuned(NamedTuple):
 
     `losses` are those of each step, `held_out` those of the captures held out, `(step, loss)`, from before the first
     step on, both after the steps with networks. `before` and `after` are those of the captures held out after all
-    steps, by the networks that it began with and by those that it returns.
+    steps, by the networks that it began with and by those that it returns, for lenses that are left out only here:
+    those of `held_out` chose the networks.
     """
 
     networks: Unrolled
@@ -110,7 +111,7 @@ def fine_tune(
     """
     check_number(images)
     progress = progress or Progress()
-    trained, held_out = _split(images, imager, grid, networks, optics, seed, progress)
+    trained, held_out, scored = _split(images, imager, grid, networks, optics, seed, progress)
     loss = eqx.filter_jit(prediction_loss)
     mean_loss = lambda networks: float(np.mean([loss(networks, each) for each in held_out]))
     recipe = Recipe(lambda key: networks, _optimizer, lambda rng: trained[rng.integers(len(trained))], prediction_loss)
@@ -130,12 +131,17 @@ def fine_tune(
             return int(np.argmin([each for _, each in history])) < len(history) - _PATIENCE
 
         state = train(recipe, init(recipe, steps=steps, seed=seed), callback=callback)
-    whole = lambda networks: np.mean([_error_of_all_steps(networks, each, progress) for each in held_out])
+    whole = lambda networks, captures: float(
+        np.mean([_error_of_all_steps(networks, each, progress) for each in captures])
+    )
     without = dataclasses.replace(best, last=0, steps=best.first + best.power.size)
-    errors = [(float(whole(each)), each) for each in (networks, best, without)]
-    after, chosen = min(errors, key=lambda each: each[0])
+    # Networks that did not change are scored once.
+    tried = {id(each): each for each in (networks, best, without)}.values()
+    chosen = min(tried, key=lambda each: whole(each, held_out))
+    before = whole(networks, scored)
+    after = before if chosen is networks else whole(chosen, scored)
     losses = [float(each) for each in state.losses[: int(state.step)]]
-    return FineTuned(chosen, losses, history, errors[0][0], after)
+    return FineTuned(chosen, losses, history, before, after)
 
 
 def check_number(captures: Sequence) -> None:
@@ -179,14 +185,17 @@ def _optimizer(steps: int) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(1.0), optax.multi_transform(adam, kinds))
 
 
-def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list[SplitCapture], list[SplitCapture]]:
-    """Captures without each of the folds, to train with, and those held out without one of them."""
+def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list[SplitCapture], ...]:
+    """Captures without each of the folds, to train with; those held out without one of them, and without another.
+
+    The first fold of those held out chooses the networks, so that its error is too small; the second only scores them.
+    """
     model = prepare_model(imager, grid, optics, progress)
     modes = num_detrend_modes(model.imager, model.optics) if isinstance(optics, str) else 0
     views = lens_type_geometries(imager, grid)
     folds = kept_pixels_of_folds(model.imager, _FOLDS)
     order = np.random.default_rng(seed).permutation(len(images))
-    trained, held_out = [], []
+    trained, held_out, scored = [], [], []
     for place, number in enumerate(progress.track(order, "First steps")):
         light, background = prepare_data(images[number], model)
         light = light - background
@@ -196,4 +205,8 @@ def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list
             system = InverseProblem(model.imager, grid, model.optics, views, modes, kept)
             start = run_fixed_steps(networks, system, kept * light)
             (held_out if is_held_out else trained).append(SplitCapture(light, system, start))
-    return trained, held_out
+        if is_held_out:
+            kept = folds[(place // _HELD_OUT + 1) % _FOLDS]
+            # All steps are run for the score: it has no use for a start.
+            scored.append(held_out[-1]._replace(system=dataclasses.replace(held_out[-1].system, kept=kept)))
+    return trained, held_out, scored

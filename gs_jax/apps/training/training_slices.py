@@ -8,10 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float16, Float32
 from scipy.ndimage import gaussian_filter
 
+from ...base.disk_cache import digest_of
 from ...base.machine import Workers
 from ...base.progress import Progress
 from ...detection.unet import standardize
@@ -94,32 +96,37 @@ def simulate_stacks(
 ) -> list[Stack]:
     """Read the first `count` stacks of a seed from `folder`; workers simulate and write those that are missing.
 
+    Stacks of other specs, or that another version of the package simulated, are not read.
+
     Raises
     ------
     InputError
         If the folder cannot be made, or a file in it is no stack.
     """
     folder = make_folder(folder)
-    missing = [number for number in range(count) if not _path(folder, seed, number).exists()]
+    paths = [_path(folder, seed, number, specs) for number in range(count)]
+    missing = [number for number, path in enumerate(paths) if not path.exists()]
     # One worker makes what one microscope images.
     groups = [[n for n in missing if n // SCENES == group] for group in sorted({n // SCENES for n in missing})]
-    stream = (workers or Workers()).mapper(partial(_writer, folder, seed, specs))
+    stream = (workers or Workers()).mapper(partial(_writer, paths, seed, specs))
     with (progress or Progress()).counter("Simulating captures", len(groups)) as advance:
         for _, result in stream(groups):
             result()
             advance()
-    return [_read(_path(folder, seed, number)) for number in range(count)]
+    return list(map(_read, paths))
 
 
-def _path(folder: Path, seed: int, number: int) -> Path:
-    return folder / f"{seed}-{number}.npz"
+def _path(folder: Path, seed: int, number: int, specs: Sequence[CaptureSpec]) -> Path:
+    """Path of a stack, whose name has a digest of all that it depends on: another one is not read in its place."""
+    key = seed, number, specs[number // SCENES % len(specs)], TRUTH_BLUR, jax.config.jax_enable_x64  # pyright: ignore
+    return folder / f"{seed}-{number}-{digest_of([repr(key).encode()])[:12]}.npz"
 
 
-def _writer(folder: Path, seed: int, specs: Sequence[CaptureSpec]):
+def _writer(paths: Sequence[Path], seed: int, specs: Sequence[CaptureSpec]):
     def write(numbers: list[int]) -> None:
         for number in numbers:
             stack = simulate_stack(seed, number, specs)
-            with atomic_write(_path(folder, seed, number)) as temporary:
+            with atomic_write(paths[number]) as temporary:
                 np.savez(temporary, allow_pickle=False, volume=stack.volume, truth=stack.truth)
 
     return write
