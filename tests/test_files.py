@@ -22,6 +22,7 @@ from PIL import Image
 
 from gs_jax import Grid
 from gs_jax.base.errors import InputError
+from gs_jax.io import files
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.files import atomic_write, check_output, write_json
 from gs_jax.io.point_tables import POINTS_HEADER, read_points, read_positions, read_table, write_points
@@ -714,6 +715,49 @@ def test_an_error_leaves_what_was_there(tmp_path, error, folder):
         assert os.listdir(tmp_path) == [path.name] * before
         if before:
             np.testing.assert_array_equal(read_volume(path)[0], VOLUME)
+
+
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_a_zarr_image_is_there_at_all_times(exchanged, tmp_path, monkeypatch):
+    """While another replaces it. Only where the system cannot exchange folders it is renamed twice."""
+    if exchanged and sys.platform not in ("linux", "darwin"):
+        pytest.skip("this system does not exchange folders")
+    if not exchanged:
+        monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    path, seen, rename = tmp_path / "v.zarr", [], os.rename
+
+    def watched(source, target):
+        rename(source, target)
+        seen.append(path.exists())
+
+    monkeypatch.setattr(os, "rename", watched)
+    for number in range(3):
+        with atomic_write(path) as temporary:
+            temporary.mkdir()
+            (temporary / ".zgroup").write_text(str(number))
+        assert (path / ".zgroup").read_text() == str(number) and os.listdir(tmp_path) == ["v.zarr"]
+    assert seen == ([] if exchanged else 2 * [False, True])
+
+
+def test_another_process_that_takes_the_name_loses_nobodys_image(tmp_path, monkeypatch):
+    """Between two renames: its folder stays, and the old one beside it."""
+    path, rename = tmp_path / "v.zarr", os.rename
+    path.mkdir()
+    (path / ".zgroup").write_text("old")
+
+    def taken(source, target):
+        rename(source, target)
+        if Path(source) == path:
+            path.mkdir()
+            (path / ".zgroup").write_text("another")
+
+    monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    monkeypatch.setattr(os, "rename", taken)
+    with pytest.raises(OSError, match=r"v\.zarr"), atomic_write(path) as temporary:
+        temporary.mkdir()
+        (temporary / ".zgroup").write_text("new")
+    texts = {(folder / ".zgroup").read_text() for folder in tmp_path.iterdir()}
+    assert (path / ".zgroup").read_text() == "another" and texts == {"another", "old"}
 
 
 def test_a_failed_rename_brings_the_old_folder_back(tmp_path, monkeypatch):

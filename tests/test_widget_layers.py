@@ -1,17 +1,35 @@
 """What napari's widget makes of captures, without napari."""
 
 import re
+import sys
+from threading import Thread
 
 import numpy as np
 import pytest
 
 from gs_jax.base.progress import CancellableProgress, Cancelled
 from gs_jax.io.volumes import read_volume
-from gs_jax.widget.layers import newest_captures, prepare_layers
+from gs_jax.widget.layers import Newest, newest_captures, prepare_layers
 
 from .test_cli import folder, run
 
 __all__ = ["folder"]
+
+
+def test_the_newest_result_is_never_lost():
+    """Put by one thread while another takes: what was put last is taken, and nothing twice or out of order."""
+    newest, last, taken = Newest(), 20_000, []
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        thread = Thread(target=lambda: [newest.put(number) for number in range(1, last + 1)])
+        thread.start()
+        while thread.is_alive():
+            taken.append(newest.take())
+    finally:
+        sys.setswitchinterval(interval)
+    found = [number for number in (*taken, newest.take()) if number is not None]
+    assert found[-1] == last and found == sorted(set(found)) and newest.take() is None
 
 
 def test_a_capture_becomes_what_the_command_writes(folder, monkeypatch, capsys):

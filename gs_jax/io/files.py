@@ -1,6 +1,7 @@
 """Reading files whole, and writing them whole or not at all: text, JSON, figures, and what other modules write."""
 
 import contextlib
+import ctypes
 import errno
 import json
 import logging
@@ -8,6 +9,7 @@ import math
 import os
 import shutil
 import stat
+import sys
 import tempfile
 import time
 import uuid
@@ -201,14 +203,28 @@ def _replace(temporary: Path, path: Path) -> None:
     if not path.is_dir():
         os.replace(temporary, path)
         return
+    if _exchange(temporary, path):  # the old folder is now the temporary one, which the caller removes
+        return
     old = _temporary_beside(path)
     os.rename(path, old)
     try:
         os.rename(temporary, path)
     except BaseException:
-        os.rename(old, path)
+        with contextlib.suppress(OSError):  # a folder that another process made of this name stays, and the old one
+            os.rename(old, path)
         raise
     _remove(old)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchange two folders at once, so that readers always find one; False where the system cannot."""
+    names, swap = (os.fsencode(first), os.fsencode(second)), 2
+    here = -100  # AT_FDCWD: names count from the working directory
+    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "renameat2"):
+        return library.renameat2(here, names[0], here, names[1], swap) == 0
+    if sys.platform == "darwin" and hasattr(library := ctypes.CDLL(None), "renamex_np"):
+        return library.renamex_np(*names, swap) == 0
+    return False
 
 
 def _remove(path: Path) -> None:

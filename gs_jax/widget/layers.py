@@ -4,6 +4,7 @@ napari's own readers of OME-TIFF ignore the position of the first voxel, and tho
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +36,24 @@ class Result(NamedTuple):
     transform: dict[str, Any]
     status: str
     warnings: list[str]
+
+
+class Newest:
+    """Hands the newest value from one thread to another, which takes it once; older ones are dropped."""
+
+    def __init__(self):
+        # Its methods cannot be interrupted by another thread: a value that is put while one is taken stays.
+        self._values: deque[Any] = deque(maxlen=1)
+
+    def put(self, value: Any) -> None:
+        self._values.append(value)
+
+    def take(self) -> Any:
+        """The newest value; None if it was taken, or there is none yet."""
+        try:
+            return self._values.pop()
+        except IndexError:
+            return None
 
 
 def prepare_layers(

@@ -28,7 +28,7 @@ from qtpy.QtCore import QTimer
 from ..base.errors import InputError
 from ..base.progress import CancellableProgress, Cancelled
 from ..cli.options import DESIGN, METHODS, SUPPRESSIONS, shipped_designs
-from .layers import Result, newest_captures, prepare_layers
+from .layers import Newest, Result, newest_captures, prepare_layers
 
 # Milliseconds between updates of the progress bar.
 _POLL_INTERVAL = 100
@@ -76,7 +76,7 @@ class Reconstruct(Container):
         self.cancel.clicked.connect(self.abort)
         self.worker: Any = None
         self._capture: Any = None
-        self._result: Result | str | None = None
+        self._result = Newest()
         self._live: list[Layer] | None = None  # of the newest capture of a folder; the next one replaces their data
         # The timer polls what the other thread sets, and is deleted with the widget.
         self._done, closed = Event(), Event()
@@ -115,10 +115,11 @@ class Reconstruct(Container):
             "suppress": self.suppress.value,
             "points": self.points.value,
         }
-        self._result = None
+        self._result = Newest()
         self._done.clear()
         work: Any = self._work
-        self.worker = create_worker(work, name, capture, request, _start_thread=False)
+        is_live = self._live is not None
+        self.worker = create_worker(work, name, capture, request, is_live, self._result, _start_thread=False)
         self._set_running(True)
         self.worker.start()
 
@@ -128,21 +129,23 @@ class Reconstruct(Container):
         self.cancel.enabled = False
         self.status.value = "Stops after this step."
 
-    def _work(self, name: str, capture: Path | np.ndarray, request: dict[str, Any]) -> None:
+    def _work(
+        self, name: str, capture: Path | np.ndarray, request: dict[str, Any], is_live: bool, results: Newest
+    ) -> None:
         # Other exceptions are errors of the program, which napari shows.
         try:
             make = prepare_layers(**request, progress=self.progress)
-            if self._live is None or not isinstance(capture, Path):
-                self._result = make(name, capture)
-            else:
+            if is_live and isinstance(capture, Path):
                 for result in newest_captures(capture, make, self.progress):
-                    self._result = result
+                    results.put(result)
+            else:
+                results.put(make(name, capture))
         except Cancelled:
             pass
         except InputError as error:
-            self._result = str(error)
+            results.put(str(error))
         except OSError as error:
-            self._result = f"{name}: {error.strerror or error}"
+            results.put(f"{name}: {error.strerror or error}")
         finally:
             self._done.set()
 
@@ -155,17 +158,18 @@ class Reconstruct(Container):
         if self._done.is_set():
             self._finish()
         elif self._live is not None:
-            result, self._result = self._result, None
-            self._show_newest(result)
+            self._show_newest(self._result.take())
 
     def _finish(self) -> None:
         self._set_running(False)
-        result, self._result, self.status.value = self._result, None, ""
+        result, self.status.value = self._result.take(), ""
+        if self._live is not None and isinstance(result, Result):
+            self._show_newest(result)
         if self.worker.abort_requested:
             self.status.value = "Cancelled."
         elif isinstance(result, str):
             show_error(result)
-        elif result is not None:
+        elif result is not None and self._live is None:
             self._show(result, self._capture)
 
     def _show_newest(self, result: Result | str | None) -> None:
@@ -178,11 +182,10 @@ class Reconstruct(Container):
                 layer.features = fields.get("features", {})
             self.status.value = result.status
         elif result is not None:
-            before = list(self.viewer.layers)
-            self._show(result, None)
-            self._live = [each for each in self.viewer.layers if each not in before]
+            self._live = self._show(result, None)
 
-    def _show(self, result: Result, capture: Layer | None) -> None:
+    def _show(self, result: Result, capture: Layer | None) -> list[Layer]:
+        """Add the layers of a result, and return them."""
         for warning in result.warnings:
             show_warning(warning)
         was_flat = self.viewer.dims.ndim < 3
@@ -191,13 +194,13 @@ class Reconstruct(Container):
         if moved:
             for name, value in result.transform.items():
                 setattr(capture, name, value)
-        for layer in result.layers:
-            self.viewer.add_layer(Layer.create(*layer))
+        added = [self.viewer.add_layer(Layer.create(*layer)) for layer in result.layers]
         if was_flat:
             self.viewer.dims.set_point(0, float(np.mean(self.viewer.dims.range[0][:2])))
         if moved:
             self.viewer.reset_view()
         self.status.value = result.status
+        return added
 
     def _set_running(self, running: bool) -> None:
         self.run.enabled = self.live.enabled = not running
