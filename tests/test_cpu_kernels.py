@@ -178,7 +178,8 @@ def wild(rays, seed):
 
     def axis(some):
         start = rng.integers(-3000, 3000, some.start.shape).astype(np.int32)
-        pixel = rng.integers(*((-200, 300), (0, 80))[seed % 2], some.pixel.shape).astype(np.int32)
+        low, high = ((-200, 300), (0, 80))[seed % 2]
+        pixel = rng.integers(low, high, some.pixel.shape).astype(np.int32)
         if seed % 3 == 0:
             pixel.sort(-1)  # they rise, as behind the lenses
         distance2 = np.where(rng.random(some.distance2.shape) < 0.1, np.nan, some.distance2)
@@ -194,7 +195,7 @@ def run_all_guarded():
     grids = (WEIGHTS[0], GRIDS[0]), (WEIGHTS[0], GRIDS[3]), (WEIGHTS[2], GRIDS[4])
     problems = [problem(weight, grid, lenses=2) for weight, grid in grids]
     for at_end in (True, False):
-        dispatch._call = partial(run_guarded, at_end=at_end)
+        vars(dispatch)["_call"] = partial(run_guarded, at_end=at_end)
         for seed, (shapes, rays, image, volume) in enumerate(problems):
             for own in (rays, *(wild(rays, 6 * seed + n) for n in range(6))):
                 for pixels in (image, (255 * image).astype(np.uint8), None):
@@ -212,9 +213,8 @@ def run_all_guarded():
             dispatch.times_columns(table, (), some(50, lenses))
         for size, shape in ((9, (61, 75)), (41, (150, 333))):
             for whole in (False, True):
-                change = size - 1 if whole else -size - 1
-                sizes = Sizes((shape[0] + size + 1 + change, shape[1] + size + 1 + change), *[None] * 3)
-                sizes = sizes._replace(sharp=(shape[0] + size + 1, shape[1] + size + 1), whole=whole, symmetric=False)
+                change, (tall, wide) = size - 1 if whole else -size - 1, (n + size + 1 for n in shape)
+                sizes = Sizes((tall + change, wide + change), (tall, wide), whole, symmetric=False)
                 sharp = [some(*sizes.sharp) for _ in range(2)]
                 dispatch.convolve(sizes, some(2, size, size), sharp)
                 dispatch.correlate(sizes, some(2, size, size), some(*sizes.image))

@@ -1,6 +1,8 @@
 """The forward model, Eq. (2): the image of a volume, with PSF models of three fidelities."""
 
+import operator
 from collections.abc import Sequence
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -155,8 +157,7 @@ def forward(
         return backproject_adjoint(volume, imager, grid)
     if isinstance(optics, PerTypePsf):
         types = zip(split_by_type(imager, optics.lenses), optics.optics, strict=True)
-        images = [forward(volume, one, grid, psf) for one, psf in types]
-        return sum(images[1:], images[0])
+        return reduce(operator.add, [forward(volume, one, grid, psf) for one, psf in types])
     if isinstance(optics, FieldVaryingPsf):
         if len(optics.kernels) != grid.depths.size:
             raise ValueError(
