@@ -297,6 +297,7 @@ WRONG_ARGUMENTS = [
     (("heights", "design.toml", "--step-um", "10", "-o", "l.csv"), "--step-um must be used with heights"),
     (("mold", "design.toml", "--positive", "--draft-deg", "1", "-o", "m.stl"), "--draft-deg must be used without"),
     (("report", "design.toml", "--dark", "d.tif", "-o", "r.html"), "--dark must be used with --capture"),
+    (("explore", "design.toml", "--terms", "t.py"), "--terms must be used with --study"),
     (("info", "design.toml", "--designs"), "--designs must be used without a FILE"),
     (("new-design", "--centers", "c.csv", "--seed", "1", "-o", "n.toml"), "--seed must be used without --centers"),
     (("train", "--network", "paper", "--workers", "2", "-o", "w.npz"), "--workers must be used with multislice"),

@@ -8,14 +8,8 @@ from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder, write_json
-from .options import DESIGN, worker_options
+from .options import DESIGN, terms_option, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
-
-terms_option = click.option(
-    "--terms",
-    type=Path,
-    help="FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.",
-)
 
 
 @click.command("optimize", epilog="Example: gs-jax optimize design/geomscope.toml --study study.toml -o new.toml")

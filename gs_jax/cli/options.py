@@ -135,6 +135,13 @@ MM = Number(1e-3, 1e4, "mm")
 UM = Number(1e-2, 1e6, "um")
 
 
+terms_option = click.option(
+    "--terms",
+    type=Path,
+    help="FILE.py with terms of your own for the study, in a dictionary TERMS. The file is executed.",
+)
+
+
 def worker_options(command):
     """Add `--workers` and `--scheduler`; the command receives `workers`, which it enters when there is work."""
 

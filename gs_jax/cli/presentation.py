@@ -9,7 +9,7 @@ from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
 from .light import Light, sample_options
-from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options
+from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options, terms_option
 from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 
 
@@ -84,10 +84,13 @@ def report_command(
 @click.option(
     "-o", "--output", type=Path, help="NEW.toml to save to; a number is added if it exists.  [default: NAME-new.toml]"
 )
+@terms_option
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0 takes a free one.")
 @click.option("--browser/--no-browser", default=True, help="Open the page in a browser.")
 @sample_options
-def explore_command(design: Path, study: Path | None, output: Path | None, port: int, browser: bool, light: Light):
+def explore_command(
+    design: Path, study: Path | None, terms: Path | None, output: Path | None, port: int, browser: bool, light: Light
+):
     """Change sensor distance, curvature, aperture, pitch, depths and field of DESIGN by sliders in a browser.
 
     The page shows violated targets, spots, the layout with ghosts, the datasheet and a small simulated reconstruction.
@@ -99,14 +102,19 @@ def explore_command(design: Path, study: Path | None, output: Path | None, port:
 
     from ..apps.explore.server import Server, Session
     from ..codesign.study import read_study
+    from ..codesign.terms import add_terms
     from ..design.design import read_design
 
+    if terms and not study:
+        raise InputError("--terms must be used with --study, which names them.")
+    if terms:
+        add_terms(terms)
     saves = output or Path(f"{design.stem}-new.toml")
     check_output(saves, [".toml"])
     microscope, targets = light.design(read_design(design)), read_study(study) if study else None
     with Progress() as progress:
         with progress.step("Compiling"):
-            session = Session(microscope, targets, saves, provenance_of(design, study))
+            session = Session(microscope, targets, saves, provenance_of(design, study, terms))
             session.move({})
     with Server(session, port) as server:
         click.echo(f"{server.url} shows {microscope.name}; Ctrl-C ends it")
