@@ -163,15 +163,19 @@ def test_a_study_in_a_sample():
     assert found.sample == found.samples["water"] and found.layers == design.layers and found.lens == design.lens
     assert list(found.imaging.working_distance_mm) == [18.0, 22.0]
     assert float(objectives.focus_offset(found.imager(), [18.0, 22.0])) < 1e-3
-    dry = gs.run_study(design, focus_study()).design
-    assert dry.sample == design.sample and abs(dry.imaging.sensor_distance_mm - found.imaging.sensor_distance_mm) > 0.05
+    dry = gs.run_study(design, focus_study(sample="air")).design
+    assert dry.imager().sample is None and abs(dry.imaging.sensor_distance_mm - found.imaging.sensor_distance_mm) > 0.05
     for tables, words in (
         ({"sample": "oil"}, "`sample` must be one of .samples. in the design, water, air, got 'oil'"),
         (
             {"sample": "water", "depths_mm": (16.0, 22.0)},
             "`depths_mm` must be 17 mm or more, where the object's medium",
         ),
-        ({"free": {"sensor_distance_mm": (1.0, 8.0)}}, "must be 1.15 or more, as thick as the windows, got .1.0, 8.0"),
+        ({}, "`sample` must be given .* has no default .sample., but .samples.: water; none stands for air"),
+        (
+            {"sample": "air", "free": {"sensor_distance_mm": (1.0, 8.0)}},
+            "must be 1.15 or more, as thick as the windows, got .1.0, 8.0",
+        ),
         (
             {"sample": "water", "free": {"depth_span_mm": (1.0, 7.0)}},
             "`free.depth_span_mm` must be below 6, twice the middle of the depths from 17 mm on, got",

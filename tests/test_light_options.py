@@ -106,7 +106,10 @@ WRONG = [
         (*SIMULATE, "--sample-index", "1.4", "--sample-at", "1", "-o", "a.tif"),
         "`surface` must be 2 mm, as",
     ),
-    ((*SIMULATE, "--depths-from", "sample", "-o", "a.tif"), "--depths-from sample must be used with a sample, got air"),
+    (
+        (*SIMULATE, "--sample", "none", "--depths-from", "sample", "-o", "a.tif"),
+        "--depths-from sample must be used with a sample, got air",
+    ),
     (("simulate", "in-gel.csv", "lab.toml", "--sample", "gel", "-o", "a.tif"), "depths must be 19 mm or more"),
     ((*RECONSTRUCT, "--sample", "gel", "-o", "v.tif"), "--depths must be 19 mm or more, where layers end"),
     ((*RECONSTRUCT, "--depths-from", "plate", "-o", "v.tif"), "is not one of 'array', 'sample'"),
@@ -114,6 +117,39 @@ WRONG = [
     (("report", "lab.toml", "--sample", "jelly", "-o", "a.html"), "`sample` must be one of"),
     (("explore", "lab.toml", "--sample", "jelly"), "`sample` must be one of"),
 ]
+
+
+ASKED = [
+    METRICS,
+    (*SIMULATE, "-o", "a.tif"),
+    (*RECONSTRUCT, "-o", "v.tif"),
+    ("tolerance", "lab.toml"),
+    ("report", "lab.toml", "-o", "a.html"),
+    ("explore", "lab.toml"),
+    ("calibrate", "lab.toml", "capture.npy", "--from-scene", "-o", "new.toml"),
+]
+
+
+@pytest.mark.parametrize("arguments", ASKED, ids=[arguments[0] for arguments in ASKED])
+def test_a_sample_is_asked_for_where_none_is_the_default(lab, monkeypatch, capsys, arguments):
+    np.save("capture.npy", np.ones((640, 640), np.uint16))
+    before = sorted(lab.iterdir())
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2 and err.count("\n") == 1 and sorted(lab.iterdir()) == before
+    assert "`sample` must be given (--sample NAME): the design has no default [sample], but [samples]: gel" in err
+
+
+RECONSTRUCTED = ("reconstruct", "capture.npy", "lab.toml", "--depths", "20", "--voxel-um", 200, "-o", "v.tif")
+REPORTED = pytest.param(("report", "lab.toml", "-o", "a.html"), marks=pytest.mark.integration)
+
+
+@pytest.mark.parametrize("command", [METRICS, RECONSTRUCTED, REPORTED], ids=lambda command: command[0])
+def test_commands_say_which_medium_they_take(lab, monkeypatch, capsys, command):
+    np.save("capture.npy", np.ones((640, 640), np.uint16))
+    gel = "n = 1.43 from z = 19 mm, behind 2 mm of n = 1.52 and 0.17 mm of n = 1.523"
+    for name, medium in (("gel", gel), ("none", "air, behind 2 mm of n = 1.52")):
+        status, out, err = run(monkeypatch, capsys, *command, "--sample", name)
+        assert status == 0 and f"objects in {medium}" in out, err
 
 
 @pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[words for _, words in WRONG])

@@ -10,10 +10,14 @@ import pytest
 
 import gs_jax as gs
 from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.codesign.study import Study
+from gs_jax.design.datasheets import datasheet
 from gs_jax.design.design import Design, checked_design
 from gs_jax.design.keys import commented
 from gs_jax.design.tables import Material
 from gs_jax.materials import MATERIALS
+from gs_jax.mold.manufacturability import check_design
+from gs_jax.mold.solids import MoldShape
 
 from .test_designs import edited
 
@@ -98,6 +102,32 @@ def test_an_imager_with_layers_makes_the_same_design(tmp_path):
     assert design.replace(sample={"refractive_index": 1.0}, layers={}).imager().filters is None
 
 
+STUDY = Study.model_validate(
+    {
+        "depths_mm": (18.0, 22.0),
+        "free": {"sensor_distance_mm": (4.0, 8.0)},
+        "terms": ({"name": "focus_offset", "minimise": 1.0},),
+        "stages": ({"solver": "lbfgsb", "steps": 1},),
+    }
+)
+
+
+def test_a_design_with_samples_needs_a_default_or_a_choice(tmp_path):
+    gel = STACK["samples"]["gel"]
+    design = gs.geomscope().replace(samples={"gel": gel, "water": {"refractive_index": "water"}})
+    for make in (design.imager, lambda: datasheet(design), lambda: gs.run_study(design, STUDY)):
+        with pytest.raises(InputError, match="`sample` must be given .* has no default .sample., but .samples.: gel"):
+            make()
+    assert design.imager("none").sample is None and design.imager("gel").sample is not None
+    # A table of air is a default, and stays one in a file. Molds ask for none.
+    dry = design.replace(sample={"refractive_index": 1.0})
+    gs.write_design(tmp_path / "dry.toml", dry)
+    assert gs.read_design(tmp_path / "dry.toml") == dry and dry.imager().sample is None
+    assert "samples by name: gel, water and no default" in str(design) and "no default" not in str(dry)
+    shape = check_design(design, MoldShape(), chord=4e-4, resolution=0.025)
+    assert all(result.level != "error" for result in shape)
+
+
 # Each: what is changed in a file, and what the line says.
 WRONG = [
     ({"layers.sensor": [{"thickness_mm": 7.0}]}, "`layers.sensor` must be at most `imaging.sensor_distance_mm`, 5.8"),
@@ -117,6 +147,7 @@ WRONG = [
     ({"lens.orientation": "curved", "sample": {"refractive_index": 1.33}}, "curved side in front, got a sample in"),
     ({"lens.orientation": "curved", "samples": {"gel": {"refractive_index": 1.33}}}, "`samples.gel.surface_mm`"),
     ({"samples": {"air": {"refractive_index": 1.33}}}, "`samples.air` must have another name"),
+    ({"samples": {"none": {"refractive_index": 1.33}}}, "`samples.none` must have another name"),
     ({"samples": {"gel": 1.33}}, "`samples.gel` must be a table"),
     ({"lens.refractive_index": "air"}, "`lens.refractive_index` must be above 1"),
     ({"lens.refractive_index": "PMMA", "imaging.wavelength_nm": 400.0}, "`imaging.wavelength_nm` and `lens.refrac"),

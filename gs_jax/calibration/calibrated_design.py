@@ -10,13 +10,13 @@ from rich.table import Table
 
 from ..base.errors import InputError
 from ..design.centers import LENS_KEYS
+from ..design.conversion import medium_in_words
 from ..design.design import Design
 from ..design.tables import CalibrationTable
 from ..design.validation import reach
 from ..geometry import Imager
 from ..io.provenance import Provenance
 from ..io.toml import one_line
-from ..layers import layers_in_front
 from ..lenses import EACH, MicrolensArray
 from .fit import Calibration
 from .sample import with_sample
@@ -78,16 +78,6 @@ def apply_calibration(
         return Design.model_validate(new.model_dump())
     except ValidationError as error:
         raise InputError(f"calibrated design: {one_line(error, Design, {})}.") from error
-
-
-def medium_in_words(imager: Imager) -> str:
-    """What holds the object, and the layers between it and the array."""
-    sample, medium = imager.sample, "air"
-    if sample is not None:
-        medium = f"n = {float(sample.refractive_index):.4g} from z = {float(imager.sample_surface):.5g} mm"
-    slabs = layers_in_front(imager.filters, sample)
-    layers = [f"{float(t):g} mm of n = {float(n):g}" for t, n in slabs if float(n) != 1]
-    return f"{medium}, behind {' and '.join(layers)}" if layers else medium
 
 
 def _lens_lists(array: MicrolensArray) -> dict[str, tuple[float, ...]]:

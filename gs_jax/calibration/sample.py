@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError
-from ..design.conversion import layers_of, sample_table, sample_tables
+from ..design.conversion import default_sample, layers_of, sample_table, sample_tables
 from ..design.design import Design
 from ..geometry import Imager
 from ..layers import Layers, object_surface
@@ -70,7 +70,8 @@ def with_sample(design: Design, imager: Imager, name: str | None) -> Design:
     What is named in the design, materials and layers, keeps its name where it has the same numbers. A fit of the
     surface may have made the device's layers behind the gap of air the sample's, with which they move.
     """
-    sample, before, wavelength = imager.sample, sample_table(design, name), 1e6 * float(imager.wavelength)
+    sample, wavelength = imager.sample, 1e6 * float(imager.wavelength)
+    before = default_sample(design) if name is None else sample_table(design, name)
     assert sample is not None
     found = sample_tables(sample)
     if np.isclose(index_of(before.refractive_index, wavelength), float(sample.refractive_index), rtol=1e-6):

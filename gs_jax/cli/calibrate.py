@@ -96,11 +96,12 @@ def calibrate_command(
     import numpy as np
     from rich.console import Console
 
-    from ..calibration.calibrated_design import apply_calibration, medium_in_words, plot_residuals, summary_table
+    from ..calibration.calibrated_design import apply_calibration, plot_residuals, summary_table
     from ..calibration.fit import PATTERN_FITTED, SELF_FITTED, calibrate, self_calibrate
     from ..calibration.sample import OF_SAMPLE, with_surface
     from ..calibration.spot_model import FITTED
     from ..calibration.spots import Sources
+    from ..design.conversion import medium_in_words
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
     from ..io.point_tables import read_positions
@@ -164,7 +165,7 @@ def _with_sample(light: Light, design, default: str) -> Light:
 
 def _other_samples(light: Light, design) -> str:
     """The names of a design's samples, if the sources are taken to be in air."""
-    from ..design.conversion import AIR, NO_SAMPLE
+    from ..design.conversion import AIR, NO_SAMPLE, default_sample
 
-    names = [*(["sample"] if design.sample != NO_SAMPLE else []), *design.samples]
+    names = [*(["sample"] if default_sample(design) != NO_SAMPLE else []), *design.samples]
     return f"; if they were in a sample: --sample {' or '.join(names)}" if light.sample == AIR and names else ""

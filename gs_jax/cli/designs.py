@@ -6,7 +6,7 @@ import click
 
 from ..base.errors import InputError
 from ..io.files import check_output, write_json
-from .light import Light, check_beyond, sample_options
+from .light import Light, check_beyond, objects_in, sample_options
 from .options import DESIGN, MM, UM, Depths, shipped_designs
 from .outputs import check_may_write, force_option, provenance_of
 
@@ -68,6 +68,7 @@ def metrics_command(
     click.echo(summary(microscope, sheet))
     for words in filter(None, (path_in_words(sheet), band_in_words(sheet))):
         click.echo(f"  {words}")
+    click.echo(f"  {objects_in(microscope.imager())}")
     click.echo(_calibration(microscope.provenance))
     console = Console()
     for table in tables(sheet):

@@ -10,7 +10,7 @@ from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, write_json
-from .light import Light, check_beyond, sample_options
+from .light import Light, check_beyond, objects_in, sample_options
 from .options import DESIGN, UM, Depths, Number, given_options
 from .outputs import check_may_write, force_option, provenance_of
 
@@ -71,6 +71,7 @@ def mask_command(design: Path, output: Path):
     above, from the plano side of the lenses. DXF and SVG are in mm, GDSII in um (needs `pip install 'gs-jax[gds]'`). A
     .json of the same name has the provenance.
     """
+    from ..design.conversion import AIR
     from ..design.design import design_text, read_design
     from ..mold.export import MASK_SUFFIXES, make_mask, write_mask
 
@@ -78,7 +79,7 @@ def mask_command(design: Path, output: Path):
     check_may_write(output, inputs=(design,))
     microscope = read_design(design)
     with errors_name_file(design):
-        mask = make_mask(microscope.imager().array)
+        mask = make_mask(microscope.imager(AIR).array)
     write_mask(output, mask, provenance_of(design, design=design_text(microscope)))
     alone, rings = len(mask.circles), len(mask.openings)
     width, height = mask.outline.max(0) - mask.outline.min(0)
@@ -210,6 +211,7 @@ def tolerance_command(
         provenance = provenance_of(design, file, positions, design=design_text(microscope))
         write_json(output, {KEY: provenance, "seed": seed} | as_json(found))
         write_figure(drawing, picture(found))
+    click.echo(objects_in(microscope.imager()))
     console = Console()
     for table in tables(found):
         console.print(table)

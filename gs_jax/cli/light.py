@@ -33,10 +33,10 @@ class Light(NamedTuple):
         from ..design.conversion import object_begins, sample_table
 
         changes: dict[str, Any] = {} if self.wavelength_nm is None else {"wavelength_nm": self.wavelength_nm}
-        if self.sample is not None:
-            changes["sample"] = sample_table(design, self.sample)
         if self.refractive_index is not None:
             changes["sample"] = {"refractive_index": self.refractive_index, "surface_mm": self.surface}
+        elif self.sample is not None or design.samples:
+            changes["sample"] = sample_table(design, self.sample)
         changed = design.replace(**changes) if changes else design
         begins, (near, far) = object_begins(changed), changed.imaging.working_distance_mm
         return changed if near >= begins else changed.replace(working_distance_mm=(begins, far))
@@ -62,6 +62,13 @@ class Light(NamedTuple):
             raise InputError(f"--depths must be {NEAREST:g} mm or more from the array, got {min(moved):g}.")
         check_beyond(imager, moved, "--depths")
         return moved
+
+
+def objects_in(imager) -> str:
+    """The medium that a command takes to hold the object, in words."""
+    from ..design.conversion import medium_in_words
+
+    return f"objects in {medium_in_words(imager)}"
 
 
 def check_beyond(imager, depths: Iterable[float], name: str) -> None:
@@ -92,7 +99,7 @@ def sample_options(command):
 # Names of the options of `sample_options`.
 LIGHT_OPTIONS = ("sample", "sample_index", "sample_at", "wavelength_nm")
 _SAMPLE_OPTIONS = (
-    click.option("--sample", help="NAME of one of [samples] in DESIGN, or air.  [default: DESIGN's [sample]]"),
+    click.option("--sample", help="NAME of one of [samples] in DESIGN, or none for air.  [default: DESIGN's [sample]]"),
     click.option("--sample-index", type=Number(1.0, 5.0), help="Refractive index of the object's medium."),
     click.option("--sample-at", type=_SURFACE, help="Depth at which that medium begins."),
     click.option("--wavelength-nm", type=_NM, help="Wavelength of the light.  [default: DESIGN's]"),

@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError, errors_name_file, input_error, needs_extra
 from ..base.progress import Progress
 from ..io.files import check_output, make_folder
-from .light import Light, sample_options
+from .light import Light, objects_in, sample_options
 from .options import CAPTURE_OPTIONS, DESIGN, CaptureOptions, capture_options, given_options, terms_option
 from .outputs import PARTIAL, check_may_write, partial_outputs, provenance_of
 
@@ -75,7 +75,8 @@ def report_command(
     with Progress() as progress, errors_name_file(design):
         write_report(output, microscope, **results, origins=origins, provenance=provenance, progress=progress)
     camera.print_corrections()
-    click.echo(f"{output}: {output.stat().st_size / 1e6:.1f} MB, opens in any browser")
+    size = f"{output.stat().st_size / 1e6:.1f} MB, opens in any browser"
+    click.echo(f"{output}: {size}; {objects_in(microscope.imager())}")
 
 
 @click.command("explore", epilog="Example: gs-jax explore geomscope --study targets.toml -o mine.toml")
@@ -117,7 +118,7 @@ def explore_command(
             session = Session(microscope, targets, saves, provenance_of(design, study, terms))
             session.move({})
     with Server(session, port) as server:
-        click.echo(f"{server.url} shows {microscope.name}; Ctrl-C ends it")
+        click.echo(f"{server.url} shows {microscope.name}, {objects_in(microscope.imager())}; Ctrl-C ends it")
         if browser:
             webbrowser.open_new_tab(server.url)
         server.serve_forever()

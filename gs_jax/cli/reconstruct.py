@@ -11,7 +11,7 @@ from ..base.errors import InputError, needs_extra
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..io.files import check_output
-from .light import Light, light_options
+from .light import Light, light_options, objects_in
 from .options import (
     DESIGN,
     FIDELITIES,
@@ -223,7 +223,7 @@ def reconstruct_command(
     camera.print_corrections()
     z, y, x = result.volume.shape
     size = f"{z} x {y} x {x} voxels (z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
-    click.echo(f"{output}: {size}, {depth_range(shown)}")
+    click.echo(f"{output}: {size}, {depth_range(shown)}, {objects_in(imager)}")
     if residual:
         click.echo(f"{output}: imaged again it is {residual_in_words(residual)}")
     if predicted:

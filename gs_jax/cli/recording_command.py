@@ -14,6 +14,7 @@ import click
 from ..base.errors import InputError, InputWarning
 from ..base.machine import Workers
 from ..base.progress import Progress
+from .light import objects_in
 from .options import UM, CaptureOptions, Number, depth_range
 from .outputs import RESUMABLE, partial_outputs, provenance_of
 
@@ -204,7 +205,7 @@ def reconstruct_recording(
     rest = f"; {before} were there" if before else ""
     rate = f"{new} frames in {seconds:.3g} s, {new / seconds:.3g} frames/s{rest}" if new else "all frames were there"
     voxels = f"{size} voxels (t, z, y, x), {plan.grid.pitch * 1000:.4g} um laterally"
-    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}")
+    click.echo(f"{output}: {voxels}, {depth_range(plain_depths(grid))}, {objects_in(plan.imager)}")
     click.echo(f"{output}: {rate}")
     if check:
         click.echo(f"{output}: {check}")

@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
-from .light import Light, check_beyond, light_options
+from .light import Light, check_beyond, light_options, objects_in
 from .options import DESIGN, PSFS, SIMULATED, Number, given_options
 from .outputs import check_may_write, provenance_of
 
@@ -91,7 +91,7 @@ def simulate_command(
         with progress.step("Writing"):
             write_capture(output, image, provenance_of(scene, design=design_text(microscope)))
     size = " x ".join(map(str, image.shape))
-    click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}")
+    click.echo(f"{output}: {size} pixels, {image.dtype}, from {image.min():g} to {image.max():g}, {objects_in(imager)}")
 
 
 def _placed(scene: Path, objects, grid, light: Light, imager):

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from .light import objects_in
 from .options import CaptureOptions
 from .outputs import RESUMABLE, partial_outputs, provenance_of
 from .recording_command import MAX_NAMED, frames_of, print_notes, request_of, write_series_points
@@ -84,7 +85,7 @@ def watch_folder(
         if state.failures <= MAX_NAMED:
             click.echo(f"gs-jax: frame {number} ({series.names[number]}): {reason}", err=True)
 
-    click.echo(f"{folder}: watched until Ctrl-C", err=True)
+    click.echo(f"{folder}: watched until Ctrl-C, {objects_in(plan.imager)}", err=True)
     before, _ = sys.getswitchinterval(), sys.setswitchinterval(_SWITCH)
     try:
         with watched, progress.counter("Reconstructing", None, rate="frames", words=state.words) as advance:

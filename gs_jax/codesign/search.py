@@ -198,11 +198,11 @@ class _Saver:
 def initial_design(design: Design, study: Study) -> Design:
     """Apply the sample, the orientation and the lens types of a study to a design.
 
-    Raises `InputError` if it has no such sample, its depths are in front of that, its lenses have another number of
-    types, or are ideal thin lenses, which have no radii.
+    Raises `InputError` if it has no such sample, or several and none is chosen, its depths are in front of that, its
+    lenses have another number of types, or are ideal thin lenses, which have no radii.
     """
+    table = sample_table(design, study.sample)
     if study.sample is not None:
-        table = sample_table(design, study.sample)
         depths = study.depths_mm or design.imaging.working_distance_mm
         design = design.replace(sample=table.model_dump(), working_distance_mm=depths)
     if study.orientation is not None:

@@ -5,7 +5,7 @@ name = "geomscope-optimized"
 depths_mm = [18.0, 23.0]
 confusion_um = 36.0
 kinds = 1                               # of lenses: 2 for two foci on one plate
-sample = "water"                        # of the design's [samples]; its [sample] by default
+sample = "water"                        # one of the design's [samples]; its [sample] by default
 
 [free]                                  # name = [lowest, highest]; see gs_jax.codesign.parameters
 sensor_distance_mm = [2.0, 6.0]
@@ -133,10 +133,11 @@ class Study(Table):
     `margin`: fraction by which targets are tightened during the search, so that the rounded result meets them.
     `exposure`: electrons that each mm^2 of clear aperture at 20 mm collects from an emitter of 40 um x 40 um, for terms
     that count light. `orientation`: side of the lenses toward the object, if it is not the design's. `sample`: of the
-    design's `[samples]`, or "air", the one that holds the object; it becomes that of the new design. `kinds`: number of
-    lens types; lenses that are alike are divided into so many types, with radii spread over the depths, and each type
-    has its own radius, aperture and conic constant. `starts`: number of starts of the first stage; all but the first
-    are random within the bounds, and the best goes on. `seed`: of random numbers.
+    design's `[samples]`, or "air", the one that holds the object; it becomes that of the new design, and must be given
+    if the design has several and no `[sample]`. `kinds`: number of lens types; lenses that are alike are divided into
+    so many types, with radii spread over the depths, and each type has its own radius, aperture and conic constant.
+    `starts`: number of starts of the first stage; all but the first are random within the bounds, and the best goes on.
+    `seed`: of random numbers.
     """
 
     design: str | None = Field(default=None, description="the file of a design, relative to the study")

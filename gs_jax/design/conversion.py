@@ -13,15 +13,16 @@ from jaxtyping import Float64
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..io.point_tables import read_columns
-from ..layers import Layers, Sample, object_surface, reduced_distance
+from ..layers import Layers, Sample, layers_in_front, object_surface, reduced_distance
 from ..lenses import lenses_by_type
 from ..materials import EmissionBand, index_of
 from ..optics import theory
 from ..optics.apertures import clear_diameter
 from .tables import ImagingTable, LayersTable, LayerTable, LensTable, SampleTable
 
-# The name of no sample, and the table of none.
+# The names of no sample, and the table of none.
 AIR, NO_SAMPLE = "air", SampleTable(refractive_index=1.0)
+_NO_SAMPLE = (AIR, "none")
 
 
 def layers_of(tables: Sequence[LayerTable], wavelength_nm: float) -> Layers | None:
@@ -48,14 +49,38 @@ def chosen_sample(design, sample: str | Sample | None, wavelength_nm: float) -> 
     return sample_of(sample_table(design, sample), wavelength_nm)
 
 
+def default_sample(design) -> SampleTable:
+    """The table `[sample]`, or that of air: for checks, which have to choose."""
+    return NO_SAMPLE if design.sample is None else design.sample
+
+
 def sample_table(design, name: str | None) -> SampleTable:
-    """The sample of a name, or the default one (None), as the file has it."""
+    """The sample of a name, or the default one (None), as the file has it.
+
+    Raises `InputError` if there is none of this name, or no default among several.
+    """
     if name is None:
-        return design.sample
-    if name != AIR and name not in design.samples:
+        if design.sample is None and design.samples:
+            names = ", ".join(design.samples)
+            raise InputError(
+                f"`sample` must be given (--sample NAME): the design has no default [sample], but [samples]: {names}; "
+                "none stands for air."
+            )
+        return default_sample(design)
+    if name not in (*_NO_SAMPLE, *design.samples):
         names = ", ".join([*design.samples, AIR])
         raise InputError(f"`sample` must be one of [samples] in the design, {names}, got {short_repr(name)}.")
-    return NO_SAMPLE if name == AIR else design.samples[name]
+    return NO_SAMPLE if name in _NO_SAMPLE else design.samples[name]
+
+
+def medium_in_words(imager: Imager) -> str:
+    """What holds the object, and the layers between it and the array."""
+    sample, medium = imager.sample, "air"
+    if sample is not None:
+        medium = f"n = {float(sample.refractive_index):.4g} from z = {float(imager.sample_surface):.5g} mm"
+    slabs = layers_in_front(imager.filters, sample)
+    layers = [f"{float(t):g} mm of n = {float(n):g}" for t, n in slabs if float(n) != 1]
+    return f"{medium}, behind {' and '.join(layers)}" if layers else medium
 
 
 def plate_index(design) -> float:
@@ -66,7 +91,7 @@ def plate_index(design) -> float:
 def reduced_depth(design, depth: float, index: float | None = None) -> float:
     """Reduced depth `z'` in the default sample, mm, of lenses of the design's index or another."""
     wavelength = design.imaging.wavelength_nm
-    filters, sample = layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength)
+    filters, sample = layers_of(design.layers.object, wavelength), sample_of(default_sample(design), wavelength)
     in_front = _plate(design, index) if design.lens.orientation == "plano" else 0.0
     return float(reduced_distance(depth, filters, sample)) + in_front
 
@@ -81,7 +106,7 @@ def reduced_sensor_distance(design, distance: float, index: float | None = None)
 def object_begins(design) -> float:
     """Depth at which the default sample begins, or air beyond the filters, mm."""
     wavelength = design.imaging.wavelength_nm
-    begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(design.sample, wavelength))
+    begins = object_surface(layers_of(design.layers.object, wavelength), sample_of(default_sample(design), wavelength))
     return float(f"{float(begins):.9g}")
 
 
@@ -94,8 +119,11 @@ def path_in_words(design) -> list[str]:
         for side, layers in sides
         if layers
     ]
-    if design.sample != NO_SAMPLE:
-        lines.append(f"  objects in n = {index(design.sample)}, from z = {object_begins(design):g} mm")
+    if (default := default_sample(design)) != NO_SAMPLE:
+        lines.append(f"  objects in n = {index(default)}, from z = {object_begins(design):g} mm")
+    if design.samples:
+        choice = " and no default" if design.sample is None else ""
+        lines.append(f"  samples by name: {', '.join(design.samples)}{choice}")
     return lines
 
 
@@ -109,12 +137,12 @@ def check_path(design) -> None:
             raise ValueError(f"`imaging.wavelength_nm` and `{key}`: {str(error).removesuffix('.')}") from error
         if key == "lens.refractive_index" and not index > 1:
             raise ValueError(f'`lens.refractive_index` must be above 1, got "{material}"')
-    if AIR in design.samples:
-        raise ValueError('`samples.air` must have another name: "air" is no sample')
+    for name in design.samples.keys() & _NO_SAMPLE:
+        raise ValueError(f'`samples.{name}` must have another name: "{name}" is no sample')
     behind, v = _total(design.layers.sensor), design.imaging.sensor_distance_mm
     if behind > v:
         raise ValueError(f"`layers.sensor` must be at most `imaging.sensor_distance_mm`, {v:g} mm, got {behind:g} mm")
-    _check_sample(design, "sample", design.sample)
+    _check_sample(design, "sample", default_sample(design))
     for name, table in design.samples.items():
         _check_sample(design, f"samples.{name}", table)
     begins, working = object_begins(design), list(design.imaging.working_distance_mm)
@@ -146,7 +174,7 @@ def _materials(design) -> list[tuple[str, Any]]:
     """All indices by their keys."""
     layers = {"layers.object": design.layers.object, "layers.sensor": design.layers.sensor}
     found: list[tuple[str, Any]] = [("lens.refractive_index", design.lens.refractive_index)]
-    samples = {"sample": design.sample} | {f"samples.{name}": table for name, table in design.samples.items()}
+    samples = {"sample": default_sample(design)} | {f"samples.{name}": table for name, table in design.samples.items()}
     for key, table in samples.items():
         found.append((f"{key}.refractive_index", table.refractive_index))
         layers[f"{key}.layers"] = table.layers

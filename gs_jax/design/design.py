@@ -22,7 +22,6 @@ from ..materials import index_of
 from ..typing import PathLike
 from .centers import LENS_KEYS, CentersTable, inline_centers
 from .conversion import (
-    NO_SAMPLE,
     chosen_sample,
     emission_band,
     inline_spectrum,
@@ -59,12 +58,12 @@ class Design(Table):
     layers: LayersTable = Field(
         default=LayersTable(), title="filters and windows in the light's path", description="a table"
     )
-    sample: SampleTable = Field(
-        default=NO_SAMPLE, title="the medium that holds the object; air by default", description="a table"
+    sample: SampleTable | None = Field(
+        default=None, title="the medium that holds the object by default; air without it", description="a table"
     )
     samples: dict[str, SampleTable] = Field(
         default={},
-        title="other samples by name, each a table like `[sample]`, for `--sample NAME`",
+        title="samples by name, each a table like `[sample]`, for `--sample NAME`; one is needed without `[sample]`",
         description="a table of tables",
     )
     calibration: CalibrationTable = Field(
@@ -115,8 +114,8 @@ class Design(Table):
         Parameters
         ----------
         sample
-            What holds the object: the name of one of `[samples]`, "air" for none, or a `Sample`. By default that of
-            `[sample]`, or air.
+            What holds the object: the name of one of `[samples]`, "air" or "none" for air, or a `Sample`. By default
+            that of `[sample]`; without one air, but where the design has `[samples]` a name is needed.
         wavelength_nm
             Of the light, if it is another than the design's, nm. Indices of materials follow; the design's emission
             band does not count.
@@ -124,7 +123,8 @@ class Design(Table):
         Raises
         ------
         InputError
-            If there is no such sample, or the wavelength is beyond the range of designs or of a material.
+            If there is no such sample, one of several is needed, or the wavelength is beyond the range of designs or
+            of a material.
 
         Examples
         --------

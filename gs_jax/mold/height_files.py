@@ -17,6 +17,7 @@ from PIL import Image, PngImagePlugin
 
 from ..base.errors import InputError, input_error
 from ..base.progress import Progress
+from ..design.conversion import AIR
 from ..design.design import Design, read_design
 from ..io.files import atomic_write, check_output, decoding, write_json
 from ..io.provenance import KEY, Provenance, sidecar
@@ -83,7 +84,7 @@ def write_heights(
     source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
     design = design if isinstance(design, Design) else read_design(design)
     raise_first_error(check_design(design, MoldShape(), chord=4e-4, resolution=0.025), InputError, source)
-    array, suffix = design.imager().array, path.suffix.lower()
+    array, suffix = design.imager(AIR).array, path.suffix.lower()
     is_list, is_optical = suffix == ".csv", suffix in (".csv", ".dat")
     heights = HeightMap(array, min(array.plate) / _LIST_POINTS if is_list else step)
     _check_count(heights, _MAX_LINES if suffix in (".xyz", ".dat") else _MAX_POINTS)

@@ -14,6 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..base.errors import InputError
 from ..base.progress import Progress
+from ..design.conversion import AIR
 from ..design.design import Design, read_design
 from ..io.files import atomic_write, check_output, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
@@ -108,7 +109,7 @@ def make_mold(
     design = design if isinstance(design, Design) else read_design(design)
     checks = check_design(design, shape, chord=chord, resolution=resolution, layer=layer)
     raise_first_error(checks, InputError, source)
-    imager = design.imager()
+    imager = design.imager(AIR)
     array = imager.array
     part = array_solid(array, chord, progress=progress)
     with progress.step("Building and checking the solid"):

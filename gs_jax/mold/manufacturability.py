@@ -11,6 +11,7 @@ import manifold3d as m3
 import numpy as np
 from scipy.spatial import KDTree
 
+from ..design.conversion import AIR
 from ..design.design import Design
 from ..layouts import cell_edges, coverage, max_gap
 from ..lenses import MicrolensArray
@@ -50,7 +51,7 @@ def check_design(
     `chord` is the chordal tolerance of the facets, `resolution` the smallest feature that the printer makes, and
     `layer` the thickness of its layers, if it prints layers, all in mm.
     """
-    imager = design.imager()
+    imager = design.imager(AIR)
     array = imager.array
     # Rims that are too steep have no solid to check further.
     if (slope := _check_slope(array)).level == "error":

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...base.errors import needs_extra
+from ...design.conversion import default_sample
 from ...design.design import Design
 from ...geometry import Imager
 from ...layers import layers_in_front
@@ -164,7 +165,7 @@ def _slabs(imager: Imager) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]
 def _layers(design: Design, imager: Imager, end: float, far: float) -> list[tuple[float, float, str]]:
     """Begin and end of each layer that is not air, along the drawing, and what it is."""
     front, behind = _slabs(imager)
-    on_array, cover = design.layers.object, design.sample.layers
+    on_array, cover = design.layers.object, default_sample(design).layers
     names = [each.name for each in on_array] + [""] * (len(front) - len(on_array) - len(cover))
     names += [each.name for each in cover]
     faces, found = _faces(front), []

@@ -11,7 +11,7 @@ from jaxtyping import Float, Num
 
 from ...base.errors import InputError
 from ...base.machine import describe
-from ...design.conversion import NO_SAMPLE, object_begins
+from ...design.conversion import NO_SAMPLE, default_sample, object_begins
 from ...design.datasheets import circle_of_confusion_of
 from ...design.design import Design, span_of
 from ...grid import Grid
@@ -110,7 +110,7 @@ def device_rows(design: Design, sheet: Mapping[str, Any]) -> list[tuple[str, str
 
 
 def _path_rows(design: Design) -> list[tuple[str, str]]:
-    layers, sample = design.layers, design.sample
+    layers, sample = design.layers, default_sample(design)
     sides = {"on the array": layers.object, "before the object": sample.layers, "on the sensor": layers.sensor}
 
     def words(layer):
@@ -119,9 +119,8 @@ def _path_rows(design: Design) -> list[tuple[str, str]]:
         return f"{layer.name or 'layer'}, {layer.thickness_mm:g} mm, n = {layer.refractive_index}"
 
     rows = [(side, "; ".join(map(words, parts))) for side, parts in sides.items() if parts]
-    if sample == NO_SAMPLE:
-        return rows
-    return [*rows, ("objects in", f"n = {sample.refractive_index} from {object_begins(design):g} mm")]
+    medium = "air" if sample == NO_SAMPLE else f"n = {sample.refractive_index} from {object_begins(design):g} mm"
+    return [*rows, ("objects in", medium)]
 
 
 def calibration_rows(design: Design) -> list[tuple[str, str, str]]:
