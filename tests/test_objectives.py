@@ -7,15 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from scipy.ndimage import uniform_filter
 
+from experiments.profiles import fwhm as profile_width
 from gs_jax import objectives
 from gs_jax.codesign.parameters import candidate, evaluated, start_values
 from gs_jax.codesign.terms import TERMS
 from gs_jax.design.datasheets import datasheet
 from gs_jax.design.start import geomscope
 from gs_jax.geometry import Imager
+from gs_jax.grid import Sensor
 from gs_jax.layouts import max_gap, nearest_neighbour_distances
 from gs_jax.objectives import Conditions
+from gs_jax.objectives.spot_sizes import _outermost_half
 from gs_jax.optics.psf import diffraction_psf
 
 # Off the raster of places, where a hole has a kink.
@@ -113,6 +117,63 @@ def test_width_of_an_ideal_lens_out_of_focus(focused):
     per_light = expected / np.asarray(lens.term("light_percent")) ** 0.25
     np.testing.assert_allclose(jax.jit(lambda c: c.term("width_per_light_um"))(lens), per_light, rtol=1e-9)
     np.testing.assert_allclose(jax.jit(lambda c: c.term("encircled_radius_um"))(lens), np.sqrt(0.8) * radius, rtol=0.03)
+    # The even disc falls to a half at its edge, and half of its light is within the root of a half of its radius.
+    names = ("fwhm_um", "rms_width_um", "half_light_radius_um")
+    width, rms, half = (np.asarray(size) for size in jax.jit(lambda c: [c.term(name) for name in names])(lens))
+    np.testing.assert_allclose(width, 2 * radius, rtol=0.03)
+    np.testing.assert_allclose(rms, expected / np.sqrt(8 * np.log(2)), rtol=1e-9)
+    np.testing.assert_allclose(half, np.sqrt(0.5) * radius, rtol=0.03)
+
+
+@pytest.mark.parametrize(("pixel", "diameter"), [(0.1, 0.3), (20.0, 1.0)], ids=["Airy disc", "pixel"])
+def test_sizes_of_a_perfect_image_are_those_of_closed_forms(focused, pixel, diameter):
+    """In focus diffraction or the pixel alone makes the PSF; half of an Airy disc's light is within 0.535 lambda v / D.
+
+    A Gaussian as wide as the Airy disc has half of its light within 1.177 sigma, 4 % less.
+    """
+    v = 1 / (1 / focused.imager.array.focal_length - 1 / focused.imager.reduced_depth(20.5))
+    lens = ideal(focused, v, diameter)
+    sensor = dataclasses.replace(lens.imager.sensor, pixel_pitch=pixel / 1000)
+    imager, depths = dataclasses.replace(lens.imager, sensor=sensor), jnp.array([20.5])
+    at, scale = dataclasses.replace(lens.at, depths=depths), float(imager.magnification(20.5))
+    sizes = jax.jit(lambda c: [c.term(name)[0] for name in ("fwhm_um", "rms_width_um", "half_light_radius_um")])
+    width, rms, half = (float(size) * scale for size in sizes(Case(imager, at)))
+    if pixel > 1:
+        # Of a square pixel: its side, its standard deviation, and the radius of half of its area.
+        expected = pixel, np.sqrt(pixel**2 / 12 + (0.437 * 0.52 * float(v)) ** 2), pixel * np.sqrt(0.5 / np.pi)
+    else:
+        airy = 0.52 * float(v) / diameter
+        expected = 1.029 * airy, 1.029 * airy / np.sqrt(8 * np.log(2)), 0.535 * airy
+    np.testing.assert_allclose((width, rms), expected[:2], rtol=0.01)
+    assert half == pytest.approx(expected[2], rel=0.05)
+
+
+def test_half_the_height_of_a_gaussian():
+    radii = jnp.linspace(0, 5, 101)
+    assert float(_outermost_half(radii, jnp.exp(-(radii**2) / 2))) == pytest.approx(
+        2 * np.sqrt(2 * np.log(2)), rel=1e-3
+    )
+    # A ring brighter than half of the core counts.
+    ring = jnp.exp(-(radii**2) / 2) + 0.8 * jnp.exp(-((radii - 4) ** 2) / 0.1)
+    assert 8 < float(_outermost_half(radii, ring)) < 9
+
+
+@pytest.mark.integration
+def test_the_width_at_half_height_is_that_of_diffraction(design):
+    """Of the paper's lenses, whose core stands in wide stray light: RMS widths are ten times as wide."""
+    imager, parts = design.imager(), 9
+    depths, radius = np.array([18.0, 22.0]), float(objectives.clear_diameter(imager, [20.0])) / 2
+    fine = dataclasses.replace(imager, sensor=Sensor((401, 401), imager.sensor.pixel_pitch / parts))
+    for depth, width, rms in zip(
+        depths, *(f(imager, depths) for f in (objectives.fwhm, objectives.rms_width)), strict=True
+    ):
+        image = np.asarray(diffraction_psf(fine, depth, size=401, radius=radius, samples=1))
+        line = uniform_filter(image, parts)[200] * (np.abs(np.arange(401) - 200) < 100)
+        places = fine.sensor.pixel_pitch * np.arange(401) / float(imager.magnification(depth))
+        assert float(width) == pytest.approx(profile_width(places, line), rel=0.02) and rms > 8 * width
+    by_distance = lambda v: jnp.sum(objectives.fwhm(dataclasses.replace(imager, sensor_distance=v), depths))
+    width, slope = jax.jit(by_distance), jax.jit(jax.grad(by_distance))(5.3)
+    assert float(slope) == pytest.approx(float(width(5.3 + 1e-5) - width(5.3 - 1e-5)) / 2e-5, rel=1e-3)
 
 
 @pytest.mark.integration

@@ -147,6 +147,7 @@ def test_what_cannot_be_searched_is_refused(make, words):
 OBJECTIVES = {
     "spot_width": objectives.spot_width,
     "encircled_radius": objectives.encircled_radius,
+    "half_light_radius": objectives.half_light_radius,
     "width_per_light": objectives.width_per_light,
     "strehl": objectives.strehl,
     "lateral_resolution": objectives.lateral_resolution,

@@ -222,7 +222,10 @@ TERMS: dict[str, Term] = {
     "light_percent": Term("share of a point's light that is used", _scaled(100, objectives.light)),
     "field_of_view_mm": Term("width of the field of view", objectives.field_of_view),
     "thickness_mm": Term("thickness: filters, plate and sensor distance", _of_imager(objectives.thickness)),
-    "psf_width_um": Term("width of the spot (FWHM of its variance), in the object", _scaled(UM, objectives.spot_width)),
+    "fwhm_um": Term("full width at half maximum of the PSF on the axis, in the object", _scaled(UM, objectives.fwhm)),
+    "rms_width_um": Term("RMS width of the PSF, in the object", _scaled(UM, objectives.rms_width)),
+    "half_light_radius_um": Term("radius of half the light, in the object", _scaled(UM, objectives.half_light_radius)),
+    "psf_width_um": Term("2.355 times the RMS width of the PSF, in the object", _scaled(UM, objectives.spot_width)),
     "width_per_light_um": Term(
         "width of the spot over the fourth root of the light in percent", _scaled(UM, objectives.width_per_light)
     ),

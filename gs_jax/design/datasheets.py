@@ -173,7 +173,7 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
             "focal_length_mm": array.focal_length,
             "clear_diameter_mm": objectives.clear_diameter(imager, at),
         }
-        spots = {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", "spot_radius_um")}
+        spots = {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", *SIZES)}
         found.append({"lenses": len(array.centers), **{k: six_digits(float(x)) for k, x in numbers.items()}, **spots})
     return found
 
@@ -187,7 +187,7 @@ def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
 @over_heights
 def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
     wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
-    width, radius = _spot_sizes(imager, at)
+    sizes = _spot_sizes(*_alone(imager, at))
     return {
         "lateral_resolution_um": objectives.lateral_resolution(imager, at) * 1000,
         "axial_resolution_um": objectives.axial_resolution(imager, at) * 1000,
@@ -199,14 +199,28 @@ def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
         "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(wavefront)[:, 0], imager.wavelength),
         "focus_distance_mm": objectives.focus_distance(imager, at),
         "blur_um": objectives.sensor_blur(imager, at) * 1000,
-        "spot_width_um": width * 1000,
-        "spot_radius_um": radius * 1000,
+        **{name: size * 1000 for name, size in zip(SIZES, sizes, strict=True)},
+        "spot_width_um": theory.FWHM * sizes[1] * 1000,
     }
 
 
+# Sizes of a point's image in the object, on a lens's axis and over its field.
+SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um", "spot_radius_um")
 _spot_sizes = eqx.filter_jit(
-    lambda imager, at: (objectives.spot_width(imager, at), objectives.encircled_radius(imager, at))
+    lambda imager, at: (
+        objectives.fwhm(imager, at),
+        objectives.rms_width(imager, at),
+        objectives.half_light_radius(imager, at),
+        objectives.encircled_radius(imager, at),
+    )
 )
+
+
+def _alone(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
+    """One of the lenses, on which alone sizes of spots depend: one program serves arrays of any number of lenses."""
+    sensor = dataclasses.replace(imager.sensor, shape=(2, 2), origin=(0.0, 0.0))
+    own = dataclasses.replace(at, cells=None, clear_diameter=objectives.clear_diameter(imager, at))
+    return dataclasses.replace(imager, array=imager.array.lens(0), sensor=sensor), own
 
 
 def tables(sheet: dict[str, Any]) -> list[Table]:

@@ -23,7 +23,6 @@ from .quantities import (
     coverage as coverage,
     depth_of_field as depth_of_field,
     edge_slope as edge_slope,
-    encircled_radius as encircled_radius,
     f_number as f_number,
     far_limit as far_limit,
     field_of_view as field_of_view,
@@ -39,11 +38,17 @@ from .quantities import (
     sag as sag,
     sensor_blur as sensor_blur,
     spacing as spacing,
-    spot_width as spot_width,
     strehl as strehl,
     surface_radius as surface_radius,
     thickness as thickness,
     uncovered_distance as uncovered_distance,
     wavefront_error as wavefront_error,
+)
+from .spot_sizes import (
+    encircled_radius as encircled_radius,
+    fwhm as fwhm,
+    half_light_radius as half_light_radius,
+    rms_width as rms_width,
+    spot_width as spot_width,
     width_per_light as width_per_light,
 )

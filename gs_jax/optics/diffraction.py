@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from ..base.arrays import jit
 from ..geometry import Imager
@@ -30,8 +30,12 @@ _MARGIN = 1.08
 # Inversion of the map from lens to exit pupil: degree of the first polynomial fit, Newton steps, and the largest
 # distance left, in radii, of a ray that counts. The error of its phase is of second order in that distance.
 _DEGREE, _STEPS, _CLOSE = 7, 1, 0.02
-# Nodes of `axial_strehl` in the squared radius: the path may change by dozens of waves.
-_NODES = 64
+# Nodes of a panel of `axial_pupil`, over which the path may change by dozens of waves, and panels by default.
+_NODES, _PANELS = 64, 8
+# Coefficients of `_bessel_j0`, highest powers first.
+_J0 = (0.0002100, -0.0039444, 0.0444479, -0.3163866, 1.2656208, -2.2499997, 1.0)
+_J0_SIZE = (0.00014476, -0.00072805, 0.00137237, -0.00009512, -0.00552740, -0.00000077, 0.79788456)
+_J0_PHASE = (0.00013558, -0.00029333, -0.00054125, 0.00262573, -0.00003954, -0.04166397, -0.78539816)
 
 
 class ExitPupil(NamedTuple):
@@ -180,28 +184,73 @@ def strehl(
     return irradiance(jax.lax.stop_gradient(peak))
 
 
-def axial_strehl(imager: Imager, depth: ScalarLike, *, radius: ScalarLike | None = None) -> Float[Array, ""]:
-    """Irradiance in the middle of the spot of a point on the axis, over that without aberrations and defocus.
+class AxialPupil(NamedTuple):
+    """The exit pupil of a point on the axis, along its radius.
 
-    As of `strehl`, up to a thousand times faster: with the exit pupil's radius `u`, the phase `phi` there and the
-    lens's radius `r`, the field is `int exp(2 pi i phi / wavelength) sqrt(u u'/r) r dr`. Where the Strehl ratio is
-    above 0.1 the middle is the peak; a spot far out of focus may be brighter around it.
+    `radius`: in the exit pupil, mm. `amplitude` and `phase` of the field, and where the rays land, mm. `weight`: the
+    share of the lens's area that each stands for; `lit`: whether its ray arrives. `distance`: length of the chief ray.
+    """
+
+    radius: Float[Array, " node"]
+    amplitude: Float[Array, " node"]
+    phase: Float[Array, " node"]
+    landing: Float[Array, " node"]
+    weight: Float[Array, " node"]
+    lit: Bool[Array, " node"]
+    distance: Float[Array, ""]
+
+
+def axial_pupil(
+    imager: Imager, depth: ScalarLike, *, radius: ScalarLike | None = None, panels: int = _PANELS
+) -> AxialPupil:
+    """Trace the exit pupil of a point on the axis: `panels` of 64 nodes in the lens's squared radius.
+
+    With the exit pupil's radius `u`, the phase `phi` there and the lens's radius `r`, the field in the middle of the
+    spot is `int exp(i phi) sqrt(u u'/r) r dr`.
     """
     radius = pupil_radius(imager, radius)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    at = radius * jnp.asarray(np.sqrt((nodes + 1) / 2), radius.dtype)
+    squared = ((nodes + 1) / 2 + np.arange(panels)[:, None]).ravel() / panels
+    weight = jnp.asarray(np.tile(weights / 2, panels) / panels, radius.dtype)
+    at = radius * jnp.asarray(np.sqrt(squared), radius.dtype)
     distance = chief_ray_length(imager, trace_lenslet(imager, depth, np.zeros(2)))
 
     def trace(at):
         rays = trace_lenslet(imager, depth, jnp.stack([at, jnp.zeros_like(at)], -1))
         tangent, end = rays.tangent[:, 0], rays.landing[:, 0]
         sine = tangent / jnp.sqrt(1 + tangent**2)
-        return end - distance * sine, (rays.path - end * sine + end**2 / (2 * distance), rays.valid)
+        return end - distance * sine, (end, rays.path - end * sine + end**2 / (2 * distance), rays.valid)
 
-    seen, denser, (path, valid) = jax.jvp(trace, (at,), (jnp.ones_like(at),), has_aux=True)
-    squared = seen * denser / at
-    lit = valid & (squared > 0)
-    amplitude = jnp.where(lit, jnp.asarray(weights, at.dtype) * jnp.sqrt(jnp.where(lit, squared, 1)), 0)
+    seen, denser, (end, path, valid) = jax.jvp(trace, (at,), (jnp.ones_like(at),), has_aux=True)
+    denser = seen * denser / at
+    lit = valid & (denser > 0)
+    amplitude = jnp.where(lit, weight * jnp.sqrt(jnp.where(lit, denser, 1)), 0)
     phase = jnp.where(lit, 2 * np.pi / imager.wavelength * path, 0)
-    light = jnp.sum(amplitude * jnp.cos(phase)) ** 2 + jnp.sum(amplitude * jnp.sin(phase)) ** 2
-    return light / jnp.sum(amplitude) ** 2
+    return AxialPupil(seen, amplitude, phase, end, weight, valid, distance)
+
+
+def axial_irradiance(imager: Imager, pupil: AxialPupil, places: Float[Array, " place"]) -> Float[Array, " place"]:
+    """Irradiance at distances from the middle of the spot, mm, over that in the middle without aberrations."""
+    turn = 2 * np.pi / (imager.wavelength * pupil.distance)
+    waves = _bessel_j0(turn * places[:, None] * pupil.radius[None])
+    field = waves @ (pupil.amplitude * jnp.cos(pupil.phase)), waves @ (pupil.amplitude * jnp.sin(pupil.phase))
+    return (field[0] ** 2 + field[1] ** 2) / jnp.maximum(jnp.sum(pupil.amplitude), 1e-30) ** 2
+
+
+def _bessel_j0(x: Array) -> Array:
+    """Bessel's function of order 0 to 1e-7: Abramowitz and Stegun 9.4.1 and 9.4.3. JAX has none that is fast."""
+    x = jnp.abs(x)
+    t, s = jnp.minimum(x / 3, 1) ** 2, 3 / jnp.maximum(x, 3)
+    inner = jnp.polyval(jnp.asarray(_J0, x.dtype), t)
+    size, phase = jnp.polyval(jnp.asarray(_J0_SIZE, x.dtype), s), jnp.polyval(jnp.asarray(_J0_PHASE, x.dtype), s)
+    return jnp.where(x < 3, inner, size * jnp.sqrt(s / 3) * jnp.cos(x + phase))
+
+
+def axial_strehl(imager: Imager, depth: ScalarLike, *, radius: ScalarLike | None = None) -> Float[Array, ""]:
+    """Irradiance in the middle of the spot of a point on the axis, over that without aberrations and defocus.
+
+    As of `strehl`, up to a thousand times faster. Where the Strehl ratio is above 0.1 the middle is the peak; a spot
+    far out of focus may be brighter around it.
+    """
+    pupil = axial_pupil(imager, depth, radius=radius, panels=1)
+    return axial_irradiance(imager, pupil, jnp.zeros(1, pupil.radius.dtype))[0]
