@@ -68,7 +68,7 @@ def report(progress: Progress) -> Report:
             ("sensor distance v, mm", "sensor_distance_mm", ".3f"),
             ("conic constant", "conic_constant", ".3f"),
             ("error of volumes, of the scene's energy", "volume_error", ".4f"),
-            ("width of the spot, um", "spot_width_um", ".0f"),
+            ("2.355 times the RMS width of the spot, um", "spot_width_um", ".0f"),
             ("axial resolution, Eq. 6, um", "axial_resolution_um", ".0f"),
             ("light used, %", "light_percent", ".3f"),
             ("from the filter's face to the sensor, mm", "thickness_mm", ".2f"),

@@ -26,7 +26,8 @@ from .test_cli import run
 
 LISTS = (
     "depth_mm magnification scale lateral_resolution_um axial_resolution_um depth_of_field_mm near_limit_mm "
-    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um spot_width_um spot_radius_um"
+    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um fwhm_um rms_width_um "
+    "half_light_radius_um spot_radius_um spot_width_um"
 ).split()
 SCALARS = "f_number numerical_aperture focal_length_mm pitch_mm pitch_sd_mm field_radius_mm coverage".split()
 TABLE1 = Path(__file__).parents[1] / "experiments" / "designs" / "geomscope-table1.toml"

@@ -60,7 +60,7 @@ def test_what_a_study_says(read):
         ("[18.0, 23.0]", "[23.0, 18.0]", "near below far"),
         ("[18.0, 23.0]", "[0.0, 23.0]", r"`depths_mm\[0\]` must be .*, got 0.0"),
         ("[18.0, 23.0]", "[18.0]", "`depths_mm"),
-        ('"occupancy"', '"ocupancy"', "`terms` 1: name must be occupancy or one of 32 others, got 'ocupancy'"),
+        ('"occupancy"', '"ocupancy"', "`terms` 1: name must be occupancy or one of 35 others, got 'ocupancy'"),
         ("at_most = 0.5", "", "one of at_most, .* must be given, got none"),
         ("at_most = 0.5", "at_most = 0.5\nat_least = 0.1", "got at_most and at_least"),
         ("at_most = 0.5", "at_most = -0.5", "must be a positive number, got -0.5"),

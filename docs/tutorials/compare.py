@@ -42,8 +42,8 @@ print(small)
 # %% [markdown]
 # ## Equations and exact rays
 #
-# A datasheet has the paper's Eqs. 1 to 11 and, by exact rays, the width of a spot in the object. The formula for
-# resolution (Eq. 5) ignores aberrations, and ranks the two designs the wrong way round.
+# A datasheet has the paper's Eqs. 1 to 11 and, by exact rays, the RMS width of a point's image in the object. The
+# formula for resolution (Eq. 5) ignores aberrations, and ranks the two designs the wrong way round.
 
 # %%
 depths = [18.0, 19.0, 20.0, 21.0, 22.0, 23.0]
@@ -51,9 +51,9 @@ sheets = {design.name: datasheet(design, depths) for design in (paper, small)}
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 for name, sheet in sheets.items():
     axes[0].plot(depths, sheet["lateral_resolution_um"], label=name)
-    axes[1].plot(depths, sheet["spot_width_um"], label=name)
+    axes[1].plot(depths, sheet["rms_width_um"], label=name)
 axes[0].set(title="Eq. 5", xlabel="depth, mm", ylabel="lateral resolution, um")
-axes[1].set(title="exact rays", xlabel="depth, mm", ylabel="width of the spot, um", ylim=(0, None))
+axes[1].set(title="exact rays", xlabel="depth, mm", ylabel="RMS width of a point, um", ylim=(0, None))
 axes[1].legend()
 plt.show()
 

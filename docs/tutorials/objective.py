@@ -92,7 +92,7 @@ scope, depths = gs.geomscope(sensor_distance_mm=4.0).imager(), jnp.linspace(18.0
 
 
 def loss(scope):
-    """RMS width of the spots in the object by exact rays, mm, plus a twentieth of the sensor distance."""
+    """Width of the spots in the object by exact rays, mm: RMS over depths, plus a twentieth of the sensor distance."""
     return jnp.sqrt(jnp.mean(gs.objectives.spot_width(scope, depths) ** 2)) + 0.05 * scope.sensor_distance
 
 

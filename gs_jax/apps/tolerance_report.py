@@ -198,7 +198,7 @@ def picture(outcome: Outcome) -> Figure:
     ):
         errors.plot(outcome.depths, 1000 * rms, "o-", color=color, label=label)
     errors.plot(outcome.depths, 1000 * limits.depth_error, "k:", label="target, of each point")
-    widths.set(ylabel="spot width in the object, um", title="spot width")
+    widths.set(ylabel="2.355 RMS widths in the object, um", title="spot width")
     ratios.set(ylabel="Strehl ratio on the axis", title="Strehl ratio")
     errors.set(ylabel="depth error, um RMS", title="depth of a point, over devices and points")
     for axes in (widths, ratios, errors):

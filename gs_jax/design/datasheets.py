@@ -62,7 +62,10 @@ def datasheet(
     Returns
     -------
     dict
-        Lists with one entry a depth, and scalars. `None` stands for infinity.
+        Lists with one entry a depth, and scalars. `None` stands for infinity. Of a point's image in the object,
+        `fwhm_um` is the full width at half maximum on a lens's axis, `rms_width_um` and `half_light_radius_um` the RMS
+        width along an axis and the radius of half of the light over the field, `spot_radius_um` that of 80 % of the
+        rays, and `spot_width_um` 2.355 times the RMS width.
 
     Raises
     ------
@@ -120,7 +123,7 @@ def _over_the_band(imager: Imager, depth: float) -> dict[str, Any]:
     if imager.band is None:
         return {}
     at, each = Conditions([depth]), [one for _, one in emission_lines(imager)]
-    widths = [[float(objectives.spot_width(*part)[0]) for part in per_type(one, at)] for one in each]
+    widths = [[float(objectives.rms_width(*part)[0]) for part in per_type(one, at)] for one in each]
     best = int(np.argmin(np.mean(widths, 0)))
     focus = [float(objectives.focus_distance(*per_type(one, at)[best])[0]) for one in each]
     width = [1000 * row[best] for row in widths]
@@ -128,7 +131,8 @@ def _over_the_band(imager: Imager, depth: float) -> dict[str, Any]:
         "band_nm": [six_digits(1e6 * float(one.wavelength)) for one in each],
         "band_depth_mm": six_digits(depth),
         "band_focus_distance_mm": [six_digits(value) for value in focus],
-        "band_spot_width_um": [six_digits(value) for value in width],
+        "band_rms_width_um": [six_digits(value) for value in width],
+        "band_spot_width_um": [six_digits(theory.FWHM * value) for value in width],
     }
 
 
@@ -136,10 +140,10 @@ def band_in_words(sheet: dict[str, Any]) -> str:
     """The emission band of a datasheet in one line; empty without one."""
     if "band_nm" not in sheet:
         return ""
-    focus, width = sheet["band_focus_distance_mm"], sheet["band_spot_width_um"]
+    focus, width = sheet["band_focus_distance_mm"], sheet["band_rms_width_um"]
     moved = "" if None in focus else f"the image moves by {1000 * (max(focus) - min(focus)):.3g} um and "
     ends = f"{min(sheet['band_nm']):.4g} to {max(sheet['band_nm']):.4g} nm"
-    return f"from {ends}, {moved}spots are {_plain(min(width))} to {_plain(max(width))} um wide in the object"
+    return f"from {ends}, {moved}RMS widths are {_plain(min(width))} to {_plain(max(width))} um in the object"
 
 
 def _depth_in_focus(imager: Imager) -> float:
@@ -267,10 +271,12 @@ _TABLES = {
         "blur_um": "blur\num",
         "strehl_on_axis": "Strehl\nratio",
     },
-    "What becomes of a point, by exact rays over the field: in the object, um": {
+    "Image of a point (PSF), seen in the object: width of its core, and of all its light, um": {
         "depth_mm": "depth\nmm",
-        "spot_width_um": "width at half\nheight",
-        "spot_radius_um": "radius of\n80 % of the light",
+        "fwhm_um": "FWHM on\nthe axis",
+        "rms_width_um": "RMS\nwidth",
+        "half_light_radius_um": "half-light\nradius",
+        "spot_radius_um": "radius of\n80 %",
     },
 }
 # Types that a table has room for.
@@ -291,8 +297,8 @@ def text_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]]) 
 
 def _table_of_types(sheet: dict[str, Any]) -> Table:
     heads = [f"{one['lenses']} of f =\n{_plain(one['focal_length_mm'])} mm" for one in sheet["kinds"]]
-    columns = [map(_plain, sheet["depth_mm"]), *(map(_plain, one["spot_width_um"]) for one in sheet["kinds"])]
-    title = "Width at half height by each type of lens: in the object, um"
+    columns = [map(_plain, sheet["depth_mm"]), *(map(_plain, one["rms_width_um"]) for one in sheet["kinds"])]
+    title = "RMS width of a point's image by each type of lens: in the object, um"
     return text_table(title, ["depth\nmm", *heads], zip(*columns, strict=True))
 
 

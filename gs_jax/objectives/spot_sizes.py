@@ -128,7 +128,7 @@ def rms_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 
 def spot_width(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
-    """2.355 times `rms_width`, seen in the object, mm: the FWHM of a Gaussian of the same variance.
+    """Width of the spot, 2.355 times `rms_width`, seen in the object, mm: the FWHM of a Gaussian of that variance.
 
     Of a PSF that is no Gaussian it is not the FWHM, which `fwhm` is. Of the best type.
     """

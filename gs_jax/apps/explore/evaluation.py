@@ -18,7 +18,7 @@ from ...codesign.study import Study
 from ...codesign.targets import SIGNS, assess, evaluate as evaluate_term
 from ...codesign.terms import TERMS
 from ...design.conversion import object_begins
-from ...design.datasheets import circle_of_confusion_of, columns_of
+from ...design.datasheets import SIZES, circle_of_confusion_of, columns_of
 from ...design.design import Design
 from ...geometry import Imager
 from ...lenses import lenses_by_type
@@ -34,7 +34,7 @@ _LENS_KEYS = ("radius_of_curvature_mm", "aperture_diameter_mm")
 _FAR, _MAX_UNCOVERED = 2.0, 0.005
 # Columns of the datasheet that are shown, of the type with the narrowest spot at each depth.
 _NUMBERS = (
-    *("lateral_resolution_um", "axial_resolution_um", "spot_width_um", "spot_radius_um"),
+    *("lateral_resolution_um", "axial_resolution_um", "spot_width_um", *SIZES),
     *("blur_um", "depth_of_field_mm", "strehl_on_axis"),
 )
 
@@ -264,8 +264,8 @@ def find_violations(
     wide, promised = numbers["spot_width_um"], numbers["lateral_resolution_um"]
     if (wide > _FAR * promised).any():
         sentences.append(
-            f"By exact rays spots are up to {(wide / promised).max():.3g} times as wide as Eq. 5 predicts: "
-            f"{wide.max():.3g} um in the object."
+            f"Eq. 5 predicts {promised.max():.3g} um; the image of a point is up to {numbers['fwhm_um'].max():.3g} um "
+            f"wide at half its height, and has an RMS width of up to {numbers['rms_width_um'].max():.3g} um."
         )
     if (occupancy := numbers["occupancy"].max()) > 1:
         sentences.append(

@@ -51,7 +51,9 @@ _POLICY = (
 _MAX_KEPT, _MAX_NUMBER = 50, 10_000
 # Columns of the history: numbers of which the largest of all depths is shown.
 _COLUMNS = {
-    "spot_width_um": "spot, um",
+    "fwhm_um": "FWHM, um",
+    "rms_width_um": "RMS width, um",
+    "half_light_radius_um": "half-light radius, um",
     "lateral_resolution_um": "promised, um",
     "axial_resolution_um": "axial, um",
     "blur_um": "blur, um",
@@ -145,11 +147,12 @@ class Session:
 
     def _chart(self, now: Evaluation) -> str:
         line = lambda evaluation, name: (evaluation.depths, evaluation.numbers[name])
-        lines = {"now": line(now, "spot_width_um"), "now, promised": line(now, "lateral_resolution_um")}
-        lines["start"] = line(self.kept[0][2], "spot_width_um")
+        lines = {"now": line(now, "rms_width_um"), "now, FWHM": line(now, "fwhm_um")}
+        lines |= {"now, promised": line(now, "lateral_resolution_um"), "start": line(self.kept[0][2], "rms_width_um")}
         if len(self.kept) > 1:
-            lines[f"kept {self.kept[-1][0]}"] = line(self.kept[-1][2], "spot_width_um")
-        return line_chart(lines, x="depth z, mm", y="width of a spot, um", title="Spots by depth", log=True, marks=True)
+            lines[f"kept {self.kept[-1][0]}"] = line(self.kept[-1][2], "rms_width_um")
+        labels: Any = {"x": "depth z, mm", "y": "RMS width and FWHM, um", "title": "Image of a point"}
+        return line_chart(lines, **labels, log=True, marks=True)
 
     def _spots(self, evaluation: Evaluation, values: Values) -> str:
         def cell(spot):

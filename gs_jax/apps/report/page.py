@@ -177,9 +177,10 @@ def _optics(design: Design, progress: Progress) -> dict[str, Any]:
         radius = np.max(np.array(sheet["spot_radius_um"]) * sheet["magnification"]) / 1000
         psfs = simulate_psfs(imager, depths, diameter, float(radius))
     widths = {
-        "spot, exact rays": (depths, sheet["spot_width_um"]),
+        "FWHM on the axis": (depths, sheet["fwhm_um"]),
+        "RMS width": (depths, sheet["rms_width_um"]),
+        "half-light radius": (depths, sheet["half_light_radius_um"]),
         "predicted (Eq. 5)": (depths, sheet["lateral_resolution_um"]),
-        "radius of 80 %": (depths, sheet["spot_radius_um"]),
         "axial, predicted (Eq. 6)": (depths, sheet["axial_resolution_um"]),
     }
     labels: Any = {"x": "depth z, mm", "y": "in the object, um", "title": "Resolution by depth"}

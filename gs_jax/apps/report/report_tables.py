@@ -31,8 +31,10 @@ _ROWS = {
     "scale": ("scale of the pattern", "", "Eq. 1"),
     "lateral_resolution_um": ("lateral resolution, predicted", "um", "Eq. 5"),
     "axial_resolution_um": ("axial resolution, predicted", "um", "Eq. 6"),
-    "spot_width_um": ("width of a spot at half height, in the object", "um", "exact rays"),
-    "spot_radius_um": ("radius of 80 % of a spot's light, in the object", "um", "exact rays"),
+    "fwhm_um": ("full width at half maximum of the PSF on the axis, in the object", "um", "diffraction"),
+    "rms_width_um": ("RMS width of the PSF, in the object", "um", "exact rays"),
+    "half_light_radius_um": ("radius of half of the light, in the object", "um", "exact rays"),
+    "spot_radius_um": ("radius of 80 % of the light, in the object", "um", "exact rays"),
     "blur_um": ("blur of a thin lens on the sensor", "um", ""),
     "focus_distance_mm": ("image at", "mm", ""),
     "depth_of_field_mm": ("depth of field, if focused there", "mm", "Eq. 8"),
@@ -62,8 +64,8 @@ def datasheet_rows(design: Design, sheet: Mapping[str, Any]) -> list[Row]:
             return ""
         if key == "blur_um" and value > circle_of_confusion:
             return f"out of focus: more than the circle of confusion, {circle_of_confusion:.3g} um"
-        if key == "spot_width_um" and value > _FAR * sheet["lateral_resolution_um"][i]:
-            return "more than twice the prediction of Eq. 5"
+        if key == "rms_width_um" and sheet["spot_width_um"][i] > _FAR * sheet["lateral_resolution_um"][i]:
+            return "2.355 times it, as of a Gaussian, is more than twice the prediction of Eq. 5"
         if key == "occupancy" and value > 1:
             return "sub-images of an object that fills the field overlap"
         return ""
