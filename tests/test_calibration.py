@@ -450,7 +450,7 @@ def test_the_command(tmp_path):
     new = read_design(tmp_path / "new.toml").imager()
     np.testing.assert_allclose(new.centers, actual.centers, atol=2e-3)
     assert float(new.sensor_distance) == pytest.approx(float(actual.sensor_distance), abs=5e-3)
-    assert "standard_deviations" in read_provenance(tmp_path / "new.toml") and (tmp_path / "new.png").exists()
+    assert "standard_deviations" in read_provenance(tmp_path / "new.toml") and (tmp_path / "new.toml.png").exists()
     shown = CliRunner().invoke(commands, ["metrics", str(tmp_path / "new.toml")], catch_exceptions=False).stdout
     assert "calibrated by" in shown and "sensor_distance_mm +- " in shown
     assert new.tilt is not None and "calibrated_values" in read_provenance(tmp_path / "new.toml")

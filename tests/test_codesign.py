@@ -66,7 +66,7 @@ def test_files(table1, outcome, tmp_path):
     path = tmp_path / "new.toml"
     check_outputs(path)
     paths = write_outcome(path, outcome, parent="a/table1.toml", source="b/study.toml")
-    assert [p.name for p in paths] == ["new.toml", "new.json", "new.png"] and all(p.exists() for p in paths)
+    assert [p.name for p in paths] == ["new.toml", "new.toml.json", "new.toml.png"] and all(p.exists() for p in paths)
     written = read_design(path)
     assert written.provenance["parent"] == "table1.toml" and written.provenance["study"] == "study.toml"
     assert written.provenance["objectives"]["occupancy"][1] <= 0.5

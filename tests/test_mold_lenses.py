@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import manifold3d as m3
 import numpy as np
@@ -10,8 +11,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.integrate import quad
 
-from gs_jax import MicrolensArray
+from gs_jax import Imager, MicrolensArray, Sensor
+from gs_jax.codesign import search_report
 from gs_jax.design.design import Design
+from gs_jax.io.files import checkpoint_path, side_file
+from gs_jax.io.provenance import KEY, read_provenance
+from gs_jax.mold import make
 from gs_jax.mold.export import float32_mesh, make_mask
 from gs_jax.mold.lenslets import DRAFT, Lenslet, lenslet_height, lenslets_of, tessellate, visible_radii
 from gs_jax.mold.make import check_measurement, draw_preview, make_mold
@@ -21,6 +26,7 @@ from gs_jax.mold.solids import (
     MoldShape,
     array_solid,
     array_volume,
+    default_chord,
     lenslets_volume,
     max_chord,
     mold_solid,
@@ -258,7 +264,7 @@ def test_a_design_of_unequal_lenses_is_made(tmp_path):
     np.testing.assert_allclose(report["lens_radius_mm"], [2.0, 1.7], rtol=1e-3)
     np.testing.assert_allclose(report["lens_conic_constant"], [0, -1], atol=0.01)
     assert "turned over about x" in report["frame"] and "(sensor's side)" in report["frame"]
-    assert json.loads((tmp_path / "a.json").read_text())["lens_conic_constant"] == report["lens_conic_constant"]
+    assert json.loads((tmp_path / "a.stl.json").read_text())["lens_conic_constant"] == report["lens_conic_constant"]
     text = {finding["check"]: finding["text"] for finding in report["checks"]}
     assert "= 3.953 to 4.651 mm" in text["focal length"] and "slope by up to" in text["edge slope"]
 
@@ -299,3 +305,48 @@ def test_a_lens_that_is_too_steep_is_named():
     with pytest.raises(ValueError, match="at most 1.932 mm for lens 2, got 1.99"):
         array_solid(unequal(aperture_diameter=[1.0, 1.99, 1, 1, 1], radius_of_curvature=1.0, conic_constant=0.0))
     assert plate_thickness(unequal()) == pytest.approx(1 - lenslet_height(unequal()))
+
+
+@pytest.mark.parametrize(
+    ("diameter", "radius", "conic"), [(0.13, 0.13, 0.0), (0.1, 0.2, -0.6), (0.05, 0.05, 0.0), (0.05, 0.2, 0.0)]
+)
+def test_small_lenses_are_made_and_measured_by_default(diameter, radius, conic):
+    """The chord follows the height of the lens, down to 1.6 um: coarser facets left none to measure, or wild conics."""
+    centers = diameter * CENTERS[:, ::-1]
+    array = MicrolensArray(
+        centers,
+        size=(3 * diameter, 4 * diameter),
+        aperture_diameter=diameter,
+        radius_of_curvature=radius,
+        conic_constant=conic,
+        substrate_thickness=0.3,
+    )
+    chord = default_chord(array)
+    assert chord == pytest.approx(0.01 * lenslet_height(array)) and chord < 4e-4
+    imager = Imager(array, Sensor((100, 100), 1e-3), sensor_distance=radius / 0.43, field_radius=1.0)
+    for part in (chord, max_chord(lenslets_of(array))):
+        summary = summarize(measure_lenslets(float32_mesh(array_solid(array, part)), array), imager)
+        (lenses, *_) = check_measurement(summary, chord=part, radius=radius)
+        # The coarsest facets may leave too few for some lenses, which then are not measured.
+        assert lenses.level == "ok" or not summary["lenses_measured"], lenses.text
+        assert summary["lenses_measured"] == len(centers) or part > chord
+
+
+def test_files_beside_outputs_of_different_commands_differ():
+    outputs = [Path("focused.stl"), Path("focused.toml"), Path("focused.json"), Path("focused.npz")]
+    beside = [
+        *make.side_files(outputs[0]),
+        *search_report.side_files(outputs[1]),
+        side_file(outputs[2], ".png"),
+        *(side_file(outputs[3], suffix) for suffix in (".json", ".checkpoint")),
+    ]
+    assert len({*outputs, *beside}) == len(outputs) + len(beside)
+
+
+def test_files_of_older_versions_are_still_read(tmp_path):
+    (tmp_path / "old.stl").touch()
+    (tmp_path / "old.json").write_text(json.dumps({KEY: {"gs_jax": "0.1"}}))
+    assert read_provenance(tmp_path / "old.stl") == {"gs_jax": "0.1"}
+    (tmp_path / "new.checkpoint").touch()
+    assert checkpoint_path(tmp_path / "new.toml", resume=True) == tmp_path / "new.checkpoint"
+    assert checkpoint_path(tmp_path / "new.toml") == tmp_path / "new.toml.checkpoint"

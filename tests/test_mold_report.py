@@ -72,10 +72,10 @@ def test_mold(folder, positive):
     assert result.exit_code == 0, result.exception
     assert {path.name for path in folder.iterdir()} == {
         "design.toml",
-        *(f"part.{s}" for s in ("stl", "png", "json", "txt")),
+        *("part.stl", "part.stl.png", "part.stl.json", "part.stl.txt"),
     }
-    report = json.loads((folder / "part.json").read_text())
-    assert result.output == (folder / "part.txt").read_text()
+    report = json.loads((folder / "part.stl.json").read_text())
+    assert result.output == (folder / "part.stl.txt").read_text()
     array = read_design("design.toml").imager().array
     mesh = trimesh.load_mesh("part.stl")
     assert mesh.is_watertight and len(mesh.faces) == report["facets"]
@@ -87,7 +87,7 @@ def test_mold(folder, positive):
     assert report["verification"]["center_deviation_max_um"] < 0.1
     assert len(report["lens_radius_mm"]) == len(report["lens_center_deviation_um"]) == 5
     assert not [check for check in report["checks"] if check["level"] == "error"]
-    picture = matplotlib.image.imread("part.png")
+    picture = matplotlib.image.imread("part.stl.png")
     assert picture.shape[0] > 500 and picture.std() > 0.1
 
 
@@ -105,7 +105,7 @@ def test_the_options_change_the_mold(folder):
         *("--headroom-mm", 0.5, "--resolution-um", 100, "--no-label"),
     )
     assert result.exit_code == 0, result.exception
-    report = json.loads((folder / "part.json").read_text())
+    report = json.loads((folder / "part.stl.json").read_text())
     assert report["shrinkage_percent"] == 2 and report["draft_deg"] == pytest.approx(5)
     between = plate_thickness(read_design("design.toml").imager().array)
     side = 3 / 0.98 + 2 * (between / 0.98 + 0.5) * math.tan(math.radians(5)) + 2 * 4

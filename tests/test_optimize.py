@@ -68,14 +68,14 @@ def test_optimize(folder, own_terms):
     assert result.exit_code == 0 and "thickness_mm" in result.output and "from geomscope in" in result.output
     distance = read_design("new.toml").imaging.sensor_distance_mm
     assert 1 <= distance / (4.5 / 40 * (23 + 1 / 1.43)) < 1.01
-    assert json.loads((folder / "new.json").read_text())["terms"][1]["met_after"] is True
+    assert json.loads((folder / "new.toml.json").read_text())["terms"][1]["met_after"] is True
     assert "input own.py" in read_provenance(folder / "new.toml")
-    assert (folder / "new.png").exists() and not (folder / "new.checkpoint").exists()
+    assert (folder / "new.toml.png").exists() and not (folder / "new.toml.checkpoint").exists()
 
 
 def test_nothing_is_written_on_wrong_input(folder):
     before = set(folder.iterdir())
-    with pytest.raises(InputError, match="got no checkpoint new.checkpoint"):
+    with pytest.raises(InputError, match="got no checkpoint new.toml.checkpoint"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.toml", "--resume")
     with pytest.raises(InputError, match="got '.json'"):
         run(optimize, "table1.toml", "--study", "study.toml", "-o", "new.json")

@@ -298,7 +298,7 @@ def test_the_command(folder, monkeypatch, capsys):
     numbers = json.loads((folder / "t.json").read_text())
     assert numbers["tolerances"] == ToleranceSpec(position_um=1.0, tilt_deg=0.3).model_dump()
     assert numbers["drawn"]["devices"] == 20 and numbers["provenance"]["command"].startswith("gs-jax tolerance")
-    assert {path.name for path in folder.iterdir()} == {"design.toml", "made.toml", "t.json", "t.png"}
+    assert {path.name for path in folder.iterdir()} == {"design.toml", "made.toml", "t.json", "t.json.png"}
 
 
 @pytest.mark.parametrize(

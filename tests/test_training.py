@@ -24,6 +24,7 @@ from gs_jax.cli.train import train_command as command
 from gs_jax.design.design import read_design
 from gs_jax.detection.unet import UNet, read_weights, suppress
 from gs_jax.io.captures import write_capture
+from gs_jax.io.files import side_file
 from gs_jax.io.volumes import read_volume
 from gs_jax.reconstruction.pipeline import reconstruct
 
@@ -201,8 +202,8 @@ def test_trained_weights_reconstruct(toy_command, tmp_path, monkeypatch):
     """From `train` to the volume: `--weights` is the network of that file and no other."""
     result = toy_command("--steps", 3, "-o", tmp_path / "w.npz")
     assert result.exit_code == 0 and "3 steps" in result.output
-    assert {each.name for each in tmp_path.iterdir()} == {"w.npz", "w.json", "w.checkpoint"}
-    assert (tmp_path / "w.json").read_text().count(".") >= 3 and read_weights(tmp_path / "w.npz").widths == (4, 8)
+    assert {each.name for each in tmp_path.iterdir()} == {"w.npz", "w.npz.json", "w.npz.checkpoint"}
+    assert (tmp_path / "w.npz.json").read_text().count(".") >= 3 and read_weights(tmp_path / "w.npz").widths == (4, 8)
     (tmp_path / "design.toml").write_text(DESIGN)
     capture = np.random.default_rng(0).integers(0, 99, (96, 80)).astype(np.uint16)
     write_capture(tmp_path / "capture.tif", capture)
@@ -232,18 +233,18 @@ def test_the_command_goes_on_where_it_was_interrupted(toy_command, tmp_path, mon
     with monkeypatch.context() as patched:
         patched.setattr(sys.modules["gs_jax.apps.training.training_loop"], "paper_recipe", lambda: toy(batch=batch))
         assert toy_command("--steps", 5, "-o", broken).exit_code == 1
-    assert not broken.exists() and broken.with_suffix(".checkpoint").exists()
+    assert not broken.exists() and side_file(broken, ".checkpoint").exists()
     assert toy_command("--steps", 5, "--resume", "-o", broken).exit_code == 0
     assert_equal(read_weights(broken), read_weights(whole))
-    assert broken.with_suffix(".json").read_text() == whole.with_suffix(".json").read_text()
+    assert side_file(broken, ".json").read_text() == side_file(whole, ".json").read_text()
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
         (("-o", "w.txt"), ".npz"),
-        (("--resume", "-o", "w.npz"), "w.checkpoint"),
-        (("--network", "multislice", "--resume", "-o", "w.npz"), "w.checkpoint"),
+        (("--resume", "-o", "w.npz"), "w.npz.checkpoint"),
+        (("--network", "multislice", "--resume", "-o", "w.npz"), "w.npz.checkpoint"),
     ],
 )
 def test_wrong_arguments_write_nothing(toy_command, tmp_path, monkeypatch, arguments, message):

@@ -6,7 +6,7 @@ import click
 
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.files import check_output
+from ..io.files import check_output, side_file
 from .light import Light, light_options
 from .options import DESIGN, CaptureOptions, capture_options
 from .outputs import check_may_write, force_option, provenance_of
@@ -58,7 +58,11 @@ class _Names(click.ParamType):
     "fits rotation, shift and scale of the lenses' pattern; with CAPTURES, scale beside the rest.",
 )
 @click.option(
-    "-o", "--output", type=Path, required=True, help="CALIBRATED.toml; a picture of the residuals is written beside it."
+    "-o",
+    "--output",
+    type=Path,
+    required=True,
+    help="CALIBRATED.toml; a picture of the residuals, CALIBRATED.toml.png, is written beside it.",
 )
 @light_options
 @capture_options
@@ -116,7 +120,7 @@ def calibrate_command(
             "calibrate needs captures with --positions POINTS.csv, or a --pattern, or one capture with --from-scene."
         )
     check_output(output, [".toml"])
-    drawing = check_output(output.with_suffix(".png"), [".png"])
+    drawing = check_output(side_file(output, ".png"), [".png"])
     pictures = (*captures, *([pattern] if pattern else []))
     inputs = (design, *pictures, *([positions] if positions else []), *camera.files)
     check_may_write(output, drawing, inputs=inputs, force=force)

@@ -9,7 +9,7 @@ import click
 from ..apps.tolerance_spec import ToleranceSpec
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
-from ..io.files import check_output, write_json
+from ..io.files import check_output, side_file, write_json
 from .light import Light, check_beyond, objects_in, sample_options
 from .options import DESIGN, UM, Depths, Number, given_options
 from .outputs import check_may_write, force_option, provenance_of
@@ -22,26 +22,38 @@ PERCENT, DRAFT, HEADROOM = Number(0.0, 20.0, "%"), Number(0.0, 30.0, "degrees"),
 @click.argument("design", type=DESIGN)
 @click.option("-o", "--output", type=Path, required=True, help="MOLD.stl or MOLD.3mf.")
 @click.option("--positive", is_flag=True, help="Make the array itself instead of its mold.")
-@click.option("--chord-um", type=SMALL_UM, default=0.4, help="Largest distance between a facet and the lens surface.")
+@click.option(
+    "--chord-um",
+    type=SMALL_UM,
+    help="Largest distance between a facet and the lens surface.  [default: 0.4; less if lenses are below 40 um high]",
+)
 @click.option("--shrinkage-percent", type=PERCENT, default=0.0, help="Of the cast material; the part is made larger.")
 @click.option("--draft-deg", type=DRAFT, default=0.0, help="Of the walls' inner faces. Silicone needs none.")
 @click.option("--headroom-mm", type=HEADROOM, default=0.0, help="Walls above the array; 0 to cast under a glass plate.")
 @click.option("--resolution-um", type=FEATURE_UM, default=25.0, help="Smallest feature of the printer.")
 @click.option("--layer-um", type=FEATURE_UM, help="Thickness of the printer's layers, if any.")
 @click.option("--label/--no-label", default=True, help="Engrave the design's name in the rim.")
-def mold_command(design: Path, output: Path, positive: bool, label: bool, layer_um: float | None, **sizes: float):
+def mold_command(
+    design: Path,
+    output: Path,
+    positive: bool,
+    label: bool,
+    chord_um: float | None,
+    layer_um: float | None,
+    **sizes: float,
+):
     """Make the negative mold of the array of the file DESIGN, to print and cast the array in.
 
     Units are mm. The lenses face -z. If the plano side faces the object, x and y are the design's; if the curved side
-    does, the array is turned over about x, and y is reversed. A picture (.png) and a report (.json, .txt) of the same
-    name are written beside it; the mold is read back and measured.
+    does, the array is turned over about x, and y is reversed. A picture (MOLD.stl.png) and a report
+    (MOLD.stl.json, MOLD.stl.txt) are written beside it; the mold is read back and measured.
     """
     from ..design.design import design_text, read_design
     from ..mold.export import MESH_SUFFIXES
-    from ..mold.make import make_mold, report_text
+    from ..mold.make import make_mold, report_text, side_files
     from ..mold.solids import MoldShape
 
-    beside = [check_output(output.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt")]
+    beside = [check_output(path, [path.suffix]) for path in side_files(output)]
     check_output(output, MESH_SUFFIXES)
     if positive and (given := given_options(("draft_deg", "headroom_mm"))):
         raise InputError(f"{given[0]} must be used without --positive: it is of the mold's walls.")
@@ -53,7 +65,7 @@ def mold_command(design: Path, output: Path, positive: bool, label: bool, layer_
         shrinkage=sizes["shrinkage_percent"] / 100,
         label=microscope.name if label else "",
     )
-    accuracy = {"chord": sizes["chord_um"] / 1000, "resolution": sizes["resolution_um"] / 1000}
+    accuracy = {"chord": chord_um and chord_um / 1000, "resolution": sizes["resolution_um"] / 1000}
     provenance = provenance_of(design, design=design_text(microscope))
     with Progress() as progress, errors_name_file(design):
         options = {"positive": positive, "shape": shape, "layer": layer_um and layer_um / 1000, **accuracy}
@@ -69,7 +81,7 @@ def mask_command(design: Path, output: Path):
 
     Openings are the lenses' clear apertures. The sheet has the size and alignment marks of the mold, and is seen from
     above, from the plano side of the lenses. DXF and SVG are in mm, GDSII in um (needs `pip install 'gs-jax[gds]'`). A
-    .json of the same name has the provenance.
+    file of its name plus .json has the provenance.
     """
     from ..design.conversion import AIR
     from ..design.design import design_text, read_design
@@ -137,7 +149,9 @@ def _options(command):
 
 @click.command("tolerance", epilog="Example: gs-jax tolerance geomscope --sensor-distance-um 20 -o tolerance.json")
 @click.argument("design", type=DESIGN)
-@click.option("-o", "--output", type=Path, help="TOLERANCE.json: write the numbers, and a picture (.png) beside it.")
+@click.option(
+    "-o", "--output", type=Path, help="TOLERANCE.json: write the numbers, and beside it a picture (.json.png)."
+)
 @click.option("--tolerances", "file", type=Path, help="TOML file of tolerances: position_um = 3.0 and so on.")
 @_options
 @click.option("--max-width-um", type=UM, help="Target: width of spots in the object.  [default: 1.2 of the design's]")
@@ -187,7 +201,7 @@ def tolerance_command(
 
     # Single precision would leave errors of micrometres.
     jax.config.update("jax_enable_x64", True)
-    drawing = output and output.with_suffix(".png")
+    drawing = output and side_file(output, ".png")
     if output and drawing:
         check_output(output, [".json"])
         check_output(drawing, [".png"])

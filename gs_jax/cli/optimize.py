@@ -7,7 +7,7 @@ import click
 from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
-from ..io.files import check_output, make_folder, write_json
+from ..io.files import check_output, checkpoint_path, make_folder, write_json
 from .options import DESIGN, terms_option, worker_options
 from .outputs import PARTIAL, RESUMABLE, check_may_write, force_option, partial_outputs, provenance_of
 
@@ -25,23 +25,21 @@ def optimize_command(
 ):
     """Search for a better microscope than that of the file DESIGN, and compare both.
 
-    NEW.json (the terms, every start and step) and NEW.png (layout and history) are written beside NEW.toml. Workers run
-    the starts of the study's first stage.
+    NEW.toml.json (the terms, every start and step) and NEW.toml.png (layout and history) are written beside it. Workers
+    run the starts of the study's first stage.
     """
     import jax
     from rich.console import Console
 
     from ..codesign import search
-    from ..codesign.search_report import before_and_after, check_outputs, write_outcome
-    from ..codesign.solve import checkpoint_path
+    from ..codesign.search_report import before_and_after, check_outputs, side_files, write_outcome
     from ..codesign.terms import add_terms
 
     check_outputs(output)
-    beside = (output.with_suffix(suffix) for suffix in (".json", ".png"))
-    check_may_write(output, *beside, inputs=(design, study, terms), force=force)
+    check_may_write(output, *side_files(output), inputs=(design, study, terms), force=force)
     # Single precision stops far from the minimum.
     jax.config.update("jax_enable_x64", True)
-    checkpoint = checkpoint_path(output)
+    checkpoint = checkpoint_path(output, resume=resume)
     if resume and not checkpoint.exists():
         raise InputError(f"--resume must be used after an interrupted run, got no checkpoint {checkpoint}.")
     if terms is not None:

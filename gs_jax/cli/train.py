@@ -9,7 +9,7 @@ import click
 from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
-from ..io.files import check_output, write_json
+from ..io.files import check_output, checkpoint_path, side_file, write_json
 from .light import LIGHT_OPTIONS, Light, check_beyond, sample_options
 from .options import (
     CAPTURE_OPTIONS,
@@ -71,7 +71,7 @@ def train_command(
     """Train a network: for background suppression the paper's, or ours of seven slices; or for the unrolled inversion.
 
     Workers simulate the captures for training. Beside WEIGHTS.npz are written WEIGHTS.json, the losses,
-    WEIGHTS.checkpoint, which remains after an interrupt, and for multislice the folder WEIGHTS-stacks of simulated
+    WEIGHTS.npz.checkpoint, which remains after an interrupt, and for multislice the folder WEIGHTS-stacks of simulated
     captures (0.4 GB), which may be deleted.
 
     \b
@@ -112,7 +112,7 @@ def train_command(
     from ..solvers.unrolled import write_unrolled
 
     steps = steps or STEPS[network]
-    checkpoint, history = output.with_suffix(".checkpoint"), output.with_suffix(".json")
+    checkpoint, history = checkpoint_path(output, resume=resume), side_file(output, ".json")
     check_output(history, [".json"])
     check_may_write(output, history, inputs=())
     partial_outputs[checkpoint] = RESUMABLE
@@ -176,7 +176,7 @@ def _from_captures(
     if files is None:
         raise InputError(f"--from-captures must be a folder of captures, got {folder}.")
     check_number(files)
-    history, made = output.with_suffix(".json"), output.with_suffix(".toml")
+    history, made = side_file(output, ".json"), output.with_suffix(".toml")
     if made.exists() and design.exists() and made.samefile(design):
         raise InputError(
             f"-o must have another name than {design}: the fitted design is written beside WEIGHTS, got {output}."

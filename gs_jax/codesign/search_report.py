@@ -14,7 +14,7 @@ from rich.table import Table
 from ..design.datasheets import six_digits
 from ..design.design import Design, write_design
 from ..design.validation import of_each
-from ..io.files import check_output, write_figure, write_json
+from ..io.files import check_output, side_file, write_figure, write_json
 from ..io.provenance import Provenance
 from ..lenses import lenses_by_type
 from ..pictures import PALETTE
@@ -67,7 +67,7 @@ def write_outcome(
         The files.
     """
     path, study, records = Path(path), outcome.study, as_records(outcome)
-    paths = [path, path.with_suffix(".json"), path.with_suffix(".png")]
+    paths = [path, *side_files(path)]
     history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
     write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
     write_figure(paths[2], picture(outcome))
@@ -153,5 +153,10 @@ def _draw_layout(axes: Axes, design: Design) -> None:
 def check_outputs(path: Path) -> None:
     """Raise `InputError` unless the design, the numbers and the picture can be written."""
     check_output(path, [".toml"])
-    check_output(path.with_suffix(".json"), [".json"])
-    check_output(path.with_suffix(".png"), [".png"])
+    for beside in side_files(path):
+        check_output(beside, [beside.suffix])
+
+
+def side_files(path: Path) -> list[Path]:
+    """The files of numbers and of the picture beside a new design."""
+    return [side_file(path, suffix) for suffix in (".json", ".png")]

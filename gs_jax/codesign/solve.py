@@ -315,11 +315,6 @@ def restore_state(path: Path, state: bytes, like: State) -> State:
         return eqx.tree_deserialise_leaves(io.BytesIO(state), like)
 
 
-def checkpoint_path(output: Path) -> Path:
-    """Path of the checkpoint beside an output file."""
-    return output.with_suffix(".checkpoint")
-
-
 def _digest(study: Study, design: Design) -> str:
     own = "".join(TERMS[term.name].source for term in study.terms)
     return hashlib.sha256((study.model_dump_json() + design.model_dump_json() + own).encode()).hexdigest()

@@ -96,6 +96,17 @@ def check_output(path: PathLike, suffixes: Sequence[str]) -> Path:
     return Path(path)
 
 
+def side_file(path: PathLike, suffix: str) -> Path:
+    """The path of a file that is written beside an output, such as `new.toml.json`: those of two outputs differ."""
+    return Path(f"{os.fspath(path)}{suffix}")
+
+
+def checkpoint_path(output: Path, *, resume: bool = False) -> Path:
+    """Path of the checkpoint beside an output file; to `resume` the one of an older version, if there is no other."""
+    path, older = side_file(output, ".checkpoint"), output.with_suffix(".checkpoint")
+    return older if resume and older.exists() and not path.exists() else path
+
+
 def make_folder(path: PathLike) -> Path:
     """Make a folder and its parents if they are missing; `InputError` if it cannot be made or written to."""
     path = Path(path)

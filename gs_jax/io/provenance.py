@@ -22,7 +22,7 @@ from .._version import __version__
 from ..base.errors import input_error
 from ..grid import Grid
 from ..typing import PathLike
-from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, write_json
+from .files import TIFF_SUFFIXES, check_input, check_suffix, decoding, read_text, side_file, write_json
 from .names import plain_text
 
 Provenance = Mapping[str, str]
@@ -52,7 +52,7 @@ def input_key(path: Path) -> str:
 
 def sidecar(path: PathLike) -> Path:
     """The file beside one that has no place for its provenance."""
-    return Path(f"{path}.json")
+    return side_file(path, ".json")
 
 
 def write_sidecar(path: PathLike, provenance: Provenance | None) -> None:
@@ -131,7 +131,8 @@ _READERS: dict[str, Callable[[Path], dict]] = {
     ".toml": lambda path: tomllib.loads(read_text(path)).get(KEY, {}),
     ".npz": _from_weights,
     ".3mf": _from_3mf,
-    ".stl": lambda path: _from_json_if_there(path.with_suffix(".json")),
+    # The second name is that of older versions.
+    ".stl": lambda path: _from_json_if_there(sidecar(path)) or _from_json_if_there(path.with_suffix(".json")),
     ".json": _from_json,
     **dict.fromkeys(
         (".npy", ".csv", ".dxf", ".svg", ".gds", ".xyz", ".dat", ".ply"),

@@ -3,6 +3,7 @@
 import math
 import os
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import manifold3d as m3
@@ -16,7 +17,7 @@ from ..base.errors import InputError
 from ..base.progress import Progress
 from ..design.conversion import AIR
 from ..design.design import Design, read_design
-from ..io.files import atomic_write, check_output, write_figure, write_json, write_text
+from ..io.files import atomic_write, check_output, side_file, write_figure, write_json, write_text
 from ..io.provenance import KEY, Provenance
 from ..lenses import MicrolensArray
 from ..typing import PathLike
@@ -24,7 +25,16 @@ from .export import MESH_SUFFIXES, check_mesh_reader, float32_mesh, read_mesh, w
 from .lenslets import lenslets_of, part_centers, surface_height
 from .manufacturability import CheckResult, check_design, check_solid, raise_first_error
 from .measurement import measure_lenslets, summarize
-from .solids import MoldShape, array_solid, array_volume, mold_solid, mold_volume, preview_solid, volume_tolerance
+from .solids import (
+    MoldShape,
+    array_solid,
+    array_volume,
+    default_chord,
+    mold_solid,
+    mold_volume,
+    preview_solid,
+    volume_tolerance,
+)
 
 # Deviations from the design that are accepted, mm, relative, absolute: far below what calibration corrects.
 CENTER_TOLERANCE, RADIUS_TOLERANCE, CONIC_TOLERANCE = 1e-3, 1e-3, 1e-2
@@ -46,7 +56,7 @@ def make_mold(
     *,
     positive: bool = False,
     shape: MoldShape = MoldShape(),
-    chord: float = 4e-4,
+    chord: float | None = None,
     resolution: float = 0.025,
     layer: float | None = None,
     provenance: Provenance | None = None,
@@ -69,7 +79,8 @@ def make_mold(
     shape
         Body of the mold. Its shrinkage also enlarges the array.
     chord
-        Chordal tolerance: the largest distance between a facet and the lens surface, mm.
+        Chordal tolerance: the largest distance between a facet and the lens surface, mm. By default 0.4 um, or a
+        hundredth of the height of the lowest lens if that is less.
     resolution
         Smallest feature that the printer makes, mm.
     layer
@@ -99,18 +110,19 @@ def make_mold(
     >>> few = design.array.model_copy(update={"centers_mm": ((-0.5, 0.1), (0.6, 0.0)), "size_mm": (3.0, 3.0)})
     >>> report = gs.make_mold(design.model_copy(update={"array": few}), "mold.stl", chord=0.002)
     >>> sorted(path.name for path in Path().glob("mold.*"))
-    ['mold.json', 'mold.png', 'mold.stl', 'mold.txt']
+    ['mold.stl', 'mold.stl.json', 'mold.stl.png', 'mold.stl.txt']
     """
     progress = progress or Progress()
     path = check_output(path, MESH_SUFFIXES)
     check_mesh_reader(path)
-    picture, record, text = (check_output(path.with_suffix(suffix), [suffix]) for suffix in (".png", ".json", ".txt"))
+    picture, record, text = (check_output(beside, [beside.suffix]) for beside in side_files(path))
     source = f"design {design.name!r}" if isinstance(design, Design) else os.fspath(design)
     design = design if isinstance(design, Design) else read_design(design)
-    checks = check_design(design, shape, chord=chord, resolution=resolution, layer=layer)
-    raise_first_error(checks, InputError, source)
     imager = design.imager(AIR)
     array = imager.array
+    chord = default_chord(array) if chord is None else chord
+    checks = check_design(design, shape, chord=chord, resolution=resolution, layer=layer)
+    raise_first_error(checks, InputError, source)
     part = array_solid(array, chord, progress=progress)
     with progress.step("Building and checking the solid"):
         solid = part.scale([shape.scale] * 3) if positive else mold_solid(array, part, shape)
@@ -124,6 +136,9 @@ def make_mold(
         write_mesh(temporary, mesh, f"{design.name} {name}", provenance)
         lenses = measure_lenslets(read_mesh(temporary), array, scale=shape.scale)
         summary = summarize(lenses, imager)
+        if not summary["lenses_measured"]:
+            text = f"the chord error must be finer, got {1000 * chord:g} um, which leaves each lens too few facets"
+            raise InputError(f"{source}: {text} to be measured (--chord-um).")
         checks += check_measurement(summary, chord=chord, radius=min(each.radius for each in lenslets_of(array)))
         raise_first_error(checks, RuntimeError)
     report = {
@@ -153,6 +168,11 @@ def make_mold(
     write_json(record, report | ({KEY: dict(provenance)} if provenance else {}))
     write_text(text, report_text(report), [".txt"])
     return report
+
+
+def side_files(path: PathLike) -> list[Path]:
+    """The picture, the report for programs and the one for people beside a mold."""
+    return [side_file(path, suffix) for suffix in (".png", ".json", ".txt")]
 
 
 def check_measurement(summary: dict[str, Any], *, chord: float, radius: float) -> list[CheckResult]:

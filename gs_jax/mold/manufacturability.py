@@ -179,12 +179,12 @@ def _check_coverage(array: MicrolensArray) -> CheckResult:
 def _check_chord(array: MicrolensArray, chord: float, resolution: float) -> CheckResult:
     lenslets, given = lenslets_of(array), f"got {1000 * chord:g} um"
     if chord > (limit := max_chord(lenslets)):
-        text = f"the chord error must be at most {1000 * limit:.4g} um, a tenth of the height of a lens, {given}."
-        return CheckResult("facets", "error", text)
+        text = f"the chord error must be at most {1000 * limit:.4g} um, a tenth of the height of a lens, {given}"
+        return CheckResult("facets", "error", f"{text} (--chord-um).")
     if (count := estimate_facet_count(lenslets, visible_radii(lenslets, array.plate), chord)) > MAX_FACETS:
         least = 1000 * chord * count / MAX_FACETS
-        text = f"the chord error must be at least {least:.2g} um, {given}, which takes about {count:.2g} facets."
-        return CheckResult("facets", "error", text)
+        text = f"the chord error must be at least {least:.2g} um, {given}, which takes about {count:.2g} facets"
+        return CheckResult("facets", "error", f"{text} (--chord-um).")
     text = f"facets within {1000 * chord:g} um of the lenses"
     visible = f": the printer, with {1000 * resolution:g} um, may show them."
     return _warn_if(chord > resolution / 4, "facets", text, visible)

@@ -18,10 +18,14 @@ from .lenslets import NODES, WEIGHTS, Lenslet, lenslets_of, part_centers, surfac
 # A facet belongs to a lenslet if its corners are this close to the surface, its normal is this well aligned, and the
 # lenslet is higher than others by this margin: near a groove, facets are ambiguous.
 _MAX_DISTANCE, _MIN_ALIGNMENT, _MARGIN = 0.02, math.cos(math.radians(20)), 2e-3
-# Five unknowns and one to check them.
-_MIN_VERTICES = 6
+# Of low lenses distance and margin are at most these parts of the height.
+_DISTANCE_PART, _MARGIN_PART = 1.0, 0.05
+# Four unknowns and two to check them; with a free conic constant, enough that scatter is no shape.
+_MIN_VERTICES, _MIN_CONIC_VERTICES = 6, 12
 # RMS rounding error of float32 coordinates around 10 mm.
 _ROUNDING = 3e-7
+# Least height of a conic's surface over its middle, in radii of curvature, in its derivatives.
+_LEAST_ROOT = 1e-3
 # Vertices are outliers beyond this multiple of the median distance.
 _OUTLIER = 10
 # Largest standard deviations of what is reported: of conic constants; of centres, mm, and relative radii.
@@ -101,7 +105,7 @@ def _fit_all(vertices, facets, fits: list[_Fit]) -> tuple[list[_Fit], np.ndarray
     """Fits all lenslets to the vertices near the given ones; also returns the lenslet of each facet, -1 for none."""
     owner = _assign(vertices[facets], fits)
     if (owner < 0).all():
-        raise ValueError(f"`mesh` has no facet within {_MAX_DISTANCE} mm of any lens of the array.")
+        raise ValueError("`mesh` has no facet near any lens of the array.")
     # Vertices between lenslets belong to facets of both, those on a rim also to the plate: neither are on a surface.
     lowest, highest = np.full(len(vertices), len(fits)), np.full(len(vertices), -1)
     np.minimum.at(lowest, facets, owner[:, None])
@@ -118,15 +122,16 @@ def _group(owner, count: int) -> list[np.ndarray]:
 
 
 def _assign(corners, fits: list[_Fit]):
-    middle = corners.mean(axis=1)
-    _, owner = surface_height([fit.lenslet for fit in fits], middle[:, :2], _MARGIN)
+    middle, height = corners.mean(axis=1), max(fit.lenslet.rim_sag for fit in fits)
+    margin, most = min(_MARGIN, _MARGIN_PART * height), min(_MAX_DISTANCE, _DISTANCE_PART * height)
+    _, owner = surface_height([fit.lenslet for fit in fits], middle[:, :2], margin)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for its, fit in zip(_group(owner, len(fits)), fits, strict=True):
         distance = np.abs(_distance(corners[its], fit)[0]).max(axis=1)
         _, expected = _distance(middle[its], fit)
         cosine = np.abs((normal[its] * expected).sum(axis=1))
         aligned = cosine > _MIN_ALIGNMENT * np.linalg.norm(normal[its], axis=1)
-        owner[its[~(aligned & (distance < _MAX_DISTANCE))]] = -1
+        owner[its[~(aligned & (distance < most))]] = -1
     return owner
 
 
@@ -153,16 +158,22 @@ def _fit(fit: _Fit, points) -> _Fit:
     for _ in range(3):
         fit = _gauss_newton(fit, points, 4)
     residual, jacobian = _linearize(fit, points)
+    if not np.isfinite(jacobian).all():
+        return replace(fit, vertices=len(points), determined=False)
     misfit = float(np.sqrt((residual**2).mean()))
     x, y, _, radius = _deviations(jacobian[:, :4], misfit)
     determined = bool(max(x, y, radius / fit.lenslet.radius) < _MAX_DEVIATION)
     fit = replace(fit, misfit=misfit, conic=math.nan, vertices=len(points), determined=determined)
-    if not determined or _deviations(jacobian, 0.0)[-1] > _MAX_CONIC_DEVIATION:
+    few = len(points) < _MIN_CONIC_VERTICES
+    if not determined or few or _deviations(jacobian, 0.0)[-1] > _MAX_CONIC_DEVIATION:
         return replace(fit, conic_deviation=math.nan)
     free = fit
     for _ in range(6):
         free = _gauss_newton(free, points, 5)
     residual, jacobian = _linearize(free, points)
+    # With one more unknown a fit that has converged is no worse.
+    if not float(np.sqrt((residual**2).mean())) <= misfit + _ROUNDING:
+        return replace(fit, conic_deviation=math.nan)
     scatter = math.sqrt((residual**2).sum() / max(len(points) - 5, 1))
     return replace(fit, conic=free.lenslet.conic, conic_deviation=float(_deviations(jacobian, scatter)[-1]))
 
@@ -170,6 +181,8 @@ def _fit(fit: _Fit, points) -> _Fit:
 def _gauss_newton(fit: _Fit, points, unknowns: int, weight=1.0) -> _Fit:
     """One step in centre, vertex, radius and, as the fifth unknown, conic constant."""
     residual, jacobian = _linearize(fit, points)
+    if not np.isfinite(jacobian).all():  # a step before this one went far beyond all lenses
+        return fit
     weighted = (jacobian[:, :unknowns].T * weight).T
     x, y, vertex, radius, conic = (*np.linalg.lstsq(weighted, weight * residual, rcond=1e-12)[0], 0.0)[:5]
     lens = fit.lenslet
@@ -182,7 +195,8 @@ def _linearize(fit: _Fit, points):
     lens = fit.lenslet
     residual, normal = _distance(points, fit)
     squared = np.minimum(((points[:, :2] - lens.center) ** 2).sum(axis=1), lens.semi_aperture**2)
-    root = np.sqrt(lens.radius**2 - (1 + lens.conic) * squared)
+    # A step on the way may be a conic that ends within the lens.
+    root = np.sqrt(np.maximum(lens.radius**2 - (1 + lens.conic) * squared, (_LEAST_ROOT * lens.radius) ** 2))
     by_radius = -squared / (root * (lens.radius + root))
     by_conic = squared**2 / (2 * root * (lens.radius + root) ** 2)
     return residual, np.column_stack([normal, normal[:, 2] * by_radius, normal[:, 2] * by_conic])

@@ -34,6 +34,8 @@ from .lenslets import (
 
 ENGRAVING_DEPTH = 0.4
 MIN_LENS_DISTANCE = 1e-3
+# The chordal tolerance of lenses of 40 um height and more, mm.
+_CHORD = 4e-4
 # More facets take gigabytes of memory and of disk.
 MAX_FACETS = 5_000_000
 # Relative; facets within 0.5 um of the lenses reach 1e-5.
@@ -131,6 +133,11 @@ def array_solid(array: MicrolensArray, chord: float = 5e-4, *, progress: Progres
 def max_chord(lenslets: list[Lenslet]) -> float:
     """The coarsest chordal tolerance, a tenth of the lowest lens, mm."""
     return 0.1 * min(lenslet.rim_sag for lenslet in lenslets)
+
+
+def default_chord(array: MicrolensArray) -> float:
+    """The chordal tolerance of a part by default, mm: 0.4 um, or a hundredth of the lowest lens."""
+    return min(_CHORD, 0.01 * min(lenslet.rim_sag for lenslet in lenslets_of(array)))
 
 
 def preview_solid(array: MicrolensArray, shape: MoldShape | None) -> m3.Manifold:
