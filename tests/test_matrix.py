@@ -107,7 +107,7 @@ def layered_combined() -> Design:
 def small_lenses() -> Design:
     """Lenses of 0.1 mm, 4 um high, in a device that is a twentieth as large."""
     design, scale = cropped("geomscope"), 0.05
-    times = lambda values: tuple(tuple(scale * x for x in value) for value in values)
+    times = lambda values: tuple(tuple(round(scale * x, 4) for x in value) for value in values)
     return design.replace(
         radius_of_curvature_mm=scale * 2.0,
         aperture_diameter_mm=scale * 2.0,
@@ -117,7 +117,7 @@ def small_lenses() -> Design:
         sensor_distance_mm=scale * 5.8,
         working_distance_mm=(0.9, 1.5),
         field_radius_mm=scale * 3.0,
-        pixel_pitch_um=scale * design.sensor.pixel_pitch_um,
+        pixel_pitch_um=round(scale * design.sensor.pixel_pitch_um, 4),
     )
 
 

@@ -15,6 +15,9 @@ from gs_jax.cli import new_design
 from gs_jax.design.design import Design, design_text, read_design
 from gs_jax.design.keys import commented, design_keys, problem, schema
 from gs_jax.design.start import plate_of, radius_of
+from gs_jax.layouts import nearest_neighbour_distances
+from gs_jax.mold.manufacturability import check_design
+from gs_jax.mold.solids import MoldShape
 
 from .test_cli import folder, run
 from .test_designs import BASE, edited
@@ -97,6 +100,29 @@ def test_a_random_layout(folder, monkeypatch, capsys):
         first, again = (read_design(name).array.centers_mm for name in (f"{seed}.toml", "again.toml"))
         assert len(first) == 30 and (first == again) is same
     assert read_design("0.toml").array.size_mm == (10.35, 6.9)
+
+
+@pytest.mark.parametrize("count", [200, 150, 30])
+def test_random_layouts_fit_the_plate_and_make_a_mold(folder, monkeypatch, capsys, count):
+    """Of a sensor whose half width has five decimals, with lenses that are cut in half nowhere, and no hemispheres."""
+    made = options(centers=None, count=(count,), shape=(2608, 3478), focal_length_mm=(1.2,))
+    status, out, err = run(monkeypatch, capsys, "new-design", *made, "-o", "my.toml")
+    assert (status, err) == (0, "")
+    design = read_design("my.toml")
+    from_edge = (np.array(design.array.size_mm) / 2 - np.abs(design.array.centers_mm)).min()
+    pitch = nearest_neighbour_distances(np.array(design.array.centers_mm)).mean()
+    assert from_edge > 0.45 * pitch
+    lens = design.lens
+    assert lens.aperture_diameter_mm <= 2 * lens.radius_of_curvature_mm / 1.43
+    results = check_design(design, MoldShape(), chord=4e-4, resolution=0.025)
+    assert all(result.level != "error" for result in results)
+
+
+def test_lenses_that_no_mold_makes_are_named(lab, monkeypatch, capsys):
+    steep = options(aperture_diameter_mm=(0.99,), focal_length_mm=None, radius_of_curvature_mm=(0.5,))
+    status, _, err = run(monkeypatch, capsys, "new-design", *steep, "--sensor-distance-mm", 1.2, "-o", "my.toml")
+    assert status == 0 and "my.toml: `gs-jax mold` refuses it: `lens.aperture_diameter_mm` must be" in err
+    assert err.count("\n") == 1
 
 
 def test_mirror_unit_columns_and_corner(lab, monkeypatch, capsys):

@@ -2,9 +2,11 @@
 
 import warnings
 
+import numpy as np
 import pytest
 
 from gs_jax.base.errors import InputError, InputWarning
+from gs_jax.cli.light import ask_for_unit
 from gs_jax.cli.options import shipped_designs
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
@@ -92,3 +94,41 @@ def test_commands_say_it_once_and_go_on(folder, monkeypatch, capsys):
     assert status == 0 and "small" in out and "Warning" not in err
     assert err.splitlines() == [line for line in err.splitlines() if line.startswith("gs-jax: design.toml: imaging.")]
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("reconstruct", "a.tif", "geomscope", "--depths", "12000:15000:250", "-o", "v.tif"),
+            "'--depths': did you mean [12, 15, 0.25] mm ([12000, 15000, 250] um)?",
+        ),
+        (("metrics", "geomscope", "--depths", "18000"), "'--depths': did you mean 18 mm (18000 um)?"),
+        (("deconvolve", "a.tif", "p.tif", "--depths", "18e6", "-o", "v.tif"), "'--depths': did you mean 18 mm"),
+        (
+            ("reconstruct", "a.tif", "geomscope", "--depths", "18", "--voxel-um", "0.06", "-o", "v.tif"),
+            "'--voxel-um': did you mean 60 um (0.06 mm)?",
+        ),
+        (
+            ("layout", "--count", "20", "--size-mm", "6000", "6000", "--pitch-mm", "1.2", "-o", "c.csv"),
+            "'--size-mm': did you mean 6 mm (6000 um)?",
+        ),
+        (
+            ("metrics", "geomscope", "--sample-index", "1.3", "--sample-at", "9000"),
+            "'--sample-at': did you mean 9 mm (9000 um)?",
+        ),
+    ],
+)
+def test_options_in_another_unit_are_asked_for(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run(monkeypatch, capsys, *arguments)
+    assert status == 2 and words in err and err.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_points_in_another_unit_are_asked_for():
+    points = np.array([[0.1, 0.2, 18000.0, 1.0], [0.3, 0.2, 20000.0, 1.0]])
+    with pytest.warns(InputWarning, match=r"p.csv: z_mm = \[18000, 20000\]: did you mean \[18, 20\] mm"):
+        ask_for_unit("p.csv", points)
+    # A far source beside near ones, or alone, is meant.
+    for meant in (points[:1], points * [1, 1, 0.001, 1], np.array([[0, 0, 20.0], [0, 0, 1e4]])):
+        ask_for_unit("p.csv", meant)

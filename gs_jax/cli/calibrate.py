@@ -7,7 +7,7 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output, side_file
-from .light import Light, light_options
+from .light import Light, ask_for_unit, light_options
 from .options import DESIGN, CaptureOptions, capture_options
 from .outputs import check_may_write, force_option, provenance_of
 
@@ -139,6 +139,7 @@ def calibrate_command(
                 outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
         else:
             points, of = read_positions(positions, pictures) if positions else (np.zeros((0, 3)), np.zeros(0, int))
+            ask_for_unit(positions, points)
             points[:, 2] += light.origin(imager) or 0.0
             blurred = [len(captures)] if pattern else []
             if pattern and len(captures) not in of:

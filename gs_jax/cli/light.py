@@ -1,6 +1,7 @@
 """Options of the light's path that several commands share: the sample, the wavelength and the origin of depths."""
 
 import functools
+import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import click
 from ..base.errors import InputError
 from .options import NEAREST, Number
 
-_NM, _SURFACE = Number(10.0, 1e5, "nm"), Number(0.0, 1e4, "mm")
+_NM, _SURFACE = Number(10.0, 1e5, "nm"), Number(0.0, 1e4, "mm", usual=(0.0, 2000.0))
 
 
 class Light(NamedTuple):
@@ -69,6 +70,18 @@ def objects_in(imager) -> str:
     from ..design.conversion import medium_in_words
 
     return f"objects in {medium_in_words(imager)}"
+
+
+def ask_for_unit(path, points) -> None:
+    """Warn, as for keys of designs, if all of several points of a file are so far away that they may be in um."""
+    from ..base.errors import InputWarning
+    from ..design.validation import USUAL, slip
+
+    depths, key = points[:, 2], "imaging.working_distance_mm"
+    if len(depths) > 1 and (depths > USUAL[key][1]).all():
+        ends = sorted({float(depths.min()), float(depths.max())})
+        if question := slip(key, ends, "z_mm"):
+            warnings.warn(f"{path}: {question}", InputWarning, stacklevel=2)
 
 
 def check_beyond(imager, depths: Iterable[float], name: str) -> None:

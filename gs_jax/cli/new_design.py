@@ -60,7 +60,10 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
 )
 @click.option("--refractive-index", type=float, help="Index of lenses and plate.  [default: 1.43, PDMS]")
 @click.option(
-    "--aperture-diameter-mm", type=float, help="Diameter of a lens.  [default: mean nearest-neighbour distance]"
+    "--aperture-diameter-mm",
+    type=float,
+    help="Diameter of a lens.  [default: mean nearest-neighbour distance; with --count 1.46 times the root of the "
+    "plate's area per lens, as the paper's; at most 2 R / n]",
 )
 @click.option("--centers", type=Path, help="Lens centres: a text table with x and y in each line and any header.")
 @click.option(
@@ -78,7 +81,11 @@ def _print_schema(context: click.Context, param: click.Parameter, value: bool) -
 @click.option("--count", type=click.IntRange(1, 100_000), help="Make a random layout of this many lenses.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the random layout.")
 @click.option("--size-mm", type=float, nargs=2, help="Plate, X Y.  [default: around the lenses, or the sensor's]")
-@click.option("--substrate-thickness-mm", type=float, help="Thickness of the plate with lenses.  [default: 1]")
+@click.option(
+    "--substrate-thickness-mm",
+    type=float,
+    help="Thickness of the plate with lenses.  [default: 1, or the lenses' height plus 0.3]",
+)
 @click.option("--working-distance-mm", type=float, nargs=2, help="NEAR FAR of the object from the plate.")
 @click.option("--sensor-distance-mm", type=float, help="Lenses to sensor.  [default: thin-lens focus]")
 @click.option("--wavelength-nm", type=float, help="Wavelength.  [default: 520]")
@@ -139,6 +146,18 @@ def new_design_command(output: Path, centers: Path | None, name: str | None, for
     lens = f"f = {radius / (design.refractive_index - 1):.4g} mm (R = {radius:.4g} mm)"
     sensor = f"sensor at {design.imaging.sensor_distance_mm:g} mm"
     click.echo(f"{output}: {lenses} lenses of {lens}, {sensor}; see gs-jax metrics {output}")
+    for fault in _faults_of_mold(design):
+        click.echo(f"gs-jax: warning: {output}: `gs-jax mold` refuses it: {fault}", err=True)
+
+
+def _faults_of_mold(design) -> list[str]:
+    """What keeps the lenses of a design from being molded."""
+    from ..mold.manufacturability import check_design
+    from ..mold.solids import MoldShape, default_chord
+
+    chord = default_chord(design.imager().array)
+    results = check_design(design, MoldShape(), chord=chord, resolution=0.025)
+    return [result.text for result in results if result.level == "error"]
 
 
 def _check_together(known: dict[str, Any], centers: Path | None, asking: bool) -> None:

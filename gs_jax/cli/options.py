@@ -18,6 +18,8 @@ from ..base.machine import Workers
 
 # Far more planes than any sensor resolves; a mistyped step asks for millions.
 _MAX_DEPTHS = 10_000
+# Depths beyond are in another unit: the farthest usual object of designs, mm.
+_FARTHEST = 2000.0
 # Nearest depth that a file of volumes may have, mm.
 NEAREST = 1e-6
 
@@ -34,10 +36,11 @@ CAPTURE_OPTIONS = (*_PICTURE, "roi", "binning")
 
 
 class Number(click.ParamType):
-    """A number within bounds."""
+    """A number within bounds. A length beyond the `usual` ones that would be one of them in another unit is refused."""
 
-    def __init__(self, least: float, most: float, unit: str = ""):
+    def __init__(self, least: float, most: float, unit: str = "", usual: tuple[float, float] | None = None):
         self.least, self.most, self.unit, self.name = least, most, unit, unit or "number"
+        self.usual = usual
 
     def convert(self, value, param, ctx):
         try:
@@ -47,7 +50,18 @@ class Number(click.ParamType):
         if not self.least <= number <= self.most:
             unit = f" {self.unit}" if self.unit else ""
             self.fail(f"must be {self.least:g} to {self.most:g}{unit}, got {value!r}.", param, ctx)
+        if self.usual and (question := _other_unit([number], self.usual, self.unit)):
+            self.fail(question, param, ctx)
         return number
+
+
+def _other_unit(numbers: list[float], usual: tuple[float, float], unit: str) -> str | None:
+    # The module's import takes longer than the help of a command; usual numbers need it not.
+    if all(usual[0] <= number <= usual[1] for number in numbers if number):
+        return None
+    from ..design.validation import other_unit
+
+    return other_unit(numbers, usual, unit)
 
 
 class Depths(click.ParamType):
@@ -74,6 +88,10 @@ class Depths(click.ParamType):
         count = (stop - start) / step + 1 + 1e-6
         if count > _MAX_DEPTHS + 1:
             self.fail(f"must have at most {_MAX_DEPTHS} depths, got {value!r}, {count:.3g} depths.", param, ctx)
+        if stop > _FARTHEST and (
+            question := _other_unit([start, stop, step] if ":" in value else [start], (0.0, _FARTHEST), "mm")
+        ):
+            self.fail(question, param, ctx)
         return [round(start + i * step, 9) for i in range(int(count))]
 
     def _list(self, value, depths, param, ctx):
@@ -131,8 +149,9 @@ def shipped_designs() -> list[Path]:
 
 
 DESIGN = DesignFile()
-MM = Number(1e-3, 1e4, "mm")
-UM = Number(1e-2, 1e6, "um")
+# Lengths on a plate; and in the image or the object, of a voxel or a blur.
+MM = Number(1e-3, 1e4, "mm", usual=(0.005, 500.0))
+UM = Number(1e-2, 1e6, "um", usual=(0.1, 2e4))
 
 
 terms_option = click.option(

@@ -8,7 +8,7 @@ import click
 from ..base.errors import InputError, errors_name_file
 from ..base.progress import Progress
 from ..io.files import check_output
-from .light import Light, check_beyond, light_options, objects_in
+from .light import Light, ask_for_unit, check_beyond, light_options, objects_in
 from .options import DESIGN, PSFS, SIMULATED, Number, given_options
 from .outputs import check_may_write, provenance_of
 
@@ -105,6 +105,7 @@ def _placed(scene: Path, objects, grid, light: Light, imager):
         raise InputError("--depths-from must be array, as SCENE says that its depths count from there, got sample.")
     moved = (origin or 0.0) if said is None else 0.0
     if grid is None:
+        ask_for_unit(scene, objects)
         objects = objects + np.array([0, 0, moved, 0])
     elif moved:
         grid = grid.at(np.round(np.asarray(grid.depths, float) + moved, 6))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..base.errors import InputError
-from ..layouts import nearest_neighbour_distances, random_layout
+from ..layouts import PITCH_BY_SPACING, nearest_neighbour_distances, random_layout
 from .design import Design
 from .tables import ArrayTable, ImagingTable, LensTable, SensorTable
 from .validation import beside_sensor
@@ -17,6 +17,8 @@ from .validation import beside_sensor
 PDMS, PLATE_MM, GREEN_NM = 1.43, 1.0, 520.0
 # Of the paper's microscope: lenses that see a point; diameter over the square root of a lens's area, without holes.
 LENSES_PER_POINT, DIAMETER_BY_SPACING = 14, 1.46
+# Thickness of a plate between its lenses at least, mm.
+_SHEET_MM = 0.3
 # So few lenses leave holes, and no centre is farther from the middle of a plate.
 FEW, FARTHEST_MM = 30, 100.0
 # Share of the nearest depth that the field radius is at most: beyond, aberrations leave little of an image.
@@ -31,9 +33,14 @@ def radius_of(focal_length: float, refractive_index: float) -> float:
 
 
 def generated_centers(count: int, size: tuple[float, float], seed: int = 0) -> Float[np.ndarray, "lens 2"]:
-    """A random layout in the proportions of the paper's, mm; `InputError` as `random_layout`."""
-    diameter = DIAMETER_BY_SPACING * math.sqrt(size[0] * size[1] / count) if count >= FEW else None
-    return random_layout(count, size, diameter=diameter, seed=seed).round(4)
+    """A random layout in the proportions of the paper's, mm; `InputError` as `random_layout`.
+
+    Centres are half a pitch from the plate's edge, or more: it cuts no lens in half.
+    """
+    spacing = math.sqrt(size[0] * size[1] / count)
+    inner = tuple(max(side - PITCH_BY_SPACING * spacing, side / 2) for side in size)
+    diameter = DIAMETER_BY_SPACING * math.sqrt(inner[0] * inner[1] / count) if count >= FEW else None
+    return random_layout(count, inner, diameter=diameter, seed=seed).round(4)
 
 
 def check_unit_said(centers: Float[np.ndarray, "lens 2"]) -> None:
@@ -102,7 +109,15 @@ def _diameter(known: Known) -> float | None:
         wanted = DIAMETER_BY_SPACING * math.sqrt(width * height / len(centers))
     else:
         wanted = float(nearest_neighbour_distances(centers).mean())
-    return _three_digits(min(wanted, 2 * known["radius_of_curvature_mm"]))
+    # Beyond, light along the axis is totally reflected, long before a hemisphere.
+    return _three_digits(min(wanted, 2 * known["radius_of_curvature_mm"] / known["refractive_index"]))
+
+
+def _thickness(known: Known) -> float:
+    """The paper's, or what the height of the lenses needs."""
+    radius = known["radius_of_curvature_mm"]
+    height = radius - math.sqrt(max(radius**2 - known["aperture_diameter_mm"] ** 2 / 4, 0.0))
+    return max(PLATE_MM, _up(height + _SHEET_MM))
 
 
 def _sensor_distance(known: Known) -> float | None:
@@ -128,7 +143,7 @@ DEFAULTS: dict[str, Callable[[Known], Any]] = {
     "refractive_index": lambda known: PDMS,
     "size_mm": _size,
     "aperture_diameter_mm": _diameter,
-    "substrate_thickness_mm": lambda known: PLATE_MM,
+    "substrate_thickness_mm": _thickness,
     "sensor_distance_mm": _sensor_distance,
     "wavelength_nm": lambda known: GREEN_NM,
     "field_radius_mm": _field_radius,

@@ -186,20 +186,29 @@ def slips(data: Mapping[str, Any]) -> list[str]:
 def slip(key: str, value: Any, place: str | None = None) -> str | None:
     """The question about a value of a key, which is called `place`; None if it is usual, or not a positive number."""
     numbers = _positive(value)
-    low, high = USUAL[key]
+    (low, high), unit = USUAL[key], unit_of(key)
     if not numbers or all(low <= each <= high for each in numbers):
         return None
-    found, unit = f"{place or key} = {_numbers(numbers)}", unit_of(key)
-    if (other := _other(key, numbers)) is None:
-        return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+    found = f"{place or key} = {_numbers(numbers)}"
+    if question := other_unit(numbers, USUAL[key], unit):
+        return f"{found}: {question}"
+    return f"{found}: is it meant? Usual is {low:g} to {high:g} {unit}".rstrip() + "."
+
+
+def other_unit(numbers: list[float], usual: tuple[float, float], unit: str) -> str | None:
+    """Ask whether unusual numbers are in another unit, in which they would be usual; None if there is no such unit."""
+    if not numbers or all(usual[0] <= each <= usual[1] for each in numbers):
+        return None
+    if (other := _other(usual, unit, numbers)) is None:
+        return None
     meant, their_unit = other
     as_given = f" ({_numbers(numbers)} {their_unit})" if their_unit else ""
-    return f"{found}: did you mean {_numbers(meant)} {unit}{as_given}?"
+    return f"did you mean {_numbers(meant)} {unit}{as_given}?"
 
 
 def meant(key: str, value: Any) -> float | list[float] | None:
     """The usual value, in the key's unit, of a value that is in another unit; None if there is none."""
-    if slip(key, value) is None or (other := _other(key, _positive(value))) is None:
+    if slip(key, value) is None or (other := _other(USUAL[key], unit_of(key), _positive(value))) is None:
         return None
     return other[0] if isinstance(value, list | tuple) else other[0][0]
 
@@ -222,16 +231,16 @@ def _positive(value: Any) -> list[float]:
     return [float(each) for each in numbers] if right else []
 
 
-def _other(key: str, numbers: list[float]) -> tuple[list[float], str | None] | None:
+def _other(usual: tuple[float, float], unit: str, numbers: list[float]) -> tuple[list[float], str | None] | None:
     """Usual numbers that differ by a power of a thousand, and the unit in which the given numbers would be these."""
-    low, high = USUAL[key]
-    if (unit := unit_of(key)) not in _LADDER:
+    if unit not in _LADDER:
         return None
+    low, high = usual
     for factor in _FACTORS:
-        usual = [float(f"{each * factor:.9g}") for each in numbers]
-        if all(low <= each <= high for each in usual):
+        scaled = [float(f"{each * factor:.9g}") for each in numbers]
+        if all(low <= each <= high for each in scaled):
             step = _LADDER.index(unit) + round(math.log10(factor) / 3)
-            return usual, _LADDER[step] if 0 <= step < len(_LADDER) else None
+            return scaled, _LADDER[step] if 0 <= step < len(_LADDER) else None
     return None
 
 
