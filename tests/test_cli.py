@@ -240,7 +240,7 @@ WRONG_ARGUMENTS = [
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "-3"), "got '-3'"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "nan"), "got 'nan'"),
     ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "fine"), "got 'fine'"),
-    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0.01"), "--voxel-um, --depths: the volume must take at most"),
+    ((*RECONSTRUCT, "-o", "v.tif", "--voxel-um", "0.1"), "--voxel-um, --depths: the volume must take at most"),
     ((*RECONSTRUCT, "-o", "v.tif", "--method", "magic"), "'magic' is not"),
     ((*RECONSTRUCT, "-o", "v.tif", "--colour"), "--colour"),
     ((*RECONSTRUCT, "-o", "v.tif", "surplus"), "surplus"),

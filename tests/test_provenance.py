@@ -8,11 +8,13 @@ import pytest
 import tifffile
 from click.testing import CliRunner
 
+import gs_jax as gs
 from gs_jax import Grid, InputError
 from gs_jax.__main__ import commands
+from gs_jax.design.design import design_text
 from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.point_tables import read_points, write_points
-from gs_jax.io.provenance import made_by, read_provenance, sidecar
+from gs_jax.io.provenance import DepthFrame, made_by, read_provenance, sidecar
 from gs_jax.io.volumes import read_volume, write_volume
 from gs_jax.io.weights import read_weights, write_weights
 from gs_jax.mold.export import Mesh, read_mesh, write_mesh
@@ -67,6 +69,24 @@ def test_info_says_what_an_image_of_another_program_is_good_for(tmp_path, name):
     assert [words for words in expected if words not in shown.stdout] == []
     use = next(line for line in shown.stdout.splitlines() if line.startswith("use"))
     assert str(tmp_path) not in use
+
+
+def test_info_shows_the_first_of_many_centres(tmp_path):
+    design = gs.geomscope()
+    WRITE["c.tif"](tmp_path / "c.tif", provenance=ORIGIN | {"design": design_text(design)})
+    show = lambda *options: CliRunner().invoke(commands, ["info", str(tmp_path / "c.tif"), *options]).stdout
+    short, whole = show(), show("--verbose")
+    assert "# and 197 more" in short and short.count("\n") < 60 and "sensor_distance_mm = 5.8" in short
+    assert design_text(design) in whole
+
+
+def test_points_that_are_found_have_nine_digits():
+    points, columns = DepthFrame().points(np.full((2, 4), 1 / 3), {"lenses": np.array([3, 4]), "snr": [1 / 7, 2 / 7]})
+    assert (
+        str(points[0, 0]) == "0.33333334"
+        and str(columns["snr"][0]) == "0.14285715"
+        and str(columns["lenses"][0]) == "3"
+    )
 
 
 @pytest.mark.parametrize("name", WRITE)

@@ -1,5 +1,7 @@
 """`gs-jax layout`, `metrics` and `info`: random lens centres, the datasheet of a design, the machine and files."""
 
+import re
+from itertools import groupby
 from pathlib import Path
 
 import click
@@ -45,13 +47,16 @@ def layout_command(
 def metrics_command(
     design: Path, output: Path | None, depths: list[float] | None, confusion_um: float | None, light: Light
 ):
-    """Show the datasheet of the microscope of DESIGN (the paper's Eqs. 1-11), and its problems.
+    """Show what the microscope of DESIGN resolves (the paper's Eqs. 1-11, and exact rays), in five lines.
+
+    --verbose adds the tables by depth and all problems; --json has all numbers.
 
     DESIGN is a file, or the name of one that comes with the package, such as geomscope.
     """
     from rich.console import Console
 
-    from ..design.datasheets import band_in_words, datasheet, path_in_words, summary, tables
+    from ..base.progress import VERBOSE, verbosity
+    from ..design.datasheets import band_in_words, datasheet, overview, path_in_words, summary, tables
     from ..design.design import read_design
     from ..design.diagnostics import findings
 
@@ -66,27 +71,31 @@ def metrics_command(
     if output:
         write_json(output, sheet)
     click.echo(summary(microscope, sheet))
-    for words in filter(None, (path_in_words(sheet), band_in_words(sheet))):
+    click.echo(f"  {objects_in(microscope.imager())}; {_calibration(microscope.provenance)}")
+    lines = overview(microscope, sheet, circle_of_confusion=circle_of_confusion)
+    for words in filter(None, (path_in_words(sheet), band_in_words(sheet), *lines)):
         click.echo(f"  {words}")
-    click.echo(f"  {objects_in(microscope.imager())}")
-    click.echo(_calibration(microscope.provenance))
+    problems = findings(microscope, sheet, circle_of_confusion=circle_of_confusion)
+    if verbosity.get() != VERBOSE:
+        click.echo(f"  tables by depth and {len(problems)} remark{'s' * (len(problems) != 1)}: --verbose")
+        return
     console = Console()
     for table in tables(sheet):
         console.print()
         console.print(table)
     click.echo()
-    for sentence in findings(microscope, sheet, circle_of_confusion=circle_of_confusion):
+    for sentence in problems:
         click.echo(f"- {sentence}")
 
 
 def _calibration(provenance) -> str:
     """The line about what `gs-jax calibrate` wrote into the file."""
     if "calibrated_spots" not in provenance:
-        return "  not calibrated: the geometry is that of the design"
+        return "not calibrated: the geometry is that of the design"
     spots, captures = provenance["calibrated_spots"], provenance["calibrated_captures"]
     rms, deviations = provenance["calibrated_rms_pixels"], provenance["standard_deviations"]
     known = ", ".join(f"{name} +- {deviation:g}" for name, deviation in deviations.items())
-    return f"  calibrated by {spots} spots of {captures} captures, {rms:.3f} pixels RMS: {known}"
+    return f"calibrated by {spots} spots of {captures} captures, {rms:.3f} pixels RMS: {known}"
 
 
 @click.command("info", epilog="Examples: gs-jax info volume.ome.tif, gs-jax info --designs")
@@ -95,8 +104,11 @@ def _calibration(provenance) -> str:
 def info_command(file: Path | None, designs: bool):
     """Show versions, devices and memory; with FILE, which gs-jax command made it, and from what.
 
-    Of an image that another program made: its size, type and axes, and what commands take it for.
+    Of long lists in the design the first lines are shown, with --verbose all. Of an image that another program made:
+    its size, type and axes, and what commands take it for.
     """
+    from ..base.progress import VERBOSE, verbosity
+
     if designs and file:
         raise InputError(f"--designs must be used without a FILE, got {file}.")
     if designs:
@@ -115,5 +127,21 @@ def info_command(file: Path | None, designs: bool):
         lines = describe()
     width = max(map(len, lines))
     for name, value in lines.items():
-        # The text of a design has many lines.
+        # The text of a design has many lines, most of them of its lenses' centres.
+        value = value if verbosity.get() == VERBOSE else _shortened(value)
         click.echo(f"{name:<{width}} {value}" if "\n" not in value else f"{name}\n\n{value}")
+
+
+# A line of a list of numbers, or of pairs of them, in TOML; lines of a list that are shown.
+_NUMBERS, _SHOWN = re.compile(r"\s*\[?[-+0-9.e, ]+\]?,?\s*"), 3
+
+
+def _shortened(text: str) -> str:
+    """A text without most lines of long lists of numbers."""
+    lines = []
+    for is_list, group in groupby(text.split("\n"), lambda line: bool(line.strip() and _NUMBERS.fullmatch(line))):
+        part = list(group)
+        if is_list and len(part) > 2 * _SHOWN:
+            part = [*part[:_SHOWN], f"    # and {len(part) - _SHOWN} more"]
+        lines += part
+    return "\n".join(lines)

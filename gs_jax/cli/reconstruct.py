@@ -141,7 +141,7 @@ def reconstruct_command(
     """
     from ..design.design import design_text, read_design
     from ..io.point_tables import write_points
-    from ..io.provenance import SCORE, DepthFrame
+    from ..io.provenance import INTENSITY, SCORE, DepthFrame
     from ..io.recordings import open_recording
     from ..io.surfaces import SURFACE_SUFFIXES, write_surface
     from ..io.volumes import VOLUME_SUFFIXES, write_volume
@@ -216,7 +216,7 @@ def reconstruct_command(
             provenance |= {SCORE: predicted} if predicted else {}
             write_volume(output, result.volume, frame.grid(plan.grid), provenance)
             if points and result.points is not None:
-                write_points(points, *frame.points(result.points, result.statistics), provenance=provenance)
+                write_points(points, *frame.points(result.points, result.statistics), provenance=provenance | INTENSITY)
             if surface and (fit := result.surface):
                 maps = fit.brightness, fit.depth, fit.depth_sd
                 write_surface(surface, *maps, plan.grid, below=frame.surface or 0.0, provenance=provenance)

@@ -240,6 +240,7 @@ def write_series_points(path, series, track, provenance, frame) -> str:
     """Write the points of all frames; return their number, and that of particles, in words."""
     from ..detection.particles import track as track_particles
     from ..io.point_tables import write_points_in_time
+    from ..io.provenance import INTENSITY
 
     points, particles = 0, 0
 
@@ -253,7 +254,7 @@ def write_series_points(path, series, track, provenance, frame) -> str:
     frames = ((number, frame.columns(note["points"])) for number, note in series.notes())
     if track:
         frames = track_particles(frames, track / 1000)
-    write_points_in_time(path, count(frames), provenance=provenance)
+    write_points_in_time(path, count(frames), provenance=provenance | INTENSITY)
     words = f"{points} point{'s' * (points != 1)}"
     return f"{words} of {particles} particle{'s' * (particles != 1)}" if track else words
 

@@ -31,6 +31,8 @@ Provenance = Mapping[str, str]
 NAMESPACE, KEY = "gs_jax/provenance", "provenance"
 # Key of a volume's cross-validation in words, which a report shows beside the volume.
 SCORE = "score"
+# What the intensities of points in a capture are.
+INTENSITY = {"intensity": "all light that the point emits, in counts of the capture"}
 
 
 def made_by(command: str, inputs: Iterable[PathLike] = (), design: str = "") -> dict[str, str]:
@@ -160,20 +162,23 @@ class DepthFrame(NamedTuple):
         return grid if self.surface is None else grid.at(moved(grid.depths, -self.surface))
 
     def columns(self, columns: Mapping[str, Any]) -> dict[str, Any]:
-        """Columns of points, from those with depths from the array."""
-        if self.surface is None:
-            return dict(columns)
-        depths = moved(columns["z_mm"], -self.surface)
-        return {**columns, "z_mm": depths, SURFACE: np.full(len(depths), self.surface)}
+        """Columns of points in single precision, nine digits, from those with depths from the array."""
+        if self.surface is not None:
+            depths = moved(columns["z_mm"], -self.surface)
+            columns = {**columns, "z_mm": depths, SURFACE: np.full(len(depths), self.surface)}
+        return {name: _single(values) for name, values in columns.items()}
 
     def points(self, points: Any, more: Mapping[str, Any] | None) -> tuple[Any, Mapping[str, Any] | None]:
-        """Points and their further columns, from points with depths from the array."""
-        if self.surface is None:
-            return points, more
+        """Points and their further columns in single precision, from points with depths from the array."""
         columns = self.columns({"z_mm": np.asarray(points)[:, 2]} | dict(more or {}))
-        rows = np.array(points, float)
+        rows = np.array(points, np.float32)
         rows[:, 2] = columns.pop("z_mm")
         return rows, columns
+
+
+def _single(values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    return values.astype(np.float32) if values.dtype.kind == "f" else values
 
 
 def moved(depths: Any, by: float) -> np.ndarray:
