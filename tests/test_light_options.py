@@ -81,7 +81,7 @@ def test_what_a_calibration_finds_of_a_sample_goes_where_it_is_from(lab):
     scope = dataclasses.replace(design.imager(), filters=gs.Layers([2.0], [1.52]), sample=moved)
     new = with_sample(design, scope, None)
     assert new.layers.object == design.layers.object[:1] and new.samples == design.samples
-    assert new.sample.model_dump(exclude_defaults=True) == {
+    assert new.sample is not None and new.sample.model_dump(exclude_defaults=True) == {
         "refractive_index": "water",
         "surface_mm": 17.5,
         "layers": (slip,),

@@ -112,8 +112,8 @@ def test_random_layouts_fit_the_plate_and_make_a_mold(folder, monkeypatch, capsy
     from_edge = (np.array(design.array.size_mm) / 2 - np.abs(design.array.centers_mm)).min()
     pitch = nearest_neighbour_distances(np.array(design.array.centers_mm)).mean()
     assert from_edge > 0.45 * pitch
-    lens = design.lens
-    assert lens.aperture_diameter_mm <= 2 * lens.radius_of_curvature_mm / 1.43
+    diameter, radius = np.array([design.lens.aperture_diameter_mm, design.lens.radius_of_curvature_mm])
+    assert diameter <= 2 * radius / 1.43
     results = check_design(design, MoldShape(), chord=4e-4, resolution=0.025)
     assert all(result.level != "error" for result in results)
 

@@ -168,7 +168,7 @@ class DepthFrame(NamedTuple):
             columns = {**columns, "z_mm": depths, SURFACE: np.full(len(depths), self.surface)}
         return {name: _single(values) for name, values in columns.items()}
 
-    def points(self, points: Any, more: Mapping[str, Any] | None) -> tuple[Any, Mapping[str, Any] | None]:
+    def points(self, points: Any, more: Mapping[str, Any] | None) -> tuple[Any, Mapping[str, Any]]:
         """Points and their further columns in single precision, from points with depths from the array."""
         columns = self.columns({"z_mm": np.asarray(points)[:, 2]} | dict(more or {}))
         rows = np.array(points, np.float32)
