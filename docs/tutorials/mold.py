@@ -49,7 +49,7 @@ print(f"{report['file_bytes'] / 1e6:.1f} MB, {report['facets']} facets")
 # `make_mold` also writes a picture:
 
 # %%
-picture = plt.imread("mold.png")
+picture = plt.imread("mold.stl.png")
 figure, axis = plt.subplots(figsize=(9, 9 * picture.shape[0] / picture.shape[1]), layout="constrained")
 axis.imshow(picture)
 axis.axis("off")
