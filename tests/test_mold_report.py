@@ -105,7 +105,7 @@ def test_the_options_change_the_mold(folder):
         *("--headroom-mm", 0.5, "--resolution-um", 100, "--no-label"),
     )
     assert result.exit_code == 0, result.exception
-    report = json.loads((folder / "part.stl.json").read_text())
+    report = json.loads((folder / "part.3mf.json").read_text())
     assert report["shrinkage_percent"] == 2 and report["draft_deg"] == pytest.approx(5)
     between = plate_thickness(read_design("design.toml").imager().array)
     side = 3 / 0.98 + 2 * (between / 0.98 + 0.5) * math.tan(math.radians(5)) + 2 * 4
