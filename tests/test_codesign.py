@@ -73,6 +73,10 @@ def test_files(table1, outcome, tmp_path):
     numbers = json.loads(paths[1].read_text())
     assert [term["met_after"] for term in numbers["terms"]] == [True] * 4
     assert len(numbers["starts"]) == 2 and numbers["steps"][0]["step"] == 1
+    # Parameters in the units of their keys; those of the best start are the design's.
+    best = numbers["starts"][stages.best_end(outcome.log, 0)["start"]]["free"]
+    assert best["sensor_distance_mm"] == pytest.approx(written.imaging.sensor_distance_mm, abs=1e-4)
+    assert all(FREE[name][0] <= end["free"][name] <= FREE[name][1] for end in numbers["starts"] for name in FREE)
     assert before_and_after(outcome).row_count == 4
 
 
@@ -116,7 +120,7 @@ def test_wrong_checkpoints(table1, tmp_path, monkeypatch):
     path.write_bytes(b"{}\n")
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
-    path.write_bytes(b'{"format": "gs-jax checkpoint 3", "of": "", "log": {"steps": 1, "ends": 2}}\n')
+    path.write_bytes(b'{"format": "gs-jax checkpoint 4", "of": "", "log": {"steps": 1, "ends": 2}}\n')
     with pytest.raises(InputError, match="not a checkpoint of"):
         run_study(table1, study(), checkpoint=path, resume=True)
     interrupted(table1, study(), path, monkeypatch, writes=1)

@@ -90,6 +90,36 @@ def test_reasons():
     assert run(steps, lost, ONE, limit=3)[1] == NOT_FINITE
 
 
+def falling(free, given, key):
+    """Least at infinity, where nothing is gained: parameters move on after the cost is flat."""
+    return jnp.stack([given, jnp.exp(-free["x"])])
+
+
+def flat_below(free, given, key):
+    """Without a slope below `given`."""
+    return jnp.stack([given, jax.nn.relu(free["x"] - given)])
+
+
+@pytest.mark.parametrize("residual, solver", [*((falling, solver) for solver in SOLVERS), (flat_below, "adam")])
+def test_a_cost_that_is_flat_has_converged(residual, solver):
+    """Within a millionth of the least, 1/2, over twenty steps; before that no solver says so."""
+    start, costs = {"x": jnp.array(1.5)}, []
+    steps = stepper(residual, start, ONE, solver_of(StageTable(solver=solver)), KEY)
+    note = lambda state: costs.append(float(state.cost))
+    state, reason = run(steps, steps.begin(start, ONE), ONE, limit=200, each=note)
+    assert reason == CONVERGED and int(state.step) == len(costs) < 100
+    assert costs[-1] == pytest.approx(0.5, rel=1e-6) and np.ptp(costs[-21:]) <= 1e-6 * 0.5 < np.ptp(costs[-22:])
+
+
+def test_damping_falls_until_it_suits_the_curvature():
+    """Gauss-Newton does not see the curvature of `1 + 0.01 x^2`; with a damping of 1 a step goes 2 % of the way."""
+    bowl = lambda free, given, key: (1 + 0.01 * free["x"] ** 2)[None]
+    start = {"x": jnp.array(1.0)}
+    steps = stepper(bowl, start, ONE, solver_of(StageTable(solver="levenberg-marquardt")), KEY)
+    state, reason = run(steps, steps.begin(start, ONE), ONE, limit=200)
+    assert reason == CONVERGED and int(state.step) < 60 and abs(float(state.free["x"])) < 1e-3
+
+
 def test_adam_draws_anew_in_each_step():
     """The mean of what is drawn, within its standard error of 0.06 after 300 steps of 0.03."""
     noisy = lambda free, given, key: (free - given - 0.3 * jax.random.normal(key))[None]

@@ -98,7 +98,8 @@ def run_study(
 
     *Host.*
 
-    Searches end within a billionth of the minimum in double precision (`jax_enable_x64`); single stops far from it.
+    A search has converged when its solver has, or when the cost has changed by less than a millionth of itself over 20
+    steps, in double precision (`jax_enable_x64`). In single precision it stops far from the minimum.
 
     Parameters
     ----------
@@ -267,12 +268,14 @@ def optimize(
         From an imager to one number, or to an array of residuals, half the sum of whose squares is minimised.
         Traced and differentiated: `gs_jax.objectives` are made for it.
     imager
-        To start from. Double precision (`jax_enable_x64`) finds a minimum to a billionth, single stops far from it.
+        To start from. Use double precision (`jax_enable_x64`): single stops far from the minimum.
     free
         What may change, of `gs_jax.free`.
     solver
-        Of optimistix, a minimiser, or for residuals one of least squares; of optax, which runs all steps; or
-        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`.
+        Of optimistix, a minimiser, or for residuals one of least squares; of optax; or
+        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`. Any of them also
+        ends when the loss has changed by less than a millionth of itself over 20 steps, of optax by less than a billionth
+        (1e-5 and 1e-6 in single precision).
     bounds
         Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
         beyond it is moved inside, by 1 % of the range, with a warning.

@@ -19,6 +19,7 @@ from ..io.provenance import Provenance
 from ..lenses import lenses_by_type
 from ..pictures import PALETTE
 from ..typing import PathLike
+from .parameters import significant
 from .search import Outcome
 from .stages import best_end
 from .study import TermTable, labels
@@ -68,7 +69,7 @@ def write_outcome(
     """
     path, study, records = Path(path), outcome.study, as_records(outcome)
     paths = [path, *side_files(path)]
-    history = {"starts": outcome.log.ends, "steps": [_plain(step) for step in outcome.log.steps]}
+    history = {"starts": list(map(_plain, outcome.log.ends)), "steps": list(map(_plain, outcome.log.steps))}
     write_json(paths[1], {"name": study.name, "seconds": round(outcome.seconds, 1), "terms": records} | history)
     write_figure(paths[2], picture(outcome))
     table = {
@@ -104,7 +105,11 @@ def as_records(outcome: Outcome) -> list[dict[str, Any]]:
 
 
 def _plain(record: dict[str, Any]) -> dict[str, Any]:
-    return {key: six_digits(x) if isinstance(x, float) else x for key, x in record.items()}
+    """A record of the log with fewer digits: six of a number, seven of each value of the free parameters."""
+    numbers = {key: six_digits(x) if isinstance(x, float) else x for key, x in record.items()}
+    if "free" in record:
+        numbers["free"] = {name: significant(x).tolist() for name, x in record["free"].items()}
+    return numbers
 
 
 def picture(outcome: Outcome) -> Figure:

@@ -54,20 +54,43 @@ class LBFGSB:
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | optax.GradientTransformation | LBFGSB
 
-CONVERGED = "converged: neither the cost nor the parameters change any more"
+CONVERGED = "converged: the cost does not change any more"
 MET = "all targets are met"
 LIMIT = "stopped at the limit of {} steps"
 NOT_FINITE = "stopped: the cost or a parameter is not finite"
 
+# Steps over which a converged cost stays the same. A solver that rejects twenty steps in a row has shrunk them to less
+# than a millionth.
+_FLAT_STEPS = 20
+
 
 class State(NamedTuple):
-    """State of a solver: all that its next step depends on, arrays only."""
+    """State of a solver: all that its next step depends on, arrays only. `recent`: the last costs, oldest first."""
 
     free: PyTree[Array]
     solver: PyTree[Array]
     cost: Float[Array, ""]
+    recent: Float[Array, " recent"]
     step: Int[Array, ""]
     converged: Bool[Array, ""]
+
+    @classmethod
+    def at_start(cls, free: PyTree[Array], solver: PyTree[Array], cost: Float[Array, ""]) -> "State":
+        recent = jnp.broadcast_to(cost, _FLAT_STEPS + 1)
+        return cls(free, solver, cost, recent, jnp.array(0), jnp.array(False))
+
+    def moved(
+        self,
+        free: PyTree[Array],
+        solver: PyTree[Array],
+        cost: Float[Array, ""],
+        done: Bool[Array, ""] | bool,
+        tolerance: float,
+    ) -> "State":
+        """The state one step later. It has converged if the solver is done, or the recent costs are flat."""
+        recent = jnp.append(self.recent[1:], cost)
+        flat = jnp.ptp(recent) <= tolerance * jnp.max(jnp.abs(recent))
+        return State(free, solver, cost, recent, self.step + 1, done | (flat & (self.step + 1 >= _FLAT_STEPS)))
 
 
 class Stepper(NamedTuple):
@@ -91,7 +114,9 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         Examples of its arguments, for shapes. Free parameters are of order one without bounds; for `LBFGSB` they lie
         between 0 and 1.
     solver
-        Solvers of optax never converge: they are for random residuals, which get a new key in each step.
+        A run ends when the solver converges, or when the cost has not changed over 20 steps: by more than a millionth
+        of it (1e-5 in single precision), or by more than `least_change()` with a solver of optax, whose schedule may
+        begin with steps of nearly no length. Random residuals, which get a new key in each step, do not converge.
     key
         From which the keys of the steps follow.
     """
@@ -105,7 +130,7 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
     steps: Any = solver
     if isinstance(solver, optax.GradientTransformation):
         steps = optx.OptaxMinimiser(solver, least_change(), least_change())
-    least_squares, goes_on = (
+    least_squares, is_optax = (
         isinstance(steps, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
     )
     if least_squares and jnp.ndim(jax.eval_shape(residual, free, given, key)) == 0:
@@ -122,7 +147,7 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
     @jax.jit
     def begin(free: PyTree, given: PyTree) -> State:
         arrays = eqx.filter(init(free, (given, key)), eqx.is_array)
-        return State(free, arrays, cost(free, (given, key)), jnp.array(0), jnp.array(False))
+        return State.at_start(free, arrays, cost(free, (given, key)))
 
     @jax.jit
     def advance(state: State, given: PyTree) -> State:
@@ -131,8 +156,9 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
             new, inner, _ = steps.step(function, state.free, args, options, inner, frozenset())
         done, result = steps.terminate(function, new, args, options, inner, frozenset())
-        done = (done | (result != optx.RESULTS.successful)) & (not goes_on)
-        return State(new, eqx.filter(inner, eqx.is_array), cost(new, args), state.step + 1, done)
+        done = (done | (result != optx.RESULTS.successful)) & (not is_optax)
+        tolerance = least_change() if is_optax else _flat_change()
+        return state.moved(new, eqx.filter(inner, eqx.is_array), cost(new, args), done, tolerance)
 
     return Stepper(begin, advance)
 
@@ -144,7 +170,7 @@ def _within_box(cost, key, kept: LBFGSB) -> Stepper:
     @jax.jit
     def begin(free: PyTree, given: PyTree) -> State:
         inner = solver.init_state(free, box(free), (given, key))
-        return State(free, inner, cost(free, (given, key)), jnp.array(0), jnp.array(False))
+        return State.at_start(free, inner, cost(free, (given, key)))
 
     @jax.jit
     def advance(state: State, given: PyTree) -> State:
@@ -153,7 +179,7 @@ def _within_box(cost, key, kept: LBFGSB) -> Stepper:
         found = cost(new, args)
         still = lambda old, new: jnp.max(jnp.abs(new - old) / (1 + jnp.abs(old))) < tolerance
         same = jax.tree.leaves(jax.tree.map(still, (state.free, state.cost), (new, found)))
-        return State(new, inner, found, state.step + 1, jnp.all(jnp.stack(same)))
+        return state.moved(new, inner, found, jnp.all(jnp.stack(same)), _flat_change())
 
     return Stepper(begin, advance)
 
@@ -197,7 +223,10 @@ def solver_of(stage: StageTable) -> Solver:
     """The solver that a stage names. Adam's learning rate falls to zero by a cosine over the steps."""
     match stage.solver:
         case "levenberg-marquardt":
-            return optx.LevenbergMarquardt(least_change(), least_change())
+            # The damping falls after a good step. By default a step is good if the cost falls by 99 % of what its
+            # model predicts, which it does only where the problem is almost linear; elsewhere a search crawls.
+            search = optx.ClassicalTrustRegion(high_cutoff=_GOOD_STEP)
+            return eqx.tree_at(lambda s: s.search, optx.LevenbergMarquardt(least_change(), least_change()), search)
         case "bfgs":
             return optx.BFGS(least_change(), least_change())
         case "lbfgs":
@@ -209,9 +238,18 @@ def solver_of(stage: StageTable) -> Solver:
             return optax.adam(optax.cosine_decay_schedule(stage.learning_rate, stage.steps))
 
 
+# Share of the predicted decrease that makes a step a good one (Nocedal and Wright, Numerical Optimization, 4.1).
+_GOOD_STEP = 0.75
+
+
 def least_change() -> float:
-    """Relative change of costs and parameters at which a search ends, by precision."""
+    """Relative change of costs and parameters in one step at which a search ends, by precision."""
     return 1e-9 if jnp.zeros(()).dtype == jnp.float64 else 1e-6
+
+
+def _flat_change() -> float:
+    """Relative change of the cost over `_FLAT_STEPS` at which a search ends, by precision."""
+    return 1e-6 if jnp.zeros(()).dtype == jnp.float64 else 1e-5
 
 
 # Distance of a start from a bound at least, as a fraction of the range: at the bound the map has no slope.
@@ -263,7 +301,7 @@ def warn_if_moved(given: Mapping[str, Any], inside: Mapping[str, Any]) -> None:
             warnings.warn(text, InputWarning, stacklevel=2)
 
 
-_FORMAT = "gs-jax checkpoint 3"
+_FORMAT = "gs-jax checkpoint 4"
 
 
 @dataclass
@@ -271,7 +309,8 @@ class Log:
     """Record of a search.
 
     `steps`: one record a step, with the worst entry of each term. `ends`: one record for each finished start of a
-    stage, with the reason for stopping, whether all targets are met, and the free parameters.
+    stage, with the reason for stopping, whether all targets are met, and the values of the free parameters, in the
+    units that their names end in.
     """
 
     steps: list[dict[str, Any]] = field(default_factory=list)

@@ -265,8 +265,8 @@ def run_stages(
         # Workers finish in any order.
         for records in (log.steps, log.ends):
             records.sort(key=lambda record: (record["stage"], record["start"]))
-        free = best_end(log, stage.number)["free"]
-        values = stage.values({name: jnp.asarray(x, values[name].dtype) for name, x in free.items()}, values)
+        found = best_end(log, stage.number)["free"]
+        values = values | {name: jnp.asarray(x, values[name].dtype) for name, x in found.items()}
     return values
 
 
@@ -300,6 +300,7 @@ def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any
     limit, given = stage.table.steps, (targets_of(wanted), values)
     state, reason = run(stage.steps, state, given, limit=limit, enough=stage.enough, each=after_step)
     worst = zip(wanted, stage.watch(state.free, values), strict=True)
+    reached = stage.values(state.free, values)
     return {
         "stage": stage.number,
         "start": start,
@@ -307,7 +308,7 @@ def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any
         "cost": float(state.cost),
         "met": all(assess(term, np.asarray(x)[None]).met is not False for term, x in worst),
         "reason": reason,
-        "free": {name: np.asarray(x).tolist() for name, x in state.free.items()},
+        "free": {name: np.asarray(reached[name]).tolist() for name in state.free},
     }
 
 
