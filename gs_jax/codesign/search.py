@@ -273,9 +273,9 @@ def optimize(
         What may change, of `gs_jax.free`.
     solver
         Of optimistix, a minimiser, or for residuals one of least squares; of optax; or
-        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`. Any of them also
-        ends when the loss has changed by less than a millionth of itself over 20 steps, of optax by less than a billionth
-        (1e-5 and 1e-6 in single precision).
+        `gs_jax.codesign.solve.LBFGSB()`, which wants bounds for all. By default `optimistix.BFGS`. A search also ends
+        when the loss has changed by less than a millionth of itself over 20 steps; with a solver of optax, by less than
+        a billionth (1e-5 and 1e-6 in single precision).
     bounds
         Lowest and highest value by name, numbers or arrays. A change of variables keeps them. A start at a bound or
         beyond it is moved inside, by 1 % of the range, with a warning.
