@@ -105,7 +105,9 @@ def index_of(material: float | str, wavelength_nm: float) -> float:
 class EmissionBand(eqx.Module):
     """Wavelengths that stand for an emission band, by their shares of the light that is detected.
 
-    *Host.* Tables of PSFs are means over them; the map and what follows from it take the imager's own wavelength.
+    *Host.*
+
+    Tables of PSFs are means over them; the map and what follows from it take the imager's own wavelength.
 
     Parameters
     ----------

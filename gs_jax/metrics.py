@@ -10,6 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 
+from .base.arrays import host_code
+
 # Axes without names: the two arguments of a score need not have the same.
 Volume = Float[Array | np.ndarray, "_ _ _"]
 Points = Float[Array | np.ndarray, "_ _"]
@@ -24,6 +26,7 @@ class Quality(NamedTuple):
     gain: float
 
 
+@host_code()
 def quality(estimate: Volume, truth: Volume) -> Quality:
     """PSNR, SSIM and MSE of a volume, after the scalar gain that fits it best.
 
@@ -81,6 +84,7 @@ class Localization(NamedTuple):
     pairs: np.ndarray
 
 
+@host_code()
 def localization(found: Points, truth: Points, *, lateral: float = 0.1, axial: float = 0.4) -> Localization:
     """Match found points with true ones, each at most once, and score them.
 

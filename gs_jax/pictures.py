@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
+from .base.arrays import host_code
 from .grid import Grid
 from .typing import Points
 
@@ -264,6 +265,7 @@ class _VolumeFigure(Figure):
         return f'<div>{slider_html(slices, overlays)}<img src="{maxima}" alt="Maxima along z, x and y"></div>'
 
 
+@host_code()
 def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Points | None = None) -> Figure:
     """Maximum projections of a volume along z, y and x, to scale in mm, with points as circles.
 

@@ -1,3 +1,4 @@
+import operator
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.special import erf
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward
 from gs_jax.apps.method_benchmark import peak_mib
 from gs_jax.geometry import envelope
+from gs_jax.optics.psf import gaussian_psf
 from gs_jax.projection.point_sources import STEPS, forward_points, make_stamps
 
 from .helpers import scene
@@ -122,6 +124,22 @@ def test_gradients():
     arguments = imager.array.centers, imager.sensor_distance, imager.shift, volume, kernels
     # Steps far below a pixel: linear interpolation has kinks at whole pixels.
     check_grads(weighted, arguments, order=1, eps=1e-6, atol=1e-4, rtol=1e-4)
+
+
+def test_the_surface_of_a_lens_has_gradients_by_its_psf():
+    """Against differences; without a PSF, or with one computed before, the surface and the aperture change nothing."""
+    array = MicrolensArray([[-0.6, 0.3], [0.1, -0.5], [0.5, 0.6]], aperture_diameter=0.6)
+    imager, grid = Imager(array, Sensor((40, 40), 0.06), 5.0, 1.2), Grid([18.0, 22.0], (5, 5), 0.4)
+    weights, volume = jax.random.normal(jax.random.key(3), (40, 40)), volume_of(grid)
+    stack = lambda imager: jax.vmap(lambda depth: gaussian_psf(imager, depth, size=11))(grid.depths)
+    score = lambda imager, psf: jnp.vdot(weights, forward(volume, imager, grid, psf) ** 2)
+    whole = jax.jit(lambda imager: score(imager, stack(imager)))
+    found, fixed = jax.grad(whole)(imager).array, jax.grad(score)(imager, stack(imager)).array
+    for name in ("radius_of_curvature", "conic_constant", "aperture_diameter"):
+        moved = lambda h, of=operator.attrgetter(f"array.{name}"): eqx.tree_at(of, imager, of(imager) + h)
+        slope = (whole(moved(1e-4)) - whole(moved(-1e-4))) / 2e-4
+        assert float(getattr(found, name)) == pytest.approx(float(slope), rel=1e-5) != 0
+        assert float(getattr(fixed, name)) == 0
 
 
 def test_the_energy_is_the_envelope_times_the_object():

@@ -175,15 +175,6 @@ def test_what_is_not_finite_is_named(method):
         forward_residual(truth.at[0, 0, 0].set(np.nan), image, imager, grid, optics=psf)
 
 
-def test_within_a_gradient_it_names_what_can_be_differentiated():
-    imager, grid, psf, _, image = small()
-    of_image = lambda image: reconstruct(image, imager, grid, FISTA(steps=1), optics=psf).sum()
-    of_imager = lambda imager: reconstruct(image, imager, grid).sum()
-    for call in (lambda: jax.grad(of_image)(image), lambda: jax.jit(of_imager)(imager)):
-        with pytest.raises(InputError, match="cannot be traced .*`solve` or `backproject`"):
-            call()
-
-
 def test_the_memory_that_is_free_counts_not_the_machines(monkeypatch):
     """Of a large machine whose memory others have taken, little is left for a volume or a divided plane."""
     taken = SimpleNamespace(total=2**50, available=2**20)

@@ -3,7 +3,7 @@
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,9 +13,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Shaped
 
 from ..typing import Real
-from .errors import input_error
+from .errors import InputError, input_error
 
 Tree = TypeVar("Tree")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 # A condition in words, and the function that says which numbers of an array meet it.
 Rule = tuple[str, Callable[[np.ndarray], Any]]
 FINITE: Rule = ("finite", np.isfinite)
@@ -53,6 +55,23 @@ def jit(function: Callable, **options: Any) -> Any:
 def array_namespace(x: Any) -> Any:
     """Return `numpy` for a NumPy array, otherwise `jax.numpy`."""
     return np if isinstance(x, np.ndarray) else jnp
+
+
+def host_code(
+    instead: str = "it is host code",
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Make a function raise `InputError` if JAX traces an argument; `instead` ends the message, what to use say."""
+
+    def decorate(function):
+        @functools.wraps(function)
+        def checked(*args, **kwargs):
+            if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+                raise InputError(f"{function.__name__} cannot be traced by jit, grad or vmap; {instead}.")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
 
 
 def check_finite(name: str, values: Shaped[Array | np.ndarray, "..."], parts: str = "pixels") -> None:

@@ -12,6 +12,8 @@ _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 class InputError(ValueError):
     """Wrong input from a user, explained in one line.
 
+    *Host.*
+
     The line names the key or argument, what is expected, what was given, and the file. The command line prints it and
     exits with status 2. Any other exception is a fault of the program.
 

@@ -30,6 +30,8 @@ verbosity: ContextVar[int] = ContextVar("verbosity", default=NORMAL)
 class Progress:
     """Progress on standard error: bars on a terminal, otherwise a line every ten seconds.
 
+    *Host.*
+
     It reports only inside its `with` block, as much as `verbosity` says.
 
     Examples

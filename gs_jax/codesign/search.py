@@ -18,6 +18,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, errors_name_file, short_repr
 from ..base.machine import Workers
 from ..base.progress import Progress
@@ -248,6 +249,7 @@ class Optimum(NamedTuple):
     stats: dict[str, Any]
 
 
+@host_code()
 def optimize(
     loss: Callable[[Imager], Float[Array, "..."]],
     imager: Imager,

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Float64
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
+from ..base.arrays import host_code
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
@@ -64,6 +65,7 @@ NOT_TRUSTED = "no point is to be trusted"
 _SEARCHES = 2
 
 
+@host_code()
 def find_points(
     image: Image | DetectionImage, imager: Imager, grid: Grid, *, progress: Progress | None = None
 ) -> Points:

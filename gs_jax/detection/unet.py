@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..base.arrays import check_finite
+from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, short_repr
 from ..io import weights
 from ..io.provenance import Provenance
@@ -133,6 +133,7 @@ def multislice_network(key: PRNGKeyArray) -> UNet:
     return UNet((-3, -2, -1, 0, 1, 2, 3), (16, 32, 64, 128), standardized=True, key=key)
 
 
+@host_code()
 def suppress(volume: Float[Array | np.ndarray, "depth y x"], network: UNet | None = None) -> Volume:
     """Suppress what is out of focus in a back-projected volume, slice by slice, by a network.
 

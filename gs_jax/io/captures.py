@@ -16,6 +16,7 @@ from jaxtyping import Array, Float32, Shaped, UInt8, UInt16
 from PIL import Image, ImageFile
 from PIL.PngImagePlugin import PngInfo
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike
 from .axes import stack_axis, stack_error
@@ -148,6 +149,7 @@ def mosaic_channel(
     return parts[0] if len(parts) == 1 else np.asarray(np.mean(parts, axis=0, dtype=np.float32))
 
 
+@host_code()
 def write_capture(
     path: PathLike, image: Shaped[Array | np.ndarray, "row column"], provenance: Provenance | None = None
 ) -> None:

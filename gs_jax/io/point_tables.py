@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int, Shaped
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..typing import PathLike, Points
 from .files import MAX_TEXT_BYTES, atomic_write, check_input, check_output, read_text, write_text
@@ -80,6 +81,7 @@ def _read_points(path: PathLike) -> tuple[Float64[np.ndarray, "point 4"], dict[s
     return points, dict(zip(names[4:], table[:, 4:].T, strict=True))
 
 
+@host_code()
 def write_points(
     path: PathLike,
     points: Points,

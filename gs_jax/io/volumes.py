@@ -23,6 +23,7 @@ import numpy as np
 import tifffile
 from jaxtyping import Array, Shaped
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, input_error, needs_extra, short_repr
 from ..grid import Grid
 from ..typing import PathLike, Volume
@@ -38,6 +39,7 @@ MAX_VOXELS = 10**10
 _DESCRIPTION, _AFTER = 270, 271
 
 
+@host_code()
 def write_volume(
     path: PathLike,
     volume: Shaped[Array | np.ndarray, "depth row column"],

@@ -1,6 +1,8 @@
 """Derived quantities of an imager at depths (Eqs. 4-11), for datasheets and searches.
 
-All are *differentiable* functions of an imager and of depths `(depth,)` from the array's front. Lengths are mm. In
+*Differentiable.*
+
+All are functions of an imager and of depths `(depth,)` from the array's front. Lengths are mm. In
 place of depths they take `Conditions`, which add constants that do not follow from the imager. `gs_jax.optimize` takes
 any function that is made of these; a study names them, with units. Where lenses differ, a function gives what its
 docstring says: one value for the whole plate, one row a lens type, or the value of the best type at each depth.

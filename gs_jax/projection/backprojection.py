@@ -32,7 +32,8 @@ def backproject(
 
     *Differentiable.*
 
-    Differentiable with respect to the image, the imager and the grid's depths and origin.
+    Differentiable with respect to the image, the grid's depths and origin, and the imager: all that moves chief rays.
+    The surface and the aperture of a lens do not, so that their gradients are zero.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import jit
+from ..base.arrays import host_code, jit
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -29,6 +29,7 @@ _DEPTHS = 2
 PsfModel = Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | PerTypePsf | None
 
 
+@host_code("`gs_jax.optics.psf` has PSFs that can be")
 def make_psf_model(
     imager: Imager,
     depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
@@ -114,7 +115,10 @@ def forward(
     With a `FieldVaryingPsf` exact rays place the spot of each lens at every distance from its axis, and a voxel is the
     light that it emits in all directions; Eq. (2)'s C and PSF_o are the leading term near the axis.
 
-    The image is linear in the volume and in the PSF, and differentiable with respect to every continuous quantity.
+    The image is linear in the volume and in the PSF, and differentiable with respect to these, to the grid's depths and
+    origin, and to the imager. The surface and the aperture of a lens act by the PSF: gradients with respect to radius,
+    conic constant and aperture are zero without one, and with one that was computed before. Compute the PSF within the
+    function that is differentiated, as in the last example.
 
     Parameters
     ----------
@@ -151,6 +155,12 @@ def forward(
     >>> sharp = gs.forward(scene, scope, grid, gs.make_psf_model(scope, grid.depths, "near"))  # Eq. (2)
     >>> image.shape, sharp.shape
     ((200, 200), (200, 200))
+    >>> import jax
+    >>> from gs_jax.optics.psf import gaussian_psf
+    >>> stack = lambda lens: jax.vmap(lambda z: gaussian_psf(lens, z, size=31))(grid.depths)
+    >>> slope = jax.grad(lambda lens: (gs.forward(scene, lens, grid, stack(lens)) ** 2).sum())(scope)
+    >>> print(bool(slope.array.radius_of_curvature != 0))
+    True
     """
     volume = as_volume(volume, imager)
     if optics is None:

@@ -24,8 +24,10 @@ from .operators import as_matrix, no_structure, transpose
 class ConvolutionOperator(lx.AbstractLinearOperator):
     """Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint.
 
-    *Differentiable*, a `lineax` operator like `ImagingOperator`, also with respect to the PSFs from which it is made.
-    Its leaves are their spectra, of the size of the scene. Planes are convolved one after the other, so that no other
+    *Differentiable.*
+
+    A `lineax` operator like `ImagingOperator`, differentiable also with respect to the PSFs from which it is made. Its
+    leaves are their spectra, of the size of the scene. Planes are convolved one after the other, so that no other
     array is of that size. `gs_jax.solve` takes it with every solver, `jax.vmap` maps it over scenes and images.
 
     Parameters
@@ -149,7 +151,9 @@ def middle(image_shape: tuple[int, int], size: tuple[int, ...]) -> tuple[slice, 
 class FieldConvolutionOperator(lx.AbstractLinearOperator):
     """Imaging through PSFs that vary over the field: the image is the sum of `kernel * (weight scene)` over components.
 
-    *Differentiable*, a `lineax` operator; its transpose `.T` is the exact adjoint. So few components describe the PSF
+    *Differentiable.*
+
+    A `lineax` operator; its transpose `.T` is the exact adjoint. So few components describe the PSF
     everywhere when it varies smoothly (Flicker and Rigaut, J. Opt. Soc. Am. A 22, 504, 2005; of random multifocal
     masks: Yanny et al., Light Sci. Appl. 9, 171, 2020). `fit_field` of `gs_jax.reconstruction.field_fit` finds them.
 

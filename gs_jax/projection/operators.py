@@ -40,7 +40,9 @@ def _as_function(operator):
 class ImagingOperator(lx.AbstractLinearOperator):
     """The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint.
 
-    *Differentiable*. It is a pytree whose leaves are the numbers of the imager, the grid and the optics: a compiled
+    *Differentiable.*
+
+    It is a pytree whose leaves are the numbers of the imager, the grid and the optics: a compiled
     function that takes it as an argument is not compiled again when they change. Matrix-free; `lx.linear_solve`,
     `gs_jax.solve`, `jax.vmap` and `jax.grad` take it.
 
@@ -78,7 +80,9 @@ class ImagingOperator(lx.AbstractLinearOperator):
 class BackprojectionOperator(lx.AbstractLinearOperator):
     """The paper's back-projection as a `lineax` operator, image to volume.
 
-    *Differentiable*; a pytree like `ImagingOperator`, whose transpose it is for pinholes.
+    *Differentiable.*
+
+    A pytree like `ImagingOperator`, whose transpose it is for pinholes.
 
     Parameters
     ----------

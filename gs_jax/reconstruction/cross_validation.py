@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -53,6 +54,7 @@ class CrossValidation(NamedTuple):
         return 20 * math.log10(1 / max(self.noise, 1e-12))
 
 
+@host_code()
 def cross_validated(
     image: Image,
     imager: Imager,
@@ -66,7 +68,9 @@ def cross_validated(
 ) -> CrossValidation:
     """Score a method on a capture: reconstruct without some lenses, predict their light, and compare.
 
-    *Host.* Takes as long as `folds` reconstructions.
+    *Host.*
+
+    Takes as long as `folds` reconstructions.
 
     Sub-images overlap, so that light cannot be divided by lenses. Pixels can: each belongs to the nearest lens, whose
     light is most of its light, and each lens to one of the folds, those of neighbours differing. A fold is

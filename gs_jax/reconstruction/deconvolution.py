@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float32, Num
 
-from ..base.arrays import check_finite
+from ..base.arrays import check_finite, host_code
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -75,6 +75,7 @@ class Deconvolution(NamedTuple):
         return self.reached_noise or self.change < CONVERGED
 
 
+@host_code("use `solve` with a `ConvolutionOperator`")
 def deconvolve(
     image: Image,
     psf: Num[Array | np.ndarray, "*depth high wide"] | FieldConvolutionOperator,

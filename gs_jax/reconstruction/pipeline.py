@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from ..base.arrays import check_finite, jit, native
+from ..base.arrays import check_finite, jit, native, host_code
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -80,6 +79,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
     return grid
 
 
+@host_code("use `solve` or `backproject`")
 def reconstruct(
     image: Image,
     imager: Imager,
@@ -176,7 +176,7 @@ def reconstructor(
         If `PinholeRichardsonLucy` or `Unrolled` is used where the microscope is out of focus.
     """
     by_name = isinstance(optics, str)
-    _check(method, optics, imager, grid)
+    _check(method, optics)
     check_stop(method, stop_at_discrepancy)
     check_beyond(imager, np.asarray(grid.depths), "grid: depths")
     on_cores = by_name and optics != "pinhole"
@@ -224,12 +224,10 @@ def check_call(image, imager, grid, method, optics):
     """Raise the errors of `reconstruct` that need no computation."""
     if image.shape != imager.sensor.shape:
         raise InputError(f"image must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
-    _check(method, optics, imager, grid, image)
+    _check(method, optics)
 
 
-def _check(method, optics, *arguments):
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((method, optics, arguments))):
-        raise InputError("reconstruct cannot be traced by jit, grad or vmap; use `solve` or `backproject`.")
+def _check(method, optics):
     # A class has the attributes of the protocol, too.
     if isinstance(method, type) or not isinstance(method, BackProjection | PinholeRichardsonLucy | Solver):
         raise InputError(f"method must be an object such as BackProjection() or FISTA(), got {short_repr(method)}.")

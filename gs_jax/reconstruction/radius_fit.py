@@ -69,7 +69,9 @@ def fit_radius(
 ) -> RadiusFit:
     """Fit one factor of all radii to captures of any scenes, within 6 %.
 
-    *Host.* Takes about eight reconstructions of the middle of each of three captures.
+    *Host.*
+
+    Takes about eight reconstructions of the middle of each of three captures.
 
     Each capture is reconstructed without some lenses, whose light is predicted, as `cross_validated` does. The grid has
     these depths and voxels a third as wide, over the sensor. Of a large sensor only the middle is compared; around it

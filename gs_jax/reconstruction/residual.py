@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Shaped
 
-from ..base.arrays import check_finite
+from ..base.arrays import check_finite, host_code
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
@@ -41,6 +41,7 @@ class ForwardResidual(NamedTuple):
     regions: Float[np.ndarray, "row column"]
 
 
+@host_code("use `forward`")
 def forward_residual(
     volume: Float[Array | np.ndarray, "depth y x"],
     image: Image,

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
+from ..base.arrays import host_code
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
@@ -63,6 +64,7 @@ class SurfaceFit(NamedTuple):
         )
 
 
+@host_code()
 def fit_surface(
     image: Image,
     imager: Imager,
@@ -74,7 +76,9 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit sheets to an image: a brightness and a depth for each column of the grid.
 
-    *Host.* Fits one more sheet, too, to see whether these are enough.
+    *Host.*
+
+    Fits one more sheet, too, to see whether these are enough.
 
     Parameters
     ----------

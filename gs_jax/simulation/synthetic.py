@@ -11,7 +11,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float32, PRNGKeyArray, UInt8, UInt16
 
-from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, native
+from ..base.arrays import NOT_NEGATIVE, POSITIVE, as_float, check_fields, check_finite, host_code, native
 from ..base.errors import InputError, input_error, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
@@ -50,6 +50,7 @@ def read_scene(path: PathLike) -> tuple[np.ndarray, Grid | None]:
     return read_volume(path)
 
 
+@host_code("use `forward` with a PSF that is computed from the lens")
 def simulate(
     scene: Float[Array | np.ndarray, "..."],
     imager: Imager,

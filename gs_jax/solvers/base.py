@@ -117,9 +117,11 @@ class Solution(eqx.Module):
 def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
     """Run a solver on an image, for all its steps or until its tolerance is met.
 
-    *Differentiable*: without a tolerance, with respect to the image, the leaves of `A` and the solver's weights. It may
-    be called inside `jit`, with `gs_jax.ImagingOperator` as an argument. `gs_jax.reconstruct` is the host's function
-    from a capture to a volume.
+    *Differentiable.*
+
+    Gradients are with respect to the image, the leaves of `A` and the solver's weights, in reverse mode only without a
+    tolerance. It may be called inside `jit`, with `gs_jax.ImagingOperator` as an argument. `gs_jax.reconstruct` is the
+    host's function from a capture to a volume.
 
     Parameters
     ----------

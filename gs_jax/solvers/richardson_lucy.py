@@ -55,10 +55,10 @@ class State(NamedTuple):
 class RichardsonLucy(eqx.Module):
     """Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start.
 
-    *Differentiable*, except with total variation.
+    *Differentiable.*
 
-    The cost is the Kullback-Leibler divergence of the image from `A x + background`. Entries of `A` must not be
-    negative and need no normalisation; negative pixels (read noise) count as 0. `x` is 0 in voxels that no pixel sees,
+    With total variation it has no derivative. The cost is the Kullback-Leibler divergence of the image from
+    `A x + background`. Entries of `A` must not be negative and need no normalisation; negative pixels (read noise) count as 0. `x` is 0 in voxels that no pixel sees,
     and everywhere if the image is dark.
 
     Parameters
