@@ -91,6 +91,22 @@ def test_the_package_stands_without_what_is_made_with_it():
     assert not names(path for path in MODULES if any(name[0] in outside for name in imported(path)))
 
 
+def imports_of(*folders: str) -> set[tuple[str, str]]:
+    """Modules in these folders, with the folders of the package that they import."""
+    paths = [path for path in MODULES if top(path) in folders]
+    return {(path.stem, name[1]) for path in paths for name in imported(path) if name[0] == "gs_jax" and len(name) > 1}
+
+
+def test_the_physics_knows_no_files_and_solvers_no_microscope():
+    """As the design notes say, with their two exceptions."""
+    physics = imports_of("geometry", "lenses", "layers", "optics", "objectives", "projection")
+    assert not {(module, other) for module, other in physics if other in ("io", "design", "simulation")}
+    of_solvers = {
+        (module, other) for module, other in imports_of("solvers") if other not in ("base", "typing", "solvers")
+    }
+    assert of_solvers == {("convolution", "projection"), ("unrolled", "io")}
+
+
 def test_jaxopt_has_one_place():
     """It is no longer maintained: what replaces it replaces one module."""
     assert len(names(path for path in MODULES if any(name[0] == "jaxopt" for name in imported(path)))) == 1

@@ -58,8 +58,8 @@ class RichardsonLucy(eqx.Module):
     *Differentiable.*
 
     With total variation it has no derivative. The cost is the Kullback-Leibler divergence of the image from
-    `A x + background`. Entries of `A` must not be negative and need no normalisation; negative pixels (read noise) count as 0. `x` is 0 in voxels that no pixel sees,
-    and everywhere if the image is dark.
+    `A x + background`. Entries of `A` must not be negative and need no normalisation; negative pixels (read noise)
+    count as 0. `x` is 0 in voxels that no pixel sees, and everywhere if the image is dark.
 
     Parameters
     ----------
