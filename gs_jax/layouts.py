@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, KDTree, Voronoi
 
 from .base.errors import InputError
+from .geometry import Imager
 from .typing import Number
 
 # A position in single precision: a lens on the plate's edge is on the plate.
@@ -199,6 +201,17 @@ class Edges(NamedTuple):
     low: Float[np.ndarray, " edge"]
     high: Float[np.ndarray, " edge"]
     beyond: Int[np.ndarray, " edge"]
+
+
+def on_sensor(imager: Imager, points: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 2"]:
+    """Points of the array's plane in the sensor's frame: turned, shifted and tilted as the lens centres are, mm."""
+    points = np.asarray(points, imager.array.centers.dtype)
+    return np.asarray(eqx.tree_at(lambda i: i.array.centers, imager, points).centers, float)
+
+
+def plate_corners(imager: Imager) -> Float[np.ndarray, "4 2"]:
+    """Corners of the plate in the sensor's frame, in order around it, mm."""
+    return on_sensor(imager, np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([imager.array.plate]) / 2)
 
 
 def cell_edges(centers, size) -> Edges:

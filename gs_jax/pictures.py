@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num, Shaped, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
@@ -113,19 +114,24 @@ def round_length(most: float) -> float:
 
 def _draw_bar(axes: Axes, width: float, colour) -> None:
     length = round_length(_BAR * width)
-    said = f"{length:g} mm" if length >= 1 else f"{1000 * length:g} um"
     x, part = 0.95 - length / width, length / width
     axes.plot([x, x + part], [0.05, 0.05], color=colour, lw=2.5, solid_capstyle="butt", transform=axes.transAxes)
     # Dark behind, for images that are bright there.
     box = {"facecolor": colormaps[IMAGES](0.0), "alpha": 0.6, "lw": 0, "pad": 1}
     place = {"ha": "center", "va": "bottom", "transform": axes.transAxes, "bbox": box}
-    axes.text(x + part / 2, 0.08, said, color=colour, fontsize=8, **place)
+    axes.text(x + part / 2, 0.08, _length_text(length), color=colour, fontsize=9, **place)
 
 
-# Percentiles shown as black and white: back-projection has a pedestal and a few bright voxels.
-_BLACK, _WHITE = 50, 99.95
-# Voxels that are sampled for the percentiles of slices.
+def _length_text(length: float) -> str:
+    return f"{length:g} mm" if length >= 1 else f"{1000 * length:g} um"
+
+
+# Voxels that are sampled for the median of a volume.
 _SAMPLED = 20_000_000
+# Cells along a side of a maximum projection, at most: fewer than pixels of the picture, so that none is left out.
+_MAX_CELLS = 400
+# Labelled brightness of the colour bar, in percent of the maximum.
+_PERCENT = (0, 5, 20, 50, 100)
 # Slices and their pixels along a side, at most.
 _MAX_SLICES, _MAX_SIDE = 100, 720
 # Circles in slices at most, those of the brightest points, and their radius relative to the width.
@@ -177,17 +183,34 @@ def downsample(image: Num[np.ndarray, "row column"], max_side: int) -> Num[np.nd
     return cut.reshape(rows, min(step, cut.shape[0]), columns, min(step, cut.shape[1])).mean((1, 3))
 
 
+def block_maxima(values: Num[np.ndarray, "*shape"], steps: Sequence[int]) -> Num[np.ndarray, "*fewer"]:
+    """Maxima of blocks of `steps` along the axes; blocks at the ends may be smaller."""
+    for axis, step in enumerate(steps):
+        if step > 1:
+            values = np.maximum.reduceat(values, np.arange(0, values.shape[axis], step), axis)
+    return values
+
+
 def display_range(volume: Num[np.ndarray, "*shape"]) -> tuple[float, float]:
-    """The values shown as black and white: percentiles, or up to the maximum if nearly all is dark."""
+    """The values shown as black and white: the median, as back-projection has a pedestal, and the maximum.
+
+    With a lower white, ghosts of a hundredth of the brightest point would look as bright as the points.
+    """
     sampled = np.asarray(volume).ravel()[:: -(-np.size(volume) // _SAMPLED)]
-    low, high = (float(v) for v in np.percentile(sampled, (_BLACK, _WHITE)))
-    return low, high if high > low else float(volume.max())
+    return float(np.median(sampled)), float(np.max(volume))
+
+
+def shade(values: Num[np.ndarray, "*shape"], low: float, high: float) -> UInt8[np.ndarray, "*shape"]:
+    """Values from `low` to `high` as 0 to 255 by their square root, so that the dim is seen beside the bright."""
+    width = high - low if high > low else 1.0
+    return to_uint8(np.sqrt(np.clip((np.asarray(values, np.float32) - low) / width, 0, 1)), 0.0, 1.0)
 
 
 class Slices(NamedTuple):
     """Planes of a volume as data URIs, their depths, mm, and the values of black and white.
 
-    A pixel is the mean of `step` x `step` voxels, `size` the width and height, mm, and `total` counts all planes.
+    A pixel is the maximum of `step` x `step` voxels, `extent` is `(left, right, bottom, top)`, mm, `total` counts all
+    planes, and `brightest` is the position of the plane with the brightest voxel in the list.
     """
 
     pictures: list[str]
@@ -195,8 +218,9 @@ class Slices(NamedTuple):
     low: float
     high: float
     step: int
-    size: tuple[float, float]
+    extent: tuple[float, float, float, float]
     total: int
+    brightest: int
 
 
 def make_slices(volume: Num[np.ndarray, "depth row column"], grid: Grid, max_bytes: int) -> Slices:
@@ -205,22 +229,32 @@ def make_slices(volume: Num[np.ndarray, "depth row column"], grid: Grid, max_byt
     max_side = max(min(_MAX_SIDE, int(np.sqrt(max_bytes / len(kept)))), 64)
     low, high = display_range(volume)
     step = -(-max(volume.shape[1:]) // max_side)
-    pictures = [png_uri(to_uint8(downsample(volume[k], max_side), low, high), "magma") for k in kept]
-    height, width = (max(n // step, 1) * min(step, n) * grid.pitch for n in volume.shape[1:])
-    return Slices(pictures, [float(grid.depths[k]) for k in kept], low, high, step, (width, height), len(volume))
+    planes = [block_maxima(np.asarray(volume[k]), (step, step)) for k in kept]
+    brightest = int(np.argmax([plane.max() for plane in planes]))
+    left, _, _, top = grid.extent
+    bottom, right = (first + step * n * grid.pitch for first, n in zip((top, left), planes[0].shape, strict=True))
+    pictures = [png_uri(shade(plane, low, high), "magma") for plane in planes]
+    depths, extent = [float(grid.depths[k]) for k in kept], (left, right, bottom, top)
+    return Slices(pictures, depths, low, high, step, extent, len(volume), brightest)
 
 
 def slider_html(slices: Slices, overlays: Sequence[str] = ()) -> str:
-    """An HTML figure with a slider through slices, at first in the middle; `overlays` are SVG drawings, one a slice."""
-    start, labels = len(slices.depths) // 2, [f"{z:.5g} mm" for z in slices.depths]
+    """An HTML figure with a slider through slices, at first at the brightest; `overlays` are SVG drawings, one a slice.
+
+    A bar says how long a length is, and the caption where the edges are.
+    """
+    start, labels = slices.brightest, [f"{z:.5g} mm" for z in slices.depths]
+    left, right, bottom, top = slices.extent
+    bar = scale_bar_html(right - left)
     planes = "".join(
         f'<div class="plane" data-depth="{z}" style="position:relative"{"" if k == start else " hidden"}>'
         f'<img class="picture" src="{picture}" alt="The volume at {z}" style="display:block;width:100%">'
-        f"{overlays[k] if overlays else ''}</div>"
+        f"{overlays[k] if overlays else ''}{bar}</div>"
         for k, (z, picture) in enumerate(zip(labels, slices.pictures, strict=True))
     )
-    caption = f"Black is {slices.low:.3g} and white {slices.high:.3g} in all slices"
-    caption += f"; means of {slices.step} x {slices.step} voxels" if slices.step > 1 else ""
+    caption = f"x from {left:.4g} to {right:.4g} mm to the right, y from {top:.4g} to {bottom:.4g} mm down. "
+    caption += f"Black is {slices.low:.3g} and white {slices.high:.3g} in all slices, on a square-root scale"
+    caption += f"; maxima of {slices.step} x {slices.step} voxels" if slices.step > 1 else ""
     caption += f"; {len(labels)} of {slices.total} depths" if len(labels) < slices.total else ""
     return (
         f'<figure class="slices" style="width:100%;max-width:640px;margin:0">{planes}'
@@ -232,11 +266,22 @@ def slider_html(slices: Slices, overlays: Sequence[str] = ()) -> str:
     )
 
 
-def _circle_overlays(points: Float[np.ndarray, "point 4"], slices: Slices, grid: Grid) -> list[str]:
+def scale_bar_html(width: float) -> str:
+    """A bar with its length over a picture of so many mm: HTML for the end of an element of `position: relative`."""
+    length = round_length(_BAR * width)
+    return (
+        f'<div style="position:absolute;right:4%;bottom:4%;width:{100 * length / width:.4g}%;border-bottom:3px solid '
+        "white;color:white;font-size:.85rem;line-height:1.4;text-align:center;white-space:nowrap;"
+        f'text-shadow:0 0 3px black,0 0 3px black">{_length_text(length)}</div>'
+    )
+
+
+def _circle_overlays(points: Float[np.ndarray, "point 4"], slices: Slices) -> list[str]:
     """SVG circles around points, each in the nearest slice."""
     points = points[np.argsort(-points[:, 3], kind="stable")[:_MAX_CIRCLES]]
     nearest = np.abs(points[:, 2:3] - np.asarray(slices.depths)).argmin(1)
-    (left, _, _, top), (width, height) = grid.extent, slices.size
+    left, right, bottom, top = slices.extent
+    width, height = right - left, bottom - top
     opening = (
         f'<svg viewBox="{left:.5g} {top:.5g} {width:.5g} {height:.5g}" fill="none" stroke="cyan" '
         'style="position:absolute;inset:0;width:100%;height:100%">'
@@ -261,7 +306,7 @@ class _VolumeFigure(Figure):
         file = io.BytesIO()
         self.savefig(file, format="png", dpi=_NOTEBOOK_DPI)
         maxima = f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
-        overlays = [] if points is None else _circle_overlays(np.asarray(points), slices, grid)
+        overlays = [] if points is None else _circle_overlays(np.asarray(points), slices)
         return f'<div>{slider_html(slices, overlays)}<img src="{maxima}" alt="Maxima along z, x and y"></div>'
 
 
@@ -270,6 +315,10 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
     """Maximum projections of a volume along z, y and x, to scale in mm, with points as circles.
 
     *Host.*
+
+    All three have the same scale of brightness: from the median of the projection along z, which is black, to the
+    brightest voxel, by the square root, so that dim points are seen and ghosts of back-projection look as dim as they
+    are. A side of more than 400 voxels is drawn as the maxima of blocks, which no picture is too small to show.
 
     Parameters
     ----------
@@ -307,14 +356,18 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
     left, right, bottom, top = grid.extent
     x, y = np.linspace(left, right, grid.shape[1] + 1), np.linspace(top, bottom, grid.shape[0] + 1)
     z = _depth_edges(np.asarray(grid.depths, float), grid.pitch)
-    image = _draw_maxima(plane, x, y, volume.max(0))
-    _draw_maxima(beside, z, y, volume.max(2).T)
-    _draw_maxima(below, x, z, volume.max(1))
+    low, high = display_range(maxima := volume.max(0))
+    norm = PowerNorm(0.5, low, max(high, low + 1e-12), clip=True)
+    image = _draw_maxima(plane, x, y, maxima, norm)
+    _draw_maxima(beside, z, y, volume.max(2).T, norm)
+    _draw_maxima(below, x, z, volume.max(1), norm)
     plane.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(left, right), ylim=(bottom, top))
     beside.set(xlabel="z, mm", ylim=(bottom, top), xlim=(z[0], z[-1]))
     below.set(xlabel="x, mm", ylabel="z, mm", xlim=(left, right), ylim=(z[0], z[-1]))
-    figure.colorbar(image, ax=empty, label="from above", fraction=0.6, location="left")
-    plane.set_title(" x ".join(map(str, volume.shape)) + " voxels (z, y, x), maxima")
+    ticks = [low + (high - low) * percent / 100 for percent in _PERCENT]
+    bar = figure.colorbar(image, ax=empty, label="% of the maximum", fraction=0.6, location="left")
+    bar.set_ticks(ticks, labels=list(map(str, _PERCENT)))
+    plane.set_title(f"maxima of {' x '.join(map(str, volume.shape))} voxels (z, y, x), up to {high:.4g}")
     if points is not None and len(points):
         px, py, pz = np.asarray(points)[:, :3].T
         colors = colormaps["winter"](np.clip((pz - z[0]) / (z[-1] - z[0]), 0, 1))
@@ -324,10 +377,11 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
     return figure
 
 
-def _draw_maxima(axes, across, along, maxima):
-    # Each view has its own range: maxima over longer lines of sight are brighter.
-    low, high = np.percentile(maxima, (_BLACK, _WHITE))
-    return axes.pcolormesh(across, along, maxima, cmap="magma", vmin=low, vmax=max(high, low + 1e-12), rasterized=True)
+def _draw_maxima(axes, across, along, maxima, norm):
+    steps = [-(-n // _MAX_CELLS) for n in maxima.shape]
+    edges = (np.append(at[:-1:step], at[-1]) for at, step in zip((along, across), steps, strict=True))
+    down, right = edges
+    return axes.pcolormesh(right, down, block_maxima(maxima, steps), cmap="magma", norm=norm, rasterized=True)
 
 
 def _depth_edges(depths, pitch):

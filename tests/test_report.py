@@ -9,18 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from matplotlib.figure import Figure
 
-from gs_jax import Grid
+from gs_jax import Grid, Imager, MicrolensArray, Sensor
 from gs_jax.__main__ import main
 from gs_jax.apps.report import drawings, report_tables, report_tables as views
 from gs_jax.apps.report.drawings import line_chart
 from gs_jax.apps.report.page import write_report
 from gs_jax.base.errors import InputError
+from gs_jax.codesign import search_report
 from gs_jax.design.design import read_design
 from gs_jax.design.start import geomscope
 from gs_jax.io.point_tables import write_points
 from gs_jax.io.surfaces import write_surface
 from gs_jax.io.volumes import write_volume
+from gs_jax.layouts import plate_corners
 from gs_jax.optics.raytrace import trace_lenslet
 from gs_jax.pictures import downsample, make_slices
 
@@ -119,12 +122,12 @@ def test_a_browser_shows_it_as_it_is(made, browser, width, scheme):
 def test_keys_move_the_slider_and_the_slice(made, browser):
     with watched(browser, (made / "report.html").as_uri()) as page:
         slider, image, said = (page.locator(f"#volume .slices {name}") for name in ("input", "img:visible", "output"))
-        assert said.inner_text() == "19 mm"
+        assert said.inner_text() == "20 mm"  # the brightest
         before = image.get_attribute("src")
         slider.focus()
-        page.keyboard.press("ArrowRight")
-        assert said.inner_text() == "20 mm" and image.get_attribute("src") != before
-        assert slider.get_attribute("aria-valuetext") == "20 mm"
+        page.keyboard.press("ArrowLeft")
+        assert said.inner_text() == "19 mm" and image.get_attribute("src") != before
+        assert slider.get_attribute("aria-valuetext") == "19 mm"
         page.keyboard.press("Home")
         assert said.inner_text() == "18 mm"
 
@@ -246,6 +249,23 @@ def test_the_cloud_is_where_the_voxels_are():
     assert cloud["count"] == 1 and value == 255
     place = [cloud["first"][0] + x * cloud["pitch"][0], cloud["first"][1] + y * cloud["pitch"][1], cloud["depths"][z]]
     np.testing.assert_allclose(place, grid.to_mm(np.array([4, 300, 123])), atol=0.03)
+
+
+def test_the_plate_is_drawn_turned_and_shifted_as_its_lenses():
+    """Lenses at its corners are at the corners of its outline, in the report and in the picture of a search."""
+    corners = [(-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5)]
+    array = MicrolensArray(corners, aperture_diameter=1.0, size=(4.0, 3.0))
+    imager = Imager(array, Sensor((100, 100), 0.05), 5.0, 1.0, rotation=0.1, shift=(0.2, -0.1))
+    left, top, right, bottom = drawings.plate_and_sensor(imager)
+    np.testing.assert_allclose([left, top], np.minimum(imager.centers.min(0), -2.5))
+    np.testing.assert_allclose([right, bottom], np.maximum(imager.centers.max(0), 2.5))
+    drawn = drawings.draw_layout(imager, "data:,", (left, top, right, bottom), "nothing")
+    assert " ".join(f"{x:.4f},{y:.4f}" for x, y in np.asarray(imager.centers)) in drawn
+    turned = geomscope().replace(rotation_deg=1.0, shift_mm=(0.05, -0.1))
+    search_report._draw_layout(axes := Figure().subplots(), turned)
+    plate = axes.patches[0].get_xy()[:4]
+    np.testing.assert_allclose(plate, plate_corners(turned.imager()))
+    assert abs(plate[0, 1] - plate[1, 1]) == pytest.approx(20 * np.sin(np.radians(1)), rel=1e-5)
 
 
 def test_lenses_that_see_a_point():

@@ -201,7 +201,7 @@ def _draw_words(image: np.ndarray, depths: list[float], volumes: dict[str, np.nd
             # Back-projection has a pedestal, which is no object.
             low, high = np.percentile(plane, (50, 99.9))
             axes.imshow(plane, cmap="magma", extent=sensor.extent, vmin=low, vmax=max(high, low + 1e-9))
-            axes.set_title(f"{name}, {depth:g} mm", fontsize=9)
+            axes.set_title(f"{name}, {depth:g} mm")
         row[0].set_ylabel("y, mm")
     for axes in grid[-1]:
         axes.set_xlabel("x, mm")

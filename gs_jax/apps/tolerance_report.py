@@ -204,7 +204,7 @@ def picture(outcome: Outcome) -> Figure:
     for axes in (widths, ratios, errors):
         axes.set(xlabel="depth z, mm", ylim=(0, None))
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=10)
     name = "".join(c for c in outcome.design if " " <= c <= "~").replace("$", r"\$")
     whole = f"{100 * outcome.all_met.mean():.3g} % of {len(outcome.all_met)} devices meet all targets"
     figure.suptitle(f"{name}: {whole}")
@@ -226,4 +226,4 @@ def _draw_shares(axes, outcome: Outcome) -> None:
     axes.set_yticks(rows, labels)
     axes.invert_yaxis()
     axes.set(xlabel="share of the mean square change, by gradient, %", xlim=(0, 100), title="shares of the tolerances")
-    axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+    axes.legend(fontsize=10, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))

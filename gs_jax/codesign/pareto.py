@@ -206,7 +206,7 @@ def picture(front: Front) -> Figure:
     axes.set_title("what one costs in the other")
     axes.grid(alpha=0.3)
     if third or others.any():
-        axes.legend(fontsize=8)
+        axes.legend()
     return figure
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Polygon
 from rich.table import Table
 
 from ..design.datasheets import six_digits
@@ -16,6 +16,7 @@ from ..design.design import Design, write_design
 from ..design.validation import of_each
 from ..io.files import check_output, side_file, write_figure, write_json
 from ..io.provenance import Provenance
+from ..layouts import plate_corners
 from ..lenses import lenses_by_type
 from ..pictures import PALETTE
 from ..typing import PathLike
@@ -114,8 +115,8 @@ def _plain(record: dict[str, Any]) -> dict[str, Any]:
 
 def picture(outcome: Outcome) -> Figure:
     """Figure of the layout, and of cost and terms over the steps of the best start."""
-    figure = Figure(figsize=(13.5, 4.6), dpi=110, layout="constrained")
-    layout, cost, terms = figure.subplots(1, 3, width_ratios=(1, 1, 1.5))
+    figure = Figure(figsize=(14.5, 5), dpi=110, layout="constrained")
+    layout, cost, terms = figure.subplots(1, 3, width_ratios=(1.3, 1, 1.5))
     _draw_layout(layout, outcome.design)
     asked = outcome.study.terms
     best = lambda stage: best_end(outcome.log, stage)["start"]
@@ -131,28 +132,25 @@ def picture(outcome: Outcome) -> Figure:
         terms.plot(places, np.maximum(values / term.target, 1e-3), style, color=color, label=text)
     terms.axhline(1, color="0.6", lw=0.8)
     terms.set(yscale="log", xlabel="step", ylabel="value over target", title="terms (goals solid: over their unit)")
-    terms.legend(fontsize=7.5, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    terms.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 
 def _draw_layout(axes: Axes, design: Design) -> None:
-    """Lenses on the plate, each with its disc in the colour of its type, and the sensor."""
-    diameters = of_each(design, "aperture_diameter_mm")
-    discs = [Circle(center, d / 2) for center, d in zip(design.array.centers_mm, diameters, strict=True)]
-    for colour, which in zip(PALETTE, lenses_by_type(design.imager().array), strict=False):
+    """Lenses on the plate, each with its disc in the colour of its type, and the sensor, in the sensor's frame."""
+    imager, diameters = design.imager(), of_each(design, "aperture_diameter_mm")
+    discs = [Circle(center, d / 2) for center, d in zip(np.asarray(imager.centers), diameters, strict=True)]
+    for colour, which in zip(PALETTE, lenses_by_type(imager.array), strict=False):
         some = [discs[lens] for lens in which]
         axes.add_collection(PatchCollection(some, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.5))
-    sensor = [n * design.sensor.pixel_pitch_um / 1000 for n in design.sensor.shape[::-1]]
-    for size, middle, color, name in (
-        (design.array.size_mm, (0.0, 0.0), "k", "plate"),
-        (sensor, design.sensor.origin_mm or (0.0, 0.0), PALETTE[2], "sensor"),
-    ):
-        corner = (middle[0] - size[0] / 2, middle[1] - size[1] / 2)
-        axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=color, label=name))
-    reach = 0.55 * max(*design.array.size_mm, *sensor)
+    left, right, bottom, top = imager.sensor.extent
+    plate, sensor = plate_corners(imager), np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+    for corners, color, name in ((plate, "k", "plate"), (sensor, PALETTE[2], "sensor")):
+        axes.add_patch(Polygon(corners, fill=False, edgecolor=color, label=name))
+    reach = 1.1 * float(np.abs(np.vstack([plate, sensor])).max())
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", xlabel="x, mm", ylabel="y, mm")
     axes.set_title(f"{len(discs)} lenses, D = {max(diameters):.3g} mm")
-    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
+    axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
 
 
 def check_outputs(path: Path) -> None:

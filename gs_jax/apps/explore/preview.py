@@ -14,6 +14,7 @@ from ...grid import Grid, Sensor
 from ...optics.psf import spot_image
 from ...optics.raytrace import to_numpy
 from ...simulation.phantoms import random_points
+from ..report.drawings import plate_and_sensor
 from .evaluation import SIZE, Start, Values, lens_unit, moved_imager, pupil_samples
 
 # Cells across the map of ghosts, and its depths.
@@ -41,8 +42,7 @@ def map_ghosts(imager: Imager, near: float, far: float) -> GhostMap:
     """
     depths = np.linspace(near, far, _GHOST_DEPTHS)
     left, right, bottom, top = imager.sensor.extent
-    half_x, half_y = (side / 2 for side in imager.array.plate)
-    box = (min(left, -half_x), min(top, -half_y), max(right, half_x), max(bottom, half_y))
+    box = plate_and_sensor(imager)
     host = to_numpy(imager)
     # On the axis, at each depth and in the middle of them.
     axis = host.views_of_all(np.column_stack([np.zeros((_GHOST_DEPTHS + 1, 2)), [*depths, (near + far) / 2]]))

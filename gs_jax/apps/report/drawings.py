@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
+from matplotlib.path import Path as MatplotlibPath
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...base.errors import needs_extra
@@ -18,7 +19,7 @@ from ...design.conversion import default_sample
 from ...design.design import Design
 from ...geometry import Imager
 from ...layers import layers_in_front
-from ...layouts import cell_edges
+from ...layouts import cell_edges, on_sensor, plate_corners
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
 from ...optics.psf import least_samples, spot_image
@@ -207,6 +208,13 @@ def _chief_rays(imager: Imager, depth: float, vertex: float, end: float) -> str:
     return "".join(path(*each) for each in zip(centers[near, 0], landing[near, 0], strict=True))
 
 
+def plate_and_sensor(imager: Imager) -> tuple[float, float, float, float]:
+    """Box around plate and sensor, `(left, top, right, bottom)`, mm."""
+    left, right, bottom, top = imager.sensor.extent
+    corners = np.vstack([plate_corners(imager), [(left, top), (right, bottom)]])
+    return (*corners.min(0).tolist(), *corners.max(0).tolist())
+
+
 class LensCounts(NamedTuple):
     """Number of lenses that see each point of a plane within `(left, top, right, bottom)`, mm; mean above the plate."""
 
@@ -218,8 +226,7 @@ class LensCounts(NamedTuple):
 def count_lenses(imager: Imager, depth: float) -> LensCounts:
     """Counts lenses within the field radius whose chief ray lands on the sensor, at a depth over plate and sensor."""
     x_left, x_right, y_bottom, y_top = imager.sensor.extent
-    half_x, half_y = (side / 2 for side in imager.array.plate)
-    box = (min(x_left, -half_x), min(y_top, -half_y), max(x_right, half_x), max(y_bottom, half_y))
+    box = plate_and_sensor(imager)
     step = max(box[2] - box[0], box[3] - box[1]) / _MAP_PIXELS
     columns, rows = (max(round((high - low) / step), 1) for low, high in ((box[0], box[2]), (box[1], box[3])))
     x = box[0] + (np.arange(columns) + 0.5) * (box[2] - box[0]) / columns
@@ -235,7 +242,7 @@ def count_lenses(imager: Imager, depth: float) -> LensCounts:
         seen &= (landing[..., 1] >= y_top) & (landing[..., 1] <= y_bottom)
         seen &= (offset**2).sum(-1) <= imager.field_radius**2
         count[start : start + _BATCH] = seen.sum(0)[: len(points) - start]
-    over_plate = (np.abs(points) <= (half_x, half_y)).all(1)
+    over_plate = MatplotlibPath(plate_corners(imager)).contains_points(points)
     return LensCounts(count.reshape(rows, columns), box, float(count[over_plate].mean()))
 
 
@@ -245,7 +252,8 @@ def draw_layout(imager: Imager, picture: str, box: tuple[float, float, float, fl
     `picture` is a data URI of the plane within `box`, `(left, top, right, bottom)`, mm; `what` says what it shows.
     """
     title, bar = f"Layout of {len(imager.array.centers)} lenses over {what}", round_length((box[2] - box[0]) / 5)
-    return _macros().layout(title, picture, box, _outlines(imager), imager.array.plate, imager.sensor.extent, bar)
+    plate = " ".join(f"{x:.4f},{y:.4f}" for x, y in plate_corners(imager))
+    return _macros().layout(title, picture, box, _outlines(imager), plate, imager.sensor.extent, bar)
 
 
 def _outlines(imager: Imager) -> str:
@@ -261,9 +269,8 @@ def _outlines(imager: Imager) -> str:
     normal *= np.sign((normal * edges.start).sum(1))[:, None]
     cos = normal @ direction.T
     np.minimum.at(radius, edges.lens, np.where(cos > 1e-9, edges.height[:, None] / np.maximum(cos, 1e-9), np.inf))
-    turn = float(imager.rotation)
-    direction = direction @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    corners = np.asarray(imager.centers, float)[:, None] + radius[..., None] * direction[None]
+    corners = centers[:, None] + radius[..., None] * direction[None]
+    corners = on_sensor(imager, corners.reshape(-1, 2)).reshape(corners.shape)
     return "".join("M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in each) + "Z" for each in corners)
 
 

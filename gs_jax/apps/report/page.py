@@ -19,7 +19,7 @@ from ...grid import Grid
 from ...io.files import check_output, write_text
 from ...io.provenance import Provenance
 from ...io.surfaces import SurfaceMaps, surface_mesh
-from ...pictures import color_table, make_slices, png_uri, slider_html, to_base64, to_uint8
+from ...pictures import color_table, make_slices, png_uri, scale_bar_html, slider_html, to_base64, to_uint8
 from ...typing import Image, PathLike, Points
 from . import report_tables as tables
 from .drawings import Psfs, count_lenses, draw_layout, draw_section, ideal_mtf, line_chart, mtf, simulate_psfs
@@ -118,6 +118,8 @@ def write_report(
                 "depths": np.asarray(grid.depths, float),
                 "slider": slider_html(make_slices(volume, grid, tables.SLICE_BYTES)),
                 "projections": tables.make_projections(volume, grid),
+                "bar": scale_bar_html(grid.shape[1] * grid.pitch),
+                "extent": grid.extent,
             }
             context["views"]["volume"] = tables.voxel_view(volume, grid)
         if surface is not None:

@@ -27,7 +27,8 @@ const scenes = {
     let light = new Uint8Array(0);
     const draw = (view, context) => {
       const {width: w, height: h} = view.canvas, least = floor ? Number(floor.value) : 1;
-      if (said) said.textContent = `${Math.round(least / 2.55)} %`;
+      // Values are square roots of the brightness.
+      if (said) said.textContent = `${(100 * (least / 255) ** 2).toPrecision(2)} %`;
       if (light.length !== w * h) light = new Uint8Array(w * h);
       light.fill(0);
       const side = Math.max(1, Math.ceil(Math.max(scene.pitch[0], scene.pitch[1]) * view.scale)), half = (side - 1) / 2;

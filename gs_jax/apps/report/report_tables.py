@@ -18,7 +18,7 @@ from ...grid import Grid
 from ...io.files import read_text
 from ...lenses import MicrolensArray
 from ...mold.solids import MoldShape, preview_solid
-from ...pictures import display_range, downsample, png_uri, to_base64, to_uint8
+from ...pictures import block_maxima, display_range, downsample, png_uri, shade, to_base64, to_uint8
 from ...typing import PathLike
 
 # Spots this many times wider than Eq. 5 are marked, as in `gs_jax.design.diagnostics`.
@@ -232,7 +232,7 @@ class Projection(NamedTuple):
 
 
 def make_projections(volume: Float[np.ndarray, "depth row column"], grid: Grid) -> list[Projection]:
-    """Maxima along z, y and x, `[y, x]`, `[z, x]` and `[y, z]`, each with its own range."""
+    """Maxima along z, y and x, `[y, x]`, `[z, x]` and `[y, z]`, with the range of those along z."""
     z = np.asarray(grid.depths, float)
     order = np.argsort(z)
     width, height = grid.shape[1] * grid.pitch, grid.shape[0] * grid.pitch
@@ -242,10 +242,10 @@ def make_projections(volume: Float[np.ndarray, "depth row column"], grid: Grid) 
         (_resample_depths(volume.max(1)[order], z[order]), width, depth),
         (_resample_depths(volume.max(2)[order], z[order]).T, depth, height),
     )
-    projections = []
+    projections, shown = [], display_range(views[0][0])
     for image, across, down in views:
-        small = _block_maxima(image, [-(-n // _MAX_PIXELS) for n in image.shape])
-        projections.append(Projection(png_uri(to_uint8(small, *display_range(small)), "magma"), across, down))
+        small = block_maxima(image, [-(-n // _MAX_PIXELS) for n in image.shape])
+        projections.append(Projection(png_uri(shade(small, *shown), "magma"), across, down))
     return projections
 
 
@@ -258,17 +258,10 @@ def _resample_depths(image: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return image[np.abs(even[:, None] - depths[None]).argmin(1)]
 
 
-def _block_maxima(values: np.ndarray, steps: list[int]) -> np.ndarray:
-    for axis, step in enumerate(steps):
-        if step > 1:
-            values = np.maximum.reduceat(values, np.arange(0, values.shape[axis], step), axis)
-    return values
-
-
 def voxel_view(volume: Float[np.ndarray, "depth row column"], grid: Grid) -> dict[str, Any]:
     """The brightest voxels for the browser: indices of voxels, and brightness from 1 to 255."""
     step = [-(-n // _MAX_SIDE) for n in volume.shape]
-    values = to_uint8(_block_maxima(volume, step), *display_range(volume))
+    values = shade(block_maxima(volume, step), *display_range(volume))
     flat = values.ravel()
     floor = max(1, int(np.partition(flat, -_MAX_VOXELS)[-_MAX_VOXELS])) if flat.size > _MAX_VOXELS else 1
     kept = np.flatnonzero(flat >= floor)
