@@ -1,6 +1,8 @@
+import itertools
 import json
 import shlex
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tomli_w
@@ -8,7 +10,7 @@ from click.testing import CliRunner
 
 from gs_jax.__main__ import commands
 from gs_jax.base.errors import InputError, InputWarning
-from gs_jax.codesign import stages
+from gs_jax.codesign import pareto, stages
 from gs_jax.codesign.pareto import as_json, non_dominated, picture, trade_off
 from gs_jax.codesign.search import run_study
 from gs_jax.codesign.study import Study, read_study
@@ -77,6 +79,34 @@ def test_a_search_that_ends_in_no_number_spoils_no_other(monkeypatch):
     monkeypatch.setattr(stages, "run", first_lost)
     found = trade_off(geomscope().replace(aperture_diameter_mm=1.4), Study.model_validate(STUDY))
     assert np.isfinite(found.values).all() and found.best[1:].all()
+
+
+def test_a_looser_limit_has_no_worse_design(monkeypatch):
+    """A search that finds a narrow lens in both rounds gets the design of the tighter limit; the others stay."""
+
+    def stuck(problem, stages, terms, values, **options):
+        limit = terms[-1].at_least
+        found = {3.0: 0.15, 6.0: 0.2, 12.0: 0.1}[limit]
+        starts.append((limit, float(values["aperture_diameter_mm"])))
+        return values | {"aperture_diameter_mm": jnp.asarray(found)}
+
+    starts = []
+    monkeypatch.setattr(pareto, "run_stages", stuck)
+    found = trade_off(geomscope(), Study.model_validate(STUDY))
+    light, depth = found.values.T
+    assert [float(point.values["aperture_diameter_mm"]) for point in found.points] == [0.2, 0.2, 0.1]
+    assert light[0] == light[1] > light[2] > 0 and depth[0] == depth[1] < depth[2]
+    assert [point.limits for point in found.points] == [(3.0,), (6.0,), (12.0,)] and found.best.all()
+    # The others start from the first, then each from the best neighbour that keeps its limit.
+    assert starts[1:] == [(6.0, 0.15), (12.0, 0.15), (3.0, 0.2), (6.0, 0.15), (12.0, 0.2)]
+
+
+def test_neighbours_differ_by_one_step_of_one_limit():
+    """Whatever their order in the file."""
+    combinations = list(itertools.product((2.0, 8.0, 5.0), (0.1, 0.2)))
+    near = [{combinations[other] for other in others} for others in pareto._neighbours(combinations)]
+    assert near[0] == {(2.0, 0.2), (5.0, 0.1)} and near[-1] == {(5.0, 0.1), (2.0, 0.2), (8.0, 0.2)}
+    assert pareto._neighbours([(1.0,)]) == [[]]
 
 
 # Focus by the distance of the sensor; then the widest lens with that depth of field.
@@ -149,7 +179,7 @@ def test_the_command_reads_its_study_once_and_signs_its_numbers(tmp_path, monkey
     arguments = ["pareto", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(commands, arguments)
     assert done.exit_code == 0, done.output
-    assert len(read) == 1
+    assert len(read) == 1 and done.output.splitlines()[0].startswith("depth_of_field_mm >=  light_percent")
     found = read_provenance(tmp_path / "out" / "pareto.json")
     assert found["command"] == shlex.join(["gs-jax", *arguments]) and "[lens]" in found["design"]
     assert all(found[f"input {name}"].startswith("sha256 ") for name in ("study.toml", "start.toml"))
@@ -162,4 +192,5 @@ def test_numbers_and_picture(front, tmp_path):
     assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
     assert [entry["term"] for entry in numbers["objectives"]] == ["light_percent", "depth_of_field_mm"]
     assert all(point["on_front"] and point["feasible"] for point in numbers["points"])
+    assert [point["limits"] for point in numbers["points"]] == [{"depth_of_field_mm": x} for x in (3.0, 6.0, 12.0)]
     picture(front).savefig(tmp_path / "a.png")

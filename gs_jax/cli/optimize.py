@@ -73,6 +73,7 @@ def pareto_command(study: Path, out: Path, terms: Path | None, workers: Workers)
     from ..base.errors import errors_name_file
     from ..codesign.pareto import as_json, picture, sweep_of, trade_off
     from ..codesign.study import parent_path, read_study
+    from ..codesign.targets import SIGNS
     from ..codesign.terms import add_terms
     from ..design.design import design_text, read_design
     from ..io.files import write_figure
@@ -99,9 +100,10 @@ def pareto_command(study: Path, out: Path, terms: Path | None, workers: Workers)
     with Progress() as progress, workers:
         front = trade_off(parent, question, each=each, progress=progress, workers=workers)
     write_figure(drawing, picture(front))
-    table = Table(*(term.name for term in front.objectives), "", box=None, pad_edge=False)
+    limits = [f"{term.name} {SIGNS[term.kind]}" for term in front.objectives[1:]]
+    table = Table(*limits, *(term.name for term in front.objectives), "", box=None, pad_edge=False)
     for row, point, best in zip(front.values, front.points, front.best, strict=True):
         status = "" if best else "dominated" if point.feasible else "misses a target"
-        table.add_row(*(f"{x:.4g}" for x in row), status)
+        table.add_row(*(f"{x:g}" for x in point.limits), *(f"{x:.4g}" for x in row), status)
     Console().print(table)
     click.echo(f"{drawing}: {front.best.sum()} of {len(front.points)} points on the front")

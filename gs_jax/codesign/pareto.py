@@ -2,8 +2,9 @@
 
 By the epsilon-constraint method (Haimes, Lasdon and Wismer, IEEE Trans. Syst. Man Cybern. 1, 296, 1971) one term is
 minimised or maximised under limits on one or two others, which move from value to value. Each search is that of
-`gs_jax.codesign.search`. The first starts from the design; the others start from its result and may run in parallel.
-Every point is a design that a search found, so the true front may be better, not worse.
+`gs_jax.codesign.search`. The first starts from the design, the others from its result; then each limit is searched once
+more from the best design of a neighbouring limit. The searches of a round may run in parallel. A point is the best of
+all designs found that keep its limits, so a looser limit never has a worse one. The true front may be better.
 """
 
 import contextlib
@@ -27,15 +28,19 @@ from .search import load
 from .solve import Log
 from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages, warn_of_start
 from .study import Study, TermTable
-from .targets import Row, worst_entry
+from .targets import SIGNS, Row, assess, worst_entry
 from .terms import unit_of, with_terms
+
+# Relative gain of the goal below which two searches have found the same design.
+_LEAST_GAIN = 1e-6
 
 
 class Point(NamedTuple):
-    """Parameters of a design, and its terms (the limits last)."""
+    """Parameters of a design, its terms (those with moving limits last), and these limits."""
 
     values: Values
     rows: list[Row]
+    limits: tuple[float, ...]
 
     @property
     def feasible(self) -> bool:
@@ -120,12 +125,25 @@ def sweep_of(design: Design, study: Study) -> Sweep:
 
 def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress, workers: Workers) -> Front:
     problem, kept, moving = sweep
-    objectives = [next(term for term in kept if term.is_goal), *moving]
     combinations = list(itertools.product(*(limit.targets for limit in problem.study.pareto)))
+    neighbours = _neighbours(combinations)
     build = with_terms(partial(searcher, sweep), [term.name for term in (*kept, *moving)])
     stream, points = workers.mapper(build), {}
-    front = lambda: _front([*kept, *moving], objectives, [points[number] for number in sorted(points)])
-    with progress.counter("Trade-off", len(combinations)) as advance:
+    front = lambda: _front(sweep, [points[number] for number in sorted(points)])
+
+    def keep_better(number: int, new: Point) -> None:
+        if _is_better(sweep, new, points[number]):
+            points[number] = new
+            each(front())
+
+    def from_neighbours():
+        # The starts depend on the first round alone, so that the order in which workers finish does not matter.
+        first = dict(points)
+        for number, limits in enumerate(combinations):
+            if near := [_with_limits(sweep, first[other], limits) for other in neighbours[number]]:
+                yield number, limits, min(near, key=partial(_rank, sweep)).values
+
+    with progress.counter("Trade-off", len(combinations) + sum(map(bool, neighbours))) as advance:
         values = start_values(problem.imager, problem.at)
         warn_of_start(problem, values)
         for some in (combinations[:1], combinations[1:]):
@@ -135,7 +153,45 @@ def _trade_off(sweep: Sweep, each: Callable[[Front], object], progress: Progress
                 each(front())
                 advance()
             values = points[0].values
+        for (number, *_), result in stream(list(from_neighbours())):
+            keep_better(number, result())
+            advance()
+    for number, limits in enumerate(combinations):
+        designs = [_with_limits(sweep, point, limits) for point in points.values()]
+        keep_better(number, min(designs, key=partial(_rank, sweep)))
     return front()
+
+
+def _neighbours(combinations: list[tuple[float, ...]]) -> list[list[int]]:
+    """Of each combination of limits those whose limits are next to its own along one axis."""
+    axes = [sorted(set(axis)) for axis in zip(*combinations, strict=True)]
+    index = np.array([[axis.index(limit) for axis, limit in zip(axes, some, strict=True)] for some in combinations])
+    return [np.flatnonzero(np.abs(index - own).sum(1) == 1).tolist() for own in index]
+
+
+def _with_limits(sweep: Sweep, point: Point, limits: tuple[float, ...]) -> Point:
+    """The design of a point, assessed under other limits."""
+    terms = _with_targets(sweep.kept, sweep.moving, limits)
+    rows = [assess(term, np.array(row[:2])) for term, row in zip(terms, point.rows, strict=True)]
+    return Point(point.values, rows, limits)
+
+
+def _rank(sweep: Sweep, point: Point) -> tuple[bool, float]:
+    """Less is better: first whether a target is missed, then the goal."""
+    number = next(number for number, term in enumerate(sweep.kept) if term.is_goal)
+    goal = sweep.kept[number]
+    value = _sign(goal) * float(worst_entry(goal, jnp.array(point.rows[number][:2])))
+    return not point.feasible or not np.isfinite(value), value
+
+
+def _is_better(sweep: Sweep, new: Point, old: Point) -> bool:
+    """Whether a design meets targets that the other misses, or meets them too and has a better goal by a millionth."""
+    (misses, goal), (missed, before) = _rank(sweep, new), _rank(sweep, old)
+    return not misses and (missed or goal < before - _LEAST_GAIN * abs(before))
+
+
+def _sign(term: TermTable) -> float:
+    return -1.0 if term.kind in ("at_least", "maximise") else 1.0
 
 
 def searcher(sweep: Sweep):
@@ -150,7 +206,7 @@ def searcher(sweep: Sweep):
         # A search that comes to no number spoils no other: its point is where it started.
         with contextlib.suppress(InputError):
             values = run_stages(problem, stages, terms, values, log=Log())
-        return Point(values, rows_of(terms, entries, values))
+        return Point(values, rows_of(terms, entries, values), tuple(limits))
 
     return search
 
@@ -160,11 +216,13 @@ def _with_targets(kept, moving, limits) -> list[TermTable]:
     return [*kept, *moved]
 
 
-def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Point]) -> Front:
+def _front(sweep: Sweep, points: list[Point]) -> Front:
+    terms = [*sweep.kept, *sweep.moving]
+    objectives = [next(term for term in sweep.kept if term.is_goal), *sweep.moving]
     places = [terms.index(objective) for objective in objectives]
     ends = [[jnp.array(point.rows[place][:2]) for place in places] for point in points]
     values = np.array([[float(worst_entry(t, x)) for t, x in zip(objectives, row, strict=True)] for row in ends])
-    signs = np.array([-1.0 if t.kind in ("at_least", "maximise") else 1.0 for t in objectives])
+    signs = np.array([_sign(term) for term in objectives])
     feasible = np.array([point.feasible for point in points])
     best = np.zeros(len(points), bool)
     best[feasible] = non_dominated((values * signs)[feasible])
@@ -172,12 +230,13 @@ def _front(terms: list[TermTable], objectives: list[TermTable], points: list[Poi
 
 
 def as_json(front: Front) -> dict[str, Any]:
-    """The front's numbers: objectives and free parameters of every point."""
+    """The front's numbers: limits, objectives and free parameters of every point."""
     names = [name for name in NAMES if name != "centers_mm"]
     return {
         "objectives": [{"term": term.name, "kind": term.kind} for term in front.objectives],
         "points": [
             {term.name: float(f"{x:.6g}") for term, x in zip(front.objectives, row, strict=True)}
+            | {"limits": {t.name: limit for t, limit in zip(front.objectives[1:], point.limits, strict=True)}}
             | {"parameters": {name: significant(point.values[name]).tolist() for name in names}}
             | {"terms": {t.name: list(r[:2]) for t, r in zip(front.terms, point.rows, strict=True)}}
             | {"feasible": point.feasible, "on_front": bool(best)}
@@ -187,16 +246,15 @@ def as_json(front: Front) -> dict[str, Any]:
 
 
 def picture(front: Front) -> Figure:
-    """The goal against the first limited term; a second limit makes lines of one colour each."""
+    """The goal against the first limited term; each second limit is a line of its own colour."""
     figure = Figure(figsize=(6.4, 4.4), dpi=110, layout="constrained")
     axes = figure.subplots()
     goal, along, *third = front.objectives
-    groups = np.round(front.values[:, 2], 9) if third else np.zeros(len(front.points))
-    limits = _groups(groups)
-    for number, group in enumerate(limits):
-        some = np.isclose(groups, group, rtol=0.02) & front.best
+    groups = np.array([point.limits[1] if third else 0.0 for point in front.points])
+    for number, group in enumerate(np.unique(groups)):
+        some = (groups == group) & front.best
         order = np.argsort(front.values[some, 1])
-        label = f"{_axis(third[0])}: {group:.2g}" if third else None
+        label = f"{_axis(third[0])} {SIGNS[third[0].kind]} {group:g}" if third else None
         axes.plot(front.values[some, 1][order], front.values[some, 0][order], "o-", color=f"C{number}", label=label)
     others = ~front.best
     if others.any():
@@ -208,15 +266,6 @@ def picture(front: Front) -> Figure:
     if third or others.any():
         axes.legend()
     return figure
-
-
-def _groups(values: Float[np.ndarray, " point"]) -> list[float]:
-    """Values that differ by more than 2 %, in order."""
-    found: list[float] = []
-    for value in np.sort(values).tolist():
-        if not found or not np.isclose(value, found[-1], rtol=0.02):
-            found.append(value)
-    return found
 
 
 def _axis(term: TermTable) -> str:

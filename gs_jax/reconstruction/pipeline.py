@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from ..base.arrays import check_finite, jit, native, host_code
+from ..base.arrays import check_finite, host_code, jit, native
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
