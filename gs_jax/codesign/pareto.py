@@ -251,11 +251,13 @@ def picture(front: Front) -> Figure:
     axes = figure.subplots()
     goal, along, *third = front.objectives
     groups = np.array([point.limits[1] if third else 0.0 for point in front.points])
-    for number, group in enumerate(np.unique(groups)):
+    for number, group in enumerate(limits := np.unique(groups)):
         some = (groups == group) & front.best
         order = np.argsort(front.values[some, 1])
         label = f"{_axis(third[0])} {SIGNS[third[0].kind]} {group:g}" if third else None
-        axes.plot(front.values[some, 1][order], front.values[some, 0][order], "o-", color=f"C{number}", label=label)
+        # Limits may share designs: smaller dots lie on larger ones.
+        style = {"color": f"C{number}", "label": label, "ms": 5 + 3 * (len(limits) - 1 - number)}
+        axes.plot(front.values[some, 1][order], front.values[some, 0][order], "o-", **style)
     others = ~front.best
     if others.any():
         label = "dominated or misses a target"
