@@ -1,4 +1,3 @@
-import operator
 import subprocess
 import sys
 from pathlib import Path
@@ -127,19 +126,25 @@ def test_gradients():
 
 
 def test_the_surface_of_a_lens_has_gradients_by_its_psf():
-    """Against differences; without a PSF, or with one computed before, the surface and the aperture change nothing."""
-    array = MicrolensArray([[-0.6, 0.3], [0.1, -0.5], [0.5, 0.6]], aperture_diameter=0.6)
-    imager, grid = Imager(array, Sensor((40, 40), 0.06), 5.0, 1.2), Grid([18.0, 22.0], (5, 5), 0.4)
-    weights, volume = jax.random.normal(jax.random.key(3), (40, 40)), volume_of(grid)
-    stack = lambda imager: jax.vmap(lambda depth: gaussian_psf(imager, depth, size=11))(grid.depths)
-    score = lambda imager, psf: jnp.vdot(weights, forward(volume, imager, grid, psf) ** 2)
-    whole = jax.jit(lambda imager: score(imager, stack(imager)))
-    found, fixed = jax.grad(whole)(imager).array, jax.grad(score)(imager, stack(imager)).array
-    for name in ("radius_of_curvature", "conic_constant", "aperture_diameter"):
-        moved = lambda h, of=operator.attrgetter(f"array.{name}"): eqx.tree_at(of, imager, of(imager) + h)
-        slope = (whole(moved(1e-4)) - whole(moved(-1e-4))) / 2e-4
-        assert float(getattr(found, name)) == pytest.approx(float(slope), rel=1e-5) != 0
-        assert float(getattr(fixed, name)) == 0
+    """Against differences; the map of chief rays has none, so a PSF computed before gives none."""
+    array = MicrolensArray([[-0.6, 0.3], [0.1, -0.5]], aperture_diameter=0.6)
+    imager, grid = Imager(array, Sensor((24, 24), 0.1), 5.0, 1.2), Grid([18.0, 22.0], (3, 3), 0.6)
+    weights, volume = jax.random.normal(jax.random.key(3), (24, 24)), volume_of(grid)
+    names = ("radius_of_curvature", "conic_constant", "aperture_diameter")
+    surface = lambda imager: [getattr(imager.array, name) for name in names]
+    start = jnp.stack(surface(imager))
+
+    @jax.jit
+    def score(of_map, of_psf):
+        here, lens = (eqx.tree_at(surface, imager, list(numbers)) for numbers in (of_map, of_psf))
+        psf = jax.vmap(lambda depth: gaussian_psf(lens, depth, size=7))(grid.depths)
+        return jnp.vdot(weights, forward(volume, here, grid, psf) ** 2)
+
+    by_map, by_psf = jax.jit(jax.grad(score, (0, 1)))(start, start)
+    steps = 1e-4 * jnp.eye(3)
+    slopes = [(score(start + step, start + step) - score(start - step, start - step)) / 2e-4 for step in steps]
+    np.testing.assert_allclose(by_psf, slopes, rtol=1e-5)
+    assert np.all(by_psf != 0) and not np.any(by_map)
 
 
 def test_the_energy_is_the_envelope_times_the_object():
