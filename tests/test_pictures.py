@@ -47,14 +47,13 @@ def test_points_are_seen_in_all_views_and_ghosts_are_as_dim_as_they_are():
     for voxel, light in points.items():
         volume[voxel] = light
     figure = show(volume, grid)
-    assert all(max(axes.collections[0].get_array().shape) <= 400 for axes in figure.axes[:3])
+    meshes: list[Any] = [axes.collections[0] for axes in figure.axes[:3]]
+    assert max(max(mesh.get_array().shape) for mesh in meshes) <= 400
     for voxel, light in points.items():
         x, y, z = grid.to_mm(np.array(voxel))
         for view, place in enumerate(((x, y), (z, y), (x, z))):
             assert drawn_value(figure, view, *place) == pytest.approx(np.sqrt((light - 0.01) / 0.99), abs=1e-3)
-    meshes = [axes.collections[0] for axes in figure.axes[:3]]
-    dim = [float(np.sort(np.ravel(mesh.norm(mesh.get_array())))[-4]) for mesh in meshes]
-    assert max(dim) < 0.2
+    assert max(float(np.sort(np.ravel(mesh.norm(mesh.get_array())))[-4]) for mesh in meshes) < 0.2
     bar = figure.axes[-1]
     assert bar.get_ylabel() == "% of the maximum" and [text.get_text() for text in bar.get_yticklabels()][-1] == "100"
 
@@ -63,7 +62,8 @@ def test_slices_begin_at_the_brightest_and_say_how_long_a_length_is():
     grid = Grid([18.0, 19.0, 20.0, 21.0], (50, 60), 0.05, origin=(1.0, 0.0))
     volume = np.zeros(grid.volume_shape)
     volume[3, 20, 30] = 1.0
-    html = show(volume, grid)._repr_html_()
+    figure: Any = show(volume, grid)
+    html = figure._repr_html_()
     assert 'value="3"' in html and ">1 mm</div>" not in html and ">500 um</div>" in html
     assert "x from -0.5 to 2.5 mm to the right, y from -1.25 to 1.25 mm down" in html
     pictures = make_slices(volume, grid, 10**6).pictures

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -263,7 +264,8 @@ def test_the_plate_is_drawn_turned_and_shifted_as_its_lenses():
     assert " ".join(f"{x:.4f},{y:.4f}" for x, y in np.asarray(imager.centers)) in drawn
     turned = geomscope().replace(rotation_deg=1.0, shift_mm=(0.05, -0.1))
     search_report._draw_layout(axes := Figure().subplots(), turned)
-    plate = axes.patches[0].get_xy()[:4]
+    outline: Any = axes.patches[0]
+    plate = outline.get_xy()[:4]
     np.testing.assert_allclose(plate, plate_corners(turned.imager()))
     assert abs(plate[0, 1] - plate[1, 1]) == pytest.approx(20 * np.sin(np.radians(1)), rel=1e-5)
 
