@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64
 from scipy.ndimage import map_coordinates
-from scipy.spatial import KDTree
 
 from ..base.arrays import host_code
 from ..base.errors import InputError
@@ -26,18 +25,18 @@ from ..typing import Image
 from .background import DetectionImage, Pixels, for_each_band, subtract_background
 from .view_samples import (
     COARSE,
-    REACH,
     THRESHOLD_SNR,
     VIEW_SHARE,
     LensType,
+    OwnLight,
     ViewSamples,
     lens_types_of,
     log_false_alarms,
+    median_of_type,
     num_hypotheses,
     sample_views_by_type,
     search_grid,
-    spot_profile,
-    subtract_spots,
+    separate_points,
     survival_function,
     view_quantile,
 )
@@ -145,7 +144,7 @@ def find_points(
     survival = survival_function(detection.light, least)
     points, samples, own = _accept(np.zeros((0, 3)), detection, survival, lens_types, voxels)
     for _ in range(_SEARCHES):
-        rest = detection._replace(light=subtract_spots(detection.light, samples, own))
+        rest = detection._replace(light=own.rest)
         # A spot between two voxels must not be missed.
         dilated = rest._replace(light=_dilate(rest.light))
         new = _candidates(dilated, lens_types, voxels, progress)
@@ -154,7 +153,7 @@ def find_points(
             lit = _lit(views, survival_function(dilated.light, least), num_hypotheses(voxels))
             new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
-    points = np.column_stack([points, _intensity(points, samples, own, detection, lens_types)])
+    points = np.column_stack([points, _intensity(points, samples, own.light, detection, lens_types)])
     points = points[_inside(points, grid, float(voxels.depths[1] - voxels.depths[0]) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
 
@@ -265,45 +264,26 @@ def _lit(samples: ViewSamples, survival, tests: int) -> Bool[np.ndarray, " point
 
 def _accept(
     candidates: Positions, image: DetectionImage, survival, lens_types: Sequence[LensType], voxels: Grid
-) -> tuple[Positions, ViewSamples, Float64[np.ndarray, "point lens"]]:
-    """The points among the candidates, their samples, and their own part of each.
+) -> tuple[Positions, ViewSamples, OwnLight]:
+    """The points among the candidates, their samples, and their own light.
 
-    In order of brightness; the light of each point is subtracted from the views of those after it. Within a coarse
-    voxel of a point there is no other, only the rim of its spot.
+    Within a coarse voxel of a point there is no other, only the rim of its spot.
     """
-    samples = sample_views_by_type(candidates, image, lens_types)
-    order = np.argsort(-view_quantile(samples.light, samples.seen), kind="stable")
-    candidates, samples = candidates[order], samples.select(order)
-    tests, profile = num_hypotheses(voxels), spot_profile(samples, image.light)
-    spots, owner = samples.pixels[samples.seen], np.argwhere(samples.seen)
-    tree = KDTree(spots)
-    left, height = samples.light.copy(), np.zeros_like(samples.light)
-    accepted, scaled = np.zeros(len(candidates), bool), candidates / _voxel_size(voxels)
-    for number, seen in enumerate(samples.seen):
-        if (np.linalg.norm(scaled[accepted] - scaled[number], axis=1) < 1).any():
-            continue
-        this = slice(number, number + 1)
-        own = left[this] - _OWN_LIGHT * _median_of_type(samples, samples.light, number)
-        lit = _lit(samples.select(this)._replace(light=left[this].copy()), survival, tests)
-        if not (lit[0] and view_quantile(own, samples.seen[this])[0] >= 0):
-            continue
-        accepted[number] = True
-        height[number] = np.maximum(_median_of_type(samples, left, number), 0)
-        pixels, heights = samples.pixels[number, seen], height[number, seen]
-        for pixel, its_height, others in zip(pixels, heights, tree.query_ball_point(pixels, REACH), strict=True):
-            distance = np.hypot(*(spots[others] - pixel).T)
-            left[tuple(owner[others].T)] -= its_height * np.interp(distance, np.arange(REACH + 1), profile)
-    return candidates[accepted], samples.select(accepted), (left + height)[accepted]
+    samples, taken = sample_views_by_type(candidates, image, lens_types), []
+    tests, scaled = num_hypotheses(voxels), candidates / _voxel_size(voxels)
 
+    def take(number, left):
+        if (np.linalg.norm(scaled[taken] - scaled[number], axis=1) < 1).any():
+            return False
+        one = samples.select([number])
+        own = view_quantile((left - _OWN_LIGHT * median_of_type(samples, number))[None], one.seen)[0]
+        if own < 0 or not _lit(one._replace(light=left[None]), survival, tests)[0]:
+            return False
+        taken.append(number)
+        return True
 
-def _median_of_type(samples: ViewSamples, light: np.ndarray, point: int) -> Float64[np.ndarray, " lens"]:
-    """Median light of one point over the lenses of each lens's type, as types differ in sharpness; 0 where unseen."""
-    seen, median = samples.seen[point], np.zeros(light.shape[1])
-    of_lens = np.zeros(len(median), int) if samples.lens_type is None else samples.lens_type[point]
-    for number in np.unique(of_lens[seen]):
-        same = seen & (of_lens == number)
-        median[same] = np.median(light[point, same])
-    return median
+    own = separate_points(samples, image.light, take)
+    return candidates[own.taken], samples.select(own.taken), own
 
 
 def _intensity(

@@ -27,8 +27,8 @@ from .background import DetectionImage, Pixels, subsample, subtract_background
 VIEW_SHARE = 0.7
 # A view is lit where it exceeds the noise this many times.
 THRESHOLD_SNR = 5.0
-# Half width of the square in which the light of a spot is followed, pixels, and number of spots that show their shape.
-REACH, _EXAMPLES = 24, 500
+# Radius within which the light of a spot is followed, pixels; every third pixel beyond the second one is enough.
+REACH, _DENSE = 24, 8
 # Lenses of a type see points at depths where they bring this part of the light into the core that the best type does.
 _MIN_SHARPNESS = 0.5
 # Depths at which sharpness is traced for statistics.
@@ -173,34 +173,114 @@ def survival_function(light: Pixels, least: float = -math.inf) -> Callable:
     return lambda level: np.maximum(bright.size - np.searchsorted(bright, level), 1) / pixels.size
 
 
-def spot_profile(samples: ViewSamples, light: Pixels) -> Float64[np.ndarray, " radius"]:
-    """Radial profile of the spots in an image at 0, 1, 2, ... pixels, from 1 down to 0.
-
-    The median over the pixels of the first 500 views, so that neighbours on one side do not count.
-    """
+def _pixels_around() -> Int[np.ndarray, "pixel 2"]:
     offset = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].reshape(2, -1).T
-    middle = np.floor(samples.pixels + 0.5).astype(int)
-    whole = ((middle >= REACH) & (middle < np.array(light.shape) - REACH)).all(-1)
-    use = samples.seen & whole & (samples.light > 0)
-    pixel = middle[use][:_EXAMPLES, None] + offset
-    values = light[pixel[..., 0], pixel[..., 1]] / samples.light[use][:_EXAMPLES, None]
-    radius = np.hypot(*np.moveaxis(pixel - samples.pixels[use][:_EXAMPLES, None], -1, 0)).round().astype(np.int8)
+    radius = np.hypot(*offset.T)
+    return np.concatenate([offset[radius < _DENSE], offset[(radius >= _DENSE) & (radius < REACH)][::3]])
+
+
+_AROUND = _pixels_around()
+
+
+def spot_profile(
+    pixels: Float64[np.ndarray, "spot 2"], height: Float64[np.ndarray, " spot"], light: Pixels
+) -> Float64[np.ndarray, " radius"]:
+    """Radial profile of spots of these heights at 0, 1, 2, ... pixels, from 1 down to 0.
+
+    The median over the pixels of all spots, so that neighbours on one side do not count.
+    """
+    middle = np.floor(pixels + 0.5).astype(int)
+    use = ((middle >= REACH) & (middle < np.array(light.shape) - REACH)).all(-1) & (height > 0)
+    around = middle[use][:, None] + _AROUND
+    values = light[around[..., 0], around[..., 1]] / height[use][:, None]
+    radius = np.hypot(*np.moveaxis(around - pixels[use][:, None], -1, 0)).round().astype(np.int8)
     profile = [np.median(ring) if (ring := values[radius == r]).size else 0.0 for r in range(1, REACH)]
     return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
 
 
-def subtract_spots(light: Pixels, samples: ViewSamples, height: Float64[np.ndarray, "point lens"]) -> Pixels:
-    """Subtract from an image each view's height times the profile of these spots."""
-    profile = spot_profile(samples, light)
+def subtract_spots(
+    light: Pixels,
+    pixels: Float64[np.ndarray, "spot 2"],
+    height: Float64[np.ndarray, " spot"],
+    profile: Float64[np.ndarray, " radius"],
+) -> None:
+    """Subtract spots of this profile from an image, in place."""
     side = np.arange(-REACH, REACH + 1)
-    rest = light.copy()
-    for pixel, own in zip(samples.pixels[samples.seen], height[samples.seen], strict=True):
+    for pixel, its_height in zip(pixels, height, strict=True):
         around = [at + side for at in np.floor(pixel + 0.5).astype(int)]
         row, column = (at[(at >= 0) & (at < size)] for at, size in zip(around, light.shape, strict=True))
         distance = np.hypot((row - pixel[0])[:, None], column - pixel[1])
-        square = rest[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
-        square -= (max(own, 0) * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
-    return rest
+        square = light[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
+        square -= (its_height * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
+
+
+class OwnLight(NamedTuple):
+    """Which points are taken, the light of their views without that of the others, and an image without any of them."""
+
+    taken: Bool[np.ndarray, " point"]
+    light: Float64[np.ndarray, "taken lens"]
+    rest: Pixels
+
+
+def separate_points(
+    samples: ViewSamples,
+    light: Pixels,
+    take: Callable[[int, Float64[np.ndarray, " lens"]], bool] = lambda number, left: True,
+) -> OwnLight:
+    """Share the light of an image among points, the brighter ones first.
+
+    The light of a point is subtracted from the views of the others. Its spots are as high as the median over its views,
+    and shaped as the median over the pixels of its own views: spots of other depths are wider or narrower, and what is
+    left of a wide spot would look like a point beside it. Lenses of several types differ in height and shape.
+
+    Parameters
+    ----------
+    samples
+        Of candidates.
+    light
+        Of the image that is sampled.
+    take
+        Whether a candidate is a point, from its number and its light without that of the points before it.
+    """
+    order = np.argsort(-view_quantile(samples.light, samples.seen), kind="stable")
+    spots, owner = samples.pixels[samples.seen], np.argwhere(samples.seen)
+    tree = KDTree(spots)
+    left, height, rest = samples.light.copy(), np.zeros_like(samples.light), light.copy()
+    taken, spots_taken = np.zeros(len(left), bool), []
+    for number in order:
+        if not take(number, left[number]):
+            continue
+        taken[number] = True
+        for lenses in _lenses_by_type(samples, number):
+            pixels = samples.pixels[number, lenses]
+            height[number, lenses] = high = np.full(len(pixels), max(np.median(left[number, lenses]), 0))
+            profile = spot_profile(pixels, high, rest)
+            spots_taken.append((number, lenses, profile))
+            subtract_spots(rest, pixels, high, profile)
+            for pixel, others in zip(pixels, tree.query_ball_point(pixels, REACH), strict=True):
+                distance = np.hypot(*(spots[others] - pixel).T)
+                left[tuple(owner[others].T)] -= high[0] * np.interp(distance, np.arange(REACH + 1), profile)
+    # Views are a little brighter or darker than their median.
+    for number, lenses, profile in spots_taken:
+        subtract_spots(rest, samples.pixels[number, lenses], np.maximum(left, -height)[number, lenses], profile)
+    return OwnLight(taken, (left + height)[taken], rest)
+
+
+def _lenses_by_type(samples: ViewSamples, point: int) -> list[Int[np.ndarray, " lens"]]:
+    """Columns of the lenses that see a point, type by type: types differ in sharpness."""
+    seen = np.flatnonzero(samples.seen[point])
+    if samples.lens_type is None:
+        return [seen] if seen.size else []
+    of_lens = samples.lens_type[point, seen]
+    return [seen[of_lens == number] for number in np.unique(of_lens)]
+
+
+def median_of_type(samples: ViewSamples, point: int) -> Float64[np.ndarray, " lens"]:
+    """Median light of one point over the lenses of each lens's type; 0 where unseen."""
+    median = np.zeros(samples.light.shape[1])
+    for lenses in _lenses_by_type(samples, point):
+        median[lenses] = np.median(samples.light[point, lenses])
+    return median
 
 
 def _rounded_up(share: float, count: Shaped[np.ndarray, " point"]) -> Shaped[np.ndarray, " point"]:
@@ -225,7 +305,7 @@ def num_hypotheses(voxels: Grid) -> int:
 
 
 class DetectionStats(NamedTuple):
-    """Detection statistics, one entry for each point.
+    """Detection statistics, one entry for each point, of its own light: that of the other points is subtracted.
 
     `lit`, `lenses`: number of lenses that see the point above the noise, and that could. `log10_false_alarms`: expected
     number of chance points as good as this one in such a capture. `signal_to_noise`: light that 7 in 10 of the lenses
@@ -247,6 +327,7 @@ def detection_stats(
     depths = np.concatenate([ends, points[:, 2]])
     lens_types = lens_types_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS))
     samples = sample_views_by_type(points[:, :3], image, lens_types)
+    samples = samples._replace(light=separate_points(samples, image.light).light)
     lenses, noise = samples.seen.sum(1), samples.noise.max(1, initial=0)
     level = view_quantile(samples.light, samples.seen)
     tests = num_hypotheses(search_grid(imager, grid))
