@@ -154,6 +154,25 @@ def test_a_spot_that_is_a_ring_is_one_point():
     assert len(found) == 10 and localization(found, truth).f1 == 1
 
 
+def test_what_is_beside_a_wide_spot_is_no_point():
+    """A bright point nearer than all others, in water: spherical aberration widens its spots, theirs are sharp."""
+    design = geomscope()
+    centers = np.array(design.array.centers_mm)
+    centers = centers[np.argsort(np.abs(centers).max(1), kind="stable")[:16]]
+    side = 2 * np.abs(centers).max() + 1.2
+    water = {"refractive_index": 1.333, "surface_mm": 16.5}
+    small = design.replace(centers_mm=centers, size_mm=(side, side), shape=(1200, 1200), sample=water)
+    imager = small.imager()
+    truth = np.array(
+        [[0.165, -0.275, 17.4, 5.0], [-0.55, -0.58, 20.5, 5.0], [0.38, 0.5, 21.0, 4.0], [0.13, 0.275, 21.5, 3.0]]
+    )
+    image = simulate(truth, imager, optics="near", psf="geometric")
+    capture = np.asarray(expose(image, Camera(), jax.random.key(0), peak_electrons=10_000))
+    found = find_points(capture, imager, Grid([17.0, 22.0], (101, 101), 0.03))
+    # The images are centred on chief rays, not on the cores that are searched for: 0.3 mm.
+    assert len(found) == len(truth) and localization(found, truth).f1 == 1
+
+
 @pytest.mark.integration
 def test_what_only_half_of_the_lenses_see_is_a_ghost():
     """Spots of the left lenses of one point and of the right lenses of another: one half of each is taken away."""

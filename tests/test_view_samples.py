@@ -24,8 +24,8 @@ from gs_jax.detection.view_samples import (
     log_false_alarms,
     sample_views,
     search_grid,
+    separate_points,
     spot_profile,
-    subtract_spots,
     survival_function,
     view_quantile,
 )
@@ -187,28 +187,39 @@ def test_the_profile_of_gaussian_spots_is_gaussian_even_with_neighbours():
     row, column = np.mgrid[:400, :400]
     gaussian = lambda at: np.exp(-((row - at[0]) ** 2 + (column - at[1]) ** 2) / (2 * 3.0**2))
     light = np.sum([gaussian(at) for at in (*middles, middles[0] + [6, 0])], axis=0).astype(np.float32)
-    ones = np.ones((12, 1))
-    profile = spot_profile(ViewSamples(middles[:, None], ones, ones, ones, ones > 0), light)
+    profile = spot_profile(middles, np.ones(12), light)
     radius = np.arange(12)
     # Radii are rounded to pixels, the slope is 0.2 a pixel at most.
     np.testing.assert_allclose(profile[:12], np.exp(-(radius**2) / (2 * 3.0**2)), atol=0.1)
     assert profile[0] == 1 and profile[-1] == 0 and (np.diff(profile) <= 0).all()
-    empty = np.zeros((0, 0))
-    none = spot_profile(ViewSamples(np.zeros((0, 0, 2)), empty, empty, empty, empty > 0), light)
+    none = spot_profile(np.zeros((0, 2)), np.zeros(0), light)
     assert none[0] == 1 and not none[1:].any()
 
 
-def test_gaussian_spots_can_be_subtracted_wherever_they_are():
-    """In the middle, near another, and half beyond the edge."""
+def test_gaussian_spots_are_separated_wherever_they_are():
+    """In the middle, near another, wider than others, and half beyond the edge."""
     row, column = np.mgrid[:150, :200]
-    middles = np.array([[60.3, 70.8], [64.0, 75.0], [100.2, 120.5], [75.0, 140.0], [0.0, 100.0]])
-    heights = np.array([5.0, 4.0, 3.0, 2.0, 4.0])
-    spots = [h * np.exp(-((row - r) ** 2 + (column - c) ** 2) / 8) for h, (r, c) in zip(heights, middles, strict=True)]
+    middles = np.array([[60.3, 70.8], [64.0, 75.0], [100.2, 120.5], [75.0, 150.0], [0.0, 100.0]])
+    heights, widths = np.array([5.0, 4.0, 3.0, 2.0, 4.0]), np.array([2.0, 2.0, 2.0, 6.0, 2.0])
+    shapes = zip(heights, widths, middles, strict=True)
+    spots = [h * np.exp(-((row - r) ** 2 + (column - c) ** 2) / (2 * w**2)) for h, w, (r, c) in shapes]
     light = np.sum(spots, axis=0).astype(np.float32)
     views, ones = map_coordinates(light, middles.T, np.float64, order=1)[:, None], np.ones((5, 1))
-    rest = subtract_spots(light, ViewSamples(middles[:, None], views, ones, ones, ones > 0), heights[:, None])
+    own = separate_points(ViewSamples(middles[:, None], views, ones, ones, ones > 0), light)
     # The profile is linear between pixels, and rounded to them.
-    assert rest.shape == light.shape and np.abs(rest).max() < 0.15 * light.max()
+    assert own.taken.all() and own.rest.shape == light.shape and np.abs(own.rest).max() < 0.15 * light.max()
+    np.testing.assert_allclose(own.light[:, 0], heights, rtol=0.15)
+
+
+def test_a_flat_spot_is_subtracted_wherever_its_middle_is_taken_to_be():
+    """Blurred discs of 4 pixels, sampled 2 pixels beside their middles by all lenses."""
+    row, column = np.mgrid[:100, :100]
+    middles = np.array([[30.3, 30.8], [30.0, 70.0], [70.2, 30.5], [70.0, 69.5]])
+    discs = [np.hypot(row - r, column - c) < 4 for r, c in middles]
+    light, ones = gaussian_filter(np.sum(discs, axis=0).astype(np.float32), 0.7), np.ones((1, 4))
+    own = separate_points(ViewSamples(middles[None] + [1.4, -1.4], ones, ones, ones, ones > 0), light)
+    # Radii are rounded to pixels where the rim's slope is a third in a pixel.
+    assert np.abs(own.rest).max() < 0.5 and own.light.tolist() == [[1, 1, 1, 1]]
 
 
 def test_sharpness_separates_the_design_in_focus_from_the_printed_one():

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Shaped
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import label, map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
@@ -29,6 +29,9 @@ VIEW_SHARE = 0.7
 THRESHOLD_SNR = 5.0
 # Radius within which the light of a spot is followed, pixels; every third pixel beyond the second one is enough.
 REACH, _DENSE = 24, 8
+# Pixels this bright, relative to a spot's position, are its top; it is flat and round with so many of them, and with
+# this ratio of the smaller to the larger variance of their positions.
+_FLAT, _FEW, _ROUND = 0.8, 6, 0.5
 # Lenses of a type see points at depths where they bring this part of the light into the core that the best type does.
 _MIN_SHARPNESS = 0.5
 # Depths at which sharpness is traced for statistics.
@@ -189,11 +192,12 @@ def spot_profile(
 
     The median over the pixels of all spots, so that neighbours on one side do not count.
     """
-    middle = np.floor(pixels + 0.5).astype(int)
-    use = ((middle >= REACH) & (middle < np.array(light.shape) - REACH)).all(-1) & (height > 0)
-    around = middle[use][:, None] + _AROUND
-    values = light[around[..., 0], around[..., 1]] / height[use][:, None]
-    radius = np.hypot(*np.moveaxis(around - pixels[use][:, None], -1, 0)).round().astype(np.int8)
+    lit = height > 0
+    around = np.floor(pixels[lit] + 0.5).astype(int)[:, None] + _AROUND
+    inside = ((around >= 0) & (around < np.array(light.shape))).all(-1)
+    row, column = around[inside].T
+    values = (light[row, column] / np.broadcast_to(height[lit, None], inside.shape)[inside]).astype(np.float32)
+    radius = np.hypot(*(around - pixels[lit, None])[inside].T).round().astype(np.int8)
     profile = [np.median(ring) if (ring := values[radius == r]).size else 0.0 for r in range(1, REACH)]
     return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
 
@@ -212,6 +216,30 @@ def subtract_spots(
         distance = np.hypot((row - pixel[0])[:, None], column - pixel[1])
         square = light[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
         square -= (its_height * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
+
+
+def spot_shift(
+    pixels: Float64[np.ndarray, "spot 2"], height: Float64[np.ndarray, " spot"], light: Pixels
+) -> Float64[np.ndarray, "2"]:
+    """Distance from where spots are sampled to their middle, `(row, column)`, pixels, the same for all.
+
+    The brightest position in a flat spot is anywhere in it. The middle is that of the pixels about as bright as this
+    position in most views. There is no shift if these are few, as in sharp spots, if they are in a row, as those of two
+    points, or if no spot's surroundings are on the image.
+    """
+    side, middle = np.arange(-_DENSE, _DENSE + 1), np.floor(pixels + 0.5).astype(int)
+    use = ((middle >= _DENSE) & (middle < np.array(light.shape) - _DENSE)).all(-1) & (height > 0)
+    if not use.any():
+        return np.zeros(2)
+    row, column = middle[use].T[:, :, None] + side
+    stamp = np.median(light[row[:, :, None], column[:, None]] / height[use, None, None], 0)
+    stamp[_DENSE, _DENSE] = 1
+    flat, _ = label(stamp >= _FLAT)
+    top = np.argwhere(flat == flat[_DENSE, _DENSE])
+    if len(top) < _FEW:
+        return np.zeros(2)
+    narrow, wide = np.linalg.eigvalsh(np.cov(top.T))
+    return top.mean(0) - _DENSE if narrow > _ROUND * wide else np.zeros(2)
 
 
 class OwnLight(NamedTuple):
@@ -250,19 +278,21 @@ def separate_points(
     for number in order:
         if not take(number, left[number]):
             continue
-        taken[number] = True
+        taken[number], own = True, left[number].copy()
         for lenses in _lenses_by_type(samples, number):
+            height[number, lenses] = high = np.full(len(lenses), max(np.median(left[number, lenses]), 0))
             pixels = samples.pixels[number, lenses]
-            height[number, lenses] = high = np.full(len(pixels), max(np.median(left[number, lenses]), 0))
+            pixels = pixels + spot_shift(pixels, high, rest)
             profile = spot_profile(pixels, high, rest)
-            spots_taken.append((number, lenses, profile))
+            spots_taken.append((number, lenses, pixels, profile))
             subtract_spots(rest, pixels, high, profile)
             for pixel, others in zip(pixels, tree.query_ball_point(pixels, REACH), strict=True):
                 distance = np.hypot(*(spots[others] - pixel).T)
                 left[tuple(owner[others].T)] -= high[0] * np.interp(distance, np.arange(REACH + 1), profile)
+        left[number] = own - height[number]
     # Views are a little brighter or darker than their median.
-    for number, lenses, profile in spots_taken:
-        subtract_spots(rest, samples.pixels[number, lenses], np.maximum(left, -height)[number, lenses], profile)
+    for number, lenses, pixels, profile in spots_taken:
+        subtract_spots(rest, pixels, np.maximum(left, -height)[number, lenses], profile)
     return OwnLight(taken, (left + height)[taken], rest)
 
 
