@@ -37,7 +37,7 @@ from gs_jax.optics.psf_core import core_magnification, ring_edges, ring_window
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
 from gs_jax.projection.field_varying_model import wider_voxels
-from gs_jax.projection.point_sources import full_image_of_points
+from gs_jax.projection.point_sources import full_image_of_points, full_imager_of_points
 from gs_jax.projection.stray_light import to_pixels_table
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
@@ -192,7 +192,9 @@ def test_points_are_voxels_that_lie_anywhere():
     point = np.array([[0.2, -0.1, 20.0, 1.0]])
     one = Grid([20.0], (1, 1), 0.1, point[0, :2])
     image = np.asarray(forward(jnp.ones((1, 1, 1)), scope, one, field_varying_psf(scope, one.depths)))
-    found = full_image_of_points(point, scope)
+    image_of = full_imager_of_points(point, scope)
+    found = image_of(point)
+    np.testing.assert_array_equal(image_of(point), found)
     binned = lambda image: image.reshape(50, 4, 50, 4).sum((1, 3))
     assert np.corrcoef(binned(found).ravel(), binned(image).ravel())[0, 1] > 0.98
 

@@ -159,6 +159,9 @@ DEVICES: dict[str, Callable[[], Design]] = {
 # Numbers of pixels without a common divisor, as many as a camera has: binned or not, all methods must cope.
 LARGE = "3001 x 4093"
 DEVICES[LARGE] = lambda: cropped("geomscope", shape=(3001, 4093), sensor={"pixel_pitch_um": 4.5})
+# Pixels much finer than the core of a spot.
+FINE = "2.6 um pixels"
+DEVICES[FINE] = lambda: cropped("geomscope", shape=(3001, 4093), sensor={"pixel_pitch_um": 2.6})
 
 
 class Case:
@@ -418,7 +421,7 @@ ALWAYS_ONLY = ("samples", "small lenses")
 
 
 def pairs():
-    for number, device in enumerate(name for name in DEVICES if name != LARGE):
+    for number, device in enumerate(name for name in DEVICES if name not in (LARGE, FINE)):
         groups = IN_TURN if device in OF_BOTH else (IN_TURN[number % 2],)
         chosen = {*ALWAYS, *(tasks[number % len(tasks)] for tasks in groups)}
         for task in TASKS:
@@ -428,6 +431,7 @@ def pairs():
             yield pytest.param(device, task, "near", marks=marks, id=f"{device}-{task}")
     for task in ("points", "backproject", "list-rl", "richardson-lucy", "map"):
         yield pytest.param(LARGE, task, "near", marks=pytest.mark.integration, id=f"{LARGE}-{task}")
+    yield pytest.param(FINE, "points", "near", marks=pytest.mark.integration, id=f"{FINE}-points")
     # The designs with sharp spots, with all of the light.
     for device in ("geomscope-asphere", "geomscope-optimized"):
         for task in ("points", *METHODS):

@@ -77,7 +77,7 @@ def find_points(
        all lenses are lit, not where one is bright. Its local maxima, refined between the voxels, are candidates.
     3. In order of brightness, a candidate is a point if 7 of 10 of its lenses are lit above the noise, more than chance
        would light anywhere in the volume (`log_false_alarms`), and mostly not by points before it. The light of each
-       point is subtracted from the views of the others, by the shape of spots in this image.
+       point is subtracted from the views of the others, by the shape of its own spots.
     4. The search is repeated on what the image holds beside the points, for those near brighter ones.
 
     Nothing is random. Thresholds are multiples of the image's own noise, which is taken to be at least a thousandth of

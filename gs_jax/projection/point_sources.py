@@ -1,6 +1,7 @@
 """Images of point sources, on the host: each lens that sees a point adds a spot, a stamp of its PSF."""
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..layers import object_index
 from ..optics.core_kernels import render_harmonics, render_kernel
-from ..optics.field_varying import CORE_REACH, has_sharp_cores, kernel_size, trace_stray_light
+from ..optics.field_varying import CORE_REACH, StrayLight, has_sharp_cores, kernel_size, trace_stray_light
 from ..optics.polar_grid import make_polar_grid
 from ..optics.psf_core import PsfCores, ring_edges, trace_cores
 from ..optics.raytrace import to_numpy
@@ -223,6 +224,29 @@ def full_image_of_points(
     progress
         Shows how much is done.
     """
+    return _full_image(points, imager, _trace(points, imager, progress), progress)
+
+
+def full_imager_of_points(
+    bounds: Float[np.ndarray, "point _"], imager: Imager, progress: Progress | None = None
+) -> Callable[[Float[np.ndarray, "point 4"]], Float[np.ndarray, "row column"]]:
+    """Trace a microscope once, and return `full_image_of_points` of the points between some, `bounds`.
+
+    `bounds` are to have more depths than are traced, or the function interpolates between theirs alone.
+    """
+    optics = _trace(bounds, imager, progress)
+    return partial(_full_image, imager=imager, optics=optics._replace(stamps=list(optics.stamps)))
+
+
+class _FullOptics(NamedTuple):
+    """Stray light, the depths and nodes of its table, and the stamps of each ring."""
+
+    depths: Float[np.ndarray, " depth"]
+    stray_light: StrayLight
+    stamps: Iterable[Stamps]
+
+
+def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
     depths = np.unique(points[:, 2])
     steps = math.ceil((depths[-1] - depths[0]) / _STEP / float(object_index(imager.sample)))
     few = depths.size <= steps + 1
@@ -235,10 +259,10 @@ def full_image_of_points(
     tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))
     stray_light = trace_stray_light(level, lower[::every], grid, cores, _RINGS, progress)
-    nodes = jnp.asarray(_to_nodes(points, coarse, grid), imager.sensor_distance.dtype)
-    planes = jnp.asarray(coarse, nodes.dtype)
-    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
-    size = kernel_size(imager, stray_light.grid)
+    return _FullOptics(coarse, stray_light, _stamps_of_rings(imager, fine, tables, kernel_size(imager, grid)))
+
+
+def _stamps_of_rings(imager: Imager, depths, tables: PsfCores, size: int) -> Iterator[Stamps]:
     rings = zip(ring_edges(imager, _RINGS), *(np.moveaxis(part, 1, 0) for part in tables), strict=True)
     for edges, *parts, profiles, harmonics in rings:
         shapes = STEPS * size, STEPS
@@ -248,7 +272,15 @@ def full_image_of_points(
                 for profile, waves in zip(profiles, harmonics, strict=True)
             ]
         )
-        stamps = make_stamps(fine, kernels.astype(np.float32), Ring(edges, *parts))
+        yield make_stamps(depths, kernels.astype(np.float32), Ring(edges, *parts))
+
+
+def _full_image(points, imager: Imager, optics: _FullOptics, progress: Progress | None = None) -> np.ndarray:
+    stray_light = optics.stray_light
+    nodes = jnp.asarray(_to_nodes(points, optics.depths, stray_light.grid), imager.sensor_distance.dtype)
+    planes = jnp.asarray(optics.depths, nodes.dtype)
+    image = np.array(jax.jit(stray_light_image)(nodes, imager, stray_light, planes, jnp.zeros(2, nodes.dtype)))
+    for stamps in optics.stamps:
         image += forward_points(points, imager, stamps, progress)
     # The stray light ripples below zero in places; clipping adds light, which scaling removes.
     clipped = np.maximum(image, 0)
