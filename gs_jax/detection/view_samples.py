@@ -196,7 +196,7 @@ def spot_profile(
     around = np.floor(pixels[lit] + 0.5).astype(int)[:, None] + _AROUND
     inside = ((around >= 0) & (around < np.array(light.shape))).all(-1)
     row, column = around[inside].T
-    values = (light[row, column] / np.broadcast_to(height[lit, None], inside.shape)[inside]).astype(np.float32)
+    values = light[row, column] / np.broadcast_to(height[lit, None], inside.shape)[inside]
     radius = np.hypot(*(around - pixels[lit, None])[inside].T).round().astype(np.int8)
     profile = [np.median(ring) if (ring := values[radius == r]).size else 0.0 for r in range(1, REACH)]
     return np.minimum.accumulate(np.clip([1.0, *profile, 0.0], 0, 1))
@@ -209,7 +209,8 @@ def subtract_spots(
     profile: Float64[np.ndarray, " radius"],
 ) -> None:
     """Subtract spots of this profile from an image, in place."""
-    side = np.arange(-REACH, REACH + 1)
+    reach = int((profile > 0).sum())
+    side = np.arange(-reach, reach + 1)
     for pixel, its_height in zip(pixels, height, strict=True):
         around = [at + side for at in np.floor(pixel + 0.5).astype(int)]
         row, column = (at[(at >= 0) & (at < size)] for at, size in zip(around, light.shape, strict=True))
@@ -234,7 +235,8 @@ def spot_shift(
     row, column = middle[use].T[:, :, None] + side
     stamp = np.median(light[row[:, :, None], column[:, None]] / height[use, None, None], 0)
     stamp[_DENSE, _DENSE] = 1
-    flat, _ = label(stamp >= _FLAT)
+    flat = np.zeros(stamp.shape, int)
+    label(stamp >= _FLAT, output=flat)
     top = np.argwhere(flat == flat[_DENSE, _DENSE])
     if len(top) < _FEW:
         return np.zeros(2)
