@@ -42,7 +42,7 @@ SIZE, DEPTHS = (20.0, 20.0), (18.0, 22.0)
 # near beads are wide.
 BEADS, BOX, RATIO, LENSES, PIXELS = (20, 30), (3.0, 3.0), 8.0, 30, 1600
 WATER = {"sample": {"refractive_index": 1.333, "surface_mm": 17.0}}
-MEDIA = {"air": ({}, (18.0, 22.0)), "water": (WATER, (17.4, 22.5))}
+MEDIA: dict[str, tuple[dict, tuple[float, float]]] = {"air": ({}, (18.0, 22.0)), "water": (WATER, (17.4, 22.5))}
 
 
 def run(design: Design, scenes: dict[int, int] | None = None, *, voxel=0.03, step=0.25, progress: Progress) -> list:
