@@ -286,7 +286,7 @@ def test_scores_of_several_captures_are_those_of_all_their_points():
 
 @pytest.mark.integration
 def test_no_point_is_found_where_none_is_among_beads_of_many_intensities():
-    """Two draws of 20 beads in each medium: in water a former profile of all spots left points beside three of them."""
+    """Two draws of 20 beads in each medium: in water one profile of all spots left four points beside beads."""
     for row in point_density.draws(geomscope(), 2, (20,), progress=Progress()):
         assert row["false"] == 0 and row["recall"] >= 0.95
         assert row["lateral_rmse_um"] <= 5 and row["axial_rmse_um"] <= 60
