@@ -27,7 +27,7 @@ from gs_jax import Imager, MicrolensArray, Sensor, calibrate
 from gs_jax.base.progress import Progress
 from gs_jax.calibration.fit import PATTERN_FITTED, Calibration, refine
 from gs_jax.calibration.spot_model import predict_spots, trace_core_offsets
-from gs_jax.calibration.spots import half_light_radius, mean_shift
+from gs_jax.calibration.spots import half_light_radii, mean_shift
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import nearest_neighbour_distances
 from gs_jax.lenses import lenses_by_type
@@ -78,7 +78,7 @@ def left_out_with_distortion(found: Calibration) -> np.ndarray:
 def measured_widths(image: np.ndarray, found: Calibration, pitch: float) -> np.ndarray:
     """Half-light radius of each lens's spot, pixels."""
     places = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
-    return np.array([half_light_radius(image, place, pitch) for place in places])
+    return half_light_radii(image, places, np.full(len(places), pitch))
 
 
 def ray_widths(imager: Imager, depth: float) -> np.ndarray:
@@ -127,7 +127,8 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     rms = lambda off: float(np.sqrt((off**2).sum(-1).mean()))
     # Where a wide spot is depends on the window that looks.
     centers = np.asarray(found.imager.sensor.to_pixels(found.spots.positions))
-    two = [np.array([mean_shift(image, place, one, pitch) for place in centers]) for one in WINDOWS]
+    ones = np.ones(len(centers))
+    two = [mean_shift(image, centers, width * ones, pitch * ones) for width in WINDOWS]
     wide = seen > np.median(seen)
     results = {
         "mirrored": found.mirrored,

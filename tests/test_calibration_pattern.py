@@ -22,7 +22,7 @@ from gs_jax import (
 from gs_jax.__main__ import commands
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.calibration.pattern_matching import match_pattern
-from gs_jax.calibration.spots import find_blurred_spots, half_light_radius
+from gs_jax.calibration.spots import find_blurred_spots, half_light_radii
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import hexagonal_layout, square_layout
 
@@ -64,7 +64,7 @@ def test_middles_and_widths_of_discs():
     assert len(middles) == 12 and away.min(0).max() < 0.05
     # Half of an even disc's light is within 0.71 of its radius; these are darker toward the edge.
     assert np.all((radii > 9.9) & (radii < 10.6))
-    assert half_light_radius(np.zeros((50, 50)), np.array([25.0, 25.0]), 30.0) == 0
+    assert half_light_radii(np.zeros((50, 50)), np.array([[25.0, 25.0]]), np.array([30.0])) == 0
     assert len(find_blurred_spots(np.zeros((80, 80)), 30.0, 5)[0]) == 0
 
 

@@ -25,8 +25,8 @@ MIN_SPOTS, _MIN_SHARE = 6, 0.5
 BLURRED, _BLURRED_SHARE = 3.0, 0.7
 # How far a similarity is from the expected one must count less than a spot on a lens.
 _FARTHEST = 1e3
-# Similarities that are tried at once.
-_BATCH = 20_000
+# Similarities that are tried at once, and spots that are looked at before some are given up.
+_BATCH, _FEW = 20_000, 5
 
 
 class Similarity(NamedTuple):
@@ -80,22 +80,26 @@ def match_pattern(
     for mirrored in (False, True):
         lenses = c.conj() if mirrored else c
         factors = (p[other] - p[one])[:, None] / (lenses[second] - lenses[first])
-        pairs = np.argwhere(np.abs(np.abs(factors / expected) - 1) < tolerance)
-        for start in range(0, len(pairs), _BATCH):
-            pair, lens = pairs[start : start + _BATCH].T
-            factor = factors[pair, lens]
-            moved = p[one[pair]] - factor * lenses[first[lens]]
-            count = (_nearest_lens(p, factor, moved, tree, mirrored)[0] < radius).sum(1)
-            away = np.abs(np.log(factor / expected)) + np.abs(moved - shift) / np.abs(p).max() + mirrored
-            rank = count - away / _FARTHEST
+        pair, lens = np.nonzero(np.abs(np.abs(factors / expected) - 1) < tolerance)
+        factor = factors[pair, lens]
+        moved = p[one[pair]] - factor * lenses[first[lens]]
+        away = np.abs(np.log(factor / expected)) + np.abs(moved - shift) / np.abs(p).max() + mirrored
+        order = np.argsort(away)
+        for start in range(0, len(order), _BATCH):
+            some = order[start : start + _BATCH]
+            count = _count_on_lenses(
+                p, factor[some], moved[some], highest + away[some] / _FARTHEST, tree, mirrored, radius
+            )
+            rank = count - away[some] / _FARTHEST
             top = int(rank.argmax())
             if rank[top] > highest:
-                found = {"factor": complex(factor[top]), "shift": complex(moved[top]), "on_lenses": int(count[top])}
-                best, highest = best._replace(mirrored=mirrored, **found), float(rank[top])
+                highest, k = float(rank[top]), some[top]
+                found = {"factor": complex(factor[k]), "shift": complex(moved[k]), "on_lenses": int(count[top])}
+                best = best._replace(mirrored=mirrored, **found)
     if best.on_lenses < 2:
         return best
     # Least squares over the spots on lenses.
-    nearest = _nearest_lens(p, best.factor, best.shift, tree, best.mirrored)
+    nearest = _nearest_lens(p, best.factor, best.shift, tree, best.mirrored, radius)
     distance, lens = (np.asarray(part)[0] for part in nearest)
     use = distance < radius
     lenses = (c.conj() if best.mirrored else c)[lens[use]]
@@ -103,11 +107,25 @@ def match_pattern(
     return best._replace(factor=complex(factor), shift=complex(moved))
 
 
-def _nearest_lens(p, factor, shift, tree, mirrored):
-    """Distance of each spot, mapped back to the plate, from the nearest lens, and that lens: `(similarity, spot)`."""
+def _count_on_lenses(p, factor, shift, least, tree, mirrored, radius):
+    """Number of spots on lenses of each similarity; of those that cannot reach `least`, of the first spots alone."""
+    count, left = np.zeros(len(factor), int), len(p)
+    for few in np.array_split(p, -(-len(p) // _FEW)):
+        which = np.flatnonzero(count + left > least)
+        if len(which):
+            count[which] += (_nearest_lens(few, factor[which], shift[which], tree, mirrored, radius)[0] < radius).sum(1)
+        left -= len(few)
+    return count
+
+
+def _nearest_lens(p, factor, shift, tree, mirrored, radius):
+    """Distance of each spot, mapped back to the plate, from the nearest lens, and that lens: `(similarity, spot)`.
+
+    The distance is infinite if no lens is within the radius: that is all that counts, and much faster.
+    """
     back = (p[None] - np.atleast_1d(shift)[:, None]) / np.atleast_1d(factor)[:, None]
     back = back.conj() if mirrored else back
-    return tree.query(np.stack([back.real, back.imag], -1))
+    return tree.query(np.stack([back.real, back.imag], -1), distance_upper_bound=radius)
 
 
 def match_shift(
