@@ -33,6 +33,9 @@ SOURCES = {
     "geomscope": "the lens centres that the paper's authors publish",
     "oracle": "whole captures by the ray tracer of tests/data",
     "diffusercam": "real captures of Waller Lab's DiffuserCam tutorial",
+    "whiteimages": "white images of two light-field microscopes, from napari-LF",
+    "plenoptic": "a ray-traced white image and its makers' lens centres",
+    "stage": "real spots of an LED at five places of a stage",
     "diffusercam3d": "a real capture and a measured stack of Waller Lab's DiffuserCam",
 }
 

@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.io import loadmat
+from scipy.spatial import KDTree
 
 from experiments.printed_array import FAR as FAR_MM, SHAPE, recipe
 from gs_jax import (
@@ -22,7 +24,8 @@ from gs_jax import (
 from gs_jax.__main__ import commands
 from gs_jax.calibration.fit import PATTERN_FITTED
 from gs_jax.calibration.pattern_matching import match_pattern
-from gs_jax.calibration.spots import find_blurred_spots, half_light_radii
+from gs_jax.calibration.wide_spots import find_blurred_spots, half_light_radii
+from gs_jax.io.camera import Readout
 from gs_jax.io.captures import read_capture
 from gs_jax.layouts import hexagonal_layout, square_layout
 
@@ -105,6 +108,67 @@ def test_a_white_surface_shows_rotation_shift_and_scale():
         calibrate(
             [white(actual)], np.repeat(FAR, 2, 0), design, fit=PATTERN_FITTED, captures=np.zeros(2, int), blurred=[0]
         )
+
+
+@pytest.mark.parametrize("layout", [square_layout, pytest.param(hexagonal_layout, marks=pytest.mark.integration)])
+def test_discs_that_touch_in_uneven_light_leave_errors_that_hold(layout):
+    """Four fifths of the picture are lit: its median is the discs' own light, a third darker at one side."""
+    size, pixel = 0.125, 0.0074
+    centers = np.asarray(layout((1.6, 1.6), pitch=size))
+    design = Imager(MicrolensArray(centers), Sensor((250, 250), pixel), 2.4, 0.5)
+    built = dataclasses.replace(design.array, centers=1.01 * centers)
+    actual = dataclasses.replace(design, array=built, rotation=0.01)
+    y, x = np.mgrid[-0.5:0.5:250j, -0.5:0.5:250j]
+    image = white(actual, radius=1.01 * size / 2 / pixel + 0.3) * (1 + 0.3 * x - 0.6 * (x**2 + y**2))
+    found = calibrate([image], FAR, design, fit=PATTERN_FITTED, blurred=[0])
+    assert len(found.residuals) == len(centers) and found.rms < 0.18
+    for name, true in (("scale", 1.01), ("rotation_deg", np.degrees(0.01))):
+        assert abs(found.values[name] - true) < 3 * found.deviations[name]
+    assert found.deviations["scale"] < 5e-4
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("design", "image", "pitch", "by_phase", "rms"),
+    [
+        # By the phase of the lattice and by masks of the discs.
+        ("ur.toml", "ur_w.tif", 0.125, 17.209, 0.18),
+        # By the phase, whose mean over both directions changes by 0.001 with the window.
+        ("guv.toml", "Radiometry_GUVExperim1.tif", 0.1, 15.4007, 0.14),
+    ],
+)
+def test_real_white_images(design, image, pitch, by_phase, rms):
+    data = needs("whiteimages/ur_w.tif").parent
+    imager = read_design(data / design).imager()
+    found = calibrate([read_capture(data / image, imager.sensor.shape)], FAR, imager, fit=PATTERN_FITTED, blurred=[0])
+    pixels = pitch * float(imager.scale(FAR_MM)) / imager.sensor.pixel_pitch
+    assert found.rms < rms and abs(found.values["scale"] * pixels - by_phase) < 3 * found.deviations["scale"] * pixels
+    assert found.deviations["scale"] < 5e-4
+
+
+@pytest.mark.integration
+def test_an_overexposed_white_image_is_said_to_be(tmp_path):
+    data = needs("whiteimages/ur_over.tif").parent
+    names = [str(data / "ur.toml"), "--pattern", str(data / "ur_over.tif"), "-o", str(tmp_path / "found.toml")]
+    result = CliRunner().invoke(commands, ["calibrate", *names])
+    assert "ur_over.tif: 310649 pixels (0.63 of all) are saturated at 255" in result.stderr
+
+
+@pytest.mark.integration
+def test_centres_agree_with_those_of_another_program():
+    """In a quarter of a foreign ray-traced white image."""
+    data = needs("plenoptic/white.tif").parent
+    theirs = loadmat(data / "sf_cal.mat")["cal"][0, 0]
+    theirs = np.stack([theirs[name].ravel() - 1 for name in ("exactY", "exactX")], -1)
+    imager = read_design(data / "plen.toml").imager()
+    image = read_capture(data / "white.tif", imager.sensor.shape)[:1000, :1000]
+    imager = dataclasses.replace(imager, sensor=Readout(roi=(0, 0, 1000, 1000)).sensor(imager.sensor))
+    near = np.abs(np.asarray(imager.array.centers) + 3.1).max(1) < 2.9
+    imager = dataclasses.replace(imager, array=dataclasses.replace(imager.array, centers=imager.array.centers[near]))
+    found = calibrate([image], FAR, imager, fit=PATTERN_FITTED, blurred=[0])
+    away, which = KDTree(theirs).query(spots := np.asarray(imager.sensor.to_pixels(found.spots.positions)))
+    off = (spots - theirs[which])[away < 5]
+    assert len(off) > 2000 and np.abs(off.mean(0)).max() < 0.01 and np.sqrt((off**2).sum(1).mean()) < 0.1
 
 
 @pytest.mark.integration

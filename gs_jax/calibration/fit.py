@@ -22,12 +22,14 @@ from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
 from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses, search_rotation
+from .jackknife import jackknife_errors
 from .pattern_matching import MIN_SPOTS
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
 from .spot_model import (
     FITTABLE,
     FITTED,
     NOISE,
+    OUTLIER,
     CoreOffsets,
     Observations,
     Unknowns,
@@ -44,6 +46,7 @@ from .spot_model import (
     weighted_residuals,
 )
 from .spots import Sources, SpotLists, Spots, assign_spots, find_blurred_spots_mm, find_spots_mm
+from .wide_spots import NARROW_WINDOW
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
 _WITHIN = (1.0, 0.5, 0.25)
@@ -54,6 +57,9 @@ _THREADS = 2
 _MAX_STEPS = 300
 # Numbers of spots are padded to a multiple of this, so that few shapes are compiled.
 _MULTIPLE = 256
+# Least median of the distances of blurred spots' coordinates from a fit, pixels, and the width in that of a sharp spot
+# over it: the loss is linear beyond two standard deviations.
+_LEAST_BLURRED, _OVER_MEDIAN = 0.01, 2 / 0.6745 / OUTLIER
 # What is guessed from the pattern of the lenses, if it is fitted.
 _POSE = ("sensor_distance", "rotation", "shift")
 # What the pattern of the lenses alone determines.
@@ -201,6 +207,13 @@ def calibrate(
                 spots[k], blur[k] = find_blurred_spots_mm(images[k], guess.imager)
         sources = guess.sources._replace(blur=blur)
         result = refine(spots, guess.imager, sources, unknown, fit, progress=progress)
+        if blurred:
+            # Where the middle of a wide spot is depends on the window that looks.
+            for k in blurred:
+                spots[k], _ = find_blurred_spots_mm(images[k], guess.imager, NARROW_WINDOW)
+            narrow = refine(spots, guess.imager, sources, unknown, fit, progress=progress).values
+            for name, value in result.values.items():
+                result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
         if "scale" in fit:
             for numbers in (result.values, result.deviations):
                 numbers["scale"] *= guess.scale
@@ -251,6 +264,8 @@ def refine(
     current, points, state = imager, sources.points, None
     assigned = data = None
     for within in (progress or Progress()).track(_WITHIN, "Fitting"):
+        if assigned is not None and data is not None:
+            sources = _reweight(sources, assigned, np.asarray(residuals(state, data))[: len(assigned.lenses)])
         offsets = trace_core_offsets(current, points[sources.sharp, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
         data = _observations(imager, sources, unknown, assigned, offsets)
@@ -269,8 +284,25 @@ def refine(
     over_width = off / sources.blurs[assigned.sources, None]
     errors = standard_errors(state, data, lens_sd, estimate_noise(over_width, state, assigned.lenses))
     check_determined(errors, radius)
+    for name, error in jackknife_errors(state, data, lens_sd).items():
+        errors[name] = max(errors[name], error)
     sources = sources._replace(points=points)
     return Calibration(current, False, named_values(state), errors, sources, assigned, off)
+
+
+def _reweight(sources: Sources, spots: Spots, off) -> Sources:
+    """The sources with `blur` by how far blurred spots are from where the fit has them.
+
+    The loss then sees outliers of a pattern whatever its width: discs at its edge, which are drawn to their neighbours.
+    """
+    if sources.blur is None or sources.sharp.all():
+        return sources
+    blur = sources.blur.copy()
+    for source in np.flatnonzero(~sources.sharp):
+        mine = np.abs(off[spots.sources == source])
+        if len(mine) >= MIN_SPOTS:
+            blur[sources.captures[source]] = max(float(np.median(mine)), _LEAST_BLURRED) * _OVER_MEDIAN
+    return sources._replace(blur=blur)
 
 
 def spot_residuals(

@@ -299,7 +299,7 @@ def standard_errors(unknowns: Unknowns, data: Observations, lens_sd: float, nois
     """Standard errors by name, from the Gauss-Newton covariance; infinite where undetermined."""
     # Lenses are weighted relative to the actual noise of the spots.
     args = data, jnp.asarray(lens_sd * NOISE / noise, data.positions.dtype)
-    jacobian = np.asarray(_jacobian(unknowns, args), np.float64)
+    jacobian = np.asarray(residual_jacobian(unknowns, args), np.float64)
     lengths = np.linalg.norm(jacobian, axis=0)
     # Each unknown in steps that move spots equally, so that singular values can be compared.
     _, values, directions = np.linalg.svd(jacobian / np.where(lengths > 0, lengths, 1), full_matrices=False)
@@ -318,7 +318,8 @@ def standard_errors(unknowns: Unknowns, data: Observations, lens_sd: float, nois
 
 
 @jax.jit
-def _jacobian(unknowns, args):
+def residual_jacobian(unknowns: Unknowns, args: tuple[Observations, Float[Array, ""]]) -> Float[Array, "row number"]:
+    """Derivatives of all weighted residuals by all unknowns, both raveled."""
     flat, unravel = ravel_pytree(unknowns)
     return jax.jacfwd(lambda flat: ravel_pytree(weighted_residuals(unravel(flat), args))[0])(flat)
 

@@ -1,10 +1,7 @@
 """Point sources of a calibration, their spots in captures, and the assignment of spots to sources and lenses.
 
 The middle of a spot is where a Gaussian window that moves to the centroid of what it sees comes to rest (mean shift),
-so that rays far from the core do not count. Spots that are wide, of any shape (out of focus, aberrated, or a lens's
-image of a surface), have a window as wide as the spot itself, so that it does not stop at structure within the spot. It
-ends half-way to the nearest neighbour, so that discs that touch do not shift each other's middles: it then contains the
-whole disc, with its edges.
+so that rays far from the core do not count. Wide spots are in `wide_spots.py`.
 """
 
 from collections.abc import Collection, Sequence
@@ -12,12 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
-from scipy.ndimage import minimum_filter
 from scipy.spatial import KDTree
 from skimage.feature import peak_local_max
 
 from ..base.errors import InputError
-from ..detection.background import gaussian_smooth, subtract_background
+from ..detection.background import subtract_background
 from ..geometry import Imager
 from ..layouts import nearest_neighbour_distances
 from ..optics.lens_types import FIELDS
@@ -25,6 +21,7 @@ from ..optics.psf_core import ensquared_light
 from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .spot_model import MAX_MOVES, MOVE_TOLERANCE, WINDOW, CoreOffsets, blurred_radius, match_radius, predict_spots
+from .wide_spots import BLURRED_WINDOW, find_blurred_spots
 
 # Half width of the square that the window sees, pixels.
 _HALF = 4
@@ -117,11 +114,13 @@ def find_spots(image: Image, most: int) -> Float64[np.ndarray, "spot 2"]:
     return np.array([_middle_of_pixels(light, peak) for peak in peaks]).reshape(-1, 2)
 
 
-def find_blurred_spots_mm(image: Image, imager: Imager) -> tuple[Float64[np.ndarray, "spot 2"], float]:
+def find_blurred_spots_mm(
+    image: Image, imager: Imager, window: float = BLURRED_WINDOW
+) -> tuple[Float64[np.ndarray, "spot 2"], float]:
     """Wide spots, as far apart as lenses, `(x, y)` on the sensor, mm, and their median width in that of a sharp one."""
     centers = np.asarray(imager.array.centers, np.float64)
     pitch = float(nearest_neighbour_distances(centers).mean()) / imager.sensor.pixel_pitch
-    middles, radii = find_blurred_spots(image, pitch, _MOST_BLURRED * len(centers))
+    middles, radii = find_blurred_spots(image, pitch, _MOST_BLURRED * len(centers), window)
     width = BLURRED_WINDOW * float(np.median(radii)) / WINDOW if len(radii) else 1.0
     return np.asarray(imager.sensor.to_mm(middles), np.float64), max(width, 1 + 1e-6)
 
@@ -214,134 +213,3 @@ def classify_lenses(
             factors = np.nanmedian(off[cost(factors).argmin(0), :, :, np.arange(count)], 0)
         solutions.append(cost(factors))
     return min(solutions, key=lambda each: each.min(0).sum()).argmin(0)
-
-
-# Smoothing before maxima are looked for and least distance of maxima, in pitches of the pattern; threshold of a
-# maximum, relative to the brightest.
-_SMOOTHING, _APART, _THRESHOLD = 1 / 7, 1 / 3, 0.02
-# The background is the darkest place within a pitch: smoothing of the image before and after, in pitches.
-_BEFORE, _AFTER = 1 / 14, 1 / 2
-# The light of a spot is that within this distance of its middle, in pitches, less the light of the darkest share.
-_REACH, _DARKEST = 0.5, 0.1
-# Least distance of the nearest neighbour that counts, in pitches; the most is one.
-_NEAREST = 0.6
-# Rounds in which middles and widths are found by turns; distance from the maximum that a middle may have, in pitches.
-_BLURRED_ROUNDS, _FARTHEST = 3, 0.25
-# Standard deviation of the window over the half-light radius, which is 1.18 of a Gaussian spot. A narrower window
-# rests where a disc is brightest: of real white images the pitch changes by 0.1 % from 0.5 to 1.2, by 0.01 % above.
-BLURRED_WINDOW = 1.2
-# Pixels that are worked on at once.
-_PIXELS = 1_000_000
-
-
-def find_blurred_spots(
-    image: Image, pitch: float, most: int
-) -> tuple[Float64[np.ndarray, "spot 2"], Float64[np.ndarray, " spot"]]:
-    """Find wide spots that are about a `pitch` apart, pixels, from the middle of the pattern outward.
-
-    Returns
-    -------
-    middles
-        Fractional `(row, column)`, none within half a pitch of the edge.
-    radii
-        Half-light radius of each, pixels.
-    """
-    image = np.asarray(image, np.float64)
-    light = image - _darkness(image, pitch)
-    smooth = gaussian_smooth(light, _SMOOTHING * pitch)
-    least = _THRESHOLD * max(float(smooth.max()), 0)
-    peaks = peak_local_max(smooth, min_distance=max(int(_APART * pitch), 1), threshold_abs=least, exclude_border=False)
-    border = np.minimum(peaks, np.array(image.shape) - 1 - peaks).min(1)
-    peaks = peaks[border >= _REACH * pitch][:most].astype(float)
-    if not len(peaks):
-        return np.zeros((0, 2)), np.zeros(0)
-    pitches = np.clip(np.asarray(KDTree(peaks).query(peaks, 2)[0])[:, 1], _NEAREST * pitch, pitch)
-    middles, radii = peaks, _REACH * pitches / 2
-    for _ in range(_BLURRED_ROUNDS):
-        middles = mean_shift(light, peaks, BLURRED_WINDOW * radii, pitches)
-        radii = np.maximum(half_light_radii(light, middles, pitches), 1.0)
-    order = np.argsort(np.linalg.norm(middles - np.median(middles, 0), axis=1))
-    return middles[order], radii[order]
-
-
-def _darkness(image, pitch: float):
-    """The light between spots: where discs touch, it is all that is left of the background."""
-    smooth = gaussian_smooth(image, _BEFORE * pitch)
-    darkest = minimum_filter(smooth, size=2 * int(np.ceil(pitch / 2)) + 1, mode="nearest")
-    return gaussian_smooth(darkest, _AFTER * pitch)
-
-
-def half_light_radii(
-    image: Image, middles: Float64[np.ndarray, "spot 2"], pitches: Float64[np.ndarray, " spot"]
-) -> Float64[np.ndarray, " spot"]:
-    """Radius within which half of the light of each spot is, pixels.
-
-    The light is that within half a pitch, pixels, of the middle `(row, column)`, less the darkest tenth's.
-    """
-    image, radii = np.asarray(image, np.float64), np.zeros(len(middles))
-    for spots in _batches(pitches, _REACH):
-        squares, inside, side, start = _squares(image, middles[spots], _REACH * pitches[spots])
-        away = side + (start - middles[spots])[:, :, None]
-        distance = np.hypot(away[:, 0, :, None], away[:, 1, None, :])
-        inside &= distance <= _REACH * pitches[spots, None, None]
-        for spot, square, apart, use in zip(spots, squares, distance, inside, strict=True):
-            light, apart = square[use], apart[use]
-            order = np.argsort(apart)
-            total = np.cumsum(np.maximum(light - np.quantile(light, _DARKEST), 0)[order])
-            radii[spot] = np.interp(total[-1] / 2, total, apart[order]) if total[-1] > 0 else 0.0
-    return radii
-
-
-def mean_shift(
-    light: Float64[np.ndarray, "row column"],
-    peaks: Float64[np.ndarray, "spot 2"],
-    deviations: Float64[np.ndarray, " spot"],
-    pitches: Float64[np.ndarray, " spot"],
-) -> Float64[np.ndarray, "spot 2"]:
-    """Where Gaussian windows come to rest that move from maxima to the centroids of what they see.
-
-    A window ends at half a pitch, and rests within a quarter of its maximum; all in pixels, `(row, column)`.
-    """
-    middles = np.array(peaks, np.float64)
-    for spots in _batches(pitches, _REACH + _FARTHEST):
-        squares, inside, side, start = _squares(light, peaks[spots], (_REACH + _FARTHEST) * pitches[spots])
-        squares = np.maximum(squares, 0) * inside
-        moving = np.arange(len(spots))
-        for _ in range(MAX_MOVES):
-            which = spots[moving]
-            away = side + (start[moving] - middles[which])[:, :, None]
-            end, wide = _REACH * pitches[which, None, None], deviations[which, None, None]
-            weights = np.exp(-((away / wide) ** 2) / 2)
-            distance = np.sqrt(away[:, 0, :, None] ** 2 + away[:, 1, None, :] ** 2)
-            seen = squares[moving] * np.clip(end - distance + 0.5, 0, 1)
-            seen *= weights[:, 0, :, None] * weights[:, 1, None, :]
-            along = np.stack([seen.sum(2), seen.sum(1)], 1)
-            total = along[:, 0].sum(1)
-            step = (along * away).sum(2) / np.where(total > 0, total, 1)[:, None]
-            off = middles[which] + step - peaks[which]
-            far = np.linalg.norm(off, axis=1, keepdims=True)
-            moved = peaks[which] + off * np.minimum(1.0, _FARTHEST * pitches[which, None] / np.maximum(far, 1e-9))
-            still = np.abs(moved - middles[which]).max(1) < MOVE_TOLERANCE * deviations[which]
-            middles[which] = moved
-            moving = moving[~still & (total > 0)]
-            if not len(moving):
-                break
-    return middles
-
-
-def _batches(pitches, reach: float) -> list[np.ndarray]:
-    """Indices of spots whose squares hold so many pixels that they fit into the memory together."""
-    side = 2 * reach * float(pitches.max(initial=1)) + 3
-    return np.array_split(np.arange(len(pitches)), max(int(np.ceil(len(pitches) * side**2 / _PIXELS)), 1))
-
-
-def _squares(image, middles, reaches):
-    """Pixels about middles, which of them are in the image, their offsets, and the pixels that these count from."""
-    half, start = int(np.ceil(reaches.max(initial=1))) + 1, np.rint(middles).astype(int)
-    side = np.arange(-half, half + 1)
-    rows, columns = (start[:, axis, None] + side for axis in (0, 1))
-    inside = ((rows >= 0) & (rows < image.shape[0]))[:, :, None] & ((columns >= 0) & (columns < image.shape[1]))[
-        :, None
-    ]
-    rows, columns = (np.clip(at, 0, size - 1) for at, size in zip((rows, columns), image.shape, strict=True))
-    return image[rows[:, :, None], columns[:, None]], inside, side, start

@@ -134,6 +134,7 @@ def calibrate_command(
         if from_scene:
             capture = next(iter(captures))
             image = camera.read(capture)
+            camera.print_corrections()
             grid = voxel_grid(imager, list(light.working_distance(microscope, imager)))
             with errors_name_file(capture):
                 outcome = self_calibrate(image, imager, grid, fit=names, progress=progress)
@@ -149,12 +150,12 @@ def calibrate_command(
             with errors_name_file(positions or pattern or design):
                 Sources(points, of).check(len(pictures), imager, names, blurred)
             images = [camera.read(path) for path in progress.track(pictures, "Reading captures")]
+            camera.print_corrections()
             options = {"captures": of, "fit": names, "find_lenses": find_lenses, "blurred": blurred}
             outcome = calibrate(images, points, imager, **options, progress=progress)
     provenance = camera.recorded(provenance_of(*inputs))
     write_design(output, apply_calibration(microscope, outcome, provenance, sample=light.sample))
     write_figure(drawing, plot_residuals(outcome))
-    camera.print_corrections()
     Console().print(summary_table(microscope, outcome, with_surface(imager, names)))
     mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
     lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
