@@ -21,7 +21,15 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .initial_guess import guess_from_pattern, guess_from_pose, guess_without_lenses, search_rotation
+from .alternatives import best_alternative, describe_misfit, would_fit
+from .initial_guess import (
+    InitialGuess,
+    explained,
+    guess_from_pattern,
+    guess_from_pose,
+    guess_without_lenses,
+    search_rotation,
+)
 from .jackknife import jackknife_errors
 from .pattern_matching import MIN_SPOTS
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
@@ -45,7 +53,17 @@ from .spot_model import (
     trace_core_offsets,
     weighted_residuals,
 )
-from .spots import Sources, SpotLists, Spots, assign_spots, find_blurred_spots_mm, find_spots_mm
+from .spots import (
+    CaptureFit,
+    MisfitError,
+    Sources,
+    SpotLists,
+    Spots,
+    assign_spots,
+    capture_fits,
+    find_blurred_spots_mm,
+    find_spots_mm,
+)
 from .wide_spots import NARROW_WINDOW
 
 # Distances within which spots are assigned, over `match_radius`: wide, then narrow.
@@ -88,6 +106,8 @@ class Calibration(NamedTuple):
         The points with their fitted coordinates, mm, and the capture of each.
     spots, residuals
         The spots, and their predicted less their observed positions, `(x, y)`, pixels.
+    captures
+        Of each capture the number of spots used and expected, and their residual, pixels RMS.
     """
 
     imager: Imager
@@ -97,6 +117,7 @@ class Calibration(NamedTuple):
     sources: Sources
     spots: Spots
     residuals: Float64[np.ndarray, "spot 2"]
+    captures: Sequence[CaptureFit] = ()
 
     @property
     def rms(self) -> float:
@@ -155,7 +176,8 @@ def calibrate(
     ------
     InputError
         If points and captures do not fit together, a pixel is not finite, no pattern of lenses is found, or the spots
-        do not determine what is to be fitted.
+        do not determine what is to be fitted. If a capture has few of the spots that the geometry of the others
+        predicts, the message says whether all would fit with an axis reversed or captures swapped.
 
     Examples
     --------
@@ -190,37 +212,60 @@ def calibrate(
     spots, blur = [each for each, _ in found], np.array([width for _, width in found])
     sources = sources._replace(blur=blur)
     unknown = np.isnan(sources.points)
-    with progress.step("Matching lenses"):
+    cache: dict = {}
+
+    def guess(meant: Sources) -> InitialGuess:
         if find_lenses:
-            guess = guess_without_lenses(spots, sources, imager, images)
+            initial = guess_without_lenses(spots, meant, imager, images)
         elif set(fit).isdisjoint(_POSE):
-            guess = guess_from_pose(spots, sources, imager)
+            initial = guess_from_pose(spots, meant, imager)
         else:
-            guess = guess_from_pattern(spots, sources, imager, free_scale="scale" in fit)
+            initial = guess_from_pattern(spots, meant, imager, free_scale="scale" in fit, cache=cache)
         held = [name for name in _POSE[: 1 if find_lenses else None] if name not in fit]
         where = lambda i: [getattr(i, name) for name in held]
-        guess = guess._replace(imager=eqx.tree_at(where, guess.imager, where(imager)) if held else guess.imager)
-    if not find_lenses:
-        if guess.scale != 1:
-            # Windows are as large as the pattern turned out to be.
-            for k in blurred:
-                spots[k], blur[k] = find_blurred_spots_mm(images[k], guess.imager)
-        sources = guess.sources._replace(blur=blur)
-        result = refine(spots, guess.imager, sources, unknown, fit, progress=progress)
-        if blurred:
-            # Where the middle of a wide spot is depends on the window that looks.
-            for k in blurred:
-                spots[k], _ = find_blurred_spots_mm(images[k], guess.imager, NARROW_WINDOW)
-            narrow = refine(spots, guess.imager, sources, unknown, fit, progress=progress).values
-            for name, value in result.values.items():
-                result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
-        if "scale" in fit:
-            for numbers in (result.values, result.deviations):
-                numbers["scale"] *= guess.scale
-        return result._replace(mirrored=guess.mirrored)
-    fit = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
-    lens_sd = _UNLISTED * match_radius(guess.imager.array.centers)
-    return _drop_unseen_lenses(refine(spots, guess.imager, guess.sources, unknown, fit, lens_sd, progress))
+        return initial._replace(imager=eqx.tree_at(where, initial.imager, where(imager)) if held else initial.imager)
+
+    def fit_guess(initial: InitialGuess, progress: Progress | None = None) -> Calibration:
+        if not find_lenses:
+            return refine(spots, initial.imager, initial.sources._replace(blur=blur), unknown, fit, progress=progress)
+        names = [*(name for name in fit if name in ("sensor_distance", "depth_offset")), "lenses"]
+        lens_sd = _UNLISTED * match_radius(initial.imager.array.centers)
+        return refine(spots, initial.imager, initial.sources, unknown, names, lens_sd, progress)
+
+    def alternative() -> tuple[str, float] | None:
+        with progress.step("Trying other positions"):
+            return best_alternative(
+                sources, lambda meant: explained(spots, guess(meant)), lambda meant: fit_guess(guess(meant)).captures
+            )
+
+    try:
+        with progress.step("Matching lenses"):
+            initial = guess(sources)
+    except InputError as error:
+        if (other := alternative()) is None:
+            raise
+        raise InputError(f"{str(error).rstrip(".?")}; {would_fit(other)}") from error
+    if initial.scale != 1:
+        # Windows are as large as the pattern turned out to be.
+        for k in blurred:
+            spots[k], blur[k] = find_blurred_spots_mm(images[k], initial.imager)
+    try:
+        result = fit_guess(initial, progress)
+    except MisfitError as error:
+        raise MisfitError(error.fits, describe_misfit(error.fits, alternative())) from error
+    if find_lenses:
+        return _drop_unseen_lenses(result)
+    if blurred:
+        # Where the middle of a wide spot is depends on the window that looks.
+        for k in blurred:
+            spots[k], _ = find_blurred_spots_mm(images[k], initial.imager, NARROW_WINDOW)
+        narrow = fit_guess(initial).values
+        for name, value in result.values.items():
+            result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
+    if "scale" in fit:
+        for numbers in (result.values, result.deviations):
+            numbers["scale"] *= initial.scale
+    return result._replace(mirrored=initial.mirrored)
 
 
 def _spots_of(number: int, image: Image, imager: Imager, sources: Sources, blurred: Collection[int]):
@@ -272,22 +317,39 @@ def refine(
         state = state or initial_unknowns(fit, data)
         if not jax.tree.leaves(state):
             raise InputError(f"calibration: fit one or more of {', '.join(FITTABLE)}, got nothing to fit.")
-        check_determined(standard_errors(state, data, lens_sd, NOISE), radius)
+        _check_determined(standard_errors(state, data, lens_sd, NOISE), radius, spots, sources, assigned, imager)
         args = data, jnp.asarray(lens_sd, data.positions.dtype)
         state = optx.least_squares(weighted_residuals, solver, state, args, throw=False, max_steps=_MAX_STEPS).value
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
-            raise InputError("captures: no geometry explains the spots; are they those of the given sources?")
+            fits = capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch)
+            _check_captures([fit._replace(fits=False) for fit in fits])
         current, points = apply_to_imager(state, imager), np.asarray(source_points(state, data), np.float64)
     assert state is not None and assigned is not None and data is not None
     check_fitted_sample(current)
     off = np.asarray(residuals(state, data), np.float64)[: len(assigned.lenses)]
+    fits = capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch, off)
+    _check_captures(fits)
     over_width = off / sources.blurs[assigned.sources, None]
     errors = standard_errors(state, data, lens_sd, estimate_noise(over_width, state, assigned.lenses))
     check_determined(errors, radius)
     for name, error in jackknife_errors(state, data, lens_sd).items():
         errors[name] = max(errors[name], error)
     sources = sources._replace(points=points)
-    return Calibration(current, False, named_values(state), errors, sources, assigned, off)
+    return Calibration(current, False, named_values(state), errors, sources, assigned, off, fits)
+
+
+def _check_captures(fits: Sequence[CaptureFit]) -> None:
+    if not all(fit.fits for fit in fits):
+        raise MisfitError(fits, describe_misfit(fits, None))
+
+
+def _check_determined(errors, radius: float, spots: SpotLists, sources: Sources, assigned: Spots, imager: Imager):
+    """`check_determined`, after captures whose spots would have been needed."""
+    try:
+        check_determined(errors, radius)
+    except InputError:
+        _check_captures(capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch))
+        raise
 
 
 def _reweight(sources: Sources, spots: Spots, off) -> Sources:
@@ -320,7 +382,7 @@ def _observations(imager: Imager, sources: Sources, unknown, spots: Spots, offse
     size = -(-max(len(spots.lenses), 1) // _MULTIPLE) * _MULTIPLE
     dtype = imager.sensor_distance.dtype
     of, lenses, positions = (
-        jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)])) for part in spots
+        jnp.asarray(np.pad(part, [(0, size - len(part)), *[(0, 0)] * (part.ndim - 1)])) for part in spots[:3]
     )
     valid, unknown = jnp.arange(size) < len(spots.lenses), jnp.asarray(np.argwhere(unknown))
     points, blur = jnp.asarray(sources.points, dtype), jnp.asarray(sources.blurs, dtype)[of]

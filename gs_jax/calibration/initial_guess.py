@@ -18,7 +18,7 @@ from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .pattern_matching import BLURRED, Similarity, match_pattern, match_shift, triangulate_lenses
 from .spot_model import match_radius, trace_core_offsets, with_centers
-from .spots import Sources, SpotLists, assign_spots, classify_lenses
+from .spots import CaptureFit, Sources, SpotLists, assign_spots, capture_fits, classify_lenses
 
 # Relative error of a scale that is fitted.
 _FREE_SCALE = 0.5
@@ -47,22 +47,27 @@ class InitialGuess(NamedTuple):
     scale: float = 1.0
 
 
-def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, free_scale: bool = False) -> InitialGuess:
+def guess_from_pattern(
+    spots: SpotLists, sources: Sources, imager: Imager, *, free_scale: bool = False, cache: dict | None = None
+) -> InitialGuess:
     """Guess from the clearest pattern; of several sources in a capture, from the one that explains most spots.
 
+    `cache` holds matches by capture and depth, which are added to it: they do not depend on where the source is beside
+    the axis, except for those of a regular array.
     With `free_scale` the array behind blurred spots may have half to one and a half times the design's scale.
     `InputError` if no capture has a clear pattern.
     """
     centers = np.asarray(imager.array.centers, np.float64)
-    matches = []
+    cache, matches = {} if cache is None else cache, []
     for source, point in enumerate(sources.points):
         capture = int(sources.captures[source])
         in_capture = int((sources.captures == capture).sum())
         factor, shift, error = _expected(imager, point)
         blurred = not sources.sharp[source]
         error = _FREE_SCALE if free_scale and blurred else error
-        found = match_pattern(spots[capture], centers, factor, error, in_capture, blurred=blurred, shift=shift)
-        matches.append((found, source))
+        if (key := (capture, float(point[2]))) not in cache:
+            cache[key] = match_pattern(spots[capture], centers, factor, error, in_capture, blurred=blurred, shift=shift)
+        matches.append((cache[key], source))
     matches.sort(key=lambda match: -match[0].on_lenses)
     best = matches[0][0]
     if not best.is_clear:
@@ -84,7 +89,11 @@ def guess_from_pattern(spots: SpotLists, sources: Sources, imager: Imager, *, fr
         if not sources.sharp[source]:
             posed = _pose_by_known(spots, sources, posed)
         guesses.append(InitialGuess(posed, match.mirrored, _locate_sources(spots, sources, posed), scale))
-    return guesses[0] if len(guesses) == 1 else max(guesses, key=lambda guess: _explained(spots, guess))
+    return (
+        guesses[0]
+        if len(guesses) == 1
+        else max(guesses, key=lambda guess: sum(fit.spots for fit in explained(spots, guess)))
+    )
 
 
 def guess_from_pose(spots: SpotLists, sources: Sources, imager: Imager) -> InitialGuess:
@@ -103,11 +112,12 @@ def _expected(imager: Imager, point) -> tuple[complex, complex, float]:
     return factor, scale * complex(*np.asarray(imager.shift)) - (scale - 1) * complex(x, y), error
 
 
-def _explained(spots: SpotLists, guess: InitialGuess) -> int:
-    offsets = trace_core_offsets(guess.imager, guess.sources.points[:, 2])
-    return len(
-        assign_spots(spots, guess.sources, guess.imager, offsets, match_radius(guess.imager.array.centers)).lenses
-    )
+def explained(spots: SpotLists, guess: InitialGuess) -> list[CaptureFit]:
+    """What a guess explains of each capture."""
+    imager, sources = guess.imager, guess.sources
+    offsets = trace_core_offsets(imager, sources.points[sources.sharp, 2])
+    assigned = assign_spots(spots, sources, imager, offsets, match_radius(imager.array.centers))
+    return capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch)
 
 
 def _pose(match: Similarity, point, imager: Imager, of_array: float = 1.0) -> Imager:

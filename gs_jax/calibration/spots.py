@@ -31,6 +31,9 @@ _THRESHOLD_SNR, _MIN_DISTANCE = 8.0, 6
 _SPOTS = 60
 # Wide spots looked for, over the number of lenses.
 _MOST_BLURRED = 2
+# Least share of expected spots in a capture that fits, sharp and wide ones: chance puts a spot of twenty, and a wide
+# one of five, near to where it is expected.
+_LEAST_SHARE, _LEAST_SHARE_WIDE = 0.25, 0.5
 # Predicted spots closer than this, over `match_radius`, are blurred into one.
 _BLURRED = 0.5
 # Half widths of the squares by whose light types of lenses are told apart, pixels; rounds of alternation; least share.
@@ -99,11 +102,42 @@ class Sources(NamedTuple):
 
 
 class Spots(NamedTuple):
-    """Spots with their sources and lenses; positions on the sensor, mm."""
+    """Spots with their sources and lenses; positions on the sensor, mm.
+
+    `expected` is the number of spots that each capture should show, `away` the median distance of these from the
+    nearest spot of the capture, mm. NaN without any.
+    """
 
     sources: Int[np.ndarray, " spot"]
     lenses: Int[np.ndarray, " spot"]
     positions: Float64[np.ndarray, "spot 2"]
+    expected: Int[np.ndarray, " capture"] | None = None
+    away: Float64[np.ndarray, " capture"] | None = None
+
+
+class CaptureFit(NamedTuple):
+    """How well a geometry explains a capture: spots used of those expected, and their residual.
+
+    `away` is the median distance of expected spots from the nearest ones of the capture; lengths are in pixels.
+    """
+
+    spots: int
+    expected: int
+    rms: float
+    away: float
+    fits: bool
+
+    def __str__(self) -> str:
+        said = f"{self.spots} of {self.expected} expected spots"
+        return f"{said}, {self.rms:.3f} pixels RMS" if self.spots else said
+
+
+class MisfitError(InputError):
+    """Captures that the geometry of the others does not explain; `fits` has what it explains of each."""
+
+    def __init__(self, fits: Sequence[CaptureFit], message: str):
+        super().__init__(message)
+        self.fits = fits
 
 
 def find_spots(image: Image, most: int) -> Float64[np.ndarray, "spot 2"]:
@@ -155,14 +189,23 @@ def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: Co
     predicted = np.asarray(predict_spots(imager, np.nan_to_num(sources.points, nan=1.0), offsets, sharp), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)
     seen = ((beside < imager.field_radius) | ~sharp[:, None]) & ~np.isnan(sources.points.sum(1))[:, None]
+    # Lenses beside the sensor show nothing.
+    inside = np.abs(np.asarray(imager.sensor.to_pixels(predicted)) - (np.array(imager.sensor.shape) - 1) / 2)
+    seen &= (inside < np.array(imager.sensor.shape) / 2 - _MIN_DISTANCE).all(-1)
     rows, blurred = [], _BLURRED * match_radius(imager.array.centers)
+    expected, away = np.zeros(len(spots), int), np.full(len(spots), np.nan)
     for capture, found in enumerate(spots):
         source, lens = np.argwhere(seen & (sources.captures == capture)[:, None]).T
-        if not len(found) or not len(source):
+        if not len(source):
             continue
         wanted = predicted[source, lens]
         alone = np.asarray(KDTree(wanted).query_ball_point(wanted, blurred, return_length=True)) == 1
+        most = _SPOTS * len(np.unique(source)) if sharp[source[0]] else _MOST_BLURRED * len(centers)
+        expected[capture] = min(int(alone.sum()), most)
+        if not len(found):
+            continue
         distance, nearest = (np.asarray(part) for part in KDTree(found).query(wanted))
+        away[capture] = np.median(distance)
         near = distance < (within if sharp[source[0]] else blurred_radius(imager.array.centers))
         rows += [
             (source[k], lens[k], *found[nearest[k]])
@@ -171,7 +214,27 @@ def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: Co
             if distance[k] == distance[nearest == nearest[k]].min()
         ]
     table = np.array(rows, np.float64).reshape(-1, 4)
-    return Spots(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    return Spots(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:], expected, away)
+
+
+def capture_fits(
+    spots: Spots, lists: SpotLists, sources: Sources, pixel: float, off: Float64[np.ndarray, "spot 2"] | None = None
+) -> list[CaptureFit]:
+    """How assigned spots, of those of each capture, explain the captures; `off` are their residuals, pixels.
+
+    A capture fits if a share of the spots that it can show are where they are expected, more than chance puts there.
+    """
+    assert spots.expected is not None and spots.away is not None
+    of, fits = sources.captures[spots.sources], []
+    for capture, found in enumerate(lists):
+        mine = of == capture
+        expected, count = int(spots.expected[capture]), int(mine.sum())
+        wide = not sources.sharp[sources.captures == capture].all()
+        least = (_LEAST_SHARE_WIDE if wide else _LEAST_SHARE) * min(expected, len(found))
+        rms = float(np.sqrt((off[mine] ** 2).sum(1).mean())) if off is not None and count else np.nan
+        away = float(spots.away[capture]) / pixel
+        fits.append(CaptureFit(count, expected, rms, away, count > 0 and count >= least))
+    return fits
 
 
 def classify_lenses(

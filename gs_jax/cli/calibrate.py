@@ -104,7 +104,7 @@ def calibrate_command(
     from ..calibration.fit import PATTERN_FITTED, SELF_FITTED, calibrate, self_calibrate
     from ..calibration.sample import OF_SAMPLE, with_surface
     from ..calibration.spot_model import FITTED
-    from ..calibration.spots import Sources
+    from ..calibration.spots import MisfitError, Sources
     from ..design.conversion import medium_in_words
     from ..design.design import read_design, write_design
     from ..io.files import write_figure
@@ -152,15 +152,26 @@ def calibrate_command(
             images = [camera.read(path) for path in progress.track(pictures, "Reading captures")]
             camera.print_corrections()
             options = {"captures": of, "fit": names, "find_lenses": find_lenses, "blurred": blurred}
-            outcome = calibrate(images, points, imager, **options, progress=progress)
+            try:
+                outcome = calibrate(images, points, imager, **options, progress=progress)
+            except MisfitError as error:
+                _print_fits(pictures, error.fits)
+                raise
     provenance = camera.recorded(provenance_of(*inputs))
     write_design(output, apply_calibration(microscope, outcome, provenance, sample=light.sample))
     write_figure(drawing, plot_residuals(outcome))
     Console().print(summary_table(microscope, outcome, with_surface(imager, names)))
+    _print_fits(pictures, outcome.captures)
     mirrored = ", the array mirrored (y to -y) and rotated" if outcome.mirrored else ""
     lenses = f", {len(outcome.imager.array.centers)} lenses found" if find_lenses else ""
     click.echo(f"sources in {medium_in_words(outcome.imager)}{_other_samples(light, microscope)}")
     click.echo(f"{output}: {len(outcome.residuals)} spots, {outcome.rms:.3f} pixels RMS{mirrored}{lenses}")
+
+
+def _print_fits(pictures, fits) -> None:
+    """One line for each capture: the number of spots used, and of those expected, and their residual."""
+    for path, fit in zip(pictures, fits, strict=True):
+        click.echo(f"{path.name}: {fit}")
 
 
 def _with_sample(light: Light, design, default: str) -> Light:
