@@ -244,7 +244,7 @@ def calibrate(
     except InputError as error:
         if (other := alternative()) is None:
             raise
-        raise InputError(f"{str(error).rstrip(".?")}; {would_fit(other)}") from error
+        raise InputError(f"{str(error).rstrip('.?')}; {would_fit(other)}") from error
     if initial.scale != 1:
         # Windows are as large as the pattern turned out to be.
         for k in blurred:
