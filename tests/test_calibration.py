@@ -1,6 +1,7 @@
 """Calibration: spots and their lenses, geometry from spots that we put somewhere, and from ray-traced captures."""
 
 import dataclasses
+import re
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.quiver import QuiverKey
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +32,7 @@ from gs_jax import (
 )
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
+from gs_jax.calibration.alternatives import alternatives
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses
@@ -39,6 +42,7 @@ from gs_jax.calibration.spots import Sources, Spots, find_spots
 from gs_jax.cli.calibrate import _NAMES
 from gs_jax.design.start import geomscope
 from gs_jax.io.camera import Readout
+from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 from gs_jax.layers import reduced_distance
@@ -196,7 +200,12 @@ def test_geometry_is_found_from_a_poor_start(seed):
     assert len(found.residuals) > 20 and np.hypot(*found.residuals.T).max() < 1
     depth, seen, fitted = pattern_scales(found).T
     np.testing.assert_allclose(seen, fitted, atol=2e-4)
-    assert set(depth) <= {18.0, 20.0, 22.0} and len(plot_residuals(found).axes) == 3
+    assert set(depth) <= {18.0, 20.0, 22.0} and len(axes := plot_residuals(found).axes) == 3
+    legend = axes[0].get_legend()
+    assert legend is not None and [text.get_text() for text in legend.get_texts()] == [
+        f"capture {k}" for k in (1, 2, 3)
+    ]
+    assert any("pixels" in child.text.get_text() for child in axes[0].findobj(QuiverKey))
 
 
 @pytest.mark.integration
@@ -422,6 +431,75 @@ def test_wrong_positions_are_one_line(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         read_positions(path, ["a.tif", "b.tif"])
+
+
+def test_other_positions_that_may_have_been_meant():
+    points = np.array([[0.0, 0.0, 18.0], [0.5, 0.0, 20.0], [0.0, 0.0, 22.0]])
+    meant = {said: found.points for said, found in alternatives(Sources(points, np.arange(3)))}
+    # Near and far are captures 1 and 3; there is no y to reverse.
+    both = "the direction of z reversed (near and far swapped) or captures 1 and 3 swapped"
+    assert [said for said in meant if "sign of y" in said] == [] and any(said.startswith(both) for said in meant)
+    np.testing.assert_array_equal(meant["captures 1 and 2 swapped"], points[[1, 0, 2]])
+    reversed_x = next(found for said, found in meant.items() if said.startswith("the sign of x reversed"))
+    np.testing.assert_array_equal(reversed_x, points * [-1, 1, 1])
+    # An unknown coordinate stays unknown, and a pattern is not moved.
+    some = Sources(
+        np.append(points * [np.nan, 1, 1], [[1.0, 2.0, 1e4]], 0), np.arange(4), np.array([1.0, 1.0, 1.0, 7.0])
+    )
+    for _, found in alternatives(some):
+        assert np.isnan(found.points[:3, 0]).all() and found.points[3].tolist() == [1.0, 2.0, 1e4]
+
+
+STAGE = np.array([[0.0, 0.0, 18.0], [0.5, 0.3, 20.0], [-0.4, 0.1, 20.0], [0.0, 0.0, 22.0]])
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("find_lenses", [False, True])
+@pytest.mark.parametrize(
+    ("places", "message"),
+    [
+        (STAGE * [-1, 1, 1], "with the sign of x reversed all would fit, 0.2. pixels RMS: correct the positions"),
+        (STAGE[[3, 1, 2, 0]], r"captures 1, 4 of 4 do not fit.*near and far swapped\) or captures 1 and 4 swapped all"),
+        (STAGE[[0, 2, 1, 3]], "with captures 2 and 3 swapped all would fit"),
+        (STAGE + [[0, 0, 0], [0.7, 0, 0], [0, 0, 0], [0, 0, 0]], "capture 2 of 4 does not fit, with 0 of 1. .*no axis"),
+    ],
+    ids=["x", "near-far", "swapped", "displaced"],
+)
+def test_captures_that_do_not_fit_are_refused(tmp_path, monkeypatch, places, message, find_lenses):
+    """By the command, which prints a line for each capture, and writes nothing."""
+    monkeypatch.chdir(tmp_path)
+    array = MicrolensArray(random_layout(20, (6.0, 6.0), pitch=1.2, seed=1), size=(6.0, 6.0))
+    listed = Imager(array, Sensor((600, 600), 0.0135), sensor_distance=5.8, field_radius=3.0)
+    true = dataclasses.replace(listed, sensor_distance=5.9, rotation=0.02)
+    write_design("small.toml", Design.from_imager(listed, name="small", working_distance_mm=(18.0, 23.0)))
+    names = [f"{number}.tif" for number in range(4)]
+    for name, place in zip(names, STAGE, strict=True):
+        image = simulate(np.append(place, 1.0)[None], true, optics="near", psf="geometric")
+        write_capture(name, np.asarray(image, np.float32))
+    options = ["--find-lenses"] if find_lenses else ["--hold", "tilt"]
+    for rows, output in ((STAGE, "fits.toml"), (places, "wrong.toml")):
+        np.savetxt("p.csv", rows, delimiter=",", header="x_mm,y_mm,z_mm", comments="")
+        arguments = ["calibrate", "small.toml", *names, "--positions", "p.csv", *options, "-o", output]
+        told = CliRunner().invoke(commands, arguments)
+        lines = [line for line in told.stdout.splitlines() if "expected spots" in line]
+        assert (told.exception is None) == (output == "fits.toml") == (tmp_path / output).exists()
+        if told.exception is None:
+            assert [line.split(":")[0] for line in lines] == names and all("pixels RMS" in line for line in lines)
+        else:
+            assert isinstance(told.exception, InputError) and re.search(message, str(told.exception))
+            assert len(str(told.exception)) < 380 and not (tmp_path / "wrong.png").exists()
+            assert not lines or any(": 0 of " in line for line in lines)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("fit", [FITTED, ()])
+def test_a_device_that_is_no_bare_array_is_refused_in_a_line(fit):
+    """Real spots of an LED, through optics that no design here has."""
+    data = needs("stage/z.toml").parent
+    imager, places = read_design(data / "z.toml").imager(), read_positions(data / "places5.csv", range(5))[0][:2]
+    images = [read_capture(path, imager.sensor.shape) for path in sorted((data / "cap").glob("*.tif"))[:2]]
+    with pytest.raises(InputError, match="captures: captures 1, 2 of 2 do not fit.* nothing but a lens array before"):
+        calibrate(images, places, imager, fit=fit, find_lenses=True)
 
 
 def test_the_command_knows_what_can_be_fitted():

@@ -91,6 +91,6 @@ def describe_misfit(fits: Sequence[CaptureFit], alternative: tuple[str, float] |
     if alternative is not None:
         return f"captures: {got}; {would_fit(alternative)}"
     cause = "are positions, order and pixel pitch right?"
-    if len(wrong) == len(fits):
+    if len(wrong) > len(fits) / 2:
         cause = "are positions and pixel pitch right, and is there nothing but a lens array before the sensor?"
     return f"captures: {got}; no axis reversed or captures swapped fit either: {cause}"

@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from pydantic import ValidationError
 from rich.table import Table
 
@@ -23,6 +25,8 @@ from .sample import with_sample
 
 # Length of the longest arrow in the figure, in sides of the sensor.
 _LONGEST = 0.08
+# Width of an arrow, in widths of the drawing; captures that a legend names; share of the colours that show on white.
+_ARROW, _MOST_NAMED, _DARKEST = 0.004, 12, 0.9
 # Least half range of its axis of scales.
 _LEAST_RANGE = 1e-3
 
@@ -123,32 +127,55 @@ def pattern_scales(result: Calibration) -> Float64[np.ndarray, "source 3"]:
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
+def _round_down(length: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not longer."""
+    power = 10.0 ** np.floor(np.log10(max(length, 1e-12)))
+    return float(f"{max(step for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)) * power:.1g}")
+
+
 def plot_residuals(result: Calibration) -> Figure:
     """Residuals of all spots on the sensor, a histogram of their lengths, and the pattern's scale by depth."""
     sensor, distance = result.imager.sensor, np.hypot(*result.residuals.T)
-    figure = Figure(figsize=(12, 4), dpi=100, layout="constrained")
+    figure = Figure(figsize=(14, 5), dpi=100, layout="constrained")
     arrows, counts, lines = figure.subplots(1, 3)
     side = max(sensor.shape) * sensor.pixel_pitch
     scale = max(float(distance.max()), 1e-12) / (_LONGEST * side)
-    colours = result.sources.captures[result.spots.sources]
-    positions = result.spots.positions.T
-    arrows.quiver(*positions, *result.residuals.T, colours, angles="xy", scale_units="xy", scale=scale)
+    of = result.sources.captures[result.spots.sources]
+    for number in (numbers := np.unique(of)):
+        mine = of == number
+        colour = colormaps["viridis"](float(np.searchsorted(numbers, number)) / max(len(numbers) - 1, 1) * _DARKEST)
+        drawn = arrows.quiver(
+            *result.spots.positions[mine].T,
+            *result.residuals[mine].T,
+            color=colour,
+            angles="xy",
+            scale_units="xy",
+            scale=scale,
+            width=_ARROW,
+        )
+        drawn.set_label(f"capture {number + 1}")
+        if number == numbers[0]:
+            length = _round_down(float(distance.max()))
+            arrows.quiverkey(drawn, 0.03, 1.04, length, f"{length:g} pixels", labelpos="E", color="k")
     arrows.set(xlim=sensor.extent[:2], ylim=sensor.extent[2:], aspect="equal", xlabel="x, mm", ylabel="y, mm")
-    arrows.set_title(f"residuals, longest {distance.max():.2f} pixels; colour: capture", fontsize=9)
+    arrows.set_title("predicted less observed spots, on the sensor", pad=22)
+    if 1 < len(numbers) <= _MOST_NAMED:
+        handles = [Line2D([], [], color=drawn.get_facecolor(), label=drawn.get_label()) for drawn in arrows.collections]
+        arrows.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
     counts.hist(distance, bins=30)
-    counts.set(xlabel="distance, pixels", ylabel="spots")
-    counts.set_title(f"{len(distance)} spots, {result.rms:.3f} pixels RMS", fontsize=9)
+    counts.set(xlabel="length of the residual, pixels", ylabel="number of spots")
+    counts.set_title(f"{len(distance)} spots, {result.rms:.3f} pixels RMS")
     depth, seen, fitted = pattern_scales(result).T
     inverse = 1 / np.asarray(result.imager.reduced_depth(depth))
     order = np.argsort(inverse)
     lines.plot(inverse[order], fitted[order], color="0.6", label="1 + v/z'")
     lines.plot(inverse, seen, ".", label="spots of a source")
-    lines.set(xlabel="1/z', 1/mm", ylabel="scale of the pattern, s_z")
+    lines.set(xlabel="1 / reduced depth z', 1/mm", ylabel="scale of the lenses' pattern, s_z")
     lines.locator_params(axis="x", nbins=4)
     # Of a single depth no digits that rounding leaves.
     low, high = lines.get_ylim()
     lines.set_ylim(min(low, (low + high) / 2 - _LEAST_RANGE), max(high, (low + high) / 2 + _LEAST_RANGE))
     worst = float(np.abs(seen - fitted).max()) if len(seen) else 0.0
-    lines.set_title(f"s_z by depth (Eq. 1), off by up to {worst:.1e}", fontsize=9)
-    lines.legend(fontsize=8)
+    lines.set_title(f"scale by depth (Eq. 1), off by up to {worst:.1e}")
+    lines.legend(fontsize=9)
     return figure

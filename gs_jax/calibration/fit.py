@@ -313,6 +313,8 @@ def refine(
             sources = _reweight(sources, assigned, np.asarray(residuals(state, data))[: len(assigned.lenses)])
         offsets = trace_core_offsets(current, points[sources.sharp, 2], fit)
         assigned = assign_spots(spots, sources._replace(points=points), current, offsets, within * radius)
+        if not len(assigned.lenses):
+            _check_captures(capture_fits(assigned, spots, sources, imager.sensor.pixel_pitch))
         data = _observations(imager, sources, unknown, assigned, offsets)
         state = state or initial_unknowns(fit, data)
         if not jax.tree.leaves(state):
