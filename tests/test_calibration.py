@@ -443,9 +443,8 @@ def test_other_positions_that_may_have_been_meant():
     reversed_x = next(found for said, found in meant.items() if said.startswith("the sign of x reversed"))
     np.testing.assert_array_equal(reversed_x, points * [-1, 1, 1])
     # An unknown coordinate stays unknown, and a pattern is not moved.
-    some = Sources(
-        np.append(points * [np.nan, 1, 1], [[1.0, 2.0, 1e4]], 0), np.arange(4), np.array([1.0, 1.0, 1.0, 7.0])
-    )
+    rows = np.append(points * [np.nan, 1, 1], [[1.0, 2.0, 1e4]], 0)
+    some = Sources(rows, np.arange(4), np.array([1.0, 1.0, 1.0, 7.0]))
     for _, found in alternatives(some):
         assert np.isnan(found.points[:3, 0]).all() and found.points[3].tolist() == [1.0, 2.0, 1e4]
 

@@ -8,8 +8,8 @@ import numpy as np
 from ..base.errors import InputError
 from .spots import CaptureFit, Sources
 
-# Most captures of which all pairs are swapped, and most alternatives that are fitted.
-_MOST_SWAPPED, _MOST_FITTED = 10, 3
+# Most captures of which all pairs are swapped, alternatives that are fitted, and names of one that are said.
+_MOST_SWAPPED, _MOST_FITTED, _MOST_SAID = 10, 3, 2
 
 
 def alternatives(sources: Sources) -> Iterator[tuple[str, Sources]]:
@@ -37,13 +37,15 @@ def alternatives(sources: Sources) -> Iterator[tuple[str, Sources]]:
         meant.append(("the order of the captures reversed", points[::-1]))
     words: dict[bytes, list[str]] = {}
     for said, changed in meant:
-        # -0 is 0.
+        # What is unknown stays unknown; -0 is 0.
+        if (np.isnan(changed) != np.isnan(points)).any():
+            continue
         words.setdefault((changed + 0.0).tobytes(), []).append(said)
     words.pop((points + 0.0).tobytes(), None)
     for key, said in words.items():
         changed = sources.points.copy()
         changed[sharp] = np.frombuffer(key).reshape(points.shape)
-        yield " or ".join(said), sources._replace(points=changed)
+        yield " or ".join(said[:_MOST_SAID]), sources._replace(points=changed)
 
 
 def best_alternative(
