@@ -32,10 +32,10 @@ from gs_jax import (
 )
 from gs_jax.__main__ import commands
 from gs_jax.base.progress import Progress
-from gs_jax.calibration.alternatives import alternatives
 from gs_jax.calibration.calibrated_design import apply_calibration, pattern_scales, plot_residuals
 from gs_jax.calibration.fit import Calibration, calibrate, self_calibrate
 from gs_jax.calibration.initial_guess import guess_without_lenses
+from gs_jax.calibration.misfits import alternatives
 from gs_jax.calibration.pattern_matching import match_pattern, match_shift
 from gs_jax.calibration.spot_model import FITTABLE, FITTED, OF_DEVICE, core_offsets
 from gs_jax.calibration.spots import Sources, Spots, find_spots
@@ -495,8 +495,9 @@ def test_captures_that_do_not_fit_are_refused(tmp_path, monkeypatch, places, mes
 def test_a_device_that_is_no_bare_array_is_refused_in_a_line(fit):
     """Real spots of an LED, through optics that no design here has."""
     data = needs("stage/z.toml").parent
-    imager, places = read_design(data / "z.toml").imager(), read_positions(data / "places5.csv", range(5))[0][:2]
-    images = [read_capture(path, imager.sensor.shape) for path in sorted((data / "cap").glob("*.tif"))[:2]]
+    imager, paths = read_design(data / "z.toml").imager(), sorted((data / "cap").glob("*.tif"))
+    places = read_positions(data / "places5.csv", paths)[0][:2]
+    images = [read_capture(path, imager.sensor.shape) for path in paths[:2]]
     with pytest.raises(InputError, match="captures: captures 1, 2 of 2 do not fit.* nothing but a lens array before"):
         calibrate(images, places, imager, fit=fit, find_lenses=True)
 

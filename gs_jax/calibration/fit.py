@@ -21,7 +21,6 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..lenses import EACH
 from ..typing import Image
-from .alternatives import best_alternative, describe_misfit, would_fit
 from .initial_guess import (
     InitialGuess,
     explained,
@@ -31,6 +30,7 @@ from .initial_guess import (
     search_rotation,
 )
 from .jackknife import jackknife_errors
+from .misfits import best_alternative, describe_misfit, would_fit
 from .pattern_matching import MIN_SPOTS
 from .sample import OF_SAMPLE, check_fitted_sample, with_surface
 from .spot_model import (
