@@ -167,8 +167,8 @@ def calibrate(
     blurred
         Captures, from 0, in which every lens has one wide spot of any shape: of a source out of focus or aberrated, or
         of an even white surface, whose middle is the source's place. Middles of such spots are on chief rays, and
-        weigh in inverse proportion to their scatter about the fit. With `scale`, their pattern may have half to one and a half
-        times the size that the design's has.
+        weigh in inverse proportion to their scatter about the fit. With `scale`, their pattern may have half to one and
+        a half times the size that the design's has.
     progress
         Shows how far the work is.
 
