@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import tifffile
 
 from ..base.errors import InputError
 from .captures import CAPTURE_SUFFIXES, read_images, size_text
@@ -31,12 +32,12 @@ def summarise(path: Path) -> dict[str, str]:
 
 
 def _of_tiff(path):
-    with open_tiff(path) as (tiff, count), decoding(path, "TIFF"):
-        series, page = tiff.series[0], tiff.pages.first
+    with open_tiff(path) as opened, decoding(path, "TIFF"), tifffile.TiffFile(path) as file:
+        series, page = file.series[0], opened.first
         return {
             "pixels": size_text(page.shape[:2] if page.planarconfig == 1 else page.shape[-2:]),
             "type": str(page.dtype),
-            "pages": str(count),
+            "pages": str(opened.count),
             "axes": f"{series.axes}, {size_text(series.shape)}",
             "colours": page.photometric.name.lower(),
             "compression": page.compression.name.lower(),
