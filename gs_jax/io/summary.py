@@ -39,8 +39,8 @@ def _of_tiff(path):
             "type": str(page.dtype),
             "pages": str(opened.count),
             "axes": f"{series.axes}, {size_text(series.shape)}",
-            "colours": page.photometric.name.lower(),
-            "compression": page.compression.name.lower(),
+            "colours": tifffile.PHOTOMETRIC(page.photometric).name.lower(),
+            "compression": tifffile.COMPRESSION(page.compression).name.lower(),
         }
 
 
