@@ -280,7 +280,7 @@ WRONG_ARGUMENTS = [
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif"), "missing.csv"),
     (("simulate", "capture.tif", "design.toml", "-o", "c.tif"), "capture.tif"),
     (("simulate", "design.toml", "design.toml", "-o", "c.tif"), "got a design: SCENE comes first"),
-    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "got '.jpg' (c.jpg)"),
+    (("simulate", "missing.csv", "design.toml", "-o", "c.jpg"), "got '.jpg'; JPEG is lossy"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.png", "--no-noise"), ".tif, .tiff or .npy with --no-noise"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--psf", "round"), "'round' is not"),
     (("simulate", "missing.csv", "design.toml", "-o", "c.tif", "--peak-electrons", "0"), "--peak-electrons"),

@@ -24,7 +24,7 @@ from experiments.design_judge import (
     shared,
 )
 from experiments.ray_tracer import traced
-from gs_jax import Imager, Layers, MicrolensArray, Sensor, geomscope, rasterize
+from gs_jax import Imager, MicrolensArray, Sensor, geomscope, rasterize
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.design.design import write_design
@@ -76,11 +76,9 @@ def test_images_by_the_model_are_those_by_rays():
 
 
 def test_what_rays_do_not_know_is_refused():
-    layered = dataclasses.replace(IMAGER, filters=Layers([1.0], [1.5]))
     aspheric = dataclasses.replace(IMAGER, array=dataclasses.replace(IMAGER.array, aspheric_terms=[1e-3]))
-    for imager in (layered, aspheric):
-        with pytest.raises(InputError, match="takes no layers, no emission band and no aspheric terms"):
-            traced(np.array([[0.0, 0.0, 20.0, 1.0]]), imager, 10)
+    with pytest.raises(InputError, match="takes no emission band and no aspheric terms"):
+        traced(np.array([[0.0, 0.0, 20.0, 1.0]]), aspheric, 10)
 
 
 def test_differences_are_of_pairs():

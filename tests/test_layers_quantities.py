@@ -14,6 +14,7 @@ from gs_jax.apps.explore.evaluation import make_sliders
 from gs_jax.apps.report.drawings import draw_section
 from gs_jax.apps.report.report_tables import device_rows
 from gs_jax.apps.tolerance_analysis import tolerance
+from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.fisher import crowded_bound
 from gs_jax.codesign.linear_error import lens_electrons
 from gs_jax.codesign.study import Study
@@ -122,7 +123,8 @@ def test_searches_of_layers():
         "sample.refractive_index": (1.3, 1.6),
     }
     start, loss = float(scope.magnification(21.0)), lambda scope: (scope.magnification(21.0) - 0.275) ** 2
-    found = gs.optimize(loss, scope, free=gs.free(*bounds), bounds=bounds, steps=20).imager
+    with pytest.warns(InputWarning, match="windows.refractive_index starts at 1.001 instead of 1"):
+        found = gs.optimize(loss, scope, free=gs.free(*bounds), bounds=bounds, steps=20).imager
     assert found.filters is not None and found.sample is not None
     assert abs(float(found.magnification(21.0)) - 0.275) < 1e-3 < abs(start - 0.275)
     changed = (found.filters.thickness, found.sample.surface, found.sample.refractive_index)

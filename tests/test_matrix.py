@@ -99,6 +99,13 @@ def layered() -> Design:
     )
 
 
+def tilted_layered() -> Design:
+    """The same, tilted, for light of one wavelength: the independent ray tracer takes it."""
+    tables = stack(17.5) | {"bandwidth_nm": 0.0}
+    tables["layers"]["object"][0]["refractive_index"] = 1.52
+    return layered().replace(**tables, tilt_deg=(1.0, -0.6))
+
+
 def layered_combined() -> Design:
     """The same over a curved side, with two lens types and a tilt."""
     return combined().replace(sensor_distance_mm=5.64, working_distance_mm=(18.0, 23.0), **stack(17.5, gap=0.3))
@@ -154,7 +161,7 @@ DEVICES: dict[str, Callable[[], Design]] = {
     "odd": lambda: cropped("geomscope", shape=(601, 577)),
     "one lens": lambda: cropped("geomscope", lenses=1, array={"size_mm": (2.0, 2.0)}),
     "float64": lambda: cropped("geomscope"),
-    "tilted, layers": lambda: layered().replace(tilt_deg=(1.0, -0.6), bandwidth_nm=0.0),
+    "tilted, layers": tilted_layered,
 }
 # Numbers of pixels without a common divisor, as many as a camera has: binned or not, all methods must cope.
 LARGE = "3001 x 4093"

@@ -167,7 +167,7 @@ def test_facets_cost_light_as_the_square_of_their_depth():
 
 def test_a_file_without_lenses_is_refused():
     block = trimesh.creation.box((5, 4, 1))
-    with pytest.raises(ValueError, match="no facet within"):
+    with pytest.raises(ValueError, match="no facet near any lens"):
         measure_lenslets(Mesh(block.vertices, block.faces), random_lenses())
 
 

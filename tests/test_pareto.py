@@ -92,7 +92,8 @@ def test_a_looser_limit_has_no_worse_design(monkeypatch):
 
     starts = []
     monkeypatch.setattr(pareto, "run_stages", stuck)
-    found = trade_off(geomscope(), Study.model_validate(STUDY))
+    with pytest.warns(InputWarning, match="aperture_diameter_mm starts at 1.486 instead of 2"):
+        found = trade_off(geomscope(), Study.model_validate(STUDY))
     light, depth = found.values.T
     assert [float(point.values["aperture_diameter_mm"]) for point in found.points] == [0.2, 0.2, 0.1]
     assert light[0] == light[1] > light[2] > 0 and depth[0] == depth[1] < depth[2]

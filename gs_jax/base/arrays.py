@@ -48,7 +48,8 @@ def jit(function: Callable, **options: Any) -> Any:
             args, kwargs = native((args, kwargs))
         return compiled(*args, **kwargs)
 
-    call.lower = compiled.lower  # pyright: ignore[reportAttributeAccessIssue]
+    for name in ("lower", "_cache_size"):
+        setattr(call, name, getattr(compiled, name))
     return call
 
 

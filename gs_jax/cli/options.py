@@ -88,10 +88,7 @@ class Depths(click.ParamType):
         count = (stop - start) / step + 1 + 1e-6
         if count > _MAX_DEPTHS + 1:
             self.fail(f"must have at most {_MAX_DEPTHS} depths, got {value!r}, {count:.3g} depths.", param, ctx)
-        if stop > _FARTHEST and (
-            question := _other_unit([start, stop, step] if ":" in value else [start], (0.0, _FARTHEST), "mm")
-        ):
-            self.fail(question, param, ctx)
+        self._check_unit([start, stop, step], param, ctx)
         return [round(start + i * step, 9) for i in range(int(count))]
 
     def _list(self, value, depths, param, ctx):
@@ -100,7 +97,13 @@ class Depths(click.ParamType):
             self.fail(f"must be depths of {self.least:g} mm or more, got {value!r}.", param, ctx)
         if any(after <= before for before, after in itertools.pairwise(depths)):
             self.fail(f"must be depths in ascending order, got {value!r}.", param, ctx)
+        self._check_unit(depths, param, ctx)
         return depths
+
+    def _check_unit(self, values, param, ctx):
+        """Fail if depths look as if they were given in another unit."""
+        if max(values) > _FARTHEST and (question := _other_unit(values, (0.0, _FARTHEST), "mm")):
+            self.fail(question, param, ctx)
 
 
 class DesignFile(click.ParamType):
