@@ -7,7 +7,7 @@ falls on the pattern is divided out.
 """
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.ndimage import minimum_filter
 from scipy.spatial import KDTree
 from skimage.feature import peak_local_max
@@ -120,7 +120,7 @@ def mean_shift(
     deviations: Float64[np.ndarray, " spot"],
     pitches: Float64[np.ndarray, " spot"],
     *,
-    dark: Float64[np.ndarray, " spot"] | None = None,
+    dark: Float[np.ndarray, " spot"] | None = None,
     slopes: Float64[np.ndarray, "spot 2"] | None = None,
 ) -> Float64[np.ndarray, "spot 2"]:
     """Where Gaussian windows come to rest that move from maxima to the centroids of what they see.

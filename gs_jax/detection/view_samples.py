@@ -277,7 +277,7 @@ def separate_points(
     tree = KDTree(spots)
     left, height, rest = samples.light.copy(), np.zeros_like(samples.light), light.copy()
     taken, spots_taken = np.zeros(len(left), bool), []
-    for number in order:
+    for number in order.tolist():
         if not take(number, left[number]):
             continue
         taken[number], own = True, left[number].copy()
