@@ -8,7 +8,7 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from .base.arrays import FINITE, POSITIVE, as_float, as_pair, as_shape, check_fields
 
@@ -66,7 +66,7 @@ class Sensor(eqx.Module):
         column = (points[..., 0] - self.origin[0]) / self.pixel_pitch + middle_column
         return (np if isinstance(points, np.ndarray) else jnp).stack([row, column], axis=-1)
 
-    def to_mm(self, pixels: Float[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    def to_mm(self, pixels: Num[Array | np.ndarray, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """Points `(x, y)` of fractional `(row, column)`; the inverse of `to_pixels`."""
         middle_row, middle_column = ((n - 1) / 2 for n in self.shape)
         x = (pixels[..., 1] - middle_column) * self.pixel_pitch + self.origin[0]

@@ -68,21 +68,21 @@ class State(NamedTuple):
     """State of a solver: all that its next step depends on, arrays only. `recent`: the last costs, oldest first."""
 
     free: PyTree[Array]
-    solver: PyTree[Array]
+    solver: PyTree
     cost: Float[Array, ""]
     recent: Float[Array, " recent"]
     step: Int[Array, ""]
     converged: Bool[Array, ""]
 
     @classmethod
-    def at_start(cls, free: PyTree[Array], solver: PyTree[Array], cost: Float[Array, ""]) -> "State":
+    def at_start(cls, free: PyTree[Array], solver: PyTree, cost: Float[Array, ""]) -> "State":
         recent = jnp.broadcast_to(cost, _FLAT_STEPS + 1)
         return cls(free, solver, cost, recent, jnp.array(0), jnp.array(False))
 
     def moved(
         self,
         free: PyTree[Array],
-        solver: PyTree[Array],
+        solver: PyTree,
         cost: Float[Array, ""],
         done: Bool[Array, ""] | bool,
         tolerance: float,

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from ..base.arrays import native
 from ..geometry import Imager
@@ -72,7 +72,7 @@ class ImagingOperator(lx.AbstractLinearOperator):
     in_structure, out_structure = _volume_structure, _image_structure
     transpose, as_matrix = transpose, as_matrix
 
-    def mv(self, vector: Float[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
+    def mv(self, vector: Num[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume."""
         return forward(vector, self.imager, self.grid, self.optics)
 
@@ -107,7 +107,7 @@ class BackprojectionOperator(lx.AbstractLinearOperator):
     in_structure, out_structure = _image_structure, _volume_structure
     transpose, as_matrix = transpose, as_matrix
 
-    def mv(self, vector: Float[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
+    def mv(self, vector: Num[Array | np.ndarray, "row column"]) -> Float[Array, "depth y x"]:
         """The volume of an image."""
         options = {"method": self.method, "normalize": self.normalize, "distortion": self.distortion}
         return backproject(vector, self.imager, self.grid, **options)

@@ -237,9 +237,8 @@ def pad_to_largest(spots: list[Num[np.ndarray, "high wide"]]) -> Num[np.ndarray,
         # The point is at n // 2 of n pixels.
         before = [n // 2 - k // 2 for n, k in zip(size, spot.shape, strict=True)]
         margins = [(b, n - k - b) for b, n, k in zip(before, size, spot.shape, strict=True)]
-        return np.pad(
-            np.asarray(spot, np.float32), margins, constant_values=float((spot - subtract_offset(spot)).max())
-        )
+        spot = np.asarray(spot, np.float32)
+        return np.pad(spot, margins, constant_values=float((spot - subtract_offset(spot)).max()))
 
     return np.stack([padded(spot) for spot in spots])
 
