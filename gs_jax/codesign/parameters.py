@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, ArrayLike, Float, Float64
 from pydantic import ValidationError
 
 from ..base.errors import InputError
@@ -276,7 +276,7 @@ def new_design(design: Design, imager: Imager, at: Conditions, values: Values) -
         raise InputError(f"the values found make no microscope: {one_line(error, Design, {})}.") from error
 
 
-def significant(value: Float[Array, "..."]) -> Float64[np.ndarray, "..."]:
+def significant(value: ArrayLike) -> Float64[np.ndarray, "..."]:
     """Numbers to seven significant digits."""
     numbers = np.asarray(value, float)
     return np.array([float(f"{number:.{_SIGNIFICANT}g}") for number in numbers.flat]).reshape(numbers.shape)

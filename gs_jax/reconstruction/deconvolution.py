@@ -227,7 +227,7 @@ def bin_pixels(image: Num[np.ndarray, "row column"], side: int) -> Num[np.ndarra
     return sum_pixels(np.asarray(image, np.float32), side)
 
 
-def pad_to_largest(spots: list[Num[np.ndarray, "high wide"]]) -> Num[np.ndarray, "plane tall wide"]:
+def pad_to_largest(spots: list[Num[np.ndarray, "_ _"]]) -> Num[np.ndarray, "plane tall wide"]:
     """Stack images of points that may differ in size; smaller ones are in the middle, in their own offset."""
     size = np.max([spot.shape for spot in spots], axis=0)
 
