@@ -81,6 +81,22 @@ def aperture_edge(array, angles):
     return np.stack(edges)
 
 
+# JAX keeps listeners for good: one counts for all tests of a process.
+_compilations = [0]
+
+
+def _count(event: str, duration_secs: float, **_: str | int) -> None:
+    _compilations[0] += event == "/jax/core/compile/backend_compile_duration"
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
+def compilations() -> int:
+    """Number of programs that this process has compiled, or read from the cache."""
+    return _compilations[0]
+
+
 def backproject_loop(image, imager, grid, method="linear"):
     """The paper's sum as it is told: for each voxel, for each lens, find the pixel. Returns it and the weights' sum."""
     image = np.asarray(image, np.float64)

@@ -19,7 +19,7 @@ from gs_jax.solvers.base import differences, differences_adjoint, lambda_max, sh
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
 
-from .helpers import scene
+from .helpers import compilations, scene
 
 # Nothing but the squares, where there is a choice.
 SOLVERS = {"R-L": RichardsonLucy, "FISTA": partial(FISTA, sparsity=0.0), "ADMM": partial(ADMM, sparsity=0.0)}
@@ -108,6 +108,33 @@ def test_zero_operators_integers_and_float32(solver):
     dark = jax.jit(lambda image: solve(single, image, make(steps=20, tolerance=1e-3)))(jnp.zeros(30, jnp.float32))
     assert dark.converged and dark.x.dtype == jnp.float32 and not np.any(dark.x)
     assert np.isnan(dark.costs[dark.steps :]).all() and not np.isnan(dark.costs[: dark.steps]).any()
+
+
+@pytest.mark.parametrize(
+    "make, options",
+    [
+        (RichardsonLucy, {}),
+        (RichardsonLucy, {"tolerance": 1e-2}),
+        (FISTA, {"sparsity": 0.01}),
+        (FISTA, {"sparsity": 0.01, "tolerance": 1e-2}),
+        (ADMM, {"sparsity": 0.01, "tolerance": 1e-2}),
+    ],
+)
+def test_other_numbers_run_the_same_program(make, options):
+    """Of the image, the operator, a weight or the tolerance; the result is that of the steps one by one."""
+    image = np.asarray(dense().mv(jnp.arange(12.0)))
+    results = []
+    for factor in (1.0, 2.0):
+        A = lx.MatrixLinearOperator(factor * dense().matrix)
+        before = compilations()
+        numbers = {name: factor * value for name, value in options.items()}
+        results.append(solve(A, factor * image, make(steps=30, **numbers)))
+        compiled = compilations() - before
+    assert compiled == 0 and results[0].x.shape == (12,)
+    state = (one := make(steps=30, **numbers)).init(A, 2.0 * image)
+    for _ in range(int(results[1].steps)):
+        state, _, _ = one.step(A, 2.0 * image, state)
+    np.testing.assert_allclose(results[1].x, one.estimate(state), rtol=1e-9)
 
 
 def by_geometry():

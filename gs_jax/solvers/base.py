@@ -5,6 +5,7 @@ what does not change from step to step, so that it is computed once. `solve` run
 callers that show or interrupt the iteration call `step` themselves.
 """
 
+import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, PyTree
 
-from ..base.arrays import divide, safe_sqrt
+from ..base.arrays import divide, native, safe_sqrt
 from ..base.errors import InputError
 
 # Weights with a standard deviation of one voxel.
@@ -120,8 +121,9 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     *Differentiable.*
 
     Gradients are with respect to the image, the leaves of `A` and the solver's weights, in reverse mode only without a
-    tolerance. It may be called inside `jit`, with `gs_jax.ImagingOperator` as an argument. `gs_jax.reconstruct` is the
-    host's function from a capture to a volume.
+    tolerance. The loop is compiled once: other numbers in the image, the operator, the weights or the tolerance run the
+    same program. It may be called inside `jit`, with `gs_jax.ImagingOperator` as an argument. `gs_jax.reconstruct` is
+    the host's function from a capture to a volume.
 
     Parameters
     ----------
@@ -149,14 +151,25 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     >>> solution.x.shape, solution.costs.shape
     ((3, 41, 41), (5,))
     """
+    tolerance = jnp.asarray(solver.tolerance) if solver.tolerance else None
+    module: Any = solver  # the protocol does not say that it is one
+    # Python's numbers become arguments of the program.
+    is_number = lambda leaf: isinstance(leaf, int | float) and not isinstance(leaf, bool)
+    module = dataclasses.replace(module, tolerance=0.0)
+    module = jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf, module)
+    return _solve(A, native(image), module, tolerance)
+
+
+@eqx.filter_jit
+def _solve(A, image, solver, tolerance) -> Solution:
     state = solver.init(A, image)
-    if not solver.tolerance:
+    if tolerance is None:
         state, costs = lax.scan(lambda s, _: solver.step(A, image, s)[:2], state, length=solver.steps)
         return Solution(solver.estimate(state), costs, jnp.array(solver.steps), jnp.array(False))
 
     def unfinished(carry):
         _, _, number, residual = carry
-        return (number < solver.steps) & (residual >= solver.tolerance)
+        return (number < solver.steps) & (residual >= tolerance)
 
     def advance(carry):
         state, costs, number, _ = carry
@@ -166,7 +179,7 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     _, cost, residual = jax.eval_shape(lambda s: solver.step(A, image, s), state)
     start = state, jnp.full(solver.steps, jnp.nan, cost.dtype), jnp.array(0), jnp.array(jnp.inf, residual.dtype)
     state, costs, number, residual = lax.while_loop(unfinished, advance, start)
-    return Solution(solver.estimate(state), costs, number, residual < solver.tolerance)
+    return Solution(solver.estimate(state), costs, number, residual < tolerance)
 
 
 def check_options(solver: Any) -> None:
