@@ -101,7 +101,7 @@ def layered() -> Design:
 
 def tilted_layered() -> Design:
     """The same, tilted, for light of one wavelength: the independent ray tracer takes it."""
-    tables = stack(17.5) | {"bandwidth_nm": 0.0}
+    tables: dict[str, Any] = stack(17.5) | {"bandwidth_nm": 0.0}
     tables["layers"]["object"][0]["refractive_index"] = 1.52
     return layered().replace(**tables, tilt_deg=(1.0, -0.6))
 
