@@ -96,7 +96,7 @@ def picture(results: dict[str, Any]) -> Figure:
     """Plot widths and contrast against depth, one colour per design."""
     figure = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     panels = {
-        "fwhm_um": "width at half height, um",
+        "fwhm_um": "full width at half maximum, um",
         "most_of_light_um": "radius of 80 % of the light, um",
         "contrast_of_40_um_lines": "contrast of 40 um lines",
     }

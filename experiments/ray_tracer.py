@@ -110,7 +110,7 @@ def _layers(imager: Imager):
     index = 1.0 if sample is None else float(sample.refractive_index)
     contact = sample is None or sample.surface is None
     thick = lambda parts: float(sum(t for t, _ in parts))
-    begins = thick(filters) + thick(cover) if sample is None or sample.surface is None else float(sample.surface)
+    begins = thick(filters) + thick(cover) if contact else float(sample.surface)
     turn = _turn(imager)
     behind = float(imager.array.substrate_thickness) if plano else 0.0
     level = lambda z: (*-turn[:2, 2], turn[2, 2], turn[2, 2] * behind - (z + behind))

@@ -195,7 +195,7 @@ class Imager(eqx.Module):
         return self._cosine * (self._in_plane @ self.tilt)
 
     def moved(self, origin: Float[Array, "2"]) -> "Imager":
-        """The imager about another point `(x, y)` of its sensor, mm, at which depths begin where the array is there."""
+        """The imager with another point `(x, y)` as the origin, mm; depths begin at the array's front there."""
         if self.tilt is None:
             return eqx.tree_at(lambda i: i.shift, self, self.shift - origin)
         height, cosine = origin @ self.tilt, self._cosine
@@ -310,7 +310,7 @@ class Imager(eqx.Module):
 
     def _reduced_and_shortened(self, depth):
         """`z'`, and by how much plates that tilt with the array make it less than the distance to the vertices, mm."""
-        depth = array_namespace(self.sensor_distance).asarray(depth)
+        depth = array_namespace(self.sensor_distance).asarray(native(depth))
         plate = self.array.reduced_thickness_front * (self.array.refractive_index - 1)
         return self.reduced_depth(depth) + plate + tilted_shortening(depth, self.filters, self.sample)
 
@@ -321,7 +321,7 @@ class Imager(eqx.Module):
         return xp.multiply.outer(length, tilt)
 
     def lean(self, depth: Float[ArrayLike, "*batch"], distortion: Scalars | float = 1.0) -> Scalars:
-        """Displacement of points that makes the level map that of a tilted array, mm, `(*batch, 2)`.
+        """Displacement of points with which `chief_ray` gives the spots of a tilted array, mm, `(*batch, 2)`.
 
         Layers that tilt with the array displace rays by `t (1 - 1/n)` times its slopes; and spots are distorted about
         the image of the lens's axis, which is tilted.
@@ -364,7 +364,7 @@ class Imager(eqx.Module):
             Factor of the spot's distance from the image of the lens's axis: 1 for the chief ray, others for the core of
             a spot (`gs_jax.optics.psf_core`).
         """
-        xp = array_namespace(self.sensor_distance)
+        xp, points = array_namespace(self.sensor_distance), native(points)
         depth, lenses = points[..., 2], xp.asarray(lenses)
         magnification, reduced = distortion * self.magnification(depth), self.reduced_depth(depth)
         center, point = self.centers[lenses], points[..., :2]

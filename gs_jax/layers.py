@@ -145,7 +145,10 @@ def tilted_shortening(depth: Scalars, filters: Layers | None, sample: Sample | N
 
 
 def tilted_index(sample: Sample | None) -> Scalar | float:
-    """Index of the medium in front of a tilted array whose thickness depends on a lens's height: 1 is air."""
+    """Index of the medium in front of a tilted array: that of a sample in contact, else 1, air.
+
+    A lens that is higher by `h` has `h` less of it in front.
+    """
     return 1 if sample is None or sample.surface is not None else sample.refractive_index
 
 

@@ -130,7 +130,7 @@ def _length_text(length: float) -> str:
 _SAMPLED = 20_000_000
 # Cells along a side of a maximum projection, at most: fewer than pixels of the picture, so that none is left out.
 _MAX_CELLS = 400
-# Labelled brightness of the colour bar, in percent of the maximum.
+# Labelled brightness of the colour bar, in percent of the way from the median to the maximum.
 _PERCENT = (0, 5, 20, 50, 100)
 # Slices and their pixels along a side, at most.
 _MAX_SLICES, _MAX_SIDE = 100, 720
@@ -365,7 +365,7 @@ def show(volume: Num[Array | np.ndarray, "depth y x"], grid: Grid, *, points: Po
     beside.set(xlabel="z, mm", ylim=(bottom, top), xlim=(z[0], z[-1]))
     below.set(xlabel="x, mm", ylabel="z, mm", xlim=(left, right), ylim=(z[0], z[-1]))
     ticks = [low + (high - low) * percent / 100 for percent in _PERCENT]
-    bar = figure.colorbar(image, ax=empty, label="% of the maximum", fraction=0.6, location="left")
+    bar = figure.colorbar(image, ax=empty, label="% from median to maximum", fraction=0.6, location="left")
     bar.set_ticks(ticks, labels=list(map(str, _PERCENT)))
     plane.set_title(f"maxima of {' x '.join(map(str, volume.shape))} voxels (z, y, x), up to {high:.4g}")
     if points is not None and len(points):

@@ -25,8 +25,8 @@ from .helpers import scene
 from .test_cli import run
 
 LISTS = (
-    "depth_mm magnification scale lateral_resolution_um axial_resolution_um depth_of_field_mm near_limit_mm "
-    "far_limit_mm lenses_per_point occupancy strehl_on_axis focus_distance_mm blur_um fwhm_um rms_width_um "
+    "depth_mm magnification scale lenses_per_point occupancy lateral_resolution_um axial_resolution_um "
+    "depth_of_field_mm near_limit_mm far_limit_mm strehl_on_axis focus_distance_mm blur_um fwhm_um rms_width_um "
     "half_light_radius_um spot_radius_um spot_width_um"
 ).split()
 SCALARS = "f_number numerical_aperture focal_length_mm pitch_mm pitch_sd_mm field_radius_mm coverage".split()

@@ -136,7 +136,9 @@ def test_a_sample_is_asked_for_where_none_is_the_default(lab, monkeypatch, capsy
     before = sorted(lab.iterdir())
     status, _, err = run(monkeypatch, capsys, *arguments)
     assert status == 2 and err.count("\n") == 1 and sorted(lab.iterdir()) == before
-    assert "`sample` must be given (--sample NAME): the design has no default [sample], but [samples]: gel" in err
+    assert (
+        "`sample` must be given (--sample NAME, or sample in a study): the design has no default [sample], but " in err
+    )
 
 
 RECONSTRUCTED = ("reconstruct", "capture.npy", "lab.toml", "--depths", "20", "--voxel-um", 200, "-o", "v.tif")

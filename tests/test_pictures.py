@@ -55,7 +55,8 @@ def test_points_are_seen_in_all_views_and_ghosts_are_as_dim_as_they_are():
             assert drawn_value(figure, view, *place) == pytest.approx(np.sqrt((light - 0.01) / 0.99), abs=1e-3)
     assert max(float(np.sort(np.ravel(mesh.norm(mesh.get_array())))[-4]) for mesh in meshes) < 0.2
     bar = figure.axes[-1]
-    assert bar.get_ylabel() == "% of the maximum" and [text.get_text() for text in bar.get_yticklabels()][-1] == "100"
+    assert bar.get_ylabel() == "% from median to maximum"
+    assert [text.get_text() for text in bar.get_yticklabels()][-1] == "100"
 
 
 def test_slices_begin_at_the_brightest_and_say_how_long_a_length_is():

@@ -61,7 +61,7 @@ def array_namespace(x: Any) -> Any:
 def host_code(
     instead: str = "it is host code",
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Make a function raise `InputError` if JAX traces an argument; `instead` ends the message, what to use say."""
+    """Make a function raise `InputError` if JAX traces an argument; `instead` ends the message."""
 
     def decorate(function):
         @functools.wraps(function)

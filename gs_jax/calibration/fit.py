@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -14,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Float, Float64, Int
 
 from ..base.arrays import check_finite
-from ..base.errors import InputError
+from ..base.errors import InputError, InputWarning
 from ..base.progress import Progress
 from ..detection.point_finder import find_points
 from ..geometry import Imager
@@ -259,7 +260,12 @@ def calibrate(
         # Where the middle of a wide spot is depends on the window that looks.
         for k in blurred:
             spots[k], _ = find_blurred_spots_mm(images[k], initial.imager, NARROW_WINDOW)
-        narrow = fit_guess(initial).values
+        try:
+            narrow = fit_guess(initial).values
+        except InputError:
+            text = "wide spots are not found through a narrower window: standard deviations leave out what it changes."
+            warnings.warn(InputWarning(text), stacklevel=2)
+            narrow = result.values
         for name, value in result.values.items():
             result.deviations[name] = float(np.hypot(result.deviations[name], value - narrow[name]))
     if "scale" in fit:
@@ -342,7 +348,7 @@ def refine(
 
 def _check_captures(fits: Sequence[CaptureFit]) -> None:
     if not all(fit.fits for fit in fits):
-        raise MisfitError(fits, describe_misfit(fits, None))
+        raise MisfitError(fits, describe_misfit(fits, None, tried=False))
 
 
 def _check_determined(errors, radius: float, spots: SpotLists, sources: Sources, assigned: Spots, imager: Imager):

@@ -81,8 +81,8 @@ def would_fit(alternative: tuple[str, float]) -> str:
     return f"with {said} all would fit, {rms:.2f} pixels RMS: correct the positions."
 
 
-def describe_misfit(fits: Sequence[CaptureFit], alternative: tuple[str, float] | None) -> str:
-    """One line about captures that a geometry does not explain."""
+def describe_misfit(fits: Sequence[CaptureFit], alternative: tuple[str, float] | None, *, tried: bool = True) -> str:
+    """One line about captures that a geometry does not explain; `tried` says if other positions were."""
     wrong = [number for number, fit in enumerate(fits, 1) if not fit.fits]
     first = fits[wrong[0] - 1]
     which = f"capture {wrong[0]}" if len(wrong) == 1 else f"captures {', '.join(map(str, wrong))}"
@@ -95,4 +95,6 @@ def describe_misfit(fits: Sequence[CaptureFit], alternative: tuple[str, float] |
     cause = "are positions, order and pixel pitch right?"
     if len(wrong) > len(fits) / 2:
         cause = "are positions and pixel pitch right, and is there nothing but a lens array before the sensor?"
-    return f"captures: {got}; no axis reversed or captures swapped fit either: {cause}"
+    if not tried:
+        return f"captures: {got}."
+    return f"captures: {got}; reversing an axis or swapping captures does not help: {cause}"

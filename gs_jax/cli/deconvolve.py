@@ -20,7 +20,7 @@ _ITERATIVE = ("steps", "stop_at_noise", "psf_places", "tv", "tv_z", "sparsity")
 @click.argument("psf", type=Path, nargs=-1, required=True)
 @click.option(
     "--depths",
-    type=Depths(),
+    type=Depths(usual=1e5),  # of any mask, whose objects may be metres away
     help="START:STOP:STEP in mm, STOP included, or a list such as 10,12,40: depths of the planes, in the order of the "
     "PSFs.  [default: planes are numbered]",
 )
@@ -189,7 +189,7 @@ def deconvolve_command(
 def _print_quality(result):
     """Print the weight of smoothness that was chosen, the residual, and whether the steps converged."""
     if chosen := result.smoothness:
-        error = min(chosen.errors, default=0)
+        error = dict(zip(chosen.tried, chosen.errors, strict=True)).get(chosen.tv, 0)
         click.echo(
             f"smoothness: --tv {chosen.tv:.1g}, which predicts held-out pixels best of {len(chosen.tried)} weights, to "
             f"{error:.2g} of their RMS"

@@ -69,8 +69,8 @@ class Depths(click.ParamType):
 
     name = "start:stop:step|z,z,..."
 
-    def __init__(self, least: float = NEAREST):
-        self.least = least
+    def __init__(self, least: float = NEAREST, usual: float = _FARTHEST):
+        self.least, self.usual = least, usual
 
     def convert(self, value, param, ctx):
         if isinstance(value, list):
@@ -102,7 +102,7 @@ class Depths(click.ParamType):
 
     def _check_unit(self, values, param, ctx):
         """Fail if depths look as if they were given in another unit."""
-        if max(values) > _FARTHEST and (question := _other_unit(values, (0.0, _FARTHEST), "mm")):
+        if max(values) > self.usual and (question := _other_unit(values, (0.0, _FARTHEST), "mm")):
             self.fail(question, param, ctx)
 
 

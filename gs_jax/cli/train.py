@@ -70,7 +70,7 @@ def train_command(
 ):
     """Train a network: for background suppression the paper's, or ours of seven slices; or for the unrolled inversion.
 
-    Workers simulate the captures for training. Beside WEIGHTS.npz are written WEIGHTS.json, the losses,
+    Workers simulate the captures for training. Beside WEIGHTS.npz are written WEIGHTS.npz.json, the losses,
     WEIGHTS.npz.checkpoint, which remains after an interrupt, and for multislice the folder WEIGHTS-stacks of simulated
     captures (0.4 GB), which may be deleted.
 
@@ -219,5 +219,6 @@ def _from_captures(
     error = f"{found.before**0.5:.1%} before, {found.after**0.5:.1%} after (RMS)"
     words = f"{len(files)} captures, {len(found.losses)} steps"
     click.echo(
-        f"{output}: {words}; of captures held out, lenses that chose nothing are predicted with an error of {error}"
+        f"{output}: {words}; of captures held out, lenses that were not used in the choice are predicted with an "
+        f"error of {error}"
     )

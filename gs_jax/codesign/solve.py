@@ -334,6 +334,8 @@ def read_checkpoint(path: PathLike, study: Study, design: Design) -> tuple[Log, 
     try:
         found = json.loads(head)
         if found["format"] != _FORMAT:
+            if str(found["format"]).startswith("gs-jax checkpoint"):
+                raise InputError(f"{path}: a checkpoint of another version, which cannot be resumed.")
             raise ValueError
         log, owner = Log(**found["log"]), found["of"]
         if not isinstance(log.steps, list) or not isinstance(log.ends, list):

@@ -133,7 +133,7 @@ class Study(Table):
     `margin`: fraction by which targets are tightened during the search, so that the rounded result meets them.
     `exposure`: electrons that each mm^2 of clear aperture at 20 mm collects from an emitter of 40 um x 40 um, for terms
     that count light. `orientation`: side of the lenses toward the object, if it is not the design's. `sample`: of the
-    design's `[samples]`, or "air", the one that holds the object; it becomes that of the new design, and must be given
+    design's `[samples]`, or "none", the one that holds the object; it becomes that of the new design, and must be given
     if the design has several and no `[sample]`. `kinds`: number of lens types; lenses that are alike are divided into
     so many types, with radii spread over the depths, and each type has its own radius, aperture and conic constant.
     `starts`: number of starts of the first stage; all but the first are random within the bounds, and the best goes on.
@@ -143,7 +143,7 @@ class Study(Table):
     design: str | None = Field(default=None, description="the file of a design, relative to the study")
     name: str = Field(default="optimized", description="a string")
     orientation: Orientation | None = Field(default=None, description='"plano" or "curved"')
-    sample: str | None = Field(default=None, description='the name of one of the design\'s `[samples]`, or "air"')
+    sample: str | None = Field(default=None, description='the name of one of the design\'s `[samples]`, or "none"')
     kinds: int | None = Field(default=None, ge=1, description="a positive whole number")
     depths_mm: Depths | None = Field(default=None, description="[near, far] in mm, near below far")
     depth_count: int = Field(default=6, ge=2, le=1000, description="a whole number from 2 to 1000")

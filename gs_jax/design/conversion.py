@@ -63,8 +63,8 @@ def sample_table(design, name: str | None) -> SampleTable:
         if design.sample is None and design.samples:
             names = ", ".join(design.samples)
             raise InputError(
-                f"`sample` must be given (--sample NAME): the design has no default [sample], but [samples]: {names}; "
-                "none stands for air."
+                "`sample` must be given (--sample NAME, or sample in a study): the design has no default [sample], "
+                f"but [samples]: {names}; none stands for air."
             )
         return default_sample(design)
     if name not in (*_NO_SAMPLE, *design.samples):

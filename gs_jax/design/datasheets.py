@@ -185,7 +185,13 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
 def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
     """The columns of a datasheet by name, for lenses that are alike; may be traced."""
     magnification = imager.magnification(at.depths)
-    return {"magnification": magnification, "scale": 1 + magnification, **_columns_of_lenses(imager, at)}
+    of_array = {
+        "magnification": magnification,
+        "scale": 1 + magnification,
+        "lenses_per_point": jnp.broadcast_to(objectives.lenses_per_point(imager, at), at.depths.shape),
+        "occupancy": objectives.occupancy(imager, at),
+    }
+    return of_array | _columns_of_lenses(imager, at)
 
 
 @over_heights
@@ -198,8 +204,6 @@ def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
         "depth_of_field_mm": objectives.depth_of_field(imager, at),
         "near_limit_mm": objectives.near_limit(imager, at),
         "far_limit_mm": objectives.far_limit(imager, at),
-        "lenses_per_point": jnp.broadcast_to(objectives.lenses_per_point(imager, at), at.depths.shape),
-        "occupancy": objectives.occupancy(imager, at),
         "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(wavefront)[:, 0], imager.wavelength),
         "focus_distance_mm": objectives.focus_distance(imager, at),
         "blur_um": objectives.sensor_blur(imager, at) * 1000,

@@ -214,6 +214,8 @@ def subtract_spots(
     for pixel, its_height in zip(pixels, height, strict=True):
         around = [at + side for at in np.floor(pixel + 0.5).astype(int)]
         row, column = (at[(at >= 0) & (at < size)] for at, size in zip(around, light.shape, strict=True))
+        if not (row.size and column.size):
+            continue
         distance = np.hypot((row - pixel[0])[:, None], column - pixel[1])
         square = light[row[0] : row[-1] + 1, column[0] : column[-1] + 1]
         square -= (its_height * np.interp(distance, np.arange(REACH + 1), profile)).astype(light.dtype)
@@ -241,7 +243,9 @@ def spot_shift(
     if len(top) < _FEW:
         return np.zeros(2)
     narrow, wide = np.linalg.eigvalsh(np.cov(top.T))
-    return top.mean(0) - _DENSE if narrow > _ROUND * wide else np.zeros(2)
+    # A ring has a dark middle.
+    is_full = flat[tuple((top.mean(0) + 0.5).astype(int))] == flat[_DENSE, _DENSE]
+    return top.mean(0) - _DENSE if narrow > _ROUND * wide and is_full else np.zeros(2)
 
 
 class OwnLight(NamedTuple):
@@ -293,8 +297,9 @@ def separate_points(
                 left[tuple(owner[others].T)] -= high[0] * np.interp(distance, np.arange(REACH + 1), profile)
         left[number] = own - height[number]
     # Views are a little brighter or darker than their median.
+    unexplained = np.maximum(left, -height)
     for number, lenses, pixels, profile in spots_taken:
-        subtract_spots(rest, pixels, np.maximum(left, -height)[number, lenses], profile)
+        subtract_spots(rest, pixels, unexplained[number, lenses], profile)
     return OwnLight(taken, (left + height)[taken], rest)
 
 

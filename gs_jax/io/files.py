@@ -78,7 +78,7 @@ def check_suffix(path: PathLike, suffixes: Sequence[str]) -> str:
     """Return the suffix of a path in lower case; `InputError` if it is none of these."""
     suffix = Path(path).suffix
     if suffix.lower() not in suffixes:
-        hint = f"; {_HINTS[suffix.lower()]}" if suffix.lower() in _HINTS else ""
+        hint = f"; {_HINTS[suffix.lower()]}" if suffix.lower() in _HINTS and TIFF_SUFFIXES[0] in suffixes else ""
         raise input_error("suffix", ", ".join(suffixes), f"{short_repr(suffix)}{hint}", path)
     return suffix.lower()
 

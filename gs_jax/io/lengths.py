@@ -47,9 +47,10 @@ def unit_of_name(name: str) -> str | None:
     """
     lower = name.lower()
     for inside in re.findall(r"[(\[](.*?)[)\]]", lower):
-        if inside.strip() in _SPELLINGS:
-            return _SPELLINGS[inside.strip()]
-        if inside.strip():
+        inner = [word for word in re.findall(r"[^\W\d_]+|\"", inside) if word not in _NO_UNITS]
+        if inner and inner[-1] in _SPELLINGS:
+            return _SPELLINGS[inner[-1]]
+        if inner:
             raise _unknown(name, inside.strip())
     words = re.findall(r"[^\W\d_]+|\"", lower)
     if words and words[-1] in _SPELLINGS:
@@ -62,5 +63,5 @@ def unit_of_name(name: str) -> str | None:
 
 
 def _unknown(name: str, unit: str) -> InputError:
-    units = ", ".join(unit for unit in _UNITS)
+    units = ", ".join((*_UNITS, PIXELS))
     return InputError(f"column {name!r:.40} must be in {units}, or say nothing, got {unit!r:.40}.")

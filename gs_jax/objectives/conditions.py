@@ -47,6 +47,9 @@ class Conditions(eqx.Module):
         Clear diameter of the lenses, mm, where it is known; computed from the imager by default.
     field_radius
         `sqrt(A_e / pi)`, mm, in place of the imager's own, which decides shapes and cannot be traced.
+    height
+        Of lenses of a tilted array that are evaluated as a level one, mm: depths are less by it, and sensor distances
+        more. None, the default, is 0.
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Conditions(eqx.Module):
     cells: VoronoiCells | None = None
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
+    height: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
 
     def __check_init__(self):
         if self.depths.ndim != 1:
@@ -132,7 +136,10 @@ _HEIGHTS, _SHARES = np.array([-1, 0, 1]) * math.sqrt(9 / 5), np.array([5, 8, 5])
 
 
 def over_heights(function: Callable[[Imager, Conditions], Tree]) -> Callable[[Imager, Conditions], Tree]:
-    """Extend quantities of lenses that are alike to a tilted array: the mean over the heights of the lenses."""
+    """Extend quantities of lenses that are alike to a tilted array: the mean over the heights of the lenses.
+
+    It is infinite if the quantity is at one of them.
+    """
 
     @wraps(function)
     def mean(imager: Imager, at: Conditions) -> Tree:
@@ -146,10 +153,12 @@ def _at_heights(imager: Imager, at: Conditions) -> list[tuple[Imager, Conditions
     """Level imagers, and their conditions, at a few heights of the lenses of a tilted array."""
     if imager.tilt is None:
         return [(imager, at)]
+    if at.clear_diameter is None:
+        at = dataclasses.replace(at, clear_diameter=clear_diameter(imager, at))
     own = imager.heights
     spread = safe_sqrt(jnp.mean((own - jnp.mean(own)) ** 2))
     heights = [jnp.mean(own) + spread * jnp.asarray(number, own.dtype) for number in _HEIGHTS]
-    return [(imager.at_height(h), dataclasses.replace(at, depths=at.depths - h)) for h in heights]
+    return [(imager.at_height(h), dataclasses.replace(at, depths=at.depths - h, height=h)) for h in heights]
 
 
 def _map(function, parts):

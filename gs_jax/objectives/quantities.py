@@ -71,13 +71,15 @@ def approximate_depth_of_field(imager: Imager, depths: Depths) -> Float[Array, "
 @by_type
 def near_limit(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """The nearest depth that is in focus with a sensor focused on each depth; a row a type."""
-    return imager.depth_of(theory.near_limit(*_focus(imager, depths)))
+    at = as_conditions(imager, depths)
+    return imager.depth_of(theory.near_limit(*_focus(imager, at))) + (0 if at.height is None else at.height)
 
 
 @by_type
 def far_limit(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """The farthest depth that is in focus with a sensor focused on each depth; a row a type."""
-    return imager.depth_of(theory.far_limit(*_focus(imager, depths)))
+    at = as_conditions(imager, depths)
+    return imager.depth_of(theory.far_limit(*_focus(imager, at))) + (0 if at.height is None else at.height)
 
 
 def _focus(imager, depths):
@@ -92,7 +94,7 @@ def focus_distance(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Sensor distance `v` at which a thin lens images each depth; infinite if it does not; a row a type."""
     at = as_conditions(imager, depths)
     reduced = theory.focus_distance(imager.array.focal_length, imager.reduced_depth(at.depths))
-    return imager.sensor_distance_of(reduced)
+    return imager.sensor_distance_of(reduced) - (0 if at.height is None else at.height)
 
 
 @by_type

@@ -234,7 +234,7 @@ def axial_irradiance(imager: Imager, pupil: AxialPupil, places: Float[Array, " p
     turn = 2 * np.pi / (imager.wavelength * pupil.distance)
     waves = _bessel_j0(turn * places[:, None] * pupil.radius[None])
     field = waves @ (pupil.amplitude * jnp.cos(pupil.phase)), waves @ (pupil.amplitude * jnp.sin(pupil.phase))
-    return (field[0] ** 2 + field[1] ** 2) / jnp.maximum(jnp.sum(pupil.amplitude), 1e-30) ** 2
+    return (field[0] ** 2 + field[1] ** 2) / jnp.maximum(jnp.sum(pupil.amplitude), 1e-15) ** 2
 
 
 def _bessel_j0(x: Array) -> Array:

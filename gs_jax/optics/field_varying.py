@@ -125,11 +125,12 @@ def field_varying_psf(
     rings = None if rings is None else tuple(rings)
     if rings is not None and (len(rings) < 2 or not (np.diff((0.0, *rings)) > 0).all()):
         raise InputError(f"rings must be two or more radii that ascend, got {short_repr(rings)}.")
+    depths = np.asarray(depths, np.float64)
+    polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
     imager, height = imager.level()
-    depths = np.asarray(depths, np.float64) - float(height)
+    depths = depths - float(height)
     leaves, structure = jax.tree.flatten(imager)
     key = structure, *(np.asarray(leaf).tobytes() for leaf in (*leaves, depths))
-    polar_grid = polar_grid or make_polar_grid(imager, depths, extent=extent)
     return _cached_tables(_Request(key, polar_grid, rings, imager, depths, progress))
 
 

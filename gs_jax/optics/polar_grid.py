@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int, Num
 
 from ..geometry import Imager
+from .raytrace import to_numpy
 
 # Widest field, in reduced depths of the nearest plane: beyond, a lens transmits a third of its light and less.
 _WIDEST = 0.9
@@ -44,9 +45,15 @@ class PolarGrid(NamedTuple):
 
 
 def make_polar_grid(imager: Imager, depths: Float64[np.ndarray, " depth"], *, extent: float | None = None) -> PolarGrid:
-    """Nodes of the stray light for a range of depths and an object's extent, mm; by default the sensor's."""
+    """Nodes of the stray light for a range of depths and an object's extent, mm; by default the sensor's.
+
+    Fields are from the axes of the lenses, which lean if the array is tilted.
+    """
     extent = extent or 2 * max(map(abs, imager.sensor.extent))
-    largest_field = math.sqrt(2) * (float(jnp.abs(imager.array.centers).max()) + extent / 2)
+    lean = float(np.linalg.norm(to_numpy(imager).axis_offset(depths.max())))
+    imager, height = imager.level()
+    depths = depths - float(height)
+    largest_field = math.sqrt(2) * (float(jnp.abs(imager.array.centers).max()) + extent / 2) + lean
     near = float(imager.reduced_depth(float(depths.min())))
     widest = min(_WIDEST * near, largest_field)
     middle = float(imager.magnification(float(depths.min() + depths.max()) / 2))

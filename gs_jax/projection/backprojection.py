@@ -59,7 +59,7 @@ def backproject(
     Raises
     ------
     ValueError
-        If the image is not `sensor.shape`, or `method` is unknown.
+        If the image is not `sensor.shape`, `method` is unknown, or there is not one distortion for each depth.
 
     Examples
     --------
@@ -90,6 +90,8 @@ def backproject(
         return jnp.where(seen, volume / jnp.where(seen, total, 1), 0)
 
     distortion = jnp.ones_like(grid.depths) if distortion is None else jnp.asarray(distortion, grid.depths.dtype)
+    if distortion.shape != grid.depths.shape:
+        raise ValueError(f"`distortion` must be of the depths' shape {grid.depths.shape}, got {distortion.shape}.")
     volume = lax.map(backproject_group, (_in_groups(grid.depths), _in_groups(distortion)))
     return volume.reshape(-1, *grid.shape)[: grid.depths.size]
 

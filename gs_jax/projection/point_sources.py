@@ -254,7 +254,7 @@ def _trace(points, imager: Imager, progress: Progress | None) -> _FullOptics:
     every = 1 if few else 2
     level, height = imager.level()
     lower = fine - float(height)
-    grid = make_polar_grid(level, lower, extent=2 * float(np.abs(points[:, :2]).max()))
+    grid = make_polar_grid(imager, fine, extent=2 * float(np.abs(points[:, :2]).max()))
     sharp = has_sharp_cores(level, lower, grid)
     tables = trace_cores(level, lower, CORE_REACH * grid.pixel, _RINGS, progress, oriented=sharp)
     coarse, cores = fine[::every], PsfCores(*(part[::every] for part in tables))

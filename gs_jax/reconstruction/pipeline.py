@@ -274,9 +274,10 @@ def _backproject(image, view, grid, method, progress):
 
 
 def backproject_on_all_devices(
-    image: Image, imager: Imager, grid: Grid, *, distortion: Float[np.ndarray, " depth"], **options
+    image: Image, imager: Imager, grid: Grid, *, distortion: Float[np.ndarray, " depth"] | None = None, **options
 ) -> Float[Array, "depth y x"]:
     """`backproject` with the depths divided evenly among the devices of this process."""
+    distortion = np.ones(grid.depths.size) if distortion is None else distortion
     missing = -grid.depths.size % jax.local_device_count()
     planes = (np.pad(part, (0, missing), mode="edge") for part in (grid.depths, distortion))
     return _backproject_sharded(image, imager, grid, *planes, **options)[: grid.depths.size]

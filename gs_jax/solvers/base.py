@@ -120,10 +120,11 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
 
     *Differentiable.*
 
-    Gradients are with respect to the image, the leaves of `A` and the solver's weights, in reverse mode only without a
-    tolerance. The loop is compiled once: other numbers in the image, the operator, the weights or the tolerance run the
-    same program. It may be called inside `jit`, with `gs_jax.ImagingOperator` as an argument. `gs_jax.reconstruct` is
-    the host's function from a capture to a volume.
+    Gradients are with respect to the image, the leaves of `A` and the solver's weights. Reverse mode needs
+    `tolerance=0`. The loop is compiled once: other numbers in the image, the leaves of the operator, the weights that
+    are leaves, or the tolerance run the same program. An operator around a new Python function, such as a
+    `lineax.FunctionLinearOperator`, is compiled anew. It may be called inside `jit`, with `gs_jax.ImagingOperator` as
+    an argument. `gs_jax.reconstruct` is the host's function from a capture to a volume.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     is_number = lambda leaf: isinstance(leaf, int | float) and not isinstance(leaf, bool)
     module = dataclasses.replace(module, tolerance=0.0)
     module = jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf, module)
-    return _solve(A, native(image), module, tolerance)
+    return _solve(native(A), native(image), module, tolerance)
 
 
 @eqx.filter_jit
