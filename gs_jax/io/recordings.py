@@ -102,7 +102,8 @@ def open_recording(path: PathLike, *, page: int | str | None = None, axes: str =
 
 def _open_pages(tiff: Tiff, axes: str) -> Recording:
     """The images of a TIFF, and of the further files of its set, in the order that it declares."""
-    check_stack(tiff, axes, "; --page takes one image")
+    advice = "; --page takes one image; if all follow each other, save them with the axes TYX"
+    check_stack(tiff, axes, advice)
     images = tiff.stack.images
 
     def read(index: int, selection: Selection) -> Images:

@@ -6,8 +6,9 @@ import numpy as np
 import tifffile
 
 from ..base.errors import InputError
+from .axes import stack_axis
 from .captures import CAPTURE_SUFFIXES, read_images, size_text
-from .files import decoding
+from .files import TIFF_SUFFIXES, decoding
 from .tiff import open_tiff
 
 
@@ -19,16 +20,24 @@ def summarise(path: Path) -> dict[str, str]:
     suffix = path.suffix.lower()
     if suffix not in CAPTURE_SUFFIXES:
         return {}
-    lines = _of_tiff(path) if suffix in (".tif", ".tiff") else _of_npy(path) if suffix == ".npy" else {}
+    lines = _of_tiff(path) if suffix in TIFF_SUFFIXES else _of_npy(path) if suffix == ".npy" else {}
     try:
         image = next(read_images(path))
         use = "a capture, or a PSF for `gs-jax deconvolve`"
         lines = {"pixels": size_text(image.shape), "type": image.dtype.name} | lines
     except InputError as error:
         use = str(error).removeprefix(f"{path}: ").removesuffix(f" ({path}).").rstrip(".")
-        if int(lines.get("pages", "1")) > 1:
+        if int(lines.get("pages", "1")) > 1 and _is_stack(path):
             use = f"a recording, a stack of PSFs for `gs-jax deconvolve`, or a capture ({use})"
     return lines | {"use": use}
+
+
+def _is_stack(path):
+    """Whether the images of a file follow each other, as frames or as planes."""
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return True
+    with open_tiff(path) as opened:
+        return stack_axis(opened.stack.axes, "tz") is not None
 
 
 def _of_tiff(path):
