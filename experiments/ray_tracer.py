@@ -108,9 +108,10 @@ def _layers(imager: Imager):
     plano, sample = imager.array.orientation == "plano", imager.sample
     filters, cover = slabs(imager.filters), slabs(None if sample is None else sample.layers)
     index = 1.0 if sample is None else float(sample.refractive_index)
-    contact = sample is None or sample.surface is None
+    surface = None if sample is None else sample.surface
+    contact = surface is None
     thick = lambda parts: float(sum(t for t, _ in parts))
-    begins = thick(filters) + thick(cover) if contact else float(sample.surface)
+    begins = thick(filters) + thick(cover) if surface is None else float(surface)
     turn = _turn(imager)
     behind = float(imager.array.substrate_thickness) if plano else 0.0
     level = lambda z: (*-turn[:2, 2], turn[2, 2], turn[2, 2] * behind - (z + behind))
