@@ -52,9 +52,9 @@ def differing(imager: Imager) -> Imager:
     array, random = imager.array, np.random.default_rng(0)
     draw = lambda low, high: random.uniform(low, high, len(array.centers))
     each = {
-        "radius_of_curvature": np.asarray(array.radius_of_curvature) * draw(0.9, 1.1),
+        "radius_of_curvature": np.asarray(array.of_lenses("radius_of_curvature")) * draw(0.9, 1.1),
         "conic_constant": draw(-1.0, 0.0),
-        "aperture_diameter": np.asarray(array.aperture_diameter) * draw(0.6, 1.0),
+        "aperture_diameter": np.asarray(array.of_lenses("aperture_diameter")) * draw(0.6, 1.0),
     }
     return dataclasses.replace(imager, array=dataclasses.replace(array, **each))
 

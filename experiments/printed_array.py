@@ -114,7 +114,7 @@ def run(data: Path, *, progress: Progress) -> tuple[dict, dict]:
     with progress.step("Leaving out lenses"):
         similarity, distorted = left_out(found, found.imager), left_out_with_distortion(found)
     lenses = found.spots.lenses
-    radius = np.asarray(start.array.radius_of_curvature)[lenses]
+    radius = np.asarray(start.array.of_lenses("radius_of_curvature"))[lenses]
     pitch = pixels_per_mm * float(nearest_neighbour_distances(np.asarray(start.array.centers)).mean())
     seen = measured_widths(image, found, pitch)
     with progress.step("Tracing rays"):

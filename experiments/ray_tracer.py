@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from gs_jax import Imager, InputError
+from gs_jax.lenses import EACH
 
 # Parts of a scene, traced by threads, each into its own image.
 PARTS = 4
@@ -87,8 +88,8 @@ def _lenses(imager: Imager):
     a = imager.array
     touching = (apart < float(np.max(a.aperture_diameter))).sum(1).max()
     near = np.argsort(apart)[:, 1 : min(NEIGHBOURS + 1, touching)]
-    each = a.radius_of_curvature, a.conic_constant, a.aperture_diameter / 2
-    lenses = np.column_stack([centers, *(np.broadcast_to(np.asarray(x, np.float64), len(centers)) for x in each)])
+    radius, diameter, conic = (np.asarray(a.of_lenses(name), np.float64) for name in EACH)
+    lenses = np.column_stack([centers, radius, conic, diameter / 2])
     curve_first = a.orientation == "curved"
     shared = a.refractive_index, a.substrate_thickness, imager.sensor_distance, imager.sensor.pixel_pitch
     origin = np.asarray(imager.sensor.origin, np.float64)

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,11 @@ def _as_plate(x):
     return None if size is None or (not isinstance(size, Tracer) and np.isinf(size).all()) else size
 
 
+def _as_types(x):
+    # An array on the host: JAX would compile a conversion for each number of lenses.
+    return x if x is None or isinstance(x, Array) else jnp.asarray(np.asarray(x))
+
+
 class MicrolensArray(eqx.Module):
     """Plano-convex microlenses on one plate, their vertices in one plane.
 
@@ -41,7 +46,7 @@ class MicrolensArray(eqx.Module):
     centers
         Lens vertices `(lens, 2)` in the array's own frame, mm.
     radius_of_curvature, aperture_diameter
-        One number for all lenses, or `(lens,)`, mm. The aperture is nominal: overlapping lenses are truncated where
+        One number for all lenses, or one for each, mm. The aperture is nominal: overlapping lenses are truncated where
         their surfaces intersect, which for identical lenses is the Voronoi edge.
     refractive_index, substrate_thickness
         Index of lenses and plate; distance from the plate's plano face to the vertices, mm.
@@ -52,14 +57,15 @@ class MicrolensArray(eqx.Module):
     orientation
         The side of the lenses that faces the object, `"plano"` or `"curved"`.
     conic_constant
-        `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid. One for all lenses, or `(lens,)`.
+        `k`: 0 of a sphere, -1 of a paraboloid, between these of an ellipsoid. One for all lenses, or one for each.
     aspheric_terms
         `(term,)`: A_4, A_6, ..., in mm^-3, mm^-5, ....
     others
         Lenses on the same plate that are not imaged through, but end these where their surfaces meet; see `subset`.
     types
-        The number of each lens's type, where lenses differ. It follows from their numbers and is kept for arrays whose
-        numbers JAX traces.
+        The type of each lens, `(lens,)`, from 0 on, where lenses differ: numbers are then `(type,)`. Without it numbers
+        of each lens `(lens,)` are sorted into types of equal lenses. Numbers that JAX traces have no values to compare:
+        every lens is then a type of its own, unless `types` is given.
 
     Raises
     ------
@@ -76,32 +82,44 @@ class MicrolensArray(eqx.Module):
     """
 
     centers: Float[Array, "lens 2"] = eqx.field(converter=as_float)
-    radius_of_curvature: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
+    radius_of_curvature: Float[Array, "*type"] = eqx.field(converter=as_float, default=2.0)
     refractive_index: Float[Array, ""] = eqx.field(converter=as_float, default=1.43)
-    aperture_diameter: Float[Array, "*each"] = eqx.field(converter=as_float, default=2.0)
+    aperture_diameter: Float[Array, "*type"] = eqx.field(converter=as_float, default=2.0)
     substrate_thickness: Float[Array, ""] = eqx.field(converter=as_float, default=1.0)
     thin_lens_focal_length: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     size: Float[Array, "2"] | None = eqx.field(converter=_as_plate, default=None)
     orientation: Orientation = eqx.field(static=True, default="plano")
-    conic_constant: Float[Array, "*each"] = eqx.field(converter=as_float, default=0.0)
+    conic_constant: Float[Array, "*type"] = eqx.field(converter=as_float, default=0.0)
     aspheric_terms: Float[Array, " term"] = eqx.field(converter=as_float, default=())
     others: "MicrolensArray | None" = None
-    types: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    types: Int[Array, " lens"] | None = eqx.field(converter=_as_types, default=None)
 
     def __post_init__(self):
-        numbers = [getattr(self, name) for name in EACH]
-        shapes = {np.shape(number) for number in numbers} - {()}
-        if not shapes:
+        numbers = {name: as_float(getattr(self, name)) for name in EACH}
+        own = [name for name in EACH if numbers[name].ndim]
+        if not own:
             self.types = None
-        elif shapes == {np.shape(self.centers)[:1]} and not any(isinstance(number, Tracer) for number in numbers):
-            self.types = _types(numbers)
+        is_sorted = self.types is not None or any(isinstance(number, Tracer) for number in numbers.values())
+        if is_sorted or {numbers[name].shape for name in own} != {np.shape(self.centers)[:1]}:
+            return
+        types, first = _sorted_types([np.asarray(number) for number in numbers.values()])
+        if len(first) == len(types):
+            return
+        self.types = _as_types(types) if len(first) > 1 else None
+        for name in own:
+            values = np.asarray(numbers[name])[first if len(first) > 1 else 0]
+            setattr(self, name, jnp.asarray(values, numbers[name].dtype))
 
     def __check_init__(self):
         if self.centers.ndim != 2 or self.centers.shape[1] != 2 or self.centers.shape[0] < 1:
             raise ValueError(f"`centers` must be (lens, 2) with a lens at least, got {self.centers.shape}.")
+        lenses = self.centers.shape[0]
+        expected = (lenses if self.types is None else self.type_count,)
         for name in EACH:
-            if (shape := getattr(self, name).shape) not in ((), self.centers.shape[:1]):
-                raise ValueError(f"`{name}` must be one number or {self.centers.shape[:1]}, got {shape}.")
+            if (shape := getattr(self, name).shape) not in ((), expected):
+                raise ValueError(f"`{name}` must be one number or {expected}, got {shape}.")
+        if self.types is not None:
+            _check_types(self.types, lenses, *expected)
         if self.size is not None and self.size.shape != (2,):
             raise ValueError(f"`size` must be (x, y), got {self.size.shape}.")
         if self.orientation not in ("plano", "curved"):
@@ -128,46 +146,71 @@ class MicrolensArray(eqx.Module):
     @property
     def alike(self) -> bool:
         """Whether all lenses have the same numbers, which are scalars then."""
-        return not any(getattr(self, name).ndim for name in EACH)
+        return not self._own
+
+    @property
+    def type_count(self) -> int:
+        """Number of lens types."""
+        return max(getattr(self, name).size for name in EACH)
+
+    @property
+    def type_of_lens(self) -> Int[Array | np.ndarray, " lens"]:
+        """The type of each lens, from 0 on."""
+        if self.types is not None:
+            return self.types
+        count = len(self.centers)
+        return np.zeros(count, int) if self.alike else np.arange(count)
+
+    def of_lenses(self, name: str) -> Scalars:
+        """A number of each lens `(lens,)`: its radius of curvature, aperture diameter, conic constant, ...."""
+        value, xp = getattr(self, name), array_namespace(self.centers)
+        return value[self.type_of_lens] if value.ndim else xp.broadcast_to(value, len(self.centers))
 
     def check_alike(self) -> None:
         """Raise `InputError` unless all lenses are alike."""
         if not self.alike:
-            found = ", ".join(name for name in EACH if getattr(self, name).ndim)
-            raise InputError(f"Lenses must be alike, got lenses that differ in {found}; `lens(k)` is one of them.")
+            differ = ", ".join(self._own)
+            raise InputError(f"Lenses must be alike, got lenses that differ in {differ}; `lens(k)` is one of them.")
 
     def lens(self, index: int) -> "MicrolensArray":
         """One of the lenses alone, on the same plate."""
-        return dataclasses.replace(self, centers=self.centers[index][None], others=None, **self._numbers(index))
+        return self._alike(self.centers[index][None], self.type_of_lens[index])
+
+    def of_type(self, number: int) -> "MicrolensArray":
+        """All lenses, with the numbers of one type."""
+        return self._alike(self.centers, number)
 
     def subset(self, which: Sequence[int] | Int[np.ndarray, " kept"]) -> "MicrolensArray":
         """Lenses that are alike, such as those of a type, as an array whose `others` are the rest."""
         which = np.array(which)
         rest = np.setdiff1d(np.arange(len(self.centers)), which)
-        types = None if self.types is None else tuple(np.array(self.types)[rest].tolist())
-        kept = {"centers": self.centers[rest], "types": types, **self._numbers(rest)}
-        others = dataclasses.replace(self, **kept) if rest.size else None
-        return dataclasses.replace(self, centers=self.centers[which], others=others, **self._numbers(which[0]))
+        numbers = {name: self.of_lenses(name)[rest] for name in self._own}
+        others = dataclasses.replace(self, centers=self.centers[rest], types=None, **numbers) if rest.size else None
+        return self._alike(self.centers[which], self.type_of_lens[which[0]], others)
 
     @property
     def whole(self) -> "MicrolensArray":
         """These lenses and the others as one array."""
         if self.others is None:
             return self
-        both = self, self.others
-        each = {
-            name: jnp.concatenate([jnp.broadcast_to(getattr(part, name), len(part.centers)) for part in both])
-            for name in EACH
-        }
-        return dataclasses.replace(self, centers=jnp.concatenate([p.centers for p in both]), others=None, **each)
-
-    def _numbers(self, index) -> dict[str, Any]:
-        own = {name: getattr(self, name) for name in EACH}
-        return {name: value[index] if value.ndim else value for name, value in own.items()}
+        both, xp = (self, self.others), array_namespace(self.centers)
+        numbers = {name: xp.concatenate([part.of_lenses(name) for part in both]) for name in EACH}
+        centers = xp.concatenate([part.centers for part in both])
+        return dataclasses.replace(self, centers=centers, others=None, types=None, **numbers)
 
     @property
-    def focal_length(self) -> Float[Array, "*each"]:
-        """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm."""
+    def _own(self) -> list[str]:
+        """Names of the numbers in which lenses differ."""
+        return [name for name in EACH if getattr(self, name).ndim]
+
+    def _alike(self, centers, number, others=None) -> "MicrolensArray":
+        """Lenses of one type."""
+        numbers = {name: getattr(self, name)[number] for name in self._own}
+        return dataclasses.replace(self, centers=centers, others=others, types=None, **numbers)
+
+    @property
+    def focal_length(self) -> Float[Array, "*type"]:
+        """Focal length in air, `R / (n - 1)` for a plano-convex lens, mm; of each type where lenses differ."""
         if self.thin_lens_focal_length is None:
             return self.radius_of_curvature / (self.refractive_index - 1)
         return self.thin_lens_focal_length
@@ -207,28 +250,26 @@ class MicrolensArray(eqx.Module):
 
 
 def lenses_by_type(array: MicrolensArray) -> tuple[tuple[int, ...], ...]:
-    """Indices of the lenses of each type: lenses with the same numbers, in the order of their first lens."""
-    types = type_of_lens(array)
-    return tuple(tuple(np.flatnonzero(types == number).tolist()) for number in range(types.max() + 1))
+    """Indices of the lenses of each type. Host code."""
+    types = np.asarray(array.type_of_lens)
+    return tuple(tuple(np.flatnonzero(types == number).tolist()) for number in range(array.type_count))
 
 
-def type_of_lens(array: MicrolensArray) -> Int[np.ndarray, " lens"]:
-    """The number of each lens's type, in the order of `lenses_by_type`. The array's numbers may be traced by JAX."""
-    if array.alike:
-        return np.zeros(len(array.centers), int)
-    numbers = [getattr(array, name) for name in EACH]
-    if not any(isinstance(number, Tracer) for number in numbers):
-        return np.array(_types(numbers))
-    # Traced numbers have no values yet: the types are those of the array that they were made from.
-    if array.types is None:
-        raise InputError("Lens types must be known before JAX traces: start from an array whose lenses differ.")
-    return np.array(array.types)
+def _sorted_types(numbers: Sequence[np.ndarray]) -> tuple[Int[np.ndarray, " lens"], Int[np.ndarray, " type"]]:
+    """The type of each lens, and the first lens of each type; types are in the order of these."""
+    of_lens = np.stack(np.broadcast_arrays(*numbers), -1)
+    _, first, same = np.unique(of_lens, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    return np.argsort(order)[same.ravel()], first[order]
 
 
-def _types(numbers: Sequence[Scalars]) -> tuple[int, ...]:
-    each = np.stack(np.broadcast_arrays(*numbers), -1)
-    _, first, same = np.unique(each, axis=0, return_index=True, return_inverse=True)
-    return tuple(np.argsort(np.argsort(first))[same.ravel()].tolist())
+def _check_types(types, lenses: int, count: int) -> None:
+    if types.shape != (lenses,) or not np.issubdtype(types.dtype, np.integer):
+        raise ValueError(f"`types` must be an integer for each of {lenses} lenses, got {types.dtype} {types.shape}.")
+    if count >= lenses:
+        raise ValueError(f"`types` must be None with a number of each lens, and numbers be of each type, got {count}.")
+    if not isinstance(types, Tracer) and not np.array_equal(np.unique(types), np.arange(count)):
+        raise ValueError(f"`types` must have all numbers from 0 to {count - 1}, got {np.unique(types).tolist()}.")
 
 
 def sag(

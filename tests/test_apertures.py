@@ -196,7 +196,7 @@ def test_two_spheres_meet_in_a_circle():
 def test_alike_lenses_end_at_their_cells():
     """A list of equal numbers is what one number is, but for the sum over directions: 3e-5."""
     alike = MicrolensArray(layout(12, (5.0, 4.0)), size=(6.0, 5.0))
-    list_of_one = dataclasses.replace(alike, radius_of_curvature=np.full(12, 2.0))
+    list_of_one = dataclasses.replace(alike, radius_of_curvature=[2.0], types=np.zeros(12, int))
     np.testing.assert_allclose(aperture_area(list_of_one), aperture_area(alike), rtol=5e-5)
 
 

@@ -46,7 +46,7 @@ from gs_jax.io.captures import read_capture
 from gs_jax.io.point_tables import read_positions
 from gs_jax.io.provenance import read_provenance
 from gs_jax.layers import reduced_distance
-from gs_jax.lenses import lenses_by_type, type_of_lens
+from gs_jax.lenses import lenses_by_type
 from gs_jax.optics.lens_types import split_by_type
 
 from .helpers import needs
@@ -97,7 +97,7 @@ def traced_spots(imager: Imager, point) -> np.ndarray:
     depth = np.asarray(level.depth_of(jnp.asarray(source[2:])))
     types = split_by_type(level, lenses_by_type(level.array))
     offsets = [np.interp(field, some, core_offsets(one, depth, some)[0]) for one in types]
-    offset = np.choose(type_of_lens(level.array)[order], offsets)
+    offset = np.choose(np.asarray(level.array.type_of_lens)[order], offsets)
     landing = centers - v / source[2] * beside + (offset / np.maximum(field, 1e-12))[:, None] * beside
     vertices = turn.apply(np.column_stack([centers, 0 * field]))
     onward = turn.apply(np.column_stack([landing, 0 * field - v])) - vertices

@@ -93,8 +93,8 @@ def test_each_kind_has_its_own_values_and_a_file_has_them_for_each_lens():
     (found, at), made = candidate(*parent, values=moved), new_design(design, *parent, values=moved)
     array, which = made.imager().array, lenses_by_type(parent[0].array)
     first = which[0]
-    np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.conic_constant) == -0.7), first)
-    np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.aperture_diameter) == 0.7), first)
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.of_lenses("conic_constant")) == -0.7), first)
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(array.of_lenses("aperture_diameter")) == 0.7), first)
     np.testing.assert_allclose(found.array.radius_of_curvature, array.radius_of_curvature, atol=1e-4)
     # Rounded to 1e-4 mm; 64 directions against 512.
     np.testing.assert_allclose(objectives.clear_diameter(found, at), clear_diameter(array), rtol=1e-3)
@@ -171,7 +171,7 @@ def test_webs_are_between_apertures_of_their_own_size():
     _, parent = two_kinds()
     diameters = np.array([0.7, 0.5])
     found = candidate(*parent, values={"aperture_diameter_mm": jnp.array(diameters)})
-    centers, each = np.asarray(found[0].array.centers), np.asarray(found[0].array.aperture_diameter)
+    centers, each = np.asarray(found[0].array.centers), np.asarray(found[0].array.of_lenses("aperture_diameter"))
     least = [
         min(np.hypot(*(centers[i] - centers[j])) - (each[i] + each[j]) / 2 for j in range(12) if j != i)
         for i in range(12)

@@ -234,7 +234,7 @@ def test_the_clear_aperture_follows_the_imager(how):
 
     @jax.jit
     def values(diameter, centers):
-        changed = dataclasses.replace(array, aperture_diameter=diameter, centers=centers)
+        changed = dataclasses.replace(array, aperture_diameter=diameter, centers=centers, types=None)
         parts = per_type(dataclasses.replace(imager, array=changed), at)
         named = objectives.f_number, objectives.lateral_resolution, objectives.depth_of_field
         each = [[function(*part) for function in named] for part in parts]

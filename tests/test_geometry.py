@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -162,6 +164,22 @@ def test_lenses_may_differ():
     trace_lenslet(imager_of(second), 20.0, np.zeros(2))
     with pytest.raises(ValueError, match=r"Lenses must be alike, got lenses that differ in radius_of_curvature"):
         trace_lenslet(imager_of(array), 20.0, np.zeros(2))
+
+
+def test_numbers_of_each_lens_are_sorted_into_types():
+    centers = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+    array = MicrolensArray(centers, radius_of_curvature=[2.2, 2.0, 2.2])
+    np.testing.assert_array_equal(array.radius_of_curvature, [2.2, 2.0])
+    np.testing.assert_array_equal(array.types, [0, 1, 0])
+    np.testing.assert_array_equal(array.of_lenses("radius_of_curvature"), [2.2, 2.0, 2.2])
+    assert MicrolensArray(centers, radius_of_curvature=[2.0] * 3).alike
+    traced = jax.jit(lambda radii: MicrolensArray(centers, radii).type_count + 0 * radii[0])
+    assert traced(jnp.array([2.0, 2.0, 2.0])) == 3
+    for types, wrong in ([[0, 2, 0], "all numbers from 0 to 1"], [[0, 1], "an integer for each of 3"]):
+        with pytest.raises(ValueError, match=wrong):
+            MicrolensArray(centers, radius_of_curvature=[2.0, 2.2], types=types)
+    with pytest.raises(ValueError, match="`types` must be None with a number of each lens"):
+        dataclasses.replace(array, radius_of_curvature=[2.0, 2.1, 2.2])
 
 
 def imager_of(array):

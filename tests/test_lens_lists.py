@@ -25,8 +25,8 @@ COLUMNS = "x_mm;y_mm;radius_of_curvature_mm;conic_constant\n-1;-0.5;2;0\n0,5;1,2
 def test_lists_are_numbers_of_each_lens(tmp_path):
     design = read_design(written(tmp_path, LISTS))
     array = design.imager().array
-    np.testing.assert_array_equal(array.radius_of_curvature, RADII)
-    np.testing.assert_array_equal(array.conic_constant, [0, -0.5, 0])
+    np.testing.assert_array_equal(array.of_lenses("radius_of_curvature"), RADII)
+    np.testing.assert_array_equal(array.of_lenses("conic_constant"), [0, -0.5, 0])
     assert array.aperture_diameter.shape == () and not array.alike
     assert lenses_by_type(array) == ((0, 2), (1,))
     assert "3 lenses of 2 types, R = 1.9 to 2 mm, k = -0.5 to 0, n = 1.43, D = 2 mm" in repr(design)

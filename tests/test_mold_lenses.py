@@ -52,8 +52,10 @@ def unequal(**changes) -> MicrolensArray:
 
 def heights(array, x, y):
     """The highest lens over the land on a grid, by the definition: conics to their discs, then walls."""
-    k, r = np.asarray(array.conic_constant), np.asarray(array.radius_of_curvature)
-    k, r, reach = (np.broadcast_to(v, len(array.centers)) for v in (k, r, np.asarray(array.aperture_diameter) / 2))
+    k, r, reach = (
+        np.asarray(array.of_lenses(n)) for n in ("conic_constant", "radius_of_curvature", "aperture_diameter")
+    )
+    reach = reach / 2
     fall = lambda i, rho: rho**2 / (r[i] + np.sqrt(r[i] ** 2 - (1 + k[i]) * rho**2))
     land = max(fall(i, reach[i]) for i in range(len(r)))
     best = np.zeros((len(x), len(y)))
@@ -119,7 +121,7 @@ def test_the_volume_of_unequal_lenses_is_that_of_the_highest():
 
 def test_lists_of_equal_numbers_are_one_number():
     one = MicrolensArray(CENTERS, aperture_diameter=1.5, size=(4.0, 3.0))
-    each = dataclasses.replace(one, radius_of_curvature=np.full(5, 2.0), conic_constant=np.zeros(5))
+    each = dataclasses.replace(one, radius_of_curvature=[2.0], conic_constant=[0.0], types=np.zeros(5, int))
     same = [float32_mesh(array_solid(array, CHORD)) for array in (one, each)]
     np.testing.assert_array_equal(same[0].vertices, same[1].vertices)
     np.testing.assert_array_equal(same[0].facets, same[1].facets)

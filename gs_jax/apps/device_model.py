@@ -189,7 +189,8 @@ def log_sharpness(
     imager, radius = perturb(nominal, errors), clear_diameter(nominal, at) / 2
     assert imager.tilt is not None
     # The square of a width is a quadratic of the height: four places at the RMS coordinates give the lenses' mean.
-    x, y = jnp.sqrt(jnp.mean(nominal.centers**2, 0))
+    counted = True if at.lenses is None else at.lenses[:, None]
+    x, y = jnp.sqrt(jnp.mean(nominal.centers**2, 0, where=counted))
     heights = jnp.stack([jnp.stack(place) for place in ((x, y), (x, -y), (-x, y), (-x, -y))]) @ imager.tilt
 
     def at_height(height):

@@ -21,6 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -105,7 +106,7 @@ def simulate_scene(imager: Imager, grid: Grid, seed: int, progress: Progress | N
     # Diffraction is much finer than a coarse pixel, and would take a huge pupil there.
     kind = "diffraction" if imager.sensor.pixel_pitch < 0.02 else "geometric"
     # In JAX's own precision, as the PSFs are computed.
-    imager = jax.tree.map(lambda leaf: leaf.astype(float), imager)
+    imager = jax.tree.map(lambda leaf: leaf.astype(float) if eqx.is_inexact_array(leaf) else leaf, imager)
     image, camera = simulate_points(emitters.reshape(-1, 4), imager, kind=kind, progress=progress), Camera(gain=1.0)
     counts = expose(jnp.asarray(image), camera, jax.random.key(seed), peak_electrons=PEAK_ELECTRONS)
     return Scene(np.asarray(electrons(counts, camera)), particles, render_points(particles, grid, width))

@@ -120,8 +120,8 @@ def check_fields(part: eqx.Module, **rules: Rule) -> None:
 
 
 def to_float32(tree: Tree) -> Tree:
-    """Convert every array of a pytree to float32."""
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+    """Convert every floating-point array of a pytree to float32."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

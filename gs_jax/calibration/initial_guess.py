@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from ..base.errors import InputError
 from ..geometry import Imager
-from ..lenses import EACH, lenses_by_type
+from ..lenses import EACH
 from ..optics.raytrace import to_numpy
 from ..typing import Image
 from .pattern_matching import BLURRED, Similarity, match_pattern, match_shift, triangulate_lenses
@@ -221,7 +221,7 @@ def guess_without_lenses(
         got = f"{count} of {sum(map(len, spots))} spots on lenses that several captures show"
         raise InputError(f"captures: got {got}, half are needed; are positions and the sensor's pixels right?")
     distance = imager.sensor_distance_of(imager.reduced_sensor_distance * step)
-    types = [imager.array.lens(int(which[0])) for which in lenses_by_type(imager.array)]
+    types = [imager.array.of_type(number) for number in range(imager.array.type_count)]
     where = lambda i: (i.array, i.sensor_distance, i.rotation, i.shift, i.tilt)
     zero = jnp.zeros((), imager.sensor_distance.dtype)
     # Rotation, shift and tilt are contained in the lenses' positions.

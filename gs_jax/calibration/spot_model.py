@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int
 from ..base.errors import InputError
 from ..geometry import Imager
 from ..layouts import nearest_neighbour_distances
-from ..lenses import MicrolensArray, lenses_by_type, type_of_lens
+from ..lenses import MicrolensArray, lenses_by_type
 from ..optics.lens_types import split_by_type
 from ..optics.pupil import PupilSamples, aperture_profile, sample_pupil
 from .sample import OF_SAMPLE, number
@@ -215,10 +215,10 @@ def trace_core_offsets(imager: Imager, depths: Float[np.ndarray, " source"], fit
 
     Without depths, where all spots are blurred, there are none.
     """
-    nodes, types = np.unique(depths), jnp.asarray(type_of_lens(imager.array))
+    nodes, types = np.unique(depths), jnp.asarray(imager.array.type_of_lens)
     if not len(nodes):
         one = lambda *shape: jnp.zeros(shape, imager.sensor_distance.dtype)
-        return CoreOffsets(one(1), one(int(types.max()) + 1, 1, 1), {}, {}, types)
+        return CoreOffsets(one(1), one(imager.array.type_count, 1, 1), {}, {}, types)
     if len(nodes) > _DEPTHS:
         nodes = np.linspace(nodes[0], nodes[-1], _DEPTHS)
     offset, slopes = core_polynomials(imager, nodes), {}

@@ -26,7 +26,7 @@ from ..design.conversion import reduced_depth, reduced_sensor_distance
 from ..design.design import Design
 from ..geometry import Imager
 from ..io.toml import one_line
-from ..lenses import EACH, type_of_lens
+from ..lenses import EACH
 from ..objectives.conditions import Conditions
 from ..optics.apertures import pitch, voronoi_cells
 
@@ -89,18 +89,16 @@ class Free(NamedTuple):
             raise InputError("free: pitch must be that of two lenses or more, got a single lens.")
         values = {name: _leaf(imager, name) for name in self.names}
         for name in self.names:
-            if (types := _types(imager, name)) is not None:
+            if name in EACH and not imager.array.alike:
                 # A number that all types share may differ between them in a search.
-                values[name] = jnp.broadcast_to(values[name], len(types))[np.unique(types, return_index=True)[1]]
+                values[name] = jnp.broadcast_to(values[name], imager.array.type_count)
         return values
 
     def replaced(self, imager: Imager, values: Values) -> Imager:
         """The imager with other numbers. A pitch scales the lens centres and the plate about the middle."""
         names = [name for name in self.names if name != "pitch"]
-        types = [_types(imager, name) for name in names]
-        numbers = [values[n] if each is None else values[n][each] for n, each in zip(names, types, strict=True)]
         scale = values["pitch"] / _leaf(imager, "pitch") if "pitch" in self.names else None
-        imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, numbers)
+        imager = eqx.tree_at(lambda i: [_leaf(i, name) for name in names], imager, [values[name] for name in names])
         if scale is None:
             return imager
         lengths = lambda i: [i.array.centers] if i.array.size is None else [i.array.centers, i.array.size]
@@ -149,11 +147,6 @@ def _leaf(imager, name):
     for part in name.split("."):
         at = None if at is None else getattr(at, part)
     return at
-
-
-def _types(imager, name) -> np.ndarray | None:
-    """The type of each lens, where lenses have a number of their own."""
-    return type_of_lens(imager.array) if name in EACH and not imager.array.alike else None
 
 
 def evaluated(
@@ -284,6 +277,6 @@ def significant(value: ArrayLike) -> Float64[np.ndarray, "..."]:
 
 def _of_lenses_rounded(imager: Imager, name: str, value: Float[Array, "..."]) -> float | list[float]:
     """One number if all types come to the same."""
-    numbers = value if value.ndim == 0 else value[type_of_lens(imager.array)]
+    numbers = value if value.ndim == 0 else value[imager.array.type_of_lens]
     numbers = np.round(np.asarray(numbers, float), _DIGITS) if name.endswith("_mm") else significant(numbers)
     return numbers.tolist() if np.ptp(numbers) else float(numbers.flat[0])

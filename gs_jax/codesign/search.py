@@ -26,7 +26,6 @@ from ..design.conversion import reduced_depth, reduced_sensor_distance, sample_t
 from ..design.design import Design, read_design
 from ..geometry import Imager
 from ..layers import check_room
-from ..lenses import lenses_by_type
 from ..optics.lens_types import interleave
 from ..typing import PathLike
 from .parameters import Free, new_design, start_values
@@ -211,7 +210,7 @@ def initial_design(design: Design, study: Study) -> Design:
         design = design.replace(orientation=study.orientation)
     if study.kinds is None:
         return design
-    found = len(lenses_by_type(design.imager().array))
+    found = design.imager().array.type_count
     if found == study.kinds:
         return design
     if found > 1:

@@ -20,7 +20,6 @@ from ..base.progress import Progress
 from ..design.conversion import object_begins
 from ..design.design import Design
 from ..geometry import Imager
-from ..lenses import lenses_by_type
 from ..objectives.conditions import Conditions
 from .parameters import Values, candidate, evaluated, start_values
 from .solve import (
@@ -81,7 +80,7 @@ def problem_of(design: Design, study: Study) -> Problem:
 
 
 def _check_free(design: Design, study: Study) -> None:
-    count = len(lenses_by_type(design.imager().array))
+    count = design.imager().array.type_count
     if count > _SCENE_TYPES and any(term.name == "scene_error" for term in study.terms):
         raise InputError(f"`terms`: scene_error takes up to {_SCENE_TYPES} lens types, got {count}.")
     if "pitch_mm" in study.free and len(design.array.centers_mm) == 1:

@@ -30,6 +30,7 @@ from ..geometry import Imager, field_limit
 from ..grid import Grid
 from ..io.files import check_input, check_suffix
 from ..objectives.conditions import Conditions, finite_plate, per_type
+from ..optics.lens_types import only
 from ..typing import PathLike
 from .array_psf import array_spectrum, condition_number, mean_inverse_views, sidelobes, spectral_flatness
 from .end_to_end import reconstruction_loss
@@ -116,7 +117,10 @@ def log_error_for_exposure(imager: Imager, at: Conditions, key: PRNGKeyArray) ->
     at = dataclasses.replace(at, depths=_three(at))
     # `forward` does not scale light with the depth: all three planes have the mean.
     share = (_voxel_pitch(imager) / PLACE) ** 2
-    of_type = lambda one, own: (one, spots(one, own, _SPOT), share * jnp.mean(lens_electrons(one, own)))
+
+    def of_type(imager, at):
+        return only(imager, at.lenses), spots(imager, at, _SPOT), share * jnp.mean(lens_electrons(imager, at))
+
     return _log_error(imager, at, key, types=[of_type(*part) for part in per_type(imager, at)])
 
 

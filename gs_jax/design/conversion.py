@@ -275,6 +275,7 @@ def tables_of(imager: Imager) -> dict[str, Any]:
         raise InputError("`band` must be None: a design makes its own, of its materials and `imaging.bandwidth_nm`.")
     tilt = (0.0, 0.0) if imager.tilt is None else _scaled(np.degrees(np.arctan(np.asarray(imager.tilt))))
     focal_length = array.thin_lens_focal_length
+    of_lenses = lambda name: _decimal(getattr(array, name) if array.alike else array.of_lenses(name))
     return {
         "sensor": {
             "pixel_pitch_um": _scaled(np.float64(1000 * sensor.pixel_pitch)),
@@ -282,11 +283,11 @@ def tables_of(imager: Imager) -> dict[str, Any]:
             "origin_mm": sensor.origin if any(sensor.origin) else None,
         },
         "lens": {
-            "radius_of_curvature_mm": _decimal(array.radius_of_curvature),
+            "radius_of_curvature_mm": of_lenses("radius_of_curvature"),
             "refractive_index": _decimal(array.refractive_index),
-            "aperture_diameter_mm": _decimal(array.aperture_diameter),
+            "aperture_diameter_mm": of_lenses("aperture_diameter"),
             "orientation": array.orientation,
-            "conic_constant": _decimal(array.conic_constant),
+            "conic_constant": of_lenses("conic_constant"),
             "aspheric_terms": _decimal(array.aspheric_terms),
             "focal_length_mm": None if focal_length is None else _decimal(focal_length),
         },

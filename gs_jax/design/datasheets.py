@@ -80,7 +80,7 @@ def datasheet(
     shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
     for name in ("lenses_per_point", "occupancy"):
         shown[name] = np.sum([column[name] for column in columns], 0).tolist()
-    lenses = [len(imager.array.centers) for imager, _ in parts]
+    lenses = [_count(*part) for part in parts]
     mean = lambda values: six_digits(float(np.average(values, weights=lenses)))
     return {
         "depth_mm": depths,
@@ -166,6 +166,10 @@ def path_in_words(sheet: dict[str, Any]) -> str:
     return "; ".join(words)
 
 
+def _count(imager: Imager, at: Conditions) -> int:
+    return len(imager.array.centers) if at.lenses is None else int(np.sum(at.lenses))
+
+
 def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for (imager, at), column in zip(parts, columns, strict=True):
@@ -178,7 +182,7 @@ def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[st
             "clear_diameter_mm": objectives.clear_diameter(imager, at),
         }
         spots = {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", *SIZES)}
-        found.append({"lenses": len(array.centers), **{k: six_digits(float(x)) for k, x in numbers.items()}, **spots})
+        found.append({"lenses": _count(imager, at), **{k: six_digits(float(x)) for k, x in numbers.items()}, **spots})
     return found
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.integrate import cumulative_simpson
 from scipy.spatial import Delaunay, KDTree
 
-from ..lenses import MicrolensArray, sag, sag_slope_over_r
+from ..lenses import EACH, MicrolensArray, sag, sag_slope_over_r
 
 # Draft of the walls: lets a cast be peeled, and joins walls that touch into one body.
 DRAFT = math.radians(5)
@@ -82,9 +82,7 @@ def lenslets_of(array: MicrolensArray) -> list[Lenslet]:
     Parts have their lenslets toward -z. An array whose plano side faces the object keeps the design's x and y. One
     whose curved side faces the object is rotated about x, so that its y is reversed; a mirrored part would be wrong.
     """
-    count = len(array.centers)
-    numbers = (array.aperture_diameter, array.radius_of_curvature, array.conic_constant)
-    diameter, radius, conic = (np.broadcast_to(np.asarray(x, float), count).tolist() for x in numbers)
+    radius, diameter, conic = (np.asarray(array.of_lenses(name), float).tolist() for name in EACH)
     terms = tuple(np.asarray(array.aspheric_terms, float).tolist())
     return [
         Lenslet(center, d / 2, r, k, terms)

@@ -232,8 +232,8 @@ def summarize(measured: LensletMeasurement, imager: Imager) -> dict[str, Any]:
     array, wavelength, sensor_distance = imager.array, float(imager.wavelength), float(imager.reduced_sensor_distance)
     power = float(array.refractive_index) - 1
     shift = np.linalg.norm(measured.center - part_centers(array), axis=1)
-    radius_error = measured.radius / np.asarray(array.radius_of_curvature, float) - 1
-    conic_error = measured.conic - np.asarray(array.conic_constant, float)
+    radius_error = measured.radius / np.asarray(array.of_lenses("radius_of_curvature"), float) - 1
+    conic_error = measured.conic - np.asarray(array.of_lenses("conic_constant"), float)
     waves = power * measured.surface_rms / wavelength
     strehl = np.exp(-((2 * np.pi * waves) ** 2))
     known = np.isfinite(measured.radius)

@@ -11,13 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields, safe_sqrt
 from ..geometry import Imager
-from ..lenses import lenses_by_type, type_of_lens
 from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
-from ..optics.lens_types import split_by_type
 
 # Heights over the field at which a lens is evaluated.
 _FIELDS = 4
@@ -50,6 +48,8 @@ class Conditions(eqx.Module):
     height
         Of lenses of a tilted array that are evaluated as a level one, mm: depths are less by it, and sensor distances
         more. None, the default, is 0.
+    lenses
+        Which of the lenses count, those of a type; all by default.
 
     Raises
     ------
@@ -66,6 +66,7 @@ class Conditions(eqx.Module):
     clear_diameter: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     field_radius: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
     height: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
+    lenses: Bool[Array, " lens"] | None = None
 
     def __check_init__(self):
         if self.depths.ndim != 1:
@@ -92,15 +93,18 @@ def as_conditions(imager: Imager, depths: Depths) -> Conditions:
 
 
 def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
-    """The lenses of each type alone, and their conditions, with the clear diameter where there are several types."""
-    at = as_conditions(imager, depths)
-    if imager.array.alike:
+    """The imager with the numbers of each lens type, and the conditions with its clear diameter and its `lenses`."""
+    at, array = as_conditions(imager, depths), imager.array
+    if array.alike:
         return [(imager, at)]
-    which = lenses_by_type(imager.array)
-    diameters = _clear_diameters(imager.array, at.directions, which)
+    types, diameters = jnp.asarray(array.type_of_lens), _clear_diameters(array, at.directions)
+    with_array = lambda array: eqx.tree_at(lambda i: i.array, imager, array)
     return [
-        (one, dataclasses.replace(at, cells=None, clear_diameter=diameter))
-        for one, diameter in zip(split_by_type(imager, which), diameters, strict=True)
+        (
+            with_array(array.of_type(number)),
+            dataclasses.replace(at, cells=None, clear_diameter=diameters[number], lenses=types == number),
+        )
+        for number in range(array.type_count)
     ]
 
 
@@ -156,8 +160,10 @@ def _at_heights(imager: Imager, at: Conditions) -> list[tuple[Imager, Conditions
     if at.clear_diameter is None:
         at = dataclasses.replace(at, clear_diameter=clear_diameter(imager, at))
     own = imager.heights
-    spread = safe_sqrt(jnp.mean((own - jnp.mean(own)) ** 2))
-    heights = [jnp.mean(own) + spread * jnp.asarray(number, own.dtype) for number in _HEIGHTS]
+    mean = lambda values: jnp.mean(values, where=True if at.lenses is None else at.lenses)
+    middle = mean(own)
+    spread = safe_sqrt(mean((own - middle) ** 2))
+    heights = [middle + spread * jnp.asarray(number, own.dtype) for number in _HEIGHTS]
     return [(imager.at_height(h), dataclasses.replace(at, depths=at.depths - h, height=h)) for h in heights]
 
 
@@ -190,8 +196,8 @@ def _of_types(function, args, options) -> tuple[Array, bool]:
 
 def of_lenses(imager: Imager, values: Float[Array, "..."]) -> Float[Array, "lens ..."]:
     """A row for each lens of what `by_type` functions return."""
-    types = type_of_lens(imager.array)
-    return values[types] if types.any() else jnp.broadcast_to(values, (types.size, *values.shape))
+    array = imager.array
+    return jnp.broadcast_to(values, (len(array.centers), *values.shape)) if array.alike else values[array.type_of_lens]
 
 
 def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
@@ -201,18 +207,15 @@ def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
         return at.clear_diameter
     if array.alike:
         return _mean_diameter(array, at.cells)
-    which = lenses_by_type(array)
-    each = _clear_diameters(array, at.directions, which)
-    shares = np.array([len(lenses) for lenses in which]) / len(array.centers)
-    return jnp.sqrt(jnp.sum(jnp.asarray(shares, each.dtype) * each**2))
+    return jnp.sqrt(jnp.mean(_clear_diameters(array, at.directions)[array.type_of_lens] ** 2))
 
 
 _mean_diameter = jax.jit(lambda array, cells: diameter_of(array, cells=cells))
 
 
-@partial(jax.jit, static_argnums=(1, 2))
-def _clear_diameters(array, directions, which):
-    return clear_diameters(array, which, directions=directions)
+@partial(jax.jit, static_argnums=1)
+def _clear_diameters(array, directions):
+    return clear_diameters(array, directions=directions)
 
 
 def field_heights(imager: Imager, at: Conditions) -> Float[Array, " field"]:

@@ -127,8 +127,13 @@ def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 def lenses_per_point(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e`."""
-    count, radius = float(imager.array.centers.shape[0]), field_radius(imager, as_conditions(imager, depths))
-    return theory.lenses_per_point(count, jnp.prod(finite_plate(imager)), radius)
+    at = as_conditions(imager, depths)
+    return theory.lenses_per_point(_count(imager, at), jnp.prod(finite_plate(imager)), field_radius(imager, at))
+
+
+def _count(imager, at):
+    """Number of the lenses that are meant."""
+    return float(len(imager.array.centers)) if at.lenses is None else jnp.sum(at.lenses).astype(at.depths.dtype)
 
 
 def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
@@ -139,8 +144,9 @@ def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
 
 def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Share of the plate that is clear aperture."""
-    count = imager.array.centers.shape[0]
-    return count * math.pi / 4 * clear_diameter(imager, depths) ** 2 / jnp.prod(finite_plate(imager))
+    at = as_conditions(imager, depths)
+    discs = _count(imager, at) * math.pi / 4 * clear_diameter(imager, at) ** 2
+    return discs / jnp.prod(finite_plate(imager))
 
 
 def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
@@ -213,8 +219,7 @@ def aperture_gap(imager: Imager) -> Float[Array, " lens"]:
 
     It is the smallest feature of a mask that blocks the light between the lenses.
     """
-    centers = imager.array.centers
-    radius = jnp.broadcast_to(imager.array.aperture_diameter, len(centers)) / 2
+    centers, radius = imager.array.centers, imager.array.of_lenses("aperture_diameter") / 2
     return _nearest(safe_sqrt(_squared_distances(centers, centers)) - radius[:, None] - radius[None])
 
 

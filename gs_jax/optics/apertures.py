@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..base.arrays import jit, safe_sqrt
 from ..lenses import EACH, MicrolensArray, sag
@@ -61,7 +61,7 @@ def _edge_distances(array: MicrolensArray, count: int) -> Float[Array, "lens dir
     whole = array.whole
     angle = 2 * math.pi * (np.arange(count) + 0.5) / count
     directions = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], -1), whole.centers.dtype)
-    own = jnp.broadcast_to(whole.aperture_diameter, len(whole.centers)) / 2
+    own = whole.of_lenses("aperture_diameter") / 2
 
     def gap(lens):
         between = safe_sqrt(jnp.sum((whole.centers - whole.centers[lens][None]) ** 2, 1)) - own - own[lens]
@@ -103,10 +103,9 @@ def _envelope_edges(whole: MicrolensArray, count: int, directions) -> Float[Arra
 
 def _nearest_lenses(whole: MicrolensArray, lens):
     """A lens's centre; of it and its neighbours the offsets, radii of curvature, rims, conics, and which is itself."""
-    lenses = len(whole.centers)
-    radius, diameter, conic = (jnp.broadcast_to(getattr(whole, name), lenses) for name in EACH)
+    radius, diameter, conic = map(whole.of_lenses, EACH)
     offset = whole.centers - whole.centers[lens][None]
-    _, near = lax.top_k(-jnp.sum(offset**2, axis=1), min(_NEAREST + 1, lenses))
+    _, near = lax.top_k(-jnp.sum(offset**2, axis=1), min(_NEAREST + 1, len(whole.centers)))
     own = near == lens.astype(near.dtype)
     return whole.centers[lens], offset[near], radius[near], diameter[near] / 2, conic[near], own
 
@@ -182,29 +181,33 @@ def clear_diameter(array: MicrolensArray, *, cells: VoronoiCells | None = None) 
 
     With the `cells` of identical lenses it is a short sum, a hundred times faster.
     """
-    return jnp.sqrt(4 / math.pi * _mean_areas(512, (), array, cells)[0])
+    everywhere = jnp.ones((1, len(array.centers)), bool)
+    return jnp.sqrt(4 / math.pi * _mean_areas(512, everywhere, array, cells)[0])
 
 
-def clear_diameters(
-    array: MicrolensArray, lenses: tuple[tuple[int, ...], ...], *, directions: int = 512
-) -> Float[Array, " type"]:
-    """`clear_diameter` for each type of lens, given the indices of its lenses; `directions` as in `aperture_area`."""
-    return jnp.sqrt(4 / math.pi * _mean_areas(directions, lenses, array, None))
+def clear_diameters(array: MicrolensArray, *, directions: int = 512) -> Float[Array, " type"]:
+    """`clear_diameter` of each lens type; `directions` as in `aperture_area`."""
+    number = jnp.arange(array.type_count)[:, None]
+    return jnp.sqrt(4 / math.pi * _mean_areas(directions, number == array.type_of_lens[None], array, None))
 
 
 # Derivatives by one reverse pass per mean: a few numbers of many, which XLA then computes once for all uses.
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _mean_areas(directions: int, lenses, array: MicrolensArray, cells: VoronoiCells | None) -> Float[Array, " type"]:
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _mean_areas(
+    directions: int, members: Bool[Array, "type lens"], array: MicrolensArray, cells: VoronoiCells | None
+) -> Float[Array, " type"]:
     if cells is not None:
         return _total_cell_area(array, cells)[None] / len(array.centers)
-    areas = aperture_area(array, directions=directions)
-    return jnp.stack([jnp.mean(areas[np.array(which)]) for which in lenses or [range(len(areas))]])
+    members = members.astype(array.centers.dtype)
+    return members @ aperture_area(array, directions=directions) / jnp.sum(members, 1)
 
 
 @_mean_areas.defjvp
-def _(directions, lenses, primals, tangents):
-    (array, cells), (changes, _) = primals, tangents
-    areas, back = jax.vjp(lambda array: _mean_areas.fun(directions, lenses, array, cells), array)
+def _(directions, primals, tangents):
+    (members, array, cells), (_, changes, _) = primals, tangents
+    numbers, rest = eqx.partition(array, eqx.is_inexact_array)
+    changes = eqx.filter(changes, jax.tree.map(eqx.is_inexact_array, array))
+    areas, back = jax.vjp(lambda n: _mean_areas.fun(directions, members, eqx.combine(n, rest), cells), numbers)
     (slopes,) = jax.vmap(back)(jnp.eye(len(areas), dtype=areas.dtype))
     pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(changes), strict=True)
     return areas, sum(jnp.tensordot(slope, change, change.ndim) for slope, change in pairs)

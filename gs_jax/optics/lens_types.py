@@ -9,13 +9,13 @@ import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Float64, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Float64, Int
 
 from ..base.errors import InputWarning
 from ..geometry import Imager
 from ..grid import Grid
-from ..lenses import type_of_lens
 from .apertures import clear_area
 from .field_varying import FieldVaryingPsf
 from .psf_core import ensquared_light
@@ -30,6 +30,8 @@ MIN_SHARPNESS = 0.08
 _BLUR, _BANDS = 2.0, 5
 # Half the side of the square that collects a core's light, in pixels, and fields at which that is computed.
 HALF_SIDE, FIELDS = 3, 17
+# A coordinate that no object has, mm.
+_FAR = 1e6
 
 
 class PerTypePsf(eqx.Module):
@@ -54,7 +56,7 @@ def height_bands(imager: Imager) -> Int[np.ndarray, " lens"]:
 
 def lens_groups(imager: Imager) -> tuple[tuple[int, ...], ...]:
     """Indices of lenses that image alike: those of a type, and of a band of height if the array is tilted."""
-    types, bands = type_of_lens(imager.array), height_bands(imager)
+    types, bands = np.asarray(imager.array.type_of_lens), height_bands(imager)
     numbers = np.unique(bands * (types.max() + 1) + types, return_inverse=True)[1]
     return tuple(tuple(np.flatnonzero(numbers == number).tolist()) for number in range(numbers.max() + 1))
 
@@ -62,6 +64,13 @@ def lens_groups(imager: Imager) -> tuple[tuple[int, ...], ...]:
 def split_by_type(imager: Imager, lenses: Sequence[Sequence[int]]) -> list[Imager]:
     """The imager with the lenses of each type alone, whose apertures the other lenses still bound."""
     return [eqx.tree_at(lambda i: i.array, imager, imager.array.subset(which)) for which in lenses]
+
+
+def only(imager: Imager, lenses: Bool[Array, " lens"] | None) -> Imager:
+    """The imager with the other lenses out of sight of every object, for lenses that JAX traces; None keeps all."""
+    if lenses is None:
+        return imager
+    return eqx.tree_at(lambda i: i.array.centers, imager, jnp.where(lenses[:, None], imager.array.centers, _FAR))
 
 
 def split_groups(imager: Imager) -> tuple[list[Imager], tuple[tuple[int, ...], ...]]:

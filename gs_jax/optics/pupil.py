@@ -81,7 +81,7 @@ def _covered_by_identical(centers, diameter) -> Callable:
 def _covered_by_others(array) -> Callable:
     """Function of a lens and points: whether a point is in the disc of a neighbour whose surface is higher there."""
     whole, mine = to_numpy(array.whole), to_numpy(array)
-    radius, diameter, conic = (getattr(whole, name) for name in EACH)
+    radius, diameter, conic = map(whole.of_lenses, EACH)
     rim, own = diameter / 2, float(mine.aperture_diameter) / 2
 
     def covered(lens, points):

@@ -15,6 +15,7 @@ derivatives use NumPy, which needs no compilation.
 
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,8 +73,8 @@ class LensletRay(NamedTuple):
 
 
 def to_numpy(module: Module) -> Module:
-    """The imager or array with NumPy arrays in float64."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), module)
+    """The imager or array with NumPy arrays, its numbers in float64."""
+    return jax.tree.map(lambda x: np.asarray(x, np.float64 if eqx.is_inexact_array(x) else x.dtype), module)
 
 
 def dot(a: Coordinates, b: Coordinates) -> Scalars:

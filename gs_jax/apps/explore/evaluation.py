@@ -168,9 +168,8 @@ def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
     sharpest = jnp.argmin(numbers["spot_width_um"], 0)
     numbers = {name: jnp.take_along_axis(each, sharpest[None], 0)[0] for name, each in numbers.items()}
     numbers |= {"magnification": imager.magnification(at.depths), "occupancy": objectives.occupancy(imager, at)}
-    counts = np.array([len(lenses) for lenses in start.types])
-    shares = jnp.asarray(counts / counts.sum(), at.depths.dtype)
-    mean = lambda quantity: jnp.sum(shares * jnp.stack([quantity(*part) for part in parts]))
+    shares = [1.0 if at.lenses is None else jnp.mean(at.lenses) for _, at in parts]
+    mean = lambda quantity: sum(share * quantity(*part) for share, part in zip(shares, parts, strict=True))
     scalars = {
         "focal_length_mm": mean(lambda one, _: one.array.focal_length),
         "f_number": mean(objectives.f_number),
@@ -205,7 +204,8 @@ def moved_design(design: Design, start: Start, values: Values, provenance: dict[
     """The design of these values as a file holds it, to 0.1 um; `InputError` if they make no microscope."""
     array, rounded = moved_imager(start, values).array, lambda x: np.round(np.asarray(x, float), 4)
     size = rounded(array.plate)
-    own = {name: rounded(getattr(array, name.removesuffix("_mm"))) for name in _LENS_KEYS if name in values}
+    of_lenses = lambda key: array.of_lenses(key) if not array.alike else getattr(array, key)
+    own = {name: rounded(of_lenses(name.removesuffix("_mm"))) for name in _LENS_KEYS if name in values}
     own |= {name: rounded(values[name]) for name in ("sensor_distance_mm", "field_radius_mm")}
     return design.replace(
         **own,

@@ -259,10 +259,10 @@ def draw_layout(imager: Imager, picture: str, box: tuple[float, float, float, fl
 def _outlines(imager: Imager) -> str:
     """Discs cut at the edges of their Voronoi cells, where calibration places them on the sensor."""
     array = imager.array
-    centers, count = np.asarray(array.centers, float), len(array.centers)
-    angles = np.linspace(0, 2 * np.pi, max(6, min(48, _OUTLINE_POINTS // count)), endpoint=False)
+    centers = np.asarray(array.centers, float)
+    angles = np.linspace(0, 2 * np.pi, max(6, min(48, _OUTLINE_POINTS // len(centers))), endpoint=False)
     direction = np.column_stack([np.cos(angles), np.sin(angles)])
-    radius = np.repeat(np.broadcast_to(np.asarray(array.aperture_diameter, float) / 2, count)[:, None], len(angles), 1)
+    radius = np.repeat(np.asarray(array.of_lenses("aperture_diameter"), float)[:, None] / 2, len(angles), 1)
     edges = cell_edges(centers, array.plate)
     along = (edges.end - edges.start) / np.hypot(*(edges.end - edges.start).T)[:, None]
     normal = np.column_stack([along[:, 1], -along[:, 0]])
