@@ -43,7 +43,7 @@ from gs_jax import (
     find_points,
     forward,
     localization,
-    make_psf_model,
+    psf_model,
     quality,
     rasterize,
     read_design,
@@ -182,7 +182,7 @@ def image_of(one: Scene, imager: Imager, settings: Settings) -> np.ndarray:
 def image_by_model(emitters: np.ndarray, imager: Imager, grid: Grid) -> np.ndarray:
     """The full model's image of emitters that the voxels of a grid share."""
     volume = np.asarray(rasterize(emitters, grid), np.float32)
-    image = jax.jit(forward)(volume, imager, grid, make_psf_model(imager, grid.depths, "full"))
+    image = jax.jit(forward)(volume, imager, grid, psf_model(imager, grid, "full"))
     # Sharpened kernels ring about edges, down to -0.3 % of the brightest pixel.
     return np.maximum(np.asarray(image), 0)
 

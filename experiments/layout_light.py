@@ -39,7 +39,7 @@ from gs_jax.apps.training.simulated_captures import (
 from gs_jax.base.arrays import to_float32
 from gs_jax.base.progress import Progress
 from gs_jax.layouts import hexagonal_layout, poisson_disc_layout, random_layout, square_layout
-from gs_jax.projection.forward_model import make_psf_model
+from gs_jax.projection.forward_model import psf_model
 from gs_jax.simulation.synthetic import electrons
 
 SPEC = CaptureSpec(288, 0.018, 0.064, 7, binning=4)
@@ -84,10 +84,11 @@ def _gains(centers: np.ndarray, level: str, scenes: int, steps: int) -> list[flo
     single = to_float32(imager)
     grid = to_float32(Grid.over(sensor, depths=DEPTHS, pitch=SPEC.pitch))
     fine = to_float32(Grid(between, tuple(2 * n for n in grid.shape), SPEC.pitch / 2))
-    optics = lambda depths: (
-        trace_optics(imager, depths, SPEC) if level == "full" else make_psf_model(single, depths, "near")
-    )
-    of_scene, of_volume = optics(between), optics(DEPTHS)
+
+    def optics(grid: Grid, depths: np.ndarray):
+        return trace_optics(imager, depths, SPEC) if level == "full" else psf_model(single, grid, "near")
+
+    of_scene, of_volume = optics(fine, between), optics(grid, np.asarray(DEPTHS))
     results = []
     for number in range(scenes):
         scene = random_scene(fine.shape, np.random.default_rng(number))

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import Report, main, table
-from gs_jax import Unrolled, make_psf_model, quality, reconstruct, suppress
+from gs_jax import Unrolled, psf_model, quality, reconstruct, suppress
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.training.simulated_captures import CaptureSpec, Example, simulate_example
 from gs_jax.apps.training.training_loop import UNROLLED
@@ -77,7 +77,7 @@ def gain(volume: np.ndarray, e: Example) -> float:
 
 def imaged_noise(volume: np.ndarray, e: Example) -> float:
     """Standard deviation of the volume's image over that of the capture."""
-    image = forward(volume, e.imager, e.grid, make_psf_model(e.imager, e.grid.depths, "full"))
+    image = forward(volume, e.imager, e.grid, psf_model(e.imager, e.grid, "full"))
     return float(np.std(image) / np.std(e.image))
 
 

@@ -33,7 +33,7 @@ from gs_jax import (
     find_points,
     forward,
     localization,
-    make_psf_model,
+    psf_model,
     quality,
     rasterize,
     read_capture,
@@ -122,7 +122,7 @@ def on_words(data: Path, devices: dict[str, Imager], methods: list[str], progres
     fine = Grid(z, (count, count), _FINE)
     results = {}
     for name, each in devices.items():
-        model = forward(rasterize(emitters, fine), each, fine, make_psf_model(each, z, progress=progress))
+        model = forward(rasterize(emitters, fine), each, fine, psf_model(each, fine, progress=progress))
         results[name] = {"model": scores(np.asarray(model), electrons(image))}
         depths = np.interp(np.arange(_PLANES * (len(z) - 1) + 1) / _PLANES, np.arange(len(z)), z)
         grid = voxel_grid(each, depths.tolist(), pixels=PIXELS_PER_VOXEL)

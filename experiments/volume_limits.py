@@ -30,7 +30,7 @@ from scipy.stats import t as student
 from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import DEPTHS, PITCH, READ, STEP, VOXEL, Emitters, blobs, device, noisy, texture
-from gs_jax import Grid, Imager, ImagingOperator, make_psf_model, quality, rasterize
+from gs_jax import Grid, Imager, ImagingOperator, psf_model, quality, rasterize
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.inverse_problem import prepare_data, prepare_model
@@ -123,7 +123,7 @@ class Methods:
         self.plain = {name: by(name) for name in PLAIN}
         # Light at any depth of a scene, on voxels half as wide.
         half = Grid.over(imager.sensor, depths=depths_of(LAYER), pitch=VOXEL / 2)
-        optics = make_psf_model(self.model.imager, half.depths, "full", progress=progress)
+        optics = psf_model(self.model.imager, half, "full", progress=progress)
         self.imaging = ImagingOperator(self.model.imager, half, optics)
 
     def run(self, image: np.ndarray, truth: np.ndarray, case: str) -> dict[str, np.ndarray]:

@@ -62,7 +62,7 @@ The operators themselves, differentiable:
     ImagingOperator      The forward model as a `lineax` operator; its transpose `.T` is the exact adjoint
     BackprojectionOperator  The paper's back-projection as a `lineax` operator, image to volume
     ConvolutionOperator  Imaging through measured PSFs, one for each plane; its transpose `.T` is the exact adjoint
-    make_psf_model       The PSF model of a microscope at some depths, for `forward` and the solvers
+    psf_model            The PSF model of a microscope for a grid, for `forward` and the solvers
     solve                Run a solver on an image, for all its steps or until its tolerance is met
 
 Better designs, and their molds:

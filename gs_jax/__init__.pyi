@@ -23,7 +23,7 @@ from .metrics import localization as localization, quality as quality
 from .mold.make import make_mold as make_mold
 from .pictures import show as show
 from .projection.backprojection import backproject as backproject, backproject_adjoint as backproject_adjoint
-from .projection.forward_model import forward as forward, make_psf_model as make_psf_model
+from .projection.forward_model import forward as forward, psf_model as psf_model
 from .projection.measured_psf import ConvolutionOperator as ConvolutionOperator
 from .projection.operators import (
     BackprojectionOperator as BackprojectionOperator,

@@ -13,7 +13,7 @@ import pytest
 from jax import export
 from jax.test_util import check_grads
 
-from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward, make_psf_model
+from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint, forward, psf_model
 from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.projection import tiles
 from gs_jax.projection.bilinear import image_to_volume, rays_vjp, volume_to_image
@@ -141,7 +141,7 @@ TWO_TYPES_TILTED = {"lens": {"radius_of_curvature_mm": [2.0, 2.06] * 6}, "calibr
 def test_the_forward_model_is_the_same(fidelity, tables):
     imager = cropped("geomscope", lenses=12, shape=(300, 280), **tables).imager()
     grid = Grid.over(imager.sensor, depths=[18.0, 20.0], pitch=0.08)
-    optics = make_psf_model(imager, grid.depths, fidelity)
+    optics = psf_model(imager, grid, fidelity)
     volume, image = np.random.default_rng(0).random(grid.volume_shape), np.ones(imager.sensor.shape)
 
     def both(volume, image):

@@ -28,7 +28,7 @@ def scene():
     """Blobs, and their image without noise by one PSF for each depth."""
     truth = np.where(np.random.default_rng(1).random(GRID.volume_shape) < 0.01, 1.0, 0.0)
     truth = gaussian_filter(truth, (0, 2.5, 2.5))
-    psf = gs.make_psf_model(scope(), GRID.depths, "near")
+    psf = gs.psf_model(scope(), GRID, "near")
     return truth, psf, np.asarray(gs.forward(truth, scope(), GRID, psf), np.float64)
 
 

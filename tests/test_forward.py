@@ -79,7 +79,7 @@ def test_each_depth_is_convolved_with_its_psf():
     for depth, plane, kernel in zip(grid.depths, volume, kernels, strict=True):
         sharp = backproject_adjoint(plane[None], wide, Grid(depth[None], grid.shape, grid.pitch))
         expected += fftconvolve(sharp[1:-1, 1:-1], kernel, mode="valid")
-    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
+    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * float(expected.max()))
 
 
 @pytest.mark.integration
@@ -88,7 +88,7 @@ def test_light_of_chief_rays_beside_the_sensor():
     imager, grid = scene(shape=(48, 40))
     volume, kernels = volume_of(grid), psfs(3, 11)
     expected = forward(volume, with_sensor(imager, (48 + 40, 40 + 40)), grid, kernels)[20:-20, 20:-20]
-    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * expected.max())
+    np.testing.assert_allclose(forward(volume, imager, grid, kernels), expected, atol=1e-12 * float(expected.max()))
     # Points' images are made one by one, and nowhere else.
     lone = Grid([20.0], (1, 1), 0.01)
     beside = Imager(MicrolensArray([[0.0, 0.0]]), Sensor((41, 41), 0.01), 5.0, 3.0, shift=(0.22, 0.0))
@@ -217,7 +217,7 @@ def test_equation_2_as_printed_where_voxels_are_at_the_middle_of_zones(zones):
             r, c = np.nonzero(zone == i)
             volume[0, round(r.mean()), round(c.mean())] = 1
     expected = equation_2(volume, imager, grid, psfs(1), zone)
-    np.testing.assert_allclose(forward(volume, imager, grid, psfs(1)), expected, atol=1e-12 * expected.max())
+    np.testing.assert_allclose(forward(volume, imager, grid, psfs(1)), expected, atol=1e-12 * float(expected.max()))
 
 
 def test_equation_2_as_printed_departs_by_the_envelope_across_a_zone():
@@ -296,7 +296,7 @@ def test_many_points_are_spots_one_by_one(dtype):
     assert image.dtype == dtype
     expected = spots_one_by_one(points.astype(dtype), imager, depths, fine)
     if dtype == jnp.float64:
-        np.testing.assert_allclose(image, expected, atol=1e-12 * expected.max())
+        np.testing.assert_allclose(image, expected, atol=1e-12 * float(expected.max()))
     else:  # where a chief ray lands half-way between two fifths, rounding decides
         np.testing.assert_allclose(image.sum(), expected.sum(), rtol=1e-5)
         assert np.abs(image - expected).sum() < 2e-3 * expected.sum()

@@ -19,7 +19,7 @@ from .test_cross_validation import GRID, exposed, scope
 
 @pytest.mark.integration
 def test_lenses_that_were_left_out_are_predicted_better():
-    psf, rng, images = gs.make_psf_model(scope(), GRID.depths, "near"), np.random.default_rng(0), []
+    psf, rng, images = gs.psf_model(scope(), GRID, "near"), np.random.default_rng(0), []
     for _ in range(3):
         truth = np.where(rng.random(GRID.volume_shape) < 0.01, 1.0, 0.0)
         images.append(exposed(np.asarray(gs.forward(truth, scope(), GRID, psf)), 500))

@@ -85,7 +85,7 @@ IMAGE, VOLUME, POINT = np.ones((32, 32)), np.ones(GRID.volume_shape), np.array([
             lambda a, s: gs.simulate(a * POINT, SCOPE),
             "simulate cannot be traced.*`forward` with a PSF that",
         ),
-        (lambda a, s: gs.make_psf_model(s, [20.0]), "make_psf_model cannot be traced.*`gs_jax.optics.psf`"),
+        (lambda a, s: gs.psf_model(s, GRID), "psf_model cannot be traced.*`gs_jax.optics.psf`"),
         (lambda a, s: gs.reconstruct(a * IMAGE, SCOPE, GRID), "reconstruct cannot be traced.*`solve` or `backproject`"),
         (lambda a, s: gs.reconstruct(IMAGE, s, GRID), "reconstruct cannot be traced"),
         (lambda a, s: gs.forward_residual(a * VOLUME, IMAGE, SCOPE, GRID), "traced.*`forward`"),

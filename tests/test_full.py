@@ -22,7 +22,7 @@ from gs_jax import (
     MicrolensArray,
     Sensor,
     forward,
-    make_psf_model,
+    psf_model,
     reconstruct,
 )
 from gs_jax.design.design import read_design
@@ -393,15 +393,38 @@ def test_every_fidelity_reconstructs(fidelity):
     volume = reconstruct(image, scope, voxels, RichardsonLucy(steps=10), optics=fidelity)
     at = np.unravel_index(volume.argmax(), volume.shape)
     assert np.abs(np.array(at[1:]) - (8, 13)).max() <= 1 and np.isfinite(volume).all()
-    psf = make_psf_model(scope, DEPTHS, fidelity)
-    assert (
-        psf is None if fidelity == "pinhole" else isinstance(psf, FieldVaryingPsf if fidelity == "full" else jax.Array)
-    )
+    kind = {"pinhole": type(None), "near": jax.Array, "full": FieldVaryingPsf}[fidelity]
+    assert isinstance(psf_model(scope, voxels, fidelity).parts[0], kind)
+
+
+def test_a_model_of_other_planes_pixels_or_objects_is_refused():
+    scope, voxels = imager(), grid()
+    x, near = volume(voxels.volume_shape), psf_model(scope, voxels, "pinhole")
+    nearer = eqx.tree_at(lambda m: m.extent, near, jnp.asarray(1.0))
+    wide = dataclasses.replace(scope, sensor=dataclasses.replace(scope.sensor, pixel_pitch=0.5))
+    for model, seen_by, wrong in [
+        (near, voxels, None),
+        (near, voxels.at([18.0, 21.5]), r"grid's depths, \[18.0, 21.5\] mm, got \[18.0, 21.0\] mm"),
+        (near, voxels.at([18.0]), "grid's depths"),
+        (nearer, voxels, "grid's extent, 5 mm, got tables of 1 mm"),
+        ("full", voxels, "optics must be a PSF model .*, got 'full'"),
+    ]:
+        if wrong is None:
+            np.testing.assert_array_equal(forward(x, scope, seen_by, model), forward(x, scope, seen_by))
+            continue
+        with pytest.raises(InputError, match=wrong):
+            forward(x, scope, seen_by, model)
+    for user in (
+        lambda: ImagingOperator(wide, voxels, near),
+        lambda: reconstruct(np.ones(scope.sensor.shape), wide, voxels, RichardsonLucy(2), optics=near),
+    ):
+        with pytest.raises(InputError, match="sensor's pixels of 500 um, got"):
+            user()
 
 
 def test_an_unknown_fidelity_is_refused():
     with pytest.raises(InputError, match="fidelity must be one of full, near, pinhole, got 'exact'"):
-        make_psf_model(imager(), DEPTHS, "exact")
+        psf_model(imager(), grid(), "exact")
 
 
 @pytest.mark.integration

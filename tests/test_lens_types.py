@@ -17,7 +17,7 @@ from gs_jax import (
     Unrolled,
     find_points,
     forward,
-    make_psf_model,
+    psf_model,
     reconstruct,
 )
 from gs_jax.detection.background import DetectionImage
@@ -46,7 +46,7 @@ def differing(scope: Imager, radii=RADII, **numbers) -> Imager:
 @pytest.mark.parametrize("level", ["near", "full"])
 def test_the_adjoint_is_exact(level):
     scope, voxels = differing(imager()), grid(shape=(7, 6))
-    A = ImagingOperator(scope, voxels, make_psf_model(scope, voxels.depths, level))
+    A = ImagingOperator(scope, voxels, psf_model(scope, voxels, level))
     x = volume(voxels.volume_shape)
     y = jax.random.uniform(jax.random.key(1), scope.sensor.shape)
     one, other = jnp.vdot(y, A.mv(x)), jnp.vdot(A.T.mv(y), x)
@@ -58,11 +58,11 @@ def test_the_image_is_the_sum_of_the_kinds():
     """And of types with the same numbers nothing but what one type is, up to the cores of a mean lens."""
     scope, voxels = imager(), grid(shape=(7, 6))
     x = volume(voxels.volume_shape)
-    whole = forward(x, scope, voxels, make_psf_model(scope, voxels.depths, "near"))
+    whole = forward(x, scope, voxels, psf_model(scope, voxels, "near"))
     # A number that changes nothing, but is another.
     almost = differing(scope, np.where(RADII > 2, 2.0 + 1e-9, 2.0))
     assert len(lenses_by_type(almost.array)) == 2
-    parts = forward(x, almost, voxels, make_psf_model(almost, voxels.depths, "near"))
+    parts = forward(x, almost, voxels, psf_model(almost, voxels, "near"))
     # One PSF is of the mean clear area of all lenses, the other of each type's own.
     np.testing.assert_allclose(parts.sum(), whole.sum(), rtol=0.02)
     np.testing.assert_allclose(parts, whole, atol=0.05 * float(whole.max()))
@@ -71,7 +71,7 @@ def test_the_image_is_the_sum_of_the_kinds():
 @pytest.mark.slow
 def test_gradients():
     scope, voxels = differing(imager()), grid(shape=(4, 5))
-    optics = make_psf_model(scope, voxels.depths, "full")
+    optics = psf_model(scope, voxels, "full")
     weights = jax.random.normal(jax.random.key(2), scope.sensor.shape)
     x = volume(voxels.volume_shape)
 

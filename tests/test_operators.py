@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import lsmr
 
-from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, make_psf_model
+from gs_jax import BackprojectionOperator, ImagingOperator, backproject, backproject_adjoint, psf_model
 from gs_jax.interop import as_deepinv, as_scico, as_scipy
 
 from .helpers import scene
@@ -58,8 +58,8 @@ def test_it_composes_and_solves():
 
 OPERATORS = {
     "pinholes": lambda *scene: ImagingOperator(*scene),
-    "near": lambda imager, grid: ImagingOperator(imager, grid, make_psf_model(imager, grid.depths, "near")),
-    "full": lambda imager, grid: ImagingOperator(imager, grid, make_psf_model(imager, grid.depths, "full")),
+    "near": lambda imager, grid: ImagingOperator(imager, grid, psf_model(imager, grid, "near")),
+    "full": lambda imager, grid: ImagingOperator(imager, grid, psf_model(imager, grid, "full")),
     "back-projection": lambda *scene: BackprojectionOperator(*scene),
     "normalized": lambda *scene: BackprojectionOperator(*scene, normalize=True),
 }

@@ -13,7 +13,7 @@ from gs_jax import (
     backproject,
     find_points,
     forward,
-    make_psf_model,
+    psf_model,
     read_capture,
     read_design,
     read_points,
@@ -96,7 +96,7 @@ def test_the_image_on_a_region_is_the_region_of_the_image(level):
     imager, grid = scene()
     volume = np.random.default_rng(2).random(grid.volume_shape)
     part = with_sensor(imager, Readout(roi=(11, 8, 70, 64)).sensor(imager.sensor))
-    optics = make_psf_model(imager, grid.depths, level)
+    optics = psf_model(imager, grid, level)
     whole = np.asarray(forward(volume, imager, grid, optics))[11:81, 8:72]
     # Without a PSF rays that land within a pixel of the region's edge are not read.
     edge = np.s_[1:-1, 1:-1]
@@ -112,7 +112,7 @@ def test_an_origin_moves_the_frame_and_nothing_else(level):
     grid = grid.at([20.0])
     volume = np.random.default_rng(3).random(grid.volume_shape)
     region = Readout(roi=(11, 8, 71, 64)).sensor(imager.sensor)
-    optics = make_psf_model(imager, grid.depths, level)
+    optics = psf_model(imager, grid, level)
     seen = forward(volume, with_sensor(imager, region), grid, optics)
     moved = eqx.tree_at(
         lambda i: i.shift, with_sensor(imager, Sensor(region.shape, 0.02)), imager.shift - jnp.array(region.origin)

@@ -12,7 +12,7 @@ import pytest
 
 import gs_jax as gs
 from experiments.solver_options import glow
-from gs_jax import Grid, ImagingOperator, backproject, forward, make_psf_model
+from gs_jax import Grid, ImagingOperator, backproject, forward, psf_model
 from gs_jax.apps.method_benchmark import skip_reason
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
@@ -145,7 +145,7 @@ def test_the_near_psf_is_that_of_the_rays():
     imager, grid, _, _, image = small()
     kernel = psf_of_depth(imager, np.asarray(grid.depths), "geometric")
     of_rays = jnp.stack([kernel(z) for z in grid.depths])
-    np.testing.assert_array_equal(make_psf_model(imager, grid.depths, "near"), of_rays)
+    np.testing.assert_array_equal(psf_model(imager, grid, "near").parts[0], of_rays)
     # By name, what is in all of a square is background; this image is darker than that only where it is dark.
     found = reconstruct(image, imager, grid, FISTA(steps=7), optics="near")
     assert int(found.argmax()) == int(reconstruct(image, imager, grid, FISTA(steps=7), optics=of_rays).argmax())

@@ -116,7 +116,7 @@ def test_light_is_brightest_on_the_axis_that_leans():
 def test_no_tilt_and_a_tilt_of_zero_are_the_same():
     grid, volume = Grid([18.0, 21.0], (61, 67), 0.1), np.random.default_rng(1).random((2, 61, 67))
     image = [forward(volume, imager, grid) for imager in (tilted(None), tilted((0.0, 0.0)))]
-    np.testing.assert_allclose(*image, atol=1e-10)
+    np.testing.assert_allclose(image[0], image[1], atol=1e-10)
     slopes = jax.grad(lambda tilt: jnp.sum(tilted_by(tilt).heights ** 2 + tilted_by(tilt).centers[:, 0]))(jnp.zeros(2))
     assert np.isfinite(slopes).all()
 

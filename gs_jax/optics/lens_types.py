@@ -17,7 +17,6 @@ from ..base.errors import InputWarning
 from ..geometry import Imager
 from ..grid import Grid
 from .apertures import clear_area
-from .field_varying import FieldVaryingPsf
 from .psf_core import ensquared_light
 from .raytrace import to_numpy
 
@@ -32,17 +31,6 @@ _BLUR, _BANDS = 2.0, 5
 HALF_SIDE, FIELDS = 3, 17
 # A coordinate that no object has, mm.
 _FAR = 1e6
-
-
-class PerTypePsf(eqx.Module):
-    """PSFs of each lens type, or each `lens_groups` of a tilted array; `gs_jax.make_psf_model` makes it.
-
-    `lenses`: indices of each type's lenses. `optics`: for each type, its PSF at each depth, with the sum of its light
-    over that of the mean lens; or all of its light.
-    """
-
-    lenses: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    optics: tuple[Float[Array, "_ _ _"] | FieldVaryingPsf, ...]  # each of its own size
 
 
 def height_bands(imager: Imager) -> Int[np.ndarray, " lens"]:

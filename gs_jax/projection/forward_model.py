@@ -1,23 +1,25 @@
 """The forward model, Eq. (2): the image of a volume, with PSF models of three fidelities."""
 
+import math
 import operator
-from collections.abc import Sequence
 from functools import reduce
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
-from ..base.arrays import host_code, jit
+from ..base.arrays import as_float, host_code, jit
 from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.field_varying import FieldVaryingPsf, field_varying_psf
-from ..optics.lens_types import PerTypePsf, relative_areas, split_by_type, split_groups
+from ..optics.lens_types import relative_areas, split_by_type, split_groups
 from ..optics.polar_grid import make_polar_grid
-from ..optics.psf import psf_of_depth
+from ..optics.psf import PSFS, psf_of_depth
 from .backprojection import as_volume, backproject_adjoint
 from .convolution import scan_in_groups, sum_of_convolutions, with_margin
 from .field_varying_model import full_image
@@ -26,42 +28,82 @@ FIDELITIES = ("full", "near", "pinhole")
 # Depths that share an inverse FFT, which takes the memory of as many sharp images.
 _DEPTHS = 2
 
-PsfModel = Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | PerTypePsf | None
+# Relative difference of depths, and of lengths, up to which they are the same: a search moves them.
+_SAME = 1e-3
+
+
+class PsfModel(eqx.Module):
+    """The point spread functions of a microscope for the voxels of a grid and the pixels of its sensor.
+
+    *Differentiable.*
+
+    `gs_jax.psf_model` makes it, for `forward`, `ImagingOperator` and the solvers. It is a pytree whose leaves are the
+    tables: compiled functions that take it as an argument serve other tables of the same shapes.
+
+    Parameters
+    ----------
+    parts
+        Of each group of lenses that image alike: None for pinholes, `(depth, size, size)` for the same PSF at all
+        fields, or `FieldVaryingPsf`. Those that are not field-varying have the group's light over that of the mean
+        lens.
+    lenses
+        Indices of the lenses of each group; None if all lenses are one.
+    depths
+        Of the grid's planes, mm.
+    pixel_pitch
+        Of the sensor, mm.
+    extent
+        Side of the square about the frame's origin from which the tables follow light, mm; infinite where that does
+        not matter.
+    """
+
+    parts: tuple[Float[Array, "plane tall wide"] | FieldVaryingPsf | None, ...]
+    lenses: tuple[tuple[int, ...], ...] | None = eqx.field(static=True)
+    depths: Float[Array, " depth"] = eqx.field(converter=as_float)
+    pixel_pitch: Float[Array, ""] = eqx.field(converter=as_float)
+    extent: Float[Array, ""] = eqx.field(converter=as_float)
+
+
+# What `forward` takes: a model, or tables that a function of one's own computes.
+Optics = PsfModel | Float[Array | np.ndarray, "plane tall wide"] | FieldVaryingPsf | None
 
 
 @host_code("`gs_jax.optics.psf` has PSFs that can be")
-def make_psf_model(
+def psf_model(
     imager: Imager,
-    depths: Sequence[float] | Float[Array | np.ndarray, " depth"],
+    grid: Grid,
     fidelity: str = "full",
     *,
+    psf: str = "geometric",
     progress: Progress | None = None,
 ) -> PsfModel:
-    """The PSF model of a microscope at some depths, for `forward` and the solvers.
+    """The PSF model of a microscope for a grid.
 
     *Host.*
 
     Parameters
     ----------
-    imager, depths
-        The microscope, and the depths of the object, mm.
+    imager, grid
+        The microscope, and the voxels that are imaged.
     fidelity
         `"pinhole"`: chief rays within the field radius, no PSF. `"near"`: Eq. (2), field-constant: within the field
         radius all lenses have the PSF of a point on the axis. `"full"`: field-varying: all the light of every lens, by
         exact rays.
+    psf
+        Of a lens, for `"near"`: `"diffraction"`, `"geometric"` (rays alone) or `"gaussian"`.
     progress
         Shows how many depths are done.
 
     Returns
     -------
-    None, Array, FieldVaryingPsf or PerTypePsf
-        Tables for these depths in this order; per type if there are several types of lenses, or the array is tilted so
-        far that the blur differs from lens to lens.
+    PsfModel
+        Tables for the grid's depths in their order; of each group of lenses if there are several types, or the array is
+        tilted so far that the blur differs from lens to lens.
 
     Raises
     ------
     InputError
-        If `fidelity` is none of the three, or the PSF of a depth is wider than 128 pixels ("near").
+        If `fidelity` or `psf` is none of the three, or the PSF of a depth is wider than 128 pixels ("near").
 
     Examples
     --------
@@ -69,38 +111,66 @@ def make_psf_model(
     >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
     >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
     >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
-    >>> psf = gs.make_psf_model(scope, grid.depths, "near")
-    >>> print(psf.shape[0], gs.make_psf_model(scope, grid.depths, "pinhole"))
-    3 None
+    >>> model = gs.psf_model(scope, grid, "near")
+    >>> model.parts[0].shape[0], model.depths.tolist()
+    (3, [18.0, 20.0, 22.0])
     """
     if fidelity not in FIDELITIES:
         raise InputError(f"fidelity must be one of {', '.join(FIDELITIES)}, got {short_repr(fidelity)}.")
-    if fidelity == "pinhole":
-        return None
-    depths = np.asarray(depths)
+    if psf not in PSFS:
+        raise InputError(f"psf must be one of {', '.join(PSFS)}, got {short_repr(psf)}.")
+    depths, extent = np.asarray(grid.depths), np.inf
 
     def field_constant_psf(imager):
-        kernel = psf_of_depth(imager, depths, "geometric")
+        kernel = psf_of_depth(imager, depths, psf)
         return jnp.stack([kernel(z) for z in (progress or Progress()).track(depths, "Point spread functions")])
 
-    types, lenses = split_groups(imager)
-    if len(types) == 1:
-        full = fidelity == "full"
-        return field_varying_psf(imager, depths, progress=progress) if full else field_constant_psf(imager)
-    if fidelity == "full":
-        nodes = make_polar_grid(imager, depths)
-        psfs = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in types]
+    imagers, lenses = split_groups(imager) if fidelity != "pinhole" else ([imager], ())
+    if fidelity == "pinhole":
+        parts = [None]
+    elif fidelity == "full":
+        # The sensor is as wide as most objects, whose tables then have the same nodes.
+        extent = max(2 * max(map(abs, imager.sensor.extent)), extent_of(grid))
+        nodes = make_polar_grid(imager, depths, extent=extent)
+        parts = [field_varying_psf(one, depths, polar_grid=nodes, progress=progress) for one in imagers]
     else:
-        psfs = [area * field_constant_psf(one) for one, area in zip(types, relative_areas(types).tolist(), strict=True)]
-    return PerTypePsf(lenses, tuple(psfs))
+        areas = relative_areas(imagers).tolist() if len(imagers) > 1 else [1.0]
+        parts = [area * field_constant_psf(one) for one, area in zip(imagers, areas, strict=True)]
+    groups = lenses if len(imagers) > 1 else None
+    return PsfModel(tuple(parts), groups, grid.depths, imager.sensor.pixel_pitch, extent)
 
 
-@jit
+def extent_of(grid: Grid) -> float:
+    """Side of the square about the frame's origin that holds the centres of all voxels, mm."""
+    return 2 * max(float(abs(at)) for axis in (grid.x, grid.y) for at in (axis[0], axis[-1]))
+
+
+def check_optics(optics: Optics | str, imager: Imager, grid: Grid) -> None:
+    """Raise `InputError` if a PSF model is of other depths, pixels or a smaller object than the grid and the sensor.
+
+    Numbers that JAX traces are not compared: a check within a compiled program is a call of the host, for which JAX
+    does not keep the program on disk.
+    """
+    if isinstance(optics, str | type):
+        raise InputError(f"optics must be a PSF model such as that of psf_model(), got {short_repr(optics)}.")
+    if not isinstance(optics, PsfModel) or any(isinstance(x, Tracer) for x in jax.tree.leaves((optics, grid))):
+        return
+    own, needed = np.asarray(optics.depths, float), np.asarray(grid.depths, float)
+    allowed = "optics must be of the grid's"
+    if own.shape != needed.shape or not np.allclose(own, needed, rtol=_SAME, atol=0):
+        raise InputError(f"{allowed} depths, {short_repr(needed.tolist())} mm, got {short_repr(own.tolist())} mm.")
+    pitch, pixel = float(optics.pixel_pitch), imager.sensor.pixel_pitch
+    if not math.isclose(pitch, pixel, rel_tol=_SAME):
+        raise InputError(f"optics must be of the sensor's pixels of {1000 * pixel:g} um, got {1000 * pitch:g} um.")
+    if (extent := extent_of(grid)) > float(optics.extent) * (1 + _SAME):
+        raise InputError(f"{allowed} extent, {extent:.6g} mm, got tables of {float(optics.extent):.6g} mm.")
+
+
 def forward(
     volume: Num[Array | np.ndarray, "depth y x"],
     imager: Imager,
     grid: Grid,
-    optics: PsfModel = None,
+    optics: Optics = None,
 ) -> Float[Array, "row column"]:
     """The image of a volume, summed lens by lens: Eq. (2), or with all of the light.
 
@@ -127,9 +197,9 @@ def forward(
     imager, grid
         As for `backproject`.
     optics
-        From `gs_jax.make_psf_model`. None: points, the adjoint of `backproject`. An array: PSF_o at each depth on the
+        From `gs_jax.psf_model`. None: points, the adjoint of `backproject`. An array: PSF_o at each depth on the
         sensor's pixels, from `gs_jax.optics.psf`, `(len(depths), size, size)` of odd size. `FieldVaryingPsf`: tables of
-        all light at these depths. `PerTypePsf`: either of these for each type of lens.
+        all light at these depths.
 
     Returns
     -------
@@ -141,6 +211,8 @@ def forward(
     ------
     ValueError
         If the volume is not of the grid's shape, or there is not one PSF of odd size, or table, for each depth.
+    InputError
+        If a `PsfModel` is of other depths, of other pixels, or of a smaller object.
 
     Examples
     --------
@@ -152,7 +224,7 @@ def forward(
     >>> scene = np.zeros(grid.volume_shape)
     >>> scene[1, 20, 20] = 1.0
     >>> image = gs.forward(scene, scope, grid)  # by pinholes
-    >>> sharp = gs.forward(scene, scope, grid, gs.make_psf_model(scope, grid.depths, "near"))  # Eq. (2)
+    >>> sharp = gs.forward(scene, scope, grid, gs.psf_model(scope, grid, "near"))  # Eq. (2)
     >>> image.shape, sharp.shape
     ((200, 200), (200, 200))
     >>> import jax
@@ -162,12 +234,19 @@ def forward(
     >>> print(bool(slope.array.radius_of_curvature != 0))
     True
     """
+    check_optics(optics, imager, grid)
+    return _forward(volume, imager, grid, optics)
+
+
+@jit
+def _forward(volume, imager: Imager, grid: Grid, optics: Optics) -> Float[Array, "row column"]:
     volume = as_volume(volume, imager)
     if optics is None:
         return backproject_adjoint(volume, imager, grid)
-    if isinstance(optics, PerTypePsf):
-        types = zip(split_by_type(imager, optics.lenses), optics.optics, strict=True)
-        return reduce(operator.add, [forward(volume, one, grid, psf) for one, psf in types])
+    if isinstance(optics, PsfModel):
+        imagers = [imager] if optics.lenses is None else split_by_type(imager, optics.lenses)
+        parts = zip(imagers, optics.parts, strict=True)
+        return reduce(operator.add, [_forward(volume, one, grid, part) for one, part in parts])
     if isinstance(optics, FieldVaryingPsf):
         if len(optics.kernels) != grid.depths.size:
             raise ValueError(

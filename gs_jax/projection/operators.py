@@ -10,7 +10,7 @@ from ..base.arrays import native
 from ..geometry import Imager
 from ..grid import Grid
 from .backprojection import backproject
-from .forward_model import PsfModel, forward
+from .forward_model import Optics, check_optics, forward, psf_model
 
 
 def _volume_structure(self) -> jax.ShapeDtypeStruct:
@@ -51,7 +51,8 @@ class ImagingOperator(lx.AbstractLinearOperator):
     imager, grid
         The microscope and the voxels.
     optics
-        As for `forward`. With None each lens is a pinhole, and the transpose is `backproject`. Other models are tables,
+        As for `forward`, or the `fidelity` of `psf_model`, by which it is made. With None each lens is a pinhole, and
+        the transpose is `backproject`. Other models are tables,
         which do not follow changes of the imager and pass no derivative to the shape of the lenses. Chief rays, and
         with a `FieldVaryingPsf` the clear areas, are computed from the imager at each use and differentiated.
 
@@ -68,12 +69,20 @@ class ImagingOperator(lx.AbstractLinearOperator):
 
     imager: Imager
     grid: Grid
-    optics: PsfModel = None
+    optics: Optics | str = None
     in_structure, out_structure = _volume_structure, _image_structure
     transpose, as_matrix = transpose, as_matrix
 
+    def __post_init__(self):
+        if isinstance(self.optics, str):
+            self.optics = psf_model(self.imager, self.grid, self.optics)
+
+    def __check_init__(self):
+        check_optics(self.optics, self.imager, self.grid)
+
     def mv(self, vector: Num[Array | np.ndarray, "depth y x"]) -> Float[Array, "row column"]:
         """The image of a volume."""
+        assert not isinstance(self.optics, str)
         return forward(vector, self.imager, self.grid, self.optics)
 
 

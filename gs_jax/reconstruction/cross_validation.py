@@ -13,7 +13,7 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..projection.forward_model import PsfModel, forward
+from ..projection.forward_model import Optics, forward
 from ..solvers.surface import Surface
 from ..typing import Image, Volume
 from .inverse_problem import ImageModel, InverseProblem, num_detrend_modes, prepare_data, prepare_model
@@ -61,7 +61,7 @@ def cross_validated(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     stop_at_discrepancy: bool = False,
     folds: int = 4,
     progress: Progress | None = None,

@@ -15,9 +15,9 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
 from ..optics.field_varying import FieldVaryingPsf
-from ..optics.lens_types import PerTypePsf, height_bands, split_groups, type_weights
+from ..optics.lens_types import height_bands, split_groups, type_weights
 from ..optics.psf_core import core_distortion
-from ..projection.forward_model import PsfModel, make_psf_model
+from ..projection.forward_model import Optics, PsfModel, check_optics, psf_model
 from ..projection.operators import BackprojectionOperator, ImagingOperator
 from ..solvers.base import Operator, UnmatchedAdjointOperator
 from ..typing import Image
@@ -45,21 +45,22 @@ class ImageModel(NamedTuple):
     """
 
     imager: Imager
-    optics: PsfModel
+    optics: Optics
     binning: int = 1
     is_partial: bool = False
 
 
-def prepare_model(imager: Imager, grid: Grid, optics: PsfModel | str, progress: Progress) -> ImageModel:
+def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> ImageModel:
     """Make the forward model of a microscope for a grid; `optics` as for `reconstruct`."""
     if not isinstance(optics, str):
+        check_optics(optics, imager, grid)
         return ImageModel(imager, jnp.asarray(native(optics)) if isinstance(optics, np.ndarray) else optics)
     # At least two binned pixels must remain along each side; what fills no square is left out.
     voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
     binning = max(int(voxel + _ROUNDING), 1)
     binning = max(1, min(binning + int(voxel > _FARTHEST * binning), min(imager.sensor.shape) // 2))
     imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
-    return ImageModel(imager, make_psf_model(imager, grid.depths, optics, progress=progress), binning, optics != "full")
+    return ImageModel(imager, psf_model(imager, grid, optics, progress=progress), binning, optics != "full")
 
 
 def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
@@ -125,7 +126,7 @@ class InverseProblem(eqx.Module):
 
     imager: Imager
     grid: Grid
-    optics: PsfModel
+    optics: Optics
     back_projections: tuple[LensTypeGeometry, ...] | None = None
     detrend_modes: int = eqx.field(static=True, default=0)
     kept: Float[Array | np.ndarray, "row column"] | None = None
@@ -175,10 +176,10 @@ def _cosine_modes(size, count, dtype):
     return jnp.asarray(modes / np.linalg.norm(modes, axis=0), dtype)
 
 
-def num_detrend_modes(imager: Imager, optics: PsfModel) -> int:
+def num_detrend_modes(imager: Imager, optics: Optics) -> int:
     """Number of cosine modes per axis that are smoother than a spot's stray light; 0 for optics without."""
-    if isinstance(optics, PerTypePsf):
-        optics = optics.optics[0]
+    if isinstance(optics, PsfModel):
+        optics = optics.parts[0]
     if not isinstance(optics, FieldVaryingPsf):
         return 0
     return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_HALF_WAVE * optics.stray_light.grid.pixel))

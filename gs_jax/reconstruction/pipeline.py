@@ -20,7 +20,7 @@ from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
 from ..projection.backprojection import backproject
-from ..projection.forward_model import FIDELITIES, PsfModel
+from ..projection.forward_model import FIDELITIES, Optics
 from ..solvers.base import Solver
 from ..solvers.richardson_lucy import RichardsonLucy
 from ..solvers.surface import Surface
@@ -86,7 +86,7 @@ def reconstruct(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
@@ -110,7 +110,7 @@ def reconstruct(
         `BackProjection()`, `PinholeRichardsonLucy()`, or a solver: `RichardsonLucy()`, `FISTA()`, `ADMM()`,
         `Unrolled.pretrained()`, `Surface()`.
     optics
-        As for `forward`, or a `fidelity` of `make_psf_model`. With "full" and "near", back-projection reads the bright
+        As for `forward`, or a `fidelity` of `psf_model`. With "full" and "near", back-projection reads the bright
         cores of the spots; otherwise it follows the chief rays, as the paper does.
     stop_at_discrepancy
         Stop early where the residual is no larger than the image's noise (Morozov's discrepancy principle). Not with
@@ -153,7 +153,7 @@ def reconstructor(
     grid: Grid,
     method: Method = BackProjection(),
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     stop_at_discrepancy: bool = False,
     progress: Progress | None = None,
     read: Callable[[Any, Any, float], Any] | None = None,

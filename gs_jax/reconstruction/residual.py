@@ -10,7 +10,7 @@ from ..base.arrays import check_finite, host_code
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..projection.forward_model import PsfModel, forward
+from ..projection.forward_model import Optics, forward
 from ..typing import Image
 from .inverse_problem import prepare_data, prepare_model
 
@@ -48,7 +48,7 @@ def forward_residual(
     imager: Imager,
     grid: Grid,
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     progress: Progress | None = None,
 ) -> ForwardResidual:
     """Image a volume again, and compare the image with the capture.

@@ -12,7 +12,7 @@ from ..base.errors import InputError, short_repr
 from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
-from ..projection.forward_model import PsfModel
+from ..projection.forward_model import Optics
 from ..solvers.surface import RESTARTED_STEPS, Surface, depth_of_sheets, restarted
 from ..typing import Image, Volume
 from .pipeline import check_call, reconstructor
@@ -71,7 +71,7 @@ def fit_surface(
     grid: Grid,
     method: Surface = Surface(),
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     progress: Progress | None = None,
 ) -> SurfaceFit:
     """Fit sheets to an image: a brightness and a depth for each column of the grid.
@@ -113,7 +113,7 @@ def fit_surface(
 
 
 def surface_fitter(
-    imager: Imager, grid: Grid, method: Surface, *, optics: PsfModel | str, progress: Progress, in_time: bool = False
+    imager: Imager, grid: Grid, method: Surface, *, optics: Optics | str, progress: Progress, in_time: bool = False
 ) -> Callable[[Image, Progress], SurfaceFit]:
     """Prepare `fit_surface` for many images; parameters and errors as there.
 

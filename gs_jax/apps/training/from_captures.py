@@ -22,7 +22,7 @@ from ...base.errors import InputError
 from ...base.progress import Progress
 from ...geometry import Imager
 from ...grid import Grid
-from ...projection.forward_model import PsfModel
+from ...projection.forward_model import Optics
 from ...projection.operators import ImagingOperator
 from ...reconstruction.cross_validation import kept_pixels_of_folds
 from ...reconstruction.inverse_problem import (
@@ -76,7 +76,7 @@ def fine_tune(
     grid: Grid,
     networks: Unrolled,
     *,
-    optics: PsfModel | str = "full",
+    optics: Optics | str = "full",
     steps: int = 60,
     seed: int = 0,
     on_better: Callable[[Unrolled], None] = lambda networks: None,
