@@ -77,7 +77,7 @@ def psf_model(
     psf: str = "geometric",
     progress: Progress | None = None,
 ) -> PsfModel:
-    """The PSF model of a microscope for a grid.
+    """The PSF model of a microscope for a grid, for `forward` and the solvers.
 
     *Host.*
 
