@@ -15,6 +15,8 @@ from gs_jax.codesign.study import Study, read_study
 from gs_jax.design.design import read_design, write_design
 from gs_jax.design.start import geomscope
 
+from .helpers import compilations
+
 TERMS = [
     {"name": "lateral_resolution_um", "at_most": 40.0},
     {"name": "focus_offset", "at_most": 0.5},
@@ -50,6 +52,18 @@ def test_from_table_1_to_the_targets(table1, outcome):
     imager = outcome.design.imager()
     in_focus = 1 / (1 / imager.array.focal_length - 1 / imager.sensor_distance) - imager.reduced_depth(0.0)
     assert 18 < in_focus < 23
+
+
+def test_other_numbers_find_the_programs(table1, outcome):
+    """Another design and other bounds, targets, weights and depths: no compilation."""
+    terms = [term | {"weight": 2.0} | {k: 1.1 * v for k, v in term.items() if k != "name"} for term in TERMS]
+    free = FREE | {"sensor_distance_mm": [2.5, 5.5]}
+    before = compilations()
+    found = run_study(
+        table1.replace(sensor_distance_mm=4.2),
+        study(starts=2, terms=terms, free=free, depths_mm=(18.5, 22.5), margin=0.01),
+    )
+    assert compilations() == before and all(row.met for row in found.after)
 
 
 @pytest.mark.integration

@@ -20,6 +20,8 @@ from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.solve import LBFGSB
 from gs_jax.objectives.conditions import of_lenses, per_type
 
+from .helpers import compilations
+
 DEPTHS = np.array([18.0, 20.0, 22.0])
 
 
@@ -60,6 +62,28 @@ def test_all_solvers_come_to_the_same_imager(loss, solver, bounds):
     assert (found.result == optx.RESULTS.successful) != adam and found.value < (1e-2 if adam else 1e-12)
     assert found.stats["num_steps"] == len(seen) == len(found.stats["values"]) and seen[-1][1] == float(found.value)
     np.testing.assert_array_equal(found.imager.array.centers, small().array.centers)
+
+
+@pytest.mark.parametrize("solver", [None, optx.LevenbergMarquardt(1e-10, 1e-10)], ids=["default", "least-squares"])
+def test_other_numbers_of_the_same_shapes_find_the_programs(solver):
+    """Another start, other bounds, targets and weights: a new function, traced once, and no compilation."""
+    traced = []
+
+    def search(start, target, weight, low):
+        def loss(scope):
+            traced.append(None)
+            off = jax.nn.relu(scope.magnification(jnp.asarray([20.0])) - target) + 0.3 * scope.wavelength
+            return jnp.append(weight * off, scope.sensor_distance - 5.1 * low)
+
+        scope, limits = dataclasses.replace(small(), sensor_distance=start), {"sensor_distance": (low, 9.0)}
+        return gs.optimize(loss, scope, free=gs.free("sensor_distance"), bounds=limits, solver=solver, steps=4)
+
+    search(5.0, 0.25, 10.0, 4.0)
+    before, found = compilations(), search(5.5, 0.3, 12.0, 3.0)
+    assert compilations() == before and len(traced) == 2
+    distance = float(found.imager.sensor_distance)
+    off = max(float(found.imager.magnification(20.0)) - 0.3, 0) + 0.3 * 520e-6
+    assert float(found.value) == pytest.approx(((12 * off) ** 2 + (distance - 15.3) ** 2) / 2, rel=1e-12)
 
 
 def test_bounds_are_kept_and_steps_are_counted():
@@ -148,6 +172,11 @@ UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotat
             lambda: gs.optimize(in_focus, small(), free=FREE, bounds={"sensor_distance": (6.0, 5.0)}),
             "bounds of sensor_distance must be finite, the lower one first, got 6.0 to 5.0",
         ),
+        (
+            lambda: UNCHECKED(lambda s: s.sensor_distance > 5, small(), free=FREE),
+            "loss must return one number or array of floating point, got bool",
+        ),
+        (lambda: UNCHECKED(in_focus, gs.Imager, free=FREE), "imager must be an Imager, as .*, got "),
         (
             lambda: gs.optimize(lambda s: s.wavelength, small(), free=FREE, solver=optx.LevenbergMarquardt(1e-3, 1e-3)),
             "LevenbergMarquardt needs residuals, an array, got a scalar",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
 
-from gs_jax.codesign.solve import CONVERGED, LIMIT, MET, NOT_FINITE, State, run, solver_of, stepper
+from gs_jax.codesign.solve import CONVERGED, LIMIT, MET, NOT_FINITE, State, Stepper, run, solver_of
 from gs_jax.codesign.study import StageTable
 
 KEY = jax.random.key(0)
@@ -23,7 +23,7 @@ ONE = jnp.array(1.0)
 
 
 def solved(solver, **options):
-    steps = stepper(rosenbrock, START, ONE, solver_of(StageTable(solver=solver)), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver=solver)), KEY)
     return run(steps, steps.begin(START, ONE), ONE, limit=1000, **options)
 
 
@@ -40,7 +40,7 @@ def test_rosenbrocks_valley(solver):
 def test_rosenbrocks_valley_within_bounds():
     """L-BFGS-B of SciPy comes to the same place, on a bound; the unit square, from 0 to 1."""
     start, two = INSIDE, jnp.array(2.0)
-    steps = stepper(rosenbrock, start, two, solver_of(StageTable(solver="lbfgsb")), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver="lbfgsb")), KEY)
     state, reason = run(steps, steps.begin(start, two), two, limit=200)
     cost = lambda x: (100 * (x[1] - x[0] ** 2) ** 2 + (2 - x[0]) ** 2) / 2
     expected = minimize(cost, [0.9, 0.1], method="L-BFGS-B", bounds=[(0, 1), (0, 1)], tol=1e-14).x
@@ -53,10 +53,10 @@ def test_rosenbrocks_valley_within_bounds():
 def test_going_on_from_any_step_is_the_same(solver):
     """Bit for bit: the state is all that the next step depends on, and it survives a copy through bytes."""
     start = INSIDE if solver == "lbfgsb" else START
-    steps = stepper(rosenbrock, start, ONE, solver_of(StageTable(solver=solver)), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver=solver)), KEY)
     whole, _ = run(steps, steps.begin(start, ONE), ONE, limit=9)
     part, _ = run(steps, steps.begin(start, ONE), ONE, limit=4)
-    again = stepper(rosenbrock, start, ONE, solver_of(StageTable(solver=solver)), KEY)
+    again = Stepper(rosenbrock, solver_of(StageTable(solver=solver)), KEY)
     copy = jax.tree.map(lambda x: jnp.array(np.asarray(x).copy()), part)
     rest, _ = run(again, State(*copy), ONE, limit=9)
     jax.tree.map(np.testing.assert_array_equal, whole, rest)
@@ -65,7 +65,7 @@ def test_going_on_from_any_step_is_the_same(solver):
 @pytest.mark.parametrize("solver", (*SOLVERS, "lbfgsb"))
 def test_going_on_from_the_last_step_takes_no_other(solver):
     start = INSIDE if solver == "lbfgsb" else START
-    steps = stepper(rosenbrock, start, ONE, solver_of(StageTable(solver=solver)), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver=solver)), KEY)
     whole, reason = run(steps, steps.begin(start, ONE), ONE, limit=1000)
     again, same = run(steps, whole, ONE, limit=1000)
     assert reason == same == CONVERGED
@@ -74,7 +74,7 @@ def test_going_on_from_the_last_step_takes_no_other(solver):
 
 def test_targets_are_given_later():
     """One compilation for all of them."""
-    steps = stepper(rosenbrock, START, ONE, solver_of(StageTable(solver="levenberg-marquardt")), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver="levenberg-marquardt")), KEY)
     two = jnp.array(2.0)
     state, _ = run(steps, steps.begin(START, two), two, limit=200)
     np.testing.assert_allclose([state.free["x"], state.free["y"]], [2, 4], atol=1e-5)
@@ -82,7 +82,7 @@ def test_targets_are_given_later():
 
 def test_reasons():
     assert solved("levenberg-marquardt", enough=1e-3)[1] == MET
-    steps = stepper(rosenbrock, START, ONE, solver_of(StageTable(solver="bfgs")), KEY)
+    steps = Stepper(rosenbrock, solver_of(StageTable(solver="bfgs")), KEY)
     seen = []
     state, reason = run(steps, steps.begin(START, ONE), ONE, limit=3, each=lambda s: seen.append(int(s.step)))
     assert reason == LIMIT.format(3) == "stopped at the limit of 3 steps" and seen == [1, 2, 3]
@@ -104,7 +104,7 @@ def flat_below(free, given, key):
 def test_a_cost_that_is_flat_has_converged(residual, solver):
     """Within a millionth of the least, 1/2, over twenty steps; before that no solver says so."""
     start, costs = {"x": jnp.array(1.5)}, []
-    steps = stepper(residual, start, ONE, solver_of(StageTable(solver=solver)), KEY)
+    steps = Stepper(residual, solver_of(StageTable(solver=solver)), KEY)
     note = lambda state: costs.append(float(state.cost))
     state, reason = run(steps, steps.begin(start, ONE), ONE, limit=200, each=note)
     assert reason == CONVERGED and int(state.step) == len(costs) < 100
@@ -115,7 +115,7 @@ def test_damping_falls_until_it_suits_the_curvature():
     """Gauss-Newton does not see the curvature of `1 + 0.01 x^2`; with a damping of 1 a step goes 2 % of the way."""
     bowl = lambda free, given, key: (1 + 0.01 * free["x"] ** 2)[None]
     start = {"x": jnp.array(1.0)}
-    steps = stepper(bowl, start, ONE, solver_of(StageTable(solver="levenberg-marquardt")), KEY)
+    steps = Stepper(bowl, solver_of(StageTable(solver="levenberg-marquardt")), KEY)
     state, reason = run(steps, steps.begin(start, ONE), ONE, limit=200)
     assert reason == CONVERGED and int(state.step) < 60 and abs(float(state.free["x"])) < 1e-3
 
@@ -124,7 +124,7 @@ def test_adam_draws_anew_in_each_step():
     """The mean of what is drawn, within its standard error of 0.06 after 300 steps of 0.03."""
     noisy = lambda free, given, key: (free - given - 0.3 * jax.random.normal(key))[None]
     start = jnp.array(0.0)
-    steps = stepper(noisy, start, ONE, solver_of(StageTable(solver="adam", learning_rate=0.03)), KEY)
+    steps = Stepper(noisy, solver_of(StageTable(solver="adam", learning_rate=0.03)), KEY)
     costs = []
     state, reason = run(steps, steps.begin(start, ONE), ONE, limit=300, each=lambda s: costs.append(float(s.cost)))
     np.testing.assert_allclose(state.free, 1, atol=0.2)

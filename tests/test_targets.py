@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from gs_jax.codesign.study import TermTable
-from gs_jax.codesign.targets import Row, assess, evaluate, residual, worst_entry
+from gs_jax.codesign.targets import Objective, Row, assess, evaluate, worst_entry
 from gs_jax.codesign.terms import TERMS, Term
 
 KEY = jax.random.key(0)
@@ -20,7 +20,9 @@ def entries(monkeypatch):
     monkeypatch.setitem(TERMS, "strehl", Term("its exponential", lambda x, at: jnp.log(x), log=True))
     monkeypatch.setitem(TERMS, "blur_um", Term("noise", lambda x, at, key: x + jax.random.normal(key), random=True))
     # What stands for an imager here is an array, which the checked signature would refuse.
-    return lambda table, x, margin=0.0: inspect.unwrap(residual)(table, jnp.array(2.0), x, None, KEY, margin=margin)
+    residual = inspect.unwrap(Objective.residual)
+    of_table = Objective.of_table
+    return lambda table, x, margin=0.0: residual(of_table(table), jnp.array(2.0), x, None, KEY, margin=margin)
 
 
 def table(kind, *, name="occupancy", **more):
@@ -92,5 +94,5 @@ def test_assessment(kind, met, worst):
 
 def test_random_terms_take_the_key(entries):
     name = "blur_um"
-    draw = lambda seed: inspect.unwrap(evaluate)(name, X, None, jax.random.key(seed))
+    draw = lambda seed: inspect.unwrap(evaluate)(TERMS[name], X, None, jax.random.key(seed))
     assert (draw(0) == draw(0)).all() and (draw(0) != draw(1)).all()

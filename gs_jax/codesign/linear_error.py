@@ -194,7 +194,7 @@ def lens_electrons(imager: Imager, at: Conditions) -> Float[Array, " depth"]:
     """Electrons that a lens on its axis collects from an emitter of 40 um x 40 um."""
     area = jnp.pi / 4 * clear_diameter(imager, at) ** 2
     # In a medium the lens takes a smaller solid angle.
-    return at.exposure * area * (AWAY / imager.depth_in_medium(at.depths)) ** 2
+    return at.exposure.astype(area.dtype) * area * (AWAY / imager.depth_in_medium(at.depths)) ** 2
 
 
 @by_type

@@ -26,7 +26,7 @@ from ..typing import PathLike
 from .parameters import NAMES, Values, significant, start_values
 from .search import load
 from .solve import Log
-from .stages import Problem, entries_of, make_stage, problem_of, rows_of, run_stages, warn_of_start
+from .stages import Problem, make_stage, problem_of, rows_of, run_stages, warn_of_start
 from .study import Study, TermTable
 from .targets import SIGNS, Row, assess, worst_entry
 from .terms import unit_of, with_terms
@@ -197,7 +197,6 @@ def _sign(term: TermTable) -> float:
 def searcher(sweep: Sweep):
     """From the number of a point, its limits and where to start, to the point."""
     problem, kept, moving = sweep
-    entries = entries_of(problem, [*kept, *moving])
     stages = [make_stage(problem, index) for index in range(len(problem.study.stages))]
 
     def search(job):
@@ -206,7 +205,7 @@ def searcher(sweep: Sweep):
         # A search that comes to no number spoils no other: its point is where it started.
         with contextlib.suppress(InputError):
             values = run_stages(problem, stages, terms, values, log=Log())
-        return Point(values, rows_of(terms, entries, values), tuple(limits))
+        return Point(values, rows_of(problem, terms, values), tuple(limits))
 
     return search
 

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -38,16 +39,17 @@ from .solve import (
     Log,
     Solver,
     State,
+    Stepper,
     least_change,
     read_checkpoint,
     run,
-    stepper,
     warn_if_moved,
     write_checkpoint,
 )
-from .stages import entries_of, make_stage, problem_of, rows_of, run_stages, warn_of_start
+from .stages import make_stage, problem_of, rows_of, run_stages, warn_of_start
 from .study import Study, read_study
 from .targets import Row
+from .traced import Traced
 
 # Seconds between two checkpoints.
 _EVERY = 10.0
@@ -172,14 +174,14 @@ def _run_study(
     problem, each = problem_of(design, study), _Saver(checkpoint, every, log, study, design)
     values = start_values(problem.imager, problem.at)
     warn_of_start(problem, values)
-    before = rows_of(study.terms, entries_of(problem, study.terms), values)
+    before = rows_of(problem, study.terms, values)
     # Built when they are needed, so that compilation shows in the progress.
     stages = (make_stage(problem, index) for index in range(len(study.stages)))
     how = {"log": log, "progress": progress, "each": each, "saved": saved, "workers": workers}
     values = run_stages(problem, stages, study.terms, values, **how)
     found = new_design(design, problem.imager, problem.at, values).model_copy(update={"name": study.name})
     written = problem_of(found, study.model_copy(update={"depths_mm": None}))
-    after = rows_of(study.terms, entries_of(written, study.terms), start_values(written.imager, written.at))
+    after = rows_of(written, study.terms, start_values(written.imager, written.at))
     return Outcome(design, study, found, before, after, log, time.monotonic() - began)
 
 
@@ -308,9 +310,16 @@ def optimize(
     values = free.values(imager)
     start = {name: maps[name].free(value) for name, value in values.items()}
     warn_if_moved(values, {name: maps[name].value(free) for name, free in start.items()})
-    at = lambda moved: free.replaced(imager, {name: maps[name].value(moved[name]) for name in free.names})
-    steps_of = stepper(lambda moved, given, key: loss(at(moved)), start, None, solver, jax.random.key(0))
-    losses = []
+    key = jax.random.key(0)
+
+    def at(moved):
+        return free.replaced(imager, {name: maps[name].value(moved[name]) for name in free.names})
+
+    traced = Traced.of(lambda moved, given, key: loss(at(moved)), start, None, key)
+    if len(traced.dtypes) != 1 or not jnp.issubdtype(traced.dtypes[0], jnp.floating):
+        kinds = ", ".join(str(dtype) for dtype in traced.dtypes) or "nothing"
+        raise InputError(f"optimize: loss must return one number or array of floating point, got {kinds}.")
+    steps_of, losses = Stepper(traced, solver, key), []
 
     def after(state):
         losses.append(float(state.cost))

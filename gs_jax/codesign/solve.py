@@ -14,6 +14,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ from .terms import TERMS
 Residual = Callable[[PyTree, PyTree, Key[Array, ""]], Float[Array, " entry"]]
 
 
-class LBFGSB:
+class LBFGSB(eqx.Module):
     """L-BFGS-B (Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16, 1190, 1995), which keeps bounds by itself."""
 
     def of(self, objective: Callable[..., Float[Array, ""]]) -> Any:
@@ -93,26 +94,20 @@ class State(NamedTuple):
         return State(free, solver, cost, recent, self.step + 1, done | (flat & (self.step + 1 >= _FLAT_STEPS)))
 
 
-class Stepper(NamedTuple):
-    """A solver as compiled steps. Both functions take the arguments of a run second.
-
-    `begin`: the state at free parameters. `advance`: the state one step later.
-    """
-
-    begin: Callable[[PyTree, PyTree], State]
-    advance: Callable[[State, PyTree], State]
+def _as_solver(solver: Solver) -> Solver:
+    if isinstance(solver, optax.GradientTransformation):
+        return optx.OptaxMinimiser(solver, least_change(), least_change())
+    return solver
 
 
-def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solver, key: Key[Array, ""]) -> Stepper:
-    """Compile the steps of a solver, once for all starts.
+class Stepper(eqx.Module):
+    """A solver as compiled steps, the same programs for all numbers of one structure.
 
     Parameters
     ----------
     residual
-        Residuals, whose cost is `|residual|^2 / 2`; or the cost itself, a scalar.
-    free, given
-        Examples of its arguments, for shapes. Free parameters are of order one without bounds; for `LBFGSB` they lie
-        between 0 and 1.
+        Residuals, whose cost is `|residual|^2 / 2`; or the cost itself, a scalar. A function, or a pytree whose numbers
+        are leaves. Free parameters are of order one without bounds; for `LBFGSB` they lie between 0 and 1.
     solver
         A run ends when the solver converges, or when the cost has not changed over 20 steps: by more than a millionth
         of it (1e-5 in single precision), or by more than `least_change()` with a solver of optax, whose schedule may
@@ -121,67 +116,78 @@ def stepper(residual: Residual, free: PyTree[Array], given: PyTree, solver: Solv
         From which the keys of the steps follow.
     """
 
-    def cost(free, args):
-        found = residual(free, *args)
-        return found if jnp.ndim(found) == 0 else jnp.sum(found**2) / 2
+    residual: Residual
+    solver: Any = eqx.field(converter=_as_solver)
+    key: Key[Array, ""]
 
-    if isinstance(solver, LBFGSB):
-        return _within_box(cost, key, solver)
-    steps: Any = solver
-    if isinstance(solver, optax.GradientTransformation):
-        steps = optx.OptaxMinimiser(solver, least_change(), least_change())
-    least_squares, is_optax = (
-        isinstance(steps, kind) for kind in (optx.AbstractLeastSquaresSolver, optx.OptaxMinimiser)
-    )
-    if least_squares and jnp.ndim(jax.eval_shape(residual, free, given, key)) == 0:
-        name = type(steps).__name__
-        raise InputError(f"{name} needs residuals, an array, got a scalar loss; optimistix.BFGS takes a scalar.")
-    target = (lambda free, args: residual(free, *args)) if least_squares else cost
-    args = given, key
-    function = eqx.filter_closure_convert(lambda free, args: (target(free, args), None), free, args)
-    out, _ = eqx.filter_eval_shape(function, free, args)
-    options: dict[str, Any] = {}
-    init = lambda free, args: steps.init(function, free, args, options, out, None, frozenset())
-    static = eqx.filter(init(free, args), eqx.is_array, inverse=True)
+    @eqx.filter_jit
+    def begin(self, free: PyTree[Array], given: PyTree) -> State:
+        """The state at free parameters, with the arguments of a run."""
+        args = given, self.key
+        residual, cost = self._traced(free, args)
+        if isinstance(self.solver, LBFGSB):
+            inner = self.solver.of(cost).init_state(free, _box(free), args)
+        else:
+            init, _ = self._init(residual, cost, free, args)
+            inner = eqx.filter(init(), eqx.is_array)
+        return State.at_start(free, inner, cost(free, args))
 
-    @jax.jit
-    def begin(free: PyTree, given: PyTree) -> State:
-        arrays = eqx.filter(init(free, (given, key)), eqx.is_array)
-        return State.at_start(free, arrays, cost(free, (given, key)))
-
-    @jax.jit
-    def advance(state: State, given: PyTree) -> State:
-        args = given, jax.random.fold_in(key, state.step)
+    @eqx.filter_jit
+    def advance(self, state: State, given: PyTree) -> State:
+        """The state one step later."""
+        args = given, jax.random.fold_in(self.key, state.step)
+        residual, cost = self._traced(state.free, args)
+        if isinstance(self.solver, LBFGSB):
+            return _advance_within_box(self.solver.of(cost), cost, state, args)
+        steps, is_optax = self.solver, isinstance(self.solver, optx.OptaxMinimiser)
+        init, function = self._init(residual, cost, state.free, args)
+        # What of the solver's state is no array is the same in every step.
+        static = eqx.filter(eqx.filter_eval_shape(init), lambda x: not isinstance(x, jax.ShapeDtypeStruct))
         inner = eqx.combine(state.solver, static)
         with jax.numpy_dtype_promotion("standard"):  # Optax multiplies floats with the integer that counts its steps
-            new, inner, _ = steps.step(function, state.free, args, options, inner, frozenset())
-        done, result = steps.terminate(function, new, args, options, inner, frozenset())
+            new, inner, _ = steps.step(function, state.free, args, {}, inner, frozenset())
+        done, result = steps.terminate(function, new, args, {}, inner, frozenset())
         done = (done | (result != optx.RESULTS.successful)) & (not is_optax)
         tolerance = least_change() if is_optax else _flat_change()
         return state.moved(new, eqx.filter(inner, eqx.is_array), cost(new, args), done, tolerance)
 
-    return Stepper(begin, advance)
+    def _traced(self, free, args):
+        """The residuals and their cost; what a solver does with them does not run the user's code again."""
+        residual = eqx.filter_closure_convert(lambda free, args: self.residual(free, *args), free, args)
+
+        def cost(free, args):
+            value = residual(free, args)
+            return value if jnp.ndim(value) == 0 else jnp.sum(value**2) / 2
+
+        return residual, cost
+
+    def _init(self, residual, cost, free, args):
+        """The function that makes the solver's first state, and the function that the solver takes."""
+        least_squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
+        if least_squares and jnp.ndim(eqx.filter_eval_shape(residual, free, args)) == 0:
+            name = type(self.solver).__name__
+            raise InputError(f"{name} needs residuals, an array, got a scalar loss; optimistix.BFGS takes a scalar.")
+
+        def function(free, args):
+            return (residual if least_squares else cost)(free, args), None
+
+        out, _ = eqx.filter_eval_shape(function, free, args)
+        return partial(self.solver.init, function, free, args, {}, out, None, frozenset()), function
 
 
-def _within_box(cost, key, kept: LBFGSB) -> Stepper:
-    solver, tolerance = kept.of(cost), least_change()
-    box = lambda free: (jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free))
+def _box(free):
+    return jax.tree.map(jnp.zeros_like, free), jax.tree.map(jnp.ones_like, free)
 
-    @jax.jit
-    def begin(free: PyTree, given: PyTree) -> State:
-        inner = solver.init_state(free, box(free), (given, key))
-        return State.at_start(free, inner, cost(free, (given, key)))
 
-    @jax.jit
-    def advance(state: State, given: PyTree) -> State:
-        args = given, jax.random.fold_in(key, state.step)
-        new, inner = solver.update(state.free, state.solver, box(state.free), args)
-        found = cost(new, args)
-        still = lambda old, new: jnp.max(jnp.abs(new - old) / (1 + jnp.abs(old))) < tolerance
-        same = jax.tree.leaves(jax.tree.map(still, (state.free, state.cost), (new, found)))
-        return state.moved(new, inner, found, jnp.all(jnp.stack(same)), _flat_change())
+def _advance_within_box(solver, cost, state: State, args: PyTree) -> State:
+    new, inner = solver.update(state.free, state.solver, _box(state.free), args)
+    value, tolerance = cost(new, args), least_change()
 
-    return Stepper(begin, advance)
+    def still(old, new):
+        return jnp.max(jnp.abs(new - old) / (1 + jnp.abs(old))) < tolerance
+
+    same = jax.tree.leaves(jax.tree.map(still, (state.free, state.cost), (new, value)))
+    return state.moved(new, inner, value, jnp.all(jnp.stack(same)), _flat_change())
 
 
 def run(

@@ -3,17 +3,20 @@
 `gs_jax.codesign.search` runs them once, `gs_jax.codesign.pareto` once for each combination of limits.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
+from ..base.arrays import as_float
 from ..base.errors import InputError
 from ..base.machine import Workers
 from ..base.progress import Progress
@@ -32,15 +35,16 @@ from .solve import (
     restore_state,
     run,
     solver_of,
-    stepper,
     warn_if_moved,
 )
 from .study import StageTable, Study, TermTable, labels
-from .targets import Row, assess, evaluate, residual, worst_entry
-from .terms import with_terms
+from .targets import Objective, Row, assess, evaluate, worst_entry
+from .terms import TERMS, Term, with_terms
 
 # Most lens types of the term that images scenes by each in turn.
 _SCENE_TYPES = 8
+# Steps to which the largest magnification is rounded up, per 1.
+_PER_UNIT = 8
 
 
 class Problem(NamedTuple):
@@ -51,21 +55,54 @@ class Problem(NamedTuple):
     study: Study
 
 
-class Stage(NamedTuple):
-    """A stage that is ready to run, compiled once for all starts, targets and values of fixed parameters.
+class Residuals(eqx.Module):
+    """Residuals of a study's terms, as functions of free variables; every number of the study is a leaf.
 
-    `labels`: of its terms, for the log. `free`: from parameters to the solver's variables. `values`: from these and the
-    fixed parameters to parameters. `watch`: the worst entry of each term. `enough`: a cost at which all targets hold.
+    `bounds`: the maps between free parameters and the solver's variables.
+    """
+
+    imager: Imager
+    at: Conditions
+    bounds: dict[str, Bounds | Box]
+    objectives: tuple[Objective, ...]
+    margin: Float[Array, ""] = eqx.field(converter=as_float)
+
+    @eqx.filter_jit
+    def free(self, values: Values) -> Values:
+        """The solver's variables of parameters."""
+        return {name: bound.free(values[name]) for name, bound in self.bounds.items()}
+
+    @eqx.filter_jit
+    def values(self, free: Values, values: Values) -> Values:
+        """The parameters of the solver's variables, and of the fixed ones among `values`."""
+        return values | {name: bound.value(free[name]) for name, bound in self.bounds.items()}
+
+    def __call__(self, free: Values, given: tuple[Float[Array, " term"], Values], key: Key[Array, ""]):
+        targets, values = given
+        new = candidate(self.imager, self.at, self.values(free, values))
+        pairs = zip(self.objectives, targets, strict=True)
+        return jnp.concatenate([own.residual(target, *new, key, margin=self.margin) for own, target in pairs])
+
+
+class Stage(NamedTuple):
+    """A stage that is ready to run, the same programs for all starts, targets and values of fixed parameters.
+
+    `terms`: those that it looks at. `labels`: of these, for the log. `enough`: a cost at which all targets hold.
     """
 
     number: int
     table: StageTable
+    terms: list[TermTable]
     labels: list[str]
+    residuals: Residuals
     steps: Stepper
-    free: Callable[[Values], Values]
-    values: Callable[[Values, Values], Values]
-    watch: Callable[[Values, Values], list[Array]]
     enough: float
+
+    def watch(self, free: Values, values: Values) -> list[Float[Array, ""]]:
+        """The worst entry of each term."""
+        own, terms = self.residuals, tuple(TERMS[term.name] for term in self.terms)
+        entries = _entries(own.imager, own.at, terms, own.values(free, values), self.steps.key)
+        return [worst_entry(term, x) for term, x in zip(self.terms, entries, strict=True)]
 
 
 def problem_of(design: Design, study: Study) -> Problem:
@@ -76,7 +113,10 @@ def problem_of(design: Design, study: Study) -> Problem:
     _check_free(design, study)
     circle_of_confusion = None if study.confusion_um is None else study.confusion_um / 1000
     where = {"depths_mm": study.depths_mm, "depth_count": study.depth_count, "circle_of_confusion": circle_of_confusion}
-    return Problem(*evaluated(design, **where, exposure=study.exposure, free=study.free), study)
+    imager, at = evaluated(design, **where, exposure=study.exposure, free=study.free)
+    # It decides the shapes of windows: a few sizes, so that other numbers find the programs.
+    largest = math.ceil(at.largest_magnification * _PER_UNIT) / _PER_UNIT
+    return Problem(imager, dataclasses.replace(at, largest_magnification=largest), study)
 
 
 def _check_free(design: Design, study: Study) -> None:
@@ -114,33 +154,13 @@ def _check_room(design: Design, study: Study) -> None:
 def make_stage(problem: Problem, index: int) -> Stage:
     """The solver of a stage."""
     imager, at, study = problem
-    table, bounds = study.stages[index], _bounds_of(study, index)
+    table = study.stages[index]
     terms = terms_of(table, study.terms)
-    to_free = lambda values: {name: bound.free(values[name]) for name, bound in bounds.items()}
-    to_values = lambda free, values: values | {name: bound.value(free[name]) for name, bound in bounds.items()}
-
-    def residuals(free, given, key):
-        targets, values = given
-        found = candidate(imager, at, to_values(free, values))
-        pairs = zip(terms, targets, strict=True)
-        return jnp.concatenate([residual(term, x, *found, key, margin=study.margin) for term, x in pairs])
-
-    def watch(free, values):
-        found = candidate(imager, at, to_values(free, values))
-        return [worst_entry(term, evaluate(term.name, *found, key)) for term in terms]
-
+    objectives = tuple(map(Objective.of_table, terms))
+    residuals = Residuals(imager, at, _bounds_of(study, index), objectives, study.margin)
     key = jax.random.fold_in(jax.random.key(study.seed), index)
-    values = start_values(imager, at)
-    return Stage(
-        number=index,
-        table=table,
-        labels=labels(terms, study),
-        steps=stepper(residuals, to_free(values), (targets_of(terms), values), solver_of(table), key),
-        free=to_free,
-        values=to_values,
-        watch=jax.jit(watch),
-        enough=_enough(problem, terms),
-    )
+    steps = Stepper(residuals, solver_of(table), key)
+    return Stage(index, table, terms, labels(terms, study), residuals, steps, _enough(problem, terms))
 
 
 def _bounds_of(study: Study, index: int) -> dict[str, Bounds | Box]:
@@ -170,27 +190,27 @@ def _enough(problem: Problem, terms: Sequence[TermTable]) -> float:
     """A cost at which all targets are met: one entry misses by half the margin. Zero if there is a goal."""
     if any(term.is_goal for term in terms):
         return 0.0
-    sizes = jax.eval_shape(entries_of(problem, terms), start_values(problem.imager, problem.at))
+    functions = tuple(TERMS[term.name] for term in terms)
+    imager, at = problem.imager, problem.at
+    sizes = eqx.filter_eval_shape(_entries, imager, at, functions, start_values(imager, at), jax.random.key(0))
     least = min(term.weight / math.sqrt(size.size) for term, size in zip(terms, sizes, strict=True))
     return (least * problem.study.margin / 2) ** 2 / 2
 
 
-def entries_of(problem: Problem, terms: Sequence[TermTable]) -> Callable[[Values], list[Float[Array, " entry"]]]:
-    """Compile the function from parameters to the entries of each term; random terms have one draw."""
-
-    @jax.jit
-    def entries(values: Values):
-        found = candidate(problem.imager, problem.at, values)
-        return [evaluate(term.name, *found, jax.random.key(0)) for term in terms]
-
-    return entries
+@eqx.filter_jit
+def _entries(
+    imager: Imager, at: Conditions, terms: tuple[Term, ...], values: Values, key: Key[Array, ""]
+) -> list[Float[Array, " entry"]]:
+    """Entries of terms at parameters."""
+    new = candidate(imager, at, values)
+    return [evaluate(term, *new, key) for term in terms]
 
 
-def rows_of(
-    terms: Sequence[TermTable], entries: Callable[[Values], list[Float[Array, " entry"]]], values: Values
-) -> list[Row]:
-    """Assess terms at parameters; `entries` is of `entries_of`, for terms of the same names."""
-    return [assess(term, np.asarray(x)) for term, x in zip(terms, entries(values), strict=True)]
+def rows_of(problem: Problem, terms: Sequence[TermTable], values: Values) -> list[Row]:
+    """Assess terms at parameters; random terms have one draw."""
+    functions = tuple(TERMS[term.name] for term in terms)
+    entries = _entries(problem.imager, problem.at, functions, values, jax.random.key(0))
+    return [assess(term, np.asarray(x)) for term, x in zip(terms, entries, strict=True)]
 
 
 def random_start(problem: Problem, values: Values, start: int) -> Values:
@@ -283,7 +303,7 @@ def _starts_of_worker(problem, terms, values):
 
 def _initial_state(problem, stage, terms, values, start) -> State:
     given = targets_of(terms_of(stage.table, terms)), values
-    return stage.steps.begin(stage.free(random_start(problem, values, start)), given)
+    return stage.steps.begin(stage.residuals.free(random_start(problem, values, start)), given)
 
 
 def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any]:
@@ -299,7 +319,7 @@ def _run_start(stage, terms, values, start, state, steps, each) -> dict[str, Any
     limit, given = stage.table.steps, (targets_of(wanted), values)
     state, reason = run(stage.steps, state, given, limit=limit, enough=stage.enough, each=after_step)
     worst = zip(wanted, stage.watch(state.free, values), strict=True)
-    reached = stage.values(state.free, values)
+    reached = stage.residuals.values(state.free, values)
     return {
         "stage": stage.number,
         "start": start,

@@ -33,7 +33,8 @@ from .parameters import NAMES
 from .terms import check_term
 
 Solver = Literal["levenberg-marquardt", "bfgs", "lbfgs", "lbfgsb", "adam"]
-KINDS = ("at_most", "at_least", "equal", "minimise", "maximise")
+GOALS = ("minimise", "maximise")
+KINDS = ("at_most", "at_least", "equal", *GOALS)
 
 # Lower limits of free parameters that are not lengths.
 _LOWER_LIMITS = {
@@ -84,7 +85,7 @@ class TermTable(Table):
     @property
     def is_goal(self) -> bool:
         """Whether the term is minimised or maximised."""
-        return self.kind in ("minimise", "maximise")
+        return self.kind in GOALS
 
 
 class StageTable(Table):

@@ -3,15 +3,18 @@
 import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from ..base.arrays import as_float
 from ..geometry import Imager
 from ..objectives.conditions import Conditions
-from .study import TermTable
-from .terms import TERMS
+from ..typing import Real
+from .study import GOALS, TermTable
+from .terms import TERMS, Term
 
 # Exponent of the power mean that stands for the worst entry.
 _POWER = 8
@@ -30,44 +33,54 @@ class Row(NamedTuple):
     met: bool | None
 
 
-def evaluate(name: str, imager: Imager, at: Conditions, key: Key[Array, ""]) -> Float[Array, " entry"]:
+def evaluate(term: Term, imager: Imager, at: Conditions, key: Key[Array, ""]) -> Float[Array, " entry"]:
     """Entries of a term, in its unit."""
-    entries = _entries(name, imager, at, key)
-    return jnp.exp(entries) if TERMS[name].log else entries
+    entries = _entries(term, imager, at, key)
+    return jnp.exp(entries) if term.log else entries
 
 
-def residual(
-    table: TermTable, target: Float[Array, ""], imager: Imager, at: Conditions, key: Key[Array, ""], *, margin: float
-) -> Float[Array, " entry"]:
-    """Residual of a term, relative to its target: zero where a limit holds, so that its square is smooth.
+class Objective(eqx.Module):
+    """A term as a search sees it: its kind, `at_most` and so on, and its weight, a leaf."""
 
-    `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal; times
-    the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the place of
-    `x/t - 1` in a limit. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power 1/8.
+    term: Term = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    weight: Float[Array, ""] = eqx.field(converter=as_float)
 
-    Parameters
-    ----------
-    table
-        Kind and weight.
-    target
-        In the term's unit. Unlike the table's it may be traced.
-    margin
-        Fraction by which a limit is tightened.
-    """
-    entries = _entries(table.name, imager, at, key)
-    missing = _missing(table.kind, _ratio(table, entries, target), margin)
-    return missing * (table.weight / math.sqrt(missing.size))
+    @classmethod
+    def of_table(cls, table: TermTable) -> "Objective":
+        return cls(TERMS[table.name], table.kind, table.weight)
+
+    def residual(
+        self, target: Float[Array, ""], imager: Imager, at: Conditions, key: Key[Array, ""], *, margin: Real
+    ) -> Float[Array, " entry"]:
+        """Residual of a term, relative to its target: zero where a limit holds, so that its square is smooth.
+
+        `ln(1 + relu(x/t - (1 - margin)))` for at most, `relu(1 + margin - x/t)` for at least, `x/t - 1` for equal;
+        times the weight over the root of the number of entries. For a term that is a logarithm `ln(x/t)` takes the
+        place of `x/t - 1` in a limit. For a goal it is one entry, the mean of `(x/t)^8` (or `(t/x)^8`) to the power
+        1/8.
+
+        Parameters
+        ----------
+        target
+            In the term's unit.
+        margin
+            Fraction by which a limit is tightened.
+        """
+        ratio = self._ratio(_entries(self.term, imager, at, key), target)
+        missing = _missing(self.kind, ratio, jnp.asarray(margin, ratio.dtype))
+        return missing * (self.weight.astype(ratio.dtype) / math.sqrt(missing.size))
+
+    def _ratio(self, entries: Float[Array, " entry"], target: Float[Array, ""]) -> Float[Array, " entry"]:
+        if not self.term.log:
+            return entries / target
+        logarithm = entries - jnp.log(target)
+        # A goal needs a positive ratio.
+        is_goal = self.kind in GOALS
+        return jnp.exp(jnp.clip(logarithm, -_LONGEST, _LONGEST)) if is_goal else 1 + logarithm
 
 
-def _ratio(table: TermTable, entries: Float[Array, " entry"], target: Float[Array, ""]) -> Float[Array, " entry"]:
-    if not TERMS[table.name].log:
-        return entries / target
-    logarithm = entries - jnp.log(target)
-    # A goal needs a positive ratio.
-    return jnp.exp(jnp.clip(logarithm, -_LONGEST, _LONGEST)) if table.is_goal else 1 + logarithm
-
-
-def _missing(kind: str, ratio: Float[Array, " entry"], margin: float) -> Float[Array, " _"]:
+def _missing(kind: str, ratio: Float[Array, " entry"], margin: Float[Array, ""]) -> Float[Array, " _"]:
     match kind:
         case "at_most":
             return jnp.log1p(jax.nn.relu(ratio - (1 - margin)))
@@ -91,8 +104,7 @@ def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
     return jnp.where(positive, largest * jnp.where(positive, mean, 1) ** (1 / _POWER), 0)[None]
 
 
-def _entries(name, imager, at, key):
-    term = TERMS[name]
+def _entries(term, imager, at, key):
     return jnp.ravel(term.function(imager, at, key) if term.random else term.function(imager, at))
 
 

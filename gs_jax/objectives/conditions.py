@@ -59,7 +59,7 @@ class Conditions(eqx.Module):
 
     depths: Float[Array, " depth"] = eqx.field(converter=as_float)
     circle_of_confusion: Float[Array, ""] | None = eqx.field(converter=as_float_or_none, default=None)
-    exposure: float = eqx.field(static=True, default=1e4)
+    exposure: Float[Array, ""] = eqx.field(converter=as_float, default=1e4)
     largest_magnification: float = eqx.field(static=True, default=math.inf)
     directions: int = eqx.field(static=True, default=512)
     cells: VoronoiCells | None = None
@@ -71,7 +71,7 @@ class Conditions(eqx.Module):
     def __check_init__(self):
         if self.depths.ndim != 1:
             raise ValueError(f"`depths` must be (depth,), got {self.depths.shape}.")
-        check_fields(self, depths=POSITIVE, circle_of_confusion=POSITIVE, field_radius=POSITIVE)
+        check_fields(self, depths=POSITIVE, circle_of_confusion=POSITIVE, exposure=POSITIVE, field_radius=POSITIVE)
 
     @property
     def middle(self) -> "Conditions":

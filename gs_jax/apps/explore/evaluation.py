@@ -179,7 +179,7 @@ def _evaluate(start: Start, values: dict[str, Array], terms: tuple[str, ...]):
         "clear_diameter_mm": objectives.clear_diameter(imager, at),
     }
     key = jax.random.key(0)
-    entries = {name: evaluate_term(name, imager, at, key) for name in terms}
+    entries = {name: evaluate_term(TERMS[name], imager, at, key) for name in terms}
     diameters = jnp.stack([objectives.clear_diameter(*part) for part in parts])
     return (at.depths, numbers, scalars, entries, diameters), sharpest
 
