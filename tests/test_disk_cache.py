@@ -8,6 +8,7 @@ import pytest
 
 from gs_jax.base import disk_cache
 from gs_jax.base.disk_cache import cached_on_disk
+from gs_jax.base.value_cache import cache_by_value
 
 
 class Counted:
@@ -73,3 +74,18 @@ def test_files_that_were_not_read_for_longest_are_removed(folder, monkeypatch):
     assert len(list(folder.iterdir())) == 2 and compute.calls == 3
     cached_on_disk([b"x"], compute)
     assert compute.calls == 3
+
+
+def test_results_are_kept_for_arguments_of_the_same_values():
+    calls = []
+
+    @cache_by_value(maxsize=2)
+    def twice(tree, scale=2):
+        calls.append(scale)
+        return scale * tree["a"]
+
+    first = twice({"a": np.arange(3.0)})
+    assert twice({"a": np.arange(3.0)}) is first and len(calls) == 1
+    np.testing.assert_array_equal(twice({"a": np.arange(3)}), [0, 2, 4])
+    np.testing.assert_array_equal(twice({"a": np.arange(3.0)}, scale=3), [0, 3, 6])
+    assert calls == [2, 2, 3] and twice({"a": np.arange(3.0)}) is not first

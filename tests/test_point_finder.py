@@ -25,7 +25,7 @@ from gs_jax.optics.lens_types import interleave
 from gs_jax.simulation.phantoms import random_points
 from gs_jax.simulation.synthetic import Camera, expose, simulate, simulate_points
 
-from .helpers import needs
+from .helpers import compilations, needs
 
 
 def small() -> tuple[Imager, Grid]:
@@ -55,6 +55,21 @@ def capture_of(points, *, electrons=3000, key=0) -> np.ndarray:
 def find(image, grid=None) -> np.ndarray:
     imager, default = small()
     return find_points(image, imager, default if grid is None else grid, progress=Progress())
+
+
+def test_other_numbers_find_the_programs():
+    """Another image, and another microscope and depths whose magnification is the same: no compilation."""
+    imager, grid = small()
+    points = np.array([[0.3, -0.4, 20.2, 1.0], [-0.9, 0.8, 19.6, 0.8]])
+    first = find_points(image_of(points), imager, grid)
+    other = eqx.tree_at(
+        lambda i: (i.array.centers, i.array.thin_lens_focal_length), imager, replace_fn=lambda x: 1.01 * x
+    )
+    before = compilations()
+    find_points(image_of(points)[::-1], imager, grid)
+    find_points(image_of(points), other, Grid([18.9, 20.0, 21.1], (91, 91), 0.06))
+    assert compilations() == before
+    np.testing.assert_array_equal(find_points(image_of(points), imager, grid), first)
 
 
 def many() -> np.ndarray:

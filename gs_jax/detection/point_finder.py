@@ -7,13 +7,14 @@ The paper's particle clustering (`gs_jax.detection.particles`) needs a volume al
 import math
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64
+from jaxtyping import Array, Bool, Float, Float64, Int
 from scipy.ndimage import map_coordinates
 
-from ..base.arrays import host_code
+from ..base.arrays import host_code, jit
 from ..base.errors import InputError
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
@@ -52,8 +53,9 @@ _OWN_LIGHT = 0.5
 _FALSE_ALARMS = 0.1
 # A candidate's neighbourhood is searched so often, each time half as wide: to 1/128 of a voxel, 0.3 um.
 _REFINEMENTS = 7
-# Planes that are back-projected at once.
-_PLANES = 32
+# Planes that are back-projected at once. Planes, and voxels along an axis less one, are rounded up to multiples of
+# these, so that other depths and magnifications find the program.
+_PLANES, _FEW_PLANES, _FEW_VOXELS = 32, 8, 16
 # Depths at which the light in a core is traced.
 _DEPTHS = 5
 # Depths at which cores are traced, and margin beyond the grid, relative to the depth.
@@ -154,12 +156,17 @@ def find_points(
             new = _refine(new[lit], voxels, rest, lens_types)
             points, samples, own = _accept(np.concatenate([points, new]), detection, survival, lens_types, voxels)
     points = np.column_stack([points, _intensity(points, samples, own.light, detection, lens_types)])
-    points = points[_inside(points, grid, float(voxels.depths[1] - voxels.depths[0]) / COARSE)]
+    points = points[_inside(points, grid, _step(voxels) / COARSE)]
     return points[np.argsort(-points[:, 3], kind="stable")]
 
 
+def _ends(grid: Grid) -> tuple[float, float]:
+    depths = np.asarray(grid.depths, np.float64)
+    return depths.min(), depths.max()
+
+
 def _depths_around(grid: Grid) -> Float64[np.ndarray, " depth"]:
-    near, far = float(grid.depths.min()), float(grid.depths.max())
+    near, far = _ends(grid)
     margin = max(_MARGIN * far, (far - near) / 4)
     return np.linspace(near - min(margin, near / 2), far + margin, _TRACED)
 
@@ -169,7 +176,7 @@ def _inside(points: Points, grid: Grid, step: float) -> Bool[np.ndarray, " point
     x, y, z = points[:, :3].T
     left, right, bottom, top = grid.extent
     lateral = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
-    near, far = float(grid.depths.min()), float(grid.depths.max())
+    near, far = _ends(grid)
     return lateral & (near - step / 2 <= z) & (z <= far + step / 2)
 
 
@@ -202,37 +209,61 @@ def _candidates(rest: DetectionImage, lens_types: Sequence[LensType], voxels: Gr
         bright[band] = _log_snr(rest.light[band], rest.noise[band])
 
     for_each_band(len(bright), brighten)
-    image, last = jax.device_put(bright), voxels.depths.size - 1
-    # Parts are equally long, for one compilation: each has a plane of its neighbours, and the last plane repeats.
-    parts = math.ceil((last - 1) / _PLANES)
-    inner = math.ceil((last - 1) / parts)
-    found = [np.zeros((0, 3))]
+    planes, image = np.asarray(voxels.depths, np.float64), jax.device_put(bright)
+    last = len(planes) - 1
+    # Parts are equally long: each has a plane of its neighbours, and the last plane repeats.
+    parts = math.ceil((last - 1) / (_PLANES - 2))
+    inner = _rounded_up(math.ceil((last - 1) / parts) + 2, _FEW_PLANES) - 2
+    wider = [_rounded_up(count - 1, _FEW_VOXELS) + 1 for count in voxels.shape]
+    beyond = (np.array([0, *wider]) - [0, *voxels.shape]) // 2
+    search = Grid([1.0], wider, voxels.pitch, voxels.origin)
+    imagers, found = tuple(lens_type.imager for lens_type in lens_types), [np.zeros((0, 3))]
     for first in progress.track(range(0, last - 1, inner), "Searching for points"):
-        planes = np.minimum(first + np.arange(inner + 2), last)
-        volume = _backproject_sharp(image, lens_types, voxels.at(voxels.depths[planes]))
-        is_maximum = np.asarray(_is_maximum(volume))
+        depths = planes[np.minimum(first + np.arange(inner + 2), last)]
+        distortions = tuple(lens_type.distortion_at(depths) for lens_type in lens_types)
+        sharp = tuple(lens_type.sees(depths) for lens_type in lens_types)
+        part = eqx.tree_at(lambda g: g.depths, search, depths.astype(voxels.depths.dtype))
+        is_maximum = np.asarray(_maxima(image, imagers, part, distortions, sharp, np.array(voxels.shape)))
         # Faster than `np.argwhere` in three dimensions.
         maxima = np.stack(np.unravel_index(np.flatnonzero(is_maximum), is_maximum.shape), -1) + (first + 1, 1, 1)
-        found.append(voxels.to_mm(maxima[maxima[:, 0] < last]))
+        found.append(_to_mm(voxels, (maxima - beyond)[maxima[:, 0] < last]))
     return np.concatenate(found)
 
 
-def _backproject_sharp(image, lens_types: Sequence[LensType], voxels: Grid) -> Float[Array, "depth y x"]:
-    """`backproject` by the lenses that are sharp in each plane."""
-    depths, parts = np.asarray(voxels.depths, np.float64), []
-    for lens_type in lens_types:
-        volume = backproject(image, lens_type.imager, voxels, distortion=lens_type.distortion_at(depths))
-        if len(lens_types) == 1:
-            return volume
-        parts.append(jnp.where(lens_type.sees(depths)[:, None, None], volume, 0))
-    return sum(parts[1:], parts[0])
+def _rounded_up(count: int, step: int) -> int:
+    return -(-count // step) * step
 
 
-@jax.jit
-def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
-    """Which inner voxels exceed what three lenses would read, and all 26 neighbours; the last of equal neighbours."""
+def _to_mm(voxels: Grid, index: Int[np.ndarray, "_ 3"]) -> Positions:
+    """`Grid.to_mm` by NumPy: another shape of the grid would compile other programs."""
+    origin, planes = (np.asarray(part, np.float64) for part in (voxels.origin, voxels.depths))
+    place = origin[::-1] + (index[:, 1:] - (np.array(voxels.shape) - 1) / 2) * voxels.pitch
+    return np.column_stack([place[:, ::-1], planes[index[:, 0]]])
+
+
+@jit
+def _maxima(
+    image: Float[Array, "row column"],
+    imagers: tuple[Imager, ...],
+    voxels: Grid,
+    distortions: tuple[Float[Array | np.ndarray, " depth"], ...],
+    sharp: tuple[Bool[Array | np.ndarray, " depth"], ...],
+    shape: Int[Array | np.ndarray, "2"],
+) -> Bool[Array, "_ _ _"]:
+    """Which inner voxels, of the middle ones of this shape, exceed their neighbours and what three lenses would read.
+
+    The image is back-projected by the lenses that are sharp in each plane. Of equal neighbours the last one counts.
+    """
+    volume = jnp.zeros((), image.dtype)
+    for imager, distortion, sees in zip(imagers, distortions, sharp, strict=True):
+        of_type = backproject(image, imager, voxels, distortion=distortion)
+        volume = volume + jnp.where(sees[:, None, None], of_type, 0)
     inner = volume[1:-1, 1:-1, 1:-1]
-    highest = inner > _MIN_LENSES * VIEW_SHARE * math.log(2)
+    rows, columns = (
+        jnp.abs(2 * jnp.arange(count) - (count - 1)) <= size - 3
+        for count, size in zip(inner.shape[1:], shape, strict=True)
+    )
+    highest = (inner > _MIN_LENSES * VIEW_SHARE * math.log(2)) & (rows[:, None] & columns[None])[None]
     for step in np.ndindex(3, 3, 3):
         neighbour = volume[tuple(slice(at, at + n) for at, n in zip(step, inner.shape, strict=True))]
         highest &= inner >= neighbour if step <= (1, 1, 1) else inner > neighbour
@@ -240,7 +271,12 @@ def _is_maximum(volume: Float[Array, "depth y x"]) -> Bool[Array, "_ _ _"]:
 
 
 def _voxel_size(voxels: Grid) -> tuple:
-    return voxels.pitch, voxels.pitch, float(voxels.depths[1] - voxels.depths[0])
+    return voxels.pitch, voxels.pitch, _step(voxels)
+
+
+def _step(voxels: Grid) -> float:
+    first, second = np.asarray(voxels.depths, np.float64)[:2]
+    return second - first
 
 
 def _refine(points: Positions, voxels: Grid, rest: DetectionImage, lens_types: Sequence[LensType]) -> Positions:

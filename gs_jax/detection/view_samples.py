@@ -9,12 +9,15 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Shaped
 from scipy.ndimage import label, map_coordinates
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
+from ..base.value_cache import cache_by_value
 from ..geometry import Imager
 from ..grid import Grid
 from ..optics.lens_types import core_width, height_bands, split_groups, type_weights
@@ -84,16 +87,20 @@ class LensType(NamedTuple):
         return np.interp(depth, self.depths, self.sharpness) >= _MIN_SHARPNESS
 
 
-def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> list[LensType]:
+# Exact rays take a second: captures of a microscope share them.
+@cache_by_value(maxsize=8)
+def lens_types_of(imager: Imager, depths: Float64[np.ndarray, " depth"]) -> tuple[LensType, ...]:
     """Split an imager by the types of its lenses, with the sharpness of each type by exact rays."""
     each, groups = split_groups(imager)
     distortions = [core_distortion(one, depths) for one in each]
     if imager.array.alike:
-        return [LensType(one, depths, distortion) for one, distortion in zip(each, distortions, strict=True)]
+        return tuple(LensType(one, depths, distortion) for one, distortion in zip(each, distortions, strict=True))
     bands = height_bands(imager)[[lenses[0] for lenses in groups]]
     weights = type_weights(each, depths, core_width(imager), bands)
     best = np.stack([weights[bands == band].max(0) for band in bands])
-    return [LensType(*parts) for parts in zip(each, [depths] * len(each), distortions, weights / best, strict=True)]
+    return tuple(
+        LensType(*parts) for parts in zip(each, [depths] * len(each), distortions, weights / best, strict=True)
+    )
 
 
 def sample_views(
@@ -326,14 +333,16 @@ def _rounded_up(share: float, count: Shaped[np.ndarray, " point"]) -> Shaped[np.
 
 def search_grid(imager: Imager, grid: Grid) -> Grid:
     """Coarse voxels over the sensor and the grid's depths, with a plane beyond both ends, as maxima need neighbours."""
-    near, far = float(grid.depths.min()), float(grid.depths.max())
+    depths, host = np.asarray(grid.depths, np.float64), to_numpy(imager)
+    near, far = depths.min(), depths.max()
     middle = (near + far) / 2
-    pitch = COARSE * imager.sensor.pixel_pitch / float(imager.magnification(middle))
+    pitch = COARSE * imager.sensor.pixel_pitch / float(host.magnification(middle))
     # A lens at the field radius sees a point move from plane to plane as from voxel to voxel.
-    step = pitch * float(imager.depth_in_medium(middle)) / imager.field_radius
+    step = pitch * float(host.depth_in_medium(middle)) / imager.field_radius
     planes = near + step * np.arange(-1, math.ceil((far - near) / step) + 2)
-    # `at`, as the outer planes may lie behind the array's front.
-    return Grid.over(imager.sensor, depths=[middle], pitch=pitch).at(planes)
+    voxels = Grid.over(imager.sensor, depths=[middle], pitch=pitch)
+    # The outer planes may lie behind the array's front, which a grid of one's own may not.
+    return eqx.tree_at(lambda g: g.depths, voxels, jax.device_put(planes.astype(grid.depths.dtype)))
 
 
 def num_hypotheses(voxels: Grid) -> int:
@@ -360,8 +369,7 @@ def detection_stats(
 ) -> DetectionStats:
     """Compute the statistics of points that `find_points` found, with the same arguments and errors."""
     image = image if isinstance(image, DetectionImage) else subtract_background(image)
-    ends = np.array([grid.depths.min(), grid.depths.max()], np.float64)
-    depths = np.concatenate([ends, points[:, 2]])
+    depths = np.concatenate([np.asarray(grid.depths, np.float64), points[:, 2]])
     lens_types = lens_types_of(imager, np.linspace(depths.min(), depths.max(), _DEPTHS))
     samples = sample_views_by_type(points[:, :3], image, lens_types)
     samples = samples._replace(light=separate_points(samples, image.light).light)

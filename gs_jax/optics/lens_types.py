@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Float64, Int
 
 from ..base.errors import InputWarning
+from ..base.value_cache import cache_by_value
 from ..geometry import Imager
 from ..grid import Grid
 from .apertures import clear_area
@@ -119,12 +120,15 @@ def core_width(imager: Imager) -> float:
     return (2 * HALF_SIDE + 1) * imager.sensor.pixel_pitch
 
 
+# Captures of a microscope share it.
+@cache_by_value(maxsize=8)
 def sharpness(imager: Imager, grid: Grid) -> float:
     """Fraction of a spot's light in its core, for lenses within the field radius: the least over the grid's depths.
 
     By exact rays, for the sharpest type at each depth. Below `MIN_SHARPNESS` bright places are caustics, not points.
     """
-    depths = np.unique([float(grid.depths.min()), float(grid.depths.max())])
+    depths = np.asarray(grid.depths, np.float64)
+    depths = np.unique([depths.min(), depths.max()])
     fields = np.linspace(0, imager.field_radius, FIELDS)
     each = split_groups(imager)[0]
     light = lambda one, side: ensquared_light(one, depths, fields, side) @ fields
