@@ -7,8 +7,8 @@ PARALLEL := -n auto --maxprocesses 4 --dist worksteal
 # Shapes and types are checked at each call of a function: a quarter of the time of a run, so not in the quick one.
 TYPED := --jaxtyping-packages=gs_jax,beartype.beartype
 # About a minute of what other versions of Python, JAX and the libraries may break, compiled as users compile it.
-# Libraries older or newer than the others warn of each other.
-SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -m "not slow" \
+# Libraries older or newer than the others warn of each other, and other versions of JAX compile other programs.
+SHORT := $(PARALLEL) $(TYPED) -o filterwarnings=default -o compile_budget= -m "not slow" \
 	$(addprefix tests/test_,imports.py linear_map.py cpu_kernels.py operators.py shipped_capture.py solve.py files.py \
 	mold_files.py layers.py solvers.py::test_it_finds_two_bright_voxels \
 	apertures.py::test_a_compiled_lens_does_not_bound_itself)

@@ -15,6 +15,8 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from .compilations import CompileBudget  # noqa: E402
+
 # Strict: float64 unless a test says float32, and no silent promotion or broadcasting of ranks.
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -56,3 +58,11 @@ def _no_machine_is_slow(monkeypatch):
     """What a test reads on standard error is what it asked for, not that a slow machine took ten seconds."""
     monkeypatch.setattr("gs_jax.base.progress._EVERY", math.inf)
     monkeypatch.setattr("gs_jax.base.progress._MEASURED", math.inf)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addini("compile_budget", "file with the number of programs that test modules may compile; empty: no limit")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(CompileBudget(config))

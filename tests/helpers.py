@@ -24,6 +24,8 @@ from gs_jax import (
 )
 from gs_jax.simulation.phantoms import random_points
 
+from .compilations import compilations as compilations
+
 # Cropped captures that ship with the tests.
 CAPTURES = Path(__file__).parent / "data"
 # Whole ones, and what others publish, lie beside the repository: too large, or not ours, to ship.
@@ -79,22 +81,6 @@ def aperture_edge(array, angles):
         distance = np.where(toward > 0, lines[:, None] / np.where(toward > 0, toward, 1), np.inf)
         edges.append(np.minimum(distance.min(axis=0), float(array.aperture_diameter) / 2))
     return np.stack(edges)
-
-
-# JAX keeps listeners for good: one counts for all tests of a process.
-_compilations = [0]
-
-
-def _count(event: str, duration_secs: float, **_: str | int) -> None:
-    _compilations[0] += event == "/jax/core/compile/backend_compile_duration"
-
-
-jax.monitoring.register_event_duration_secs_listener(_count)
-
-
-def compilations() -> int:
-    """Number of programs that this process has compiled, or read from the cache."""
-    return _compilations[0]
 
 
 def backproject_loop(image, imager, grid, method="linear"):
