@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backprojec
 from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
-from gs_jax.projection.rays import Envelope, RingLight, trace
+from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight, trace
 from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpolate_windows, times_table
 
 from .helpers import scene
@@ -41,66 +41,108 @@ GRIDS += [((40, 66), 0.011)]
 WEIGHTS = [Envelope(0.45), RingLight(0.0, 0.4), RingLight(0.3, 0.5)]
 
 
-def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5, seed=0):
-    rng = np.random.default_rng(seed)
+_trace = jax.jit(trace, static_argnames=("nearest", "dtype", "limit"))
+
+
+@cache
+def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5):
+    rng = np.random.default_rng(0)
     # Some at the edges, one so far away that nothing is seen through it.
     centers = np.append(rng.uniform(-0.3, 0.3, (lenses, 2)), [[0.2, 0.17], [9.0, 9.0]], axis=0)
     imager = Imager(MicrolensArray(centers), Sensor((96, 83), 0.0045), 5.8, 0.45)
-    imager, grid = jax.tree.map(lambda a: a.astype(jnp.float32), (imager, Grid([18.0, 20.0, 23.0], *grid)))
-    parameters = None
-    if isinstance(weight, RingLight):
-        parameters = jnp.asarray(rng.normal(size=(3, 7)), jnp.float32)
-    options = dict(nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
-    rays = jax.jit(partial(trace, **options))(imager, grid)
-    image = jnp.asarray(rng.random(imager.sensor.shape), jnp.float32)
-    volume = jnp.asarray(rng.random(grid.volume_shape), jnp.float32)
-    return Shapes(imager.sensor.shape, grid.volume_shape, weight), rays, image, volume
+    imager, grid = jax.tree.map(lambda a: np.asarray(a, np.float32), (imager, Grid([18.0, 20.0, 23.0], *grid)))
+    parameters = rng.normal(size=(3, 7)).astype(np.float32) if isinstance(weight, RingLight) else None
+    rays = _trace(imager, grid, nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
+    image = rng.random(imager.sensor.shape).astype(np.float32)
+    volume = rng.random(grid.volume_shape).astype(np.float32)
+    return Shapes(imager.sensor.shape, grid.volume_shape, weight), jax.tree.map(np.asarray, rays), image, volume
 
 
-def compare(*calls):
-    """Each `(function, shapes, *arrays)` by kernels, and by XLA in float64: in float32 its derivatives cancel more.
+def doubled(tree):
+    return jax.tree.map(lambda a: a.astype(np.float64) if a.dtype == np.float32 else a, tree)
 
-    In one program each: most of the time is XLA's compiler's.
+
+@cache
+def program(function, static, tree, arrays):
+    """`function(static, *arrays)` of arrays of these shapes, compiled; by kernels unless some are float64."""
+    lowered = jax.jit(function, static_argnums=0).lower(static, *tree.unflatten(arrays))
+    calls = lowered.as_text().count(f"@{dispatch.TARGET}(")
+    assert calls == (0 if any(array.dtype == jnp.float64 for array in arrays) else len(lowered.out_info))
+    return lowered.compile()
+
+
+def run(function, static, *arrays):
+    leaves, tree = jax.tree.flatten(arrays)
+    structures = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    return jax.tree.map(np.asarray, program(function, static, tree, structures)(*arrays))
+
+
+def all_three(shapes, rays, image, volume):
+    """Back-projection, its adjoint and its gradient. Most of the time is XLA's compiler's, so they are one program."""
+    volumes = image_to_volume(shapes, rays, image), image_to_volume(shapes, rays, None)
+    gradients = rays_vjp(shapes, rays, image, volume), rays_vjp(shapes, rays, None, volume)
+    return *volumes, volume_to_image(shapes, rays, volume), *gradients
+
+
+def by_xla(shapes, rays, image, volume):
+    """`all_three` without kernels, in float64: in float32 its derivatives cancel more.
+
+    Of a larger volume and larger patches, in which the voxels that are added are dark: one program for all grids.
     """
-    double = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a
-    arrays = [arrays for _, _, *arrays in calls]
-    run = jax.jit(lambda arrays: [f(shapes, *own) for (f, shapes, *_), own in zip(calls, arrays, strict=True)])
-    ours, plain = run.lower(arrays), run.lower(jax.tree.map(double, arrays))
-    assert ours.as_text().count(f"@{dispatch.TARGET}(") == len(calls)
-    assert dispatch.TARGET not in plain.as_text()
-    result, expected = ours.compile()(arrays), plain.compile()(jax.tree.map(double, arrays))
-    for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
-        assert double(a).dtype == b.dtype
+    added = [(0, 0), *((0, room - n) for n, room in zip(volume.shape[1:], (80, 140), strict=True))]
+
+    def pad(axis, size):
+        more = [(0, 0), (0, 0), (0, size - axis.pixel.shape[-1])]
+        pixel, fraction = (np.pad(a, more, mode="edge") for a in (axis.pixel, axis.fraction))
+        return axis._replace(
+            pixel=pixel, fraction=fraction, distance2=np.pad(axis.distance2, more, constant_values=OUTSIDE)
+        )
+
+    wide = rays._replace(y=pad(rays.y, 40), x=pad(rays.x, 70))
+    shapes = shapes._replace(volume=(len(volume), 80, 140))
+    results = run(all_three, shapes, *doubled((wide, image, np.pad(volume, added))))
+
+    def crop(a, like):
+        return a[tuple(map(slice, like.shape))] if np.ndim(a) == np.ndim(like) == 3 else a
+
+    volumes, gradients = [crop(a, volume) for a in results[:2]], results[3:]
+    return *volumes, results[2], *(jax.tree.map(crop, gradient, rays) for gradient in gradients)
+
+
+def same(results, expected):
+    for a, b in zip(jax.tree.leaves(results), jax.tree.leaves(expected), strict=True):
+        assert doubled(a).dtype == b.dtype and a.shape == b.shape
         # Sums of both signs: rounding is relative to the largest.
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * float(jnp.abs(b).max()))
-    return expected
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * np.abs(b).max())
+
+
+def windows_and_tables(static, places, image, values, x, y):
+    windows, table = static
+    read, added = interpolate_windows(windows, places, image), interpolate_windows.T(windows, places, values)
+    return read, added, times_table(table, (), x), times_table.T(table, (), y)
 
 
 def test_windows_and_sparse_tables_are_those_of_xla():
     rng = np.random.default_rng(0)
     windows, lenses = Windows((61, 75), 19), 29  # no multiple of sixteen, as the columns of the tables below
     # Some end beyond the image.
-    start = jnp.asarray(rng.integers(-4, 30, (lenses, 2)), jnp.int32)
-    places = start, jnp.asarray(rng.random((lenses, 2)), jnp.float32)
-    image = jnp.asarray(rng.random(windows.shape), jnp.float32)
-    values = jnp.asarray(rng.random((windows.side, windows.side, lenses)), jnp.float32)
+    start = rng.integers(-4, 30, (lenses, 2)).astype(np.int32)
+    image = rng.random(windows.shape)
+    values = rng.random((windows.side, windows.side, lenses))
     row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), rng.random(400)
     row[:60] = 7
     entries = by_row(row, column, share, 50), by_row(column, row, share, 90)
-    table = SparseTable(0, *entries)
-    x, y = (jnp.asarray(rng.random((n, 75)), jnp.float32) for n in (90, 50))
-    read, _, product, transposed = compare(
-        (interpolate_windows, windows, places, image),
-        (interpolate_windows.T, windows, places, values),
-        (times_table, table, (), x),
-        (times_table.T, table, (), y),
-    )
+    x, y = (rng.random((n, 75)) for n in (90, 50))
+    static, arrays = (windows, SparseTable(0, *entries)), ((start, rng.random((lenses, 2))), image, values, x, y)
+    single = jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == np.float64 else a, arrays)
+    same(run(windows_and_tables, static, *single), expected := run(windows_and_tables, static, *doubled(single)))
+    read, _, product, transposed = expected
     matrix = np.zeros((50, 90))
     np.add.at(matrix, (row, column), share)
-    np.testing.assert_allclose(product, matrix @ np.asarray(x), rtol=1e-5)
-    np.testing.assert_allclose(transposed, matrix.T @ np.asarray(y), rtol=1e-5)
-    dark = ((np.asarray(start) < 0) | (np.asarray(start) + 20 > np.subtract(windows.shape, 16))).any(1)
-    assert 0 < dark.sum() < lenses and not np.asarray(read)[..., dark].any() and np.asarray(read)[..., ~dark].all()
+    np.testing.assert_allclose(product, matrix @ x, rtol=1e-5)
+    np.testing.assert_allclose(transposed, matrix.T @ y, rtol=1e-5)
+    dark = ((start < 0) | (start + 20 > np.subtract(windows.shape, 16))).any(1)
+    assert 0 < dark.sum() < lenses and not read[..., dark].any() and read[..., ~dark].all()
 
 
 @pytest.mark.parametrize(
@@ -110,26 +152,24 @@ def test_windows_and_sparse_tables_are_those_of_xla():
 )
 def test_all_three_are_those_of_xla(weight, grid):
     shapes, rays, image, volume = problem(weight, grid)
-    volumes_and_image = compare(
-        (image_to_volume, shapes, rays, image),
-        (image_to_volume, shapes, rays, None),
-        (volume_to_image, shapes, rays, volume),
-        (rays_vjp, shapes, rays, image, volume),
-        (rays_vjp, shapes, rays, None, volume),
-    )[:3]
-    assert all(result.any() for result in volumes_and_image)
+    results = run(all_three, shapes, rays, image, volume)
+    same(results, by_xla(shapes, rays, image, volume))
+    back, light, forth, *_ = results
+    assert back.any() and light.any() and forth.any()
+    # They are adjoint, too.
+    np.testing.assert_allclose(np.vdot(back, volume), np.vdot(forth, image), rtol=1e-5)
 
 
 def test_the_nearest_pixel():
-    shapes, rays, image, volume = problem(WEIGHTS[0], nearest=True)
-    compare((image_to_volume, shapes, rays, image), (volume_to_image, shapes, rays, volume))
+    arguments = problem(WEIGHTS[0], nearest=True)
+    same(run(all_three, *arguments), by_xla(*arguments))
 
 
-@pytest.mark.parametrize("dtype", [jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.bool_])
 def test_pixels_of_other_types(dtype):
     shapes, rays, image, volume = problem(WEIGHTS[0])
     image = (200 * image).astype(dtype)
-    compare((image_to_volume, shapes, rays, image), (rays_vjp, shapes, rays, image, volume))
+    same(run(all_three, shapes, rays, image, volume), by_xla(shapes, rays, image.astype(np.float32), volume))
 
 
 class GuardedMemory:
@@ -237,8 +277,8 @@ def test_sizes_that_do_not_fit_are_refused():
         lambda: dispatch.rays_vjp(shapes, (rays, image), volume[:2]),
         lambda: dispatch.gather(shapes._replace(volume=(3, 5, 5)), rays, image),
         lambda: dispatch.gather(shapes, rays._replace(parameters=rays.parameters[:2]), image),
-        lambda: dispatch.times_rows(SparseTable(0, table, table), (), jnp.ones((9, 16))),
-        lambda: dispatch.read_windows(Windows((61, 75), 19), (jnp.zeros((3, 2)), jnp.zeros((2, 2))), image),
+        lambda: dispatch.times_rows(SparseTable(0, table, table), (), np.ones((9, 16))),
+        lambda: dispatch.read_windows(Windows((61, 75), 19), (np.zeros((3, 2)), np.zeros((2, 2))), image),
     ):
         with pytest.raises(ValueError, match="must fit each other"):
             call()
@@ -247,10 +287,10 @@ def test_sizes_that_do_not_fit_are_refused():
 def test_a_job_of_many_images():
     """More buffers than a job had room for: 60 images, each with its kernel."""
     rng = np.random.default_rng(0)
-    sharp = [jnp.asarray(rng.random((20, 21)), jnp.float32) for _ in range(60)]
-    kernels = jnp.asarray(rng.random((60, 3, 3)), jnp.float32)
-    found = jax.jit(sum_of_convolutions)(sharp, kernels)
-    one = [sum_of_convolutions([image], kernel[None]) for image, kernel in zip(sharp, kernels, strict=True)]
+    sharp, kernels = list(rng.random((60, 20, 21)).astype(np.float32)), rng.random((60, 3, 3)).astype(np.float32)
+    convolve = jax.jit(sum_of_convolutions)
+    found = convolve(sharp, kernels)
+    one = [convolve([image], kernel[None]) for image, kernel in zip(sharp, kernels, strict=True)]
     np.testing.assert_allclose(found, sum(one[1:], one[0]), rtol=1e-5)
 
 
@@ -273,20 +313,8 @@ def test_memory_that_is_not_there_is_an_error():
 
 def test_nothing_is_seen():
     shapes, rays, image, volume = problem(WEIGHTS[0])
-    away = rays._replace(x=rays.x._replace(distance2=jnp.full_like(rays.x.distance2, 1e8)))
-    results = (
-        image_to_volume(shapes, away, image),
-        volume_to_image(shapes, away, volume),
-        rays_vjp(shapes, away, image, volume),
-    )
-    assert not any(result.any() for result in jax.tree.leaves(results))
-
-
-def test_adjoint():
-    for weight in WEIGHTS:
-        shapes, rays, image, volume = problem(weight)
-        forth = jnp.vdot(volume_to_image(shapes, rays, volume), image)
-        np.testing.assert_allclose(jnp.vdot(image_to_volume(shapes, rays, image), volume), forth, rtol=1e-5)
+    away = rays._replace(x=rays.x._replace(distance2=np.full_like(rays.x.distance2, 1e8)))
+    assert not any(result.any() for result in jax.tree.leaves(run(all_three, shapes, away, image, volume)))
 
 
 @pytest.mark.integration
@@ -339,8 +367,8 @@ def loading():
 
 
 def test_without_numba(monkeypatch, loading):
-    shapes, rays, image, _ = problem(WEIGHTS[0])
-    expected = image_to_volume(shapes, rays, image)
+    shapes, rays, image, volume = problem(WEIGHTS[0])
+    expected = run(all_three, shapes, rays, image, volume)[0]
     linear_map._load.cache_clear()
     monkeypatch.setitem(sys.modules, "numba", None)  # an import that fails
     assert linear_map.cpu_kernel("gather") is None
@@ -370,9 +398,8 @@ def comparisons():
     """Of all four kernels."""
     test_all_three_are_those_of_xla(WEIGHTS[0], GRIDS[0])
     test_all_three_are_those_of_xla(WEIGHTS[1], GRIDS[0])
-    for dtype in (jnp.uint8, jnp.uint16, jnp.int32, jnp.bool_):
+    for dtype in (np.uint8, np.uint16, np.int32, np.bool_):
         test_pixels_of_other_types(dtype)
-    test_adjoint()
 
 
 @pytest.mark.integration
