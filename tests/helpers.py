@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from gs_jax import (
     MicrolensArray,
     Sensor,
     expose,
+    objectives,
     read_design,
     simulate,
     write_capture,
@@ -63,6 +65,12 @@ def scene(dtype=jnp.float64, *, shape=(96, 80), voxels=(21, 17), depths=(18.0, 2
     grid = Grid(depths, voxels, pitch)
     cast = lambda leaf: jnp.asarray(leaf, dtype)
     return jax.tree.map(cast, imager), jax.tree.map(cast, grid)
+
+
+@eqx.filter_jit
+def quantities(imager, depths, names: tuple[str, ...]) -> dict[str, jax.Array]:
+    """Objectives by name, as one program for imagers of one structure, whatever their numbers."""
+    return {name: getattr(objectives, name)(imager, depths) for name in names}
 
 
 def aperture_edge(array, angles):

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,18 +25,23 @@ from gs_jax.objectives.conditions import Conditions
 from gs_jax.optics.pupil import solid_angle
 from gs_jax.optics.raytrace import refract, to_numpy, trace_lenslet
 
+from .helpers import quantities
+
 DEPTHS, INDEX = np.array([20.0, 21.5, 23.0]), 1.43
 QUANTITIES = (
     "axial_resolution",
     "depth_of_field",
     "approximate_depth_of_field",
+    "clear_diameter",
     "near_limit",
     "far_limit",
     "focus_distance",
     "focus_offset",
     "lateral_resolution",
+    "lenses_per_point",
     "light",
     "occupancy",
+    "sensor_blur",
     "spot_width",
     "wavefront_error",
 )
@@ -51,32 +57,33 @@ def in_gel() -> gs.Imager:
     return with_layers(filters=gs.Layers([2.0], [1.52]), windows=windows, sample=sample)
 
 
-@pytest.mark.parametrize("name", QUANTITIES)
-def test_layers_of_air_change_nothing(name):
+def test_layers_of_air_change_nothing():
+    # As many layers as `in_gel` has.
     air = with_layers(
         filters=gs.Layers([2.0], [1.0]),
-        windows=gs.Layers([0.6], [1.0]),
+        windows=gs.Layers([0.6, 0.55], [1.0, 1.0]),
         sample=gs.Sample(1.0, 19.0, gs.Layers([0.2], [1.0])),
     )
-    quantity = getattr(objectives, name)
-    np.testing.assert_allclose(quantity(air, DEPTHS), quantity(gs.geomscope().imager(), DEPTHS), rtol=1e-12)
+    values = quantities(air, DEPTHS, QUANTITIES)
+    for name, value in quantities(gs.geomscope().imager(), DEPTHS, QUANTITIES).items():
+        np.testing.assert_allclose(values[name], value, rtol=1e-12, err_msg=name)
 
 
 def test_lengths_along_z_are_real_ones():
     """A spot moves by `M` lateral resolutions when its point moves by the axial one, by exact rays."""
     scope, step = in_gel(), 1e-4
     rays = lambda z: trace_lenslet(scope, z, np.zeros((1, 2)), (scope.field_radius, 0.0)).landing[0, 0]
-    lateral, axial = (
-        quantity(scope, DEPTHS) for quantity in (objectives.lateral_resolution, objectives.axial_resolution)
-    )
+    values = quantities(scope, DEPTHS, QUANTITIES)
     moves = np.array([float(rays(z + step) - rays(z - step)) / (2 * step) for z in DEPTHS])
-    np.testing.assert_allclose(axial * moves, lateral * scope.magnification(DEPTHS), rtol=0.03)
-    near, far = (limit(scope, DEPTHS) for limit in (objectives.near_limit, objectives.far_limit))
-    np.testing.assert_allclose(objectives.depth_of_field(scope, DEPTHS), far - near, rtol=1e-9)
+    magnification = to_numpy(scope).magnification(DEPTHS)
+    np.testing.assert_allclose(
+        values["axial_resolution"] * moves, values["lateral_resolution"] * magnification, rtol=0.03
+    )
+    near, far = (np.asarray(values[name]) for name in ("near_limit", "far_limit"))
+    np.testing.assert_allclose(values["depth_of_field"], far - near, rtol=1e-9)
     # By the rim of the lens: at the limits a sensor that is focused on the middle has the circle of confusion.
-    middle = DEPTHS[1:2]
-    focused = dataclasses.replace(scope, sensor_distance=objectives.focus_distance(scope, middle)[0])
-    blurs = [objectives.sensor_blur(focused, end) for end in (near[1:2], far[1:2])]
+    focused = dataclasses.replace(scope, sensor_distance=values["focus_distance"][1])
+    blurs = quantities(focused, np.array([near[1], far[1], 23.0]), QUANTITIES)["sensor_blur"][:2]
     np.testing.assert_allclose(blurs, 2 * scope.sensor.pixel_pitch, rtol=1e-6)
 
 
@@ -84,9 +91,9 @@ def test_a_medium_takes_light():
     """As much as exact rays near the axis say; the exposure is that of an emitter in air."""
     scope, host = in_gel(), to_numpy(in_gel())
     ray = refract(host, DEPTHS, np.full((2, 1), 1e-4), np.zeros((2, 1)))
-    diameter = float(objectives.clear_diameter(scope, DEPTHS))
-    share = solid_angle(host, ray) * np.pi * diameter**2 / 4 / (4 * np.pi)
-    each = objectives.light(scope, DEPTHS) / objectives.lenses_per_point(scope)
+    values = quantities(scope, DEPTHS, QUANTITIES)
+    share = solid_angle(host, ray) * np.pi * float(values["clear_diameter"]) ** 2 / 4 / (4 * np.pi)
+    each = values["light"] / values["lenses_per_point"]
     np.testing.assert_allclose(each, share, rtol=1e-6)
     per_solid_angle = lens_electrons(scope, Conditions(DEPTHS)) / share
     np.testing.assert_allclose(per_solid_angle, 4 * np.pi * 1e4 * 20.0**2, rtol=1e-6)
@@ -94,13 +101,14 @@ def test_a_medium_takes_light():
 
 def test_the_bound_of_points_in_a_medium():
     """Air at the same reduced depths with as much light, but for lengths along z; beside the layers' aberrations."""
-    scope = with_layers(sample=gs.Sample(INDEX, surface=17.0))
-    at = Conditions(jnp.array([20.0, 22.0]), exposure=1e4)
-    reduced = scope.reduced_depth(at.depths) - scope.array.reduced_thickness_front
-    air = Conditions(reduced, exposure=1e4 / INDEX**2)
-    places = jnp.array([[0.3, -0.2]])
-    wet, dry = crowded_bound(scope, at, places), crowded_bound(gs.geomscope().imager(), air, places)
-    np.testing.assert_allclose(wet, np.asarray(dry) * (1.0, 1.0, INDEX), rtol=0.02)
+    scope, depths = with_layers(sample=gs.Sample(INDEX, surface=17.0)), np.array([20.0, 22.0])
+    without, reduced = with_layers(sample=gs.Sample(1.0, surface=17.0)), 17.0 + (depths - 17.0) / INDEX
+    bound = eqx.filter_jit(crowded_bound)
+    wet, dry = (
+        np.asarray(bound(device, Conditions(jnp.asarray(z), exposure=exposure), np.array([[0.3, -0.2]])))
+        for device, z, exposure in ((scope, depths, 1e4), (without, reduced, 1e4 / INDEX**2))
+    )
+    np.testing.assert_allclose(wet, dry * (1.0, 1.0, INDEX), rtol=0.02)
 
 
 def test_planes_of_the_search_for_points():
