@@ -2,6 +2,7 @@ import ctypes
 import gc
 import math
 import os
+from functools import cache
 from pathlib import Path
 
 # A test computes little and compiles much. Fewer optimisations take less time, and what was compiled is
@@ -26,9 +27,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
 
-# Programs take memory, and memory maps, of which Linux gives a process 65,530: in a worker, what it may hold, and by
-# how much memory has to grow before it is worth the seconds to look for some again.
-_MOST_BYTES, _MOST_MAPS, _GROWTH = 1.1e9, 30_000, 0.3e9
+# Programs take memory, and memory maps, of which Linux gives a process 65,530. What a worker may hold is its share of
+# half of the memory, within limits; then memory has to grow by a quarter of that before programs are dropped again.
+_MOST_MAPS, _LEAST_BYTES, _MOST_BYTES = 40_000, 1.1e9, 4e9
 _held_after_the_last_time = 0
 
 
@@ -40,13 +41,20 @@ def _compiled_code_is_dropped():
     if not Path("/proc/self").exists():
         return
     many = Path("/proc/self/maps").read_bytes().count(b"\n") > _MOST_MAPS
-    if many or _resident() > max(_MOST_BYTES, _held_after_the_last_time + _GROWTH):
+    if many or _resident() > max(_share(), _held_after_the_last_time + _share() / 4):
         jax.clear_caches()
         gc.collect()
         # The C library keeps what was freed.
         if hasattr(library := ctypes.CDLL(None), "malloc_trim"):
             library.malloc_trim(0)
         _held_after_the_last_time = _resident()
+
+
+@cache
+def _share() -> float:
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGESIZE")
+    share = memory / 2 / int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return min(max(share, _LEAST_BYTES), _MOST_BYTES)
 
 
 def _resident() -> int:
