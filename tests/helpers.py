@@ -24,6 +24,7 @@ from gs_jax import (
     write_capture,
     write_design,
 )
+from gs_jax.projection.rays import trace
 from gs_jax.simulation.phantoms import random_points
 
 from .compilations import compilations as compilations
@@ -63,8 +64,12 @@ def scene(dtype=jnp.float64, *, shape=(96, 80), voxels=(21, 17), depths=(18.0, 2
     centers = rng.uniform(-0.9, 0.9, (24, 2))
     imager = Imager(MicrolensArray(centers), Sensor(shape, 0.02), 5.8, 0.45, rotation=0.02, shift=(0.013, -0.007))
     grid = Grid(depths, voxels, pitch)
-    cast = lambda leaf: jnp.asarray(leaf, dtype)
+    cast = lambda leaf: jnp.asarray(np.asarray(leaf, dtype))
     return jax.tree.map(cast, imager), jax.tree.map(cast, grid)
+
+
+# Rays in one program; eagerly they are a hundred.
+trace_rays = jax.jit(trace, static_argnames=("nearest", "dtype", "limit"))
 
 
 @eqx.filter_jit

@@ -18,11 +18,11 @@ from gs_jax.optics.field_varying import field_varying_psf
 from gs_jax.projection import tiles
 from gs_jax.projection.bilinear import image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.linear_map import compiled_for_cpu
-from gs_jax.projection.rays import Envelope, RingLight, Shapes, trace
+from gs_jax.projection.rays import Envelope, RingLight, Shapes
 from gs_jax.projection.stray_light import Windows, interpolate_windows
 
 from . import test_full
-from .helpers import scene
+from .helpers import scene, trace_rays
 from .test_matrix import cropped
 
 ENVELOPE, RING = Envelope(0.45), RingLight(0.3, 0.5)
@@ -48,7 +48,7 @@ def same(function: Callable, *arguments, tolerance=1e-12) -> Any:
     results, expected = (program.compile()(*arguments) for program in programs)
     for a, b in zip(jax.tree.leaves(results), jax.tree.leaves(expected), strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * float(jnp.abs(b).max()))
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
     return results
 
 
@@ -57,10 +57,10 @@ def problem(weight, voxels, pitch, *, pixels=(96, 83), lenses=7, nearest=False, 
     # Some at the sensor's edge, one so far off that nothing is seen through it.
     centers = np.concatenate([[[0.02, 0.01], [9.0, 9.0]], rng.uniform(-0.3, 0.3, (40, 2))])[:lenses]
     imager = Imager(MicrolensArray(centers), Sensor(pixels, 0.0045), 5.8, 0.45, tilt=tilt)
-    imager, grid = jax.tree.map(lambda a: a.astype(dtype), (imager, Grid([18.0, 23.0], voxels, pitch)))
-    parameters = jnp.asarray(rng.normal(size=(2, 7)), dtype) if isinstance(weight, RingLight) else None
-    rays = trace(imager, grid, nearest=nearest, dtype=dtype, limit=weight.limit, parameters=parameters)
-    image, volume = (jnp.asarray(rng.random(shape), dtype) for shape in (pixels, grid.volume_shape))
+    imager, grid = jax.tree.map(lambda a: np.asarray(a, dtype), (imager, Grid([18.0, 23.0], voxels, pitch)))
+    parameters = rng.normal(size=(2, 7)).astype(dtype) if isinstance(weight, RingLight) else None
+    rays = trace_rays(imager, grid, nearest=nearest, dtype=dtype, limit=weight.limit, parameters=parameters)
+    image, volume = (rng.random(shape).astype(dtype) for shape in (pixels, grid.volume_shape))
     return Shapes(pixels, grid.volume_shape, weight), rays, image, volume
 
 
@@ -108,8 +108,8 @@ def test_windows_are_added_alike():
     windows, count = Windows((61, 75), 19), 30
     rng = np.random.default_rng(0)
     # Some end beyond the image.
-    places = jnp.asarray(rng.integers(-4, 30, (count, 2)), jnp.int32), jnp.asarray(rng.random((count, 2)))
-    spots = jnp.asarray(rng.random((windows.side, windows.side, count)))
+    places = rng.integers(-4, 30, (count, 2)).astype(np.int32), rng.random((count, 2))
+    spots = rng.random((windows.side, windows.side, count))
     assert same(partial(interpolate_windows.T, windows), places, spots).any()
 
 
@@ -165,7 +165,7 @@ def exported(function: Callable, *arguments) -> tuple[int, int]:
 
 def test_projections_for_cuda_have_at_most_one_loop_with_a_traced_number_of_steps():
     imager, grid = scene(jnp.float32)
-    image, volume = (jnp.zeros(shape, jnp.float32) for shape in (imager.sensor.shape, grid.volume_shape))
+    image, volume = (np.zeros(shape, np.float32) for shape in (imager.sensor.shape, grid.volume_shape))
     # The others are over groups of depths, bands of the image and groups of lenses.
     assert exported(backproject, image, imager, grid) == (2, 1)
     assert exported(backproject_adjoint, volume, imager, grid) == (3, 1)

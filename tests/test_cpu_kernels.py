@@ -21,10 +21,10 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backprojec
 from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
-from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight, trace
+from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight
 from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpolate_windows, times_table
 
-from .helpers import scene
+from .helpers import scene, trace_rays
 
 numba = pytest.importorskip("numba")
 NumbaError = pytest.importorskip("numba.core.errors").NumbaError
@@ -41,9 +41,6 @@ GRIDS += [((40, 66), 0.011)]
 WEIGHTS = [Envelope(0.45), RingLight(0.0, 0.4), RingLight(0.3, 0.5)]
 
 
-_trace = jax.jit(trace, static_argnames=("nearest", "dtype", "limit"))
-
-
 @cache
 def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5):
     rng = np.random.default_rng(0)
@@ -52,7 +49,7 @@ def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5):
     imager = Imager(MicrolensArray(centers), Sensor((96, 83), 0.0045), 5.8, 0.45)
     imager, grid = jax.tree.map(lambda a: np.asarray(a, np.float32), (imager, Grid([18.0, 20.0, 23.0], *grid)))
     parameters = rng.normal(size=(3, 7)).astype(np.float32) if isinstance(weight, RingLight) else None
-    rays = _trace(imager, grid, nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
+    rays = trace_rays(imager, grid, nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
     image = rng.random(imager.sensor.shape).astype(np.float32)
     volume = rng.random(grid.volume_shape).astype(np.float32)
     return Shapes(imager.sensor.shape, grid.volume_shape, weight), jax.tree.map(np.asarray, rays), image, volume
