@@ -18,11 +18,11 @@ def test_chief_ray_obeys_equations_1_and_3():
     imager = Imager(MicrolensArray([[1.5, -2.0]], substrate_thickness=1.0), Sensor((64, 64), 0.0045), 5.8, 3.0)
     reduced = 20 + 1 / 1.43
     q = np.array([0.3, 0.7])
-    (((x, y),),) = imager.project(jnp.array([[*q, 20.0]]))
+    (((x, y),),) = np.asarray(jax.jit(Imager.project)(imager, np.array([[*q, 20.0]])))
     scale, magnification = (reduced + 5.8) / reduced, 5.8 / reduced
     np.testing.assert_allclose([x, y], scale * np.array([1.5, -2.0]) - magnification * q, rtol=1e-14)
-    np.testing.assert_allclose(imager.scale(jnp.array(20.0)), scale, rtol=1e-14)
-    np.testing.assert_allclose(imager.magnification(jnp.array(20.0)), magnification, rtol=1e-14)
+    np.testing.assert_allclose(imager.scale(20.0), scale, rtol=1e-14)
+    np.testing.assert_allclose(imager.magnification(20.0), magnification, rtol=1e-14)
 
 
 def test_chief_ray_follows_snells_law_through_the_plate():
@@ -32,7 +32,7 @@ def test_chief_ray_follows_snells_law_through_the_plate():
     tilt = np.linspace(0, 0.1, 200_001)
     reaches = depth * np.tan(tilt) + thickness * np.tan(np.arcsin(np.sin(tilt) / n))
     exact = -v * np.tan(np.interp(lateral, reaches, tilt))  # at the vertex the surface is flat: the air angle again
-    image = imager.project(jnp.array([[lateral, 0.0, depth]]))[0, 0, 0]
+    image = np.asarray(jax.jit(Imager.project)(imager, np.array([[lateral, 0.0, depth]])))[0, 0, 0]
     # Paraxial: the next term is (t/n - t/n^3) tan^3 / 2 of lateral, 6e-6 here.
     np.testing.assert_allclose(image, exact, rtol=1e-5)
 
@@ -45,10 +45,11 @@ def test_rotation_is_from_x_toward_y_and_before_the_shift():
 
 def test_pixels_have_whole_numbers_at_their_centres():
     sensor = Sensor((5, 4), 0.0045)
-    corner = jnp.array([-1.5 * 0.0045, -2 * 0.0045])  # x of column 0, y of row 0
+    corner = np.array([-1.5 * 0.0045, -2 * 0.0045])  # x of column 0, y of row 0
     np.testing.assert_allclose(sensor.to_pixels(corner), [0, 0], atol=1e-12)
-    points = jax.random.normal(jax.random.key(0), (7, 2))
-    np.testing.assert_allclose(sensor.to_mm(sensor.to_pixels(points)), points, rtol=1e-12)
+    points = np.random.default_rng(0).normal(size=(7, 2))
+    there_and_back = jax.jit(lambda points: sensor.to_mm(sensor.to_pixels(points)))
+    np.testing.assert_allclose(there_and_back(points), points, rtol=1e-12)
 
 
 def test_grid_is_centred():
@@ -84,9 +85,9 @@ def test_geometry_has_gradients():
 def test_gradient_is_finite_on_the_axis_and_at_coincident_lenses():
     imager = Imager(MicrolensArray([[0.0, 0.0], [0.0, 0.0]]), Sensor((64, 64), 0.0045), 5.8, 3.0)
     total = lambda i: (
-        jnp.sum(i.project(jnp.array([[0.0, 0.0, 20.0]])) ** 2) + jnp.sum(envelope(0.0, i.scale(20.0), 3.0))
+        jnp.sum(i.project(np.array([[0.0, 0.0, 20.0]])) ** 2) + jnp.sum(envelope(0.0, i.scale(20.0), 3.0))
     )
-    assert all(jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(jax.grad(total)(imager)))
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(jax.jit(jax.grad(total))(imager)))
 
 
 def test_focal_length_follows_the_radius_unless_given():
@@ -106,7 +107,7 @@ def test_a_grid_knows_where_its_voxels_are():
 
 
 def test_map_is_separable():
-    center, q = jnp.array([1.0, 2.0]), jnp.array([0.3, -0.4])
+    center, q = np.array([1.0, 2.0]), np.array([0.3, -0.4])
     np.testing.assert_array_equal(chief_ray(center, q, 0.28)[0], chief_ray(center[0], q[0], 0.28))
 
 
