@@ -16,7 +16,11 @@ from gs_jax.base.errors import InputError
 from gs_jax.interop import as_scipy
 from gs_jax.io.recordings import open_recording
 from gs_jax.optics.aberrations import wavefront_rms
-from gs_jax.simulation.synthetic import simulate_points
+from gs_jax.projection.bilinear import image_to_volume
+from gs_jax.projection.point_sources import forward_points, make_stamps
+from gs_jax.projection.rays import Envelope, Shapes
+
+from .helpers import trace_rays
 
 SCOPE = gs.Imager(gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]]), gs.Sensor((64, 64), 0.06), 5.8, 3.0)
 GRID = gs.Grid.over(SCOPE.sensor, depths=[18.0, 22.0], pitch=0.4)
@@ -139,16 +143,27 @@ def test_points_without_a_processor_among_the_devices(monkeypatch):
             raise RuntimeError("Unknown backend cpu")
         return devices()
 
-    expected = simulate_points(POINTS, SCOPE, kind="gaussian")
+    stamps = make_stamps(np.array([20.0]), np.ones((1, 15, 15)))
+    expected = forward_points(POINTS, SCOPE, stamps)
     monkeypatch.setattr(jax, "devices", without_processor)
-    np.testing.assert_array_equal(simulate_points(POINTS, SCOPE, kind="gaussian"), expected)
+    np.testing.assert_array_equal(forward_points(POINTS, SCOPE, stamps), expected)
     assert "cpu" in asked
 
 
 def test_without_compilation():
     """`JAX_DISABLE_JIT`: a primitive that calls itself would never end."""
+    rays = trace_rays(SCOPE, GRID, nearest=False, dtype=np.dtype(np.float64))
+    shapes = Shapes(SCOPE.sensor.shape, GRID.volume_shape, Envelope(SCOPE.field_radius))
+    with disable_jit():
+        volume = image_to_volume(shapes, rays, IMAGE)
+    np.testing.assert_allclose(volume, gs.backproject(IMAGE, SCOPE, GRID), rtol=1e-5, atol=1e-5 * np.max(volume))
+
+
+@pytest.mark.integration
+def test_a_call_without_compilation():
+    """All of it, one operation after the other."""
     with jax.numpy_dtype_promotion("standard"):
         expected = gs.backproject(IMAGE, SCOPE, GRID)
         with disable_jit():
-            found = gs.backproject(IMAGE, SCOPE, GRID)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.max()))
+            volume = gs.backproject(IMAGE, SCOPE, GRID)
+    np.testing.assert_allclose(volume, expected, rtol=1e-5, atol=1e-5 * float(expected.max()))
