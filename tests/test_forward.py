@@ -15,6 +15,7 @@ from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backprojec
 from gs_jax.apps.method_benchmark import peak_mib
 from gs_jax.geometry import envelope
 from gs_jax.optics.psf import gaussian_psf
+from gs_jax.optics.raytrace import to_numpy
 from gs_jax.projection.point_sources import STEPS, forward_points, make_stamps
 
 from .helpers import scene
@@ -23,7 +24,7 @@ from .helpers import scene
 def psfs(depths, size=5, dtype=jnp.float64):
     """Lopsided, one for each depth, of sum 1."""
     kernels = np.random.default_rng(1).uniform(0.1, 1, (depths, size, size))
-    return jnp.asarray(kernels / kernels.sum((1, 2), keepdims=True), dtype)
+    return (kernels / kernels.sum((1, 2), keepdims=True)).astype(dtype)
 
 
 def with_sensor(imager, shape):
@@ -31,7 +32,7 @@ def with_sensor(imager, shape):
 
 
 def volume_of(grid, dtype=jnp.float64):
-    return jax.random.uniform(jax.random.key(2), grid.volume_shape, dtype)
+    return np.random.default_rng(2).random(grid.volume_shape).astype(dtype)
 
 
 @pytest.mark.integration
@@ -103,11 +104,15 @@ def test_light_of_chief_rays_beside_the_sensor():
 def test_its_transpose_is_its_adjoint(dtype, tolerance):
     imager, grid = scene(dtype)
     volume, kernels = volume_of(grid, dtype), psfs(3, dtype=dtype)
-    image = jax.random.normal(jax.random.key(3), imager.sensor.shape, dtype)
-    apply = lambda volume: forward(volume, imager, grid, kernels)
-    (back,) = jax.linear_transpose(apply, volume)(image)
-    forth = jnp.vdot(apply(volume), image)
-    np.testing.assert_allclose(jnp.vdot(volume, back), forth, rtol=tolerance)
+    image = np.random.default_rng(3).normal(size=imager.sensor.shape).astype(dtype)
+
+    @jax.jit
+    def both(volume, image, imager, grid, kernels):
+        (back,) = jax.linear_transpose(lambda volume: forward(volume, imager, grid, kernels), volume)(image)
+        return jnp.vdot(volume, back), jnp.vdot(forward(volume, imager, grid, kernels), image)
+
+    back, forth = both(volume, image, imager, grid, kernels)
+    np.testing.assert_allclose(back, forth, rtol=tolerance)
 
 
 @pytest.mark.integration
@@ -129,34 +134,34 @@ def test_the_surface_of_a_lens_has_gradients_by_its_psf():
     """Against differences; the map of chief rays has none, so a PSF computed before gives none."""
     array = MicrolensArray([[-0.6, 0.3], [0.1, -0.5]], aperture_diameter=0.6)
     imager, grid = Imager(array, Sensor((24, 24), 0.1), 5.0, 1.2), Grid([18.0, 22.0], (3, 3), 0.6)
-    weights, volume = jax.random.normal(jax.random.key(3), (24, 24)), volume_of(grid)
+    weights, volume = np.random.default_rng(3).normal(size=(24, 24)), volume_of(grid)
     names = ("radius_of_curvature", "conic_constant", "aperture_diameter")
     surface = lambda imager: [getattr(imager.array, name) for name in names]
-    start = jnp.stack(surface(imager))
+    start = np.stack(surface(imager))
 
-    @jax.jit
     def score(of_map, of_psf):
         here, lens = (eqx.tree_at(surface, imager, list(numbers)) for numbers in (of_map, of_psf))
         psf = jax.vmap(lambda depth: gaussian_psf(lens, depth, size=7))(grid.depths)
         return jnp.vdot(weights, forward(volume, here, grid, psf) ** 2)
 
-    by_map, by_psf = jax.jit(jax.grad(score, (0, 1)))(start, start)
-    steps = 1e-4 * jnp.eye(3)
-    slopes = [(score(start + step, start + step) - score(start - step, start - step)) / 2e-4 for step in steps]
+    with_slopes = jax.jit(jax.value_and_grad(score, (0, 1)))
+    _, (by_map, by_psf) = with_slopes(start, start)
+    value = lambda numbers: float(with_slopes(numbers, numbers)[0])
+    slopes = [(value(start + step) - value(start - step)) / 2e-4 for step in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(by_psf, slopes, rtol=1e-5)
-    assert np.all(by_psf != 0) and not np.any(by_map)
+    assert np.all(np.asarray(by_psf) != 0) and not np.any(by_map)
 
 
 def test_the_energy_is_the_envelope_times_the_object():
     imager = Imager(MicrolensArray([[0.1, 0.0], [-0.3, 0.2]]), Sensor((200, 200), 0.02), 5.8, 0.45)
     grid = Grid([20.0, 24.0], (3, 3), 0.1)
     volume = volume_of(grid)
-    y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
-    expected = 0
-    for z, plane in zip(grid.depths, volume, strict=True):
-        for cx, cy in np.asarray(imager.centers):
-            light = envelope((x - cx) ** 2 + (y - cy) ** 2, imager.reduced_depth(z), imager.field_radius)
-            expected += jnp.vdot(light, plane)
+    y, x = np.meshgrid(grid.y, grid.x, indexing="ij")
+    expected, host = 0, to_numpy(imager)
+    for z, plane in zip(np.asarray(grid.depths), volume, strict=True):
+        for cx, cy in host.centers:
+            light = envelope((x - cx) ** 2 + (y - cy) ** 2, host.reduced_depth(z), imager.field_radius)
+            expected += np.vdot(light, plane)
     np.testing.assert_allclose(forward(volume, imager, grid, psfs(2)).sum(), expected, rtol=1e-12)
 
 
@@ -164,7 +169,7 @@ def test_the_energy_is_the_envelope_times_the_object():
 def test_wrong_psfs_are_refused(shape):
     imager, grid = scene()
     with pytest.raises(ValueError, match=r"`optics` must be \(3, size, size\) with an odd size"):
-        forward(volume_of(grid), imager, grid, jnp.ones(shape))
+        forward(volume_of(grid), imager, grid, np.ones(shape))
 
 
 def zones_of_lenses(grid, centers):
@@ -181,7 +186,7 @@ def equation_2(volume, imager, grid, psf, zone):
     """
     rows, columns = imager.sensor.shape
     image = np.zeros((rows, columns))
-    x, y = np.asarray(grid.x), np.asarray(grid.y)
+    x, y, imager = np.asarray(grid.x), np.asarray(grid.y), to_numpy(imager)
     raster = lambda place: np.round(np.asarray(imager.sensor.to_pixels(np.asarray(place)))).astype(int)
     for d, z in enumerate(np.asarray(grid.depths)):
         scale, magnification = float(imager.scale(z)), float(imager.magnification(z))
@@ -249,10 +254,11 @@ def test_points_are_gaussians_where_the_chief_rays_land():
     fine = np.stack([np.outer(*2 * [line(size, (size - 1) / 2, w, 0.02 / STEPS)]) for w in width])
     image = forward_points(points, imager, make_stamps(np.array([20.0, 22.0]), fine))
     expected = np.zeros((120, 100))
-    pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
+    imager = to_numpy(imager)
+    pixels = imager.sensor.to_pixels(imager.project(points[:, :3]))
     for (x, y, z, intensity), places in zip(points, pixels.swapaxes(0, 1), strict=True):
         far = (z - 20) / 2
-        for (cx, cy), (row, column) in zip(np.asarray(imager.centers), places, strict=True):
+        for (cx, cy), (row, column) in zip(imager.centers, places, strict=True):
             light = float(envelope((cx - x) ** 2 + (cy - y) ** 2, imager.reduced_depth(z), imager.field_radius))
             for w, part in zip(width, (1 - far, far), strict=True):
                 expected += intensity * light * part * np.outer(line(120, row, w), line(100, column, w))
@@ -263,14 +269,12 @@ def test_points_are_gaussians_where_the_chief_rays_land():
 
 def spots_one_by_one(points, imager, depths, fine):
     """`forward_points` as it is told, without stamps: on pixels a fifth as large, which are then summed."""
-    size = fine.shape[-1]
+    size, imager = fine.shape[-1], to_numpy(imager)
     rows, columns = (n * STEPS for n in imager.sensor.shape)
     image = np.zeros((rows + 2 * size, columns + 2 * size))
-    pixels = np.asarray(imager.sensor.to_pixels(imager.project(points[:, :3])))
-    distance2 = ((np.asarray(imager.centers)[:, None] - points[None, :, :2]) ** 2).sum(-1)
-    weights = points[:, 3] * np.asarray(
-        envelope(distance2, imager.reduced_depth(points[:, 2])[None], imager.field_radius)
-    )
+    pixels = imager.sensor.to_pixels(imager.project(points[:, :3]))
+    distance2 = ((imager.centers[:, None] - points[None, :, :2]) ** 2).sum(-1)
+    weights = points[:, 3] * envelope(distance2, imager.reduced_depth(points[:, 2])[None], imager.field_radius)
     planes = np.interp(points[:, 2], depths, np.arange(len(depths)))
     for lens, number in zip(*np.nonzero(weights), strict=True):
         near = min(int(planes[number]), len(depths) - 2)
@@ -289,7 +293,7 @@ def test_many_points_are_spots_one_by_one(dtype):
     rng = np.random.default_rng(5)
     imager, _ = scene(dtype, shape=(530, 40))
     points = rng.uniform([-1, -1.5, 17, 0.5], [1, 1.5, 24, 2.0], (2500, 4))
-    points[0, :2] = imager.centers[0]
+    points[0, :2] = to_numpy(imager).centers[0]
     depths, fine = np.array([18.0, 19.0, 22.0]), np.zeros((3, 5 * STEPS, 5 * STEPS))
     fine[:, 2:-2, 2:-2] = rng.uniform(0, 1, (3, 21, 21))  # a margin for what moves
     image = forward_points(points.astype(dtype), imager, make_stamps(depths, fine.astype(dtype)))
