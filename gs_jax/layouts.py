@@ -11,6 +11,7 @@ from itertools import product
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, KDTree, Voronoi
@@ -205,8 +206,8 @@ class Edges(NamedTuple):
 
 def on_sensor(imager: Imager, points: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 2"]:
     """Points of the array's plane in the sensor's frame: turned, shifted and tilted as the lens centres are, mm."""
-    points = np.asarray(points, imager.array.centers.dtype)
-    return np.asarray(eqx.tree_at(lambda i: i.array.centers, imager, points).centers, float)
+    host = jax.tree.map(np.asarray, imager)
+    return np.asarray(eqx.tree_at(lambda i: i.array.centers, host, points).centers, float)
 
 
 def plate_corners(imager: Imager) -> Float[np.ndarray, "4 2"]:

@@ -84,9 +84,7 @@ def test_geometry_has_gradients():
 
 def test_gradient_is_finite_on_the_axis_and_at_coincident_lenses():
     imager = Imager(MicrolensArray([[0.0, 0.0], [0.0, 0.0]]), Sensor((64, 64), 0.0045), 5.8, 3.0)
-    total = lambda i: (
-        jnp.sum(i.project(np.array([[0.0, 0.0, 20.0]])) ** 2) + jnp.sum(envelope(0.0, i.scale(20.0), 3.0))
-    )
+    total = lambda i: jnp.sum(i.project(np.array([[0.0, 0.0, 20.0]])) ** 2) + jnp.sum(envelope(0.0, i.scale(20.0), 3.0))
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(jax.jit(jax.grad(total))(imager)))
 
 

@@ -95,7 +95,7 @@ def test_a_medium_takes_light():
     share = solid_angle(host, ray) * np.pi * float(values["clear_diameter"]) ** 2 / 4 / (4 * np.pi)
     each = values["light"] / values["lenses_per_point"]
     np.testing.assert_allclose(each, share, rtol=1e-6)
-    per_solid_angle = lens_electrons(scope, Conditions(DEPTHS)) / share
+    per_solid_angle = eqx.filter_jit(lens_electrons)(scope, Conditions(DEPTHS)) / share
     np.testing.assert_allclose(per_solid_angle, 4 * np.pi * 1e4 * 20.0**2, rtol=1e-6)
 
 
@@ -116,9 +116,9 @@ def test_planes_of_the_search_for_points():
     scope = in_gel()
     planes = np.asarray(search_grid(scope, gs.Grid([20.0, 23.0], (9, 9), 0.1)).depths)
     middle = len(planes) // 2
-    x = float(scope.centers[0, 0]) + scope.field_radius
-    points = np.array([[x, float(scope.centers[0, 1]), z] for z in planes[middle : middle + 2]])
-    moved = np.diff(np.asarray(scope.project(points))[0, :, 0])
+    x, y = to_numpy(scope).centers[0] + (scope.field_radius, 0.0)
+    points = np.array([[x, y, z] for z in planes[middle : middle + 2]])
+    moved = np.diff(to_numpy(scope).project(points)[0, :, 0])
     np.testing.assert_allclose(abs(moved), COARSE * scope.sensor.pixel_pitch, rtol=0.03)
 
 

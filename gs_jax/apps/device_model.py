@@ -239,7 +239,7 @@ def depth_arguments(
     if sources is None:
         middle = (near + far) / 2
         sources = np.array([[0, 0, near], [0, 0, middle], [imager.field_radius, 0, middle], [0, 0, far]])
-    centers = np.asarray(imager.centers, np.float64)
+    centers = to_numpy(imager).centers
     x, y = np.abs(centers - centers.mean(0)).max(0) / 2
     places = centers.mean(0) + np.array([[0, 0], [-x, -y], [x, -y], [-x, y], [x, y]])
     points = np.array([[*place, depth] for depth in depths for place in places])

@@ -144,7 +144,7 @@ def _pose_by_known(spots: SpotLists, sources: Sources, imager: Imager) -> Imager
     """
     known = np.flatnonzero(~np.isnan(sources.points).any(1) & sources.sharp)
     best: tuple[int, float, tuple[float, float]] = 0, 1.0, (0.0, 0.0)
-    centers, radius = np.asarray(imager.centers, np.float64), match_radius(imager.array.centers)
+    centers, radius = to_numpy(imager).centers, match_radius(imager.array.centers)
     for source in known:
         found, point = spots[int(sources.captures[source])], sources.points[source]
         for step in np.linspace(1 - _DISTANCE_ERROR, 1 + _DISTANCE_ERROR, _STEPS):
@@ -182,7 +182,7 @@ def _locate(spots, depth: float, imager: Imager, radius: float) -> tuple[float, 
         magnification = max(abs(match.factor) - 1, 1e-3)
         depth = max(float(imager.depth_of(imager.reduced_sensor_distance / magnification)), 1e-3)
     magnification = float(imager.magnification(depth))
-    pattern = (1 + magnification) * np.asarray(imager.centers, np.float64)
+    pattern = (1 + magnification) * to_numpy(imager).centers
     shift, _ = match_shift(spots, pattern, radius)
     x, y = -shift / magnification
     return float(x), float(y), depth
@@ -252,7 +252,7 @@ def search_rotation(spots: Float64[np.ndarray, "spot 2"], imager: Imager, depths
 
 def _concentration(spots, imager: Imager, magnification: float, within: float) -> float:
     """How clearly rays meet in a plane: the sum of cubes of the number of rays near each."""
-    centers = np.asarray(imager.centers, np.float64)
+    centers = to_numpy(imager).centers
     points = ((1 + magnification) * centers - spots[:, None]) / magnification
     points = points[np.linalg.norm(points - centers, axis=-1) < imager.field_radius]
     if not len(points):

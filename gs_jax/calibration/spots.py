@@ -184,7 +184,7 @@ def assign_spots(spots: SpotLists, sources: Sources, imager: Imager, offsets: Co
 
     Blurred spots may be `blurred_radius` away. A source with an unknown coordinate has no spots. Lengths are in mm.
     """
-    centers = np.asarray(imager.centers, np.float64)
+    centers = to_numpy(imager).centers
     sharp = sources.sharp
     predicted = np.asarray(predict_spots(imager, np.nan_to_num(sources.points, nan=1.0), offsets, sharp), np.float64)
     beside = np.linalg.norm(centers[None] - sources.points[:, None, :2], axis=-1)

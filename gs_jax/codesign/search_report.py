@@ -18,6 +18,7 @@ from ..io.files import check_output, side_file, write_figure, write_json
 from ..io.provenance import Provenance
 from ..layouts import plate_corners
 from ..lenses import lenses_by_type
+from ..optics.raytrace import to_numpy
 from ..pictures import PALETTE
 from ..typing import PathLike
 from .parameters import significant
@@ -139,7 +140,7 @@ def picture(outcome: Outcome) -> Figure:
 def _draw_layout(axes: Axes, design: Design) -> None:
     """Lenses on the plate, each with its disc in the colour of its type, and the sensor, in the sensor's frame."""
     imager, diameters = design.imager(), of_each(design, "aperture_diameter_mm")
-    discs = [Circle(center, d / 2) for center, d in zip(np.asarray(imager.centers), diameters, strict=True)]
+    discs = [Circle(center, d / 2) for center, d in zip(to_numpy(imager).centers, diameters, strict=True)]
     for colour, which in zip(PALETTE, lenses_by_type(imager.array), strict=False):
         some = [discs[lens] for lens in which]
         axes.add_collection(PatchCollection(some, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.5))

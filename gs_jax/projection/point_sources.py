@@ -116,7 +116,7 @@ def forward_points(
     rows, columns = _tiles(imager.sensor.shape, size)
     side = _TILE + size - 1
     tiles = jnp.zeros((rows * columns, side, side), kernels.dtype, device=kernels.device)
-    lenses, weight = KDTree(np.asarray(imager.centers)), _weight(imager, stamps)
+    lenses, weight = KDTree(to_numpy(imager).centers), _weight(imager, stamps)
     starts = range(0, len(points), _POINTS)
     for start in (progress or Progress()).track(starts, "Imaging points"):
         batch = points[start : start + _POINTS]

@@ -23,6 +23,7 @@ from ...layouts import cell_edges, on_sensor, plate_corners
 from ...mold.lenslets import lenslet_height, lenslets_of, surface_height
 from ...optics import theory
 from ...optics.psf import least_samples, spot_image
+from ...optics.raytrace import to_numpy
 from ...pictures import round_length
 
 # Left, right, top and bottom of a chart's axes in its 440 x 290 pixels, and line styles to tell lines without colours.
@@ -108,7 +109,7 @@ def draw_section(design: Design) -> str:
 
     Chief rays start at a point on the axis in the middle of the working distance.
     """
-    imager, plano = design.imager(), design.lens.orientation == "plano"
+    imager, plano = to_numpy(design.imager()), design.lens.orientation == "plano"
     near, far = design.imaging.working_distance_mm
     width, thickness = design.array.size_mm[0], design.array.substrate_thickness_mm
     end = thickness + design.imaging.sensor_distance_mm
@@ -194,8 +195,7 @@ def _chief_rays(imager: Imager, depth: float, vertex: float, end: float) -> str:
         float(x)
         for x in (imager.array.reduced_thickness_front, imager.reduced_sensor_distance, imager.reduced_depth(depth))
     )
-    centers = np.asarray(imager.centers, float)
-    landing = np.asarray(imager.project(np.array([[0.0, 0.0, depth]])), float)[:, 0]
+    centers, landing = imager.centers, imager.project(np.array([[0.0, 0.0, depth]]))[:, 0]
     pitch = np.sqrt(np.prod(imager.array.plate) / len(centers))
     near = (np.hypot(*centers.T) <= imager.field_radius) & (np.abs(centers[:, 1]) <= _SECTION_WIDTH * pitch)
 
@@ -233,15 +233,14 @@ def count_lenses(imager: Imager, depth: float) -> LensCounts:
     y = box[1] + (np.arange(rows) + 0.5) * (box[3] - box[1]) / rows
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     count = np.empty(len(points), int)
+    host = to_numpy(imager)
     for start in range(0, len(points), _BATCH):
-        # The last batch is padded, so that one size is compiled.
-        batch = points[np.minimum(np.arange(start, start + _BATCH), len(points) - 1)]
-        views = imager.views_of_all(np.column_stack([batch, np.full(len(batch), depth)]))
-        landing, offset = np.asarray(views.spot, float), np.asarray(views.offset, float)
-        seen = (landing[..., 0] >= x_left) & (landing[..., 0] <= x_right)
-        seen &= (landing[..., 1] >= y_top) & (landing[..., 1] <= y_bottom)
-        seen &= (offset**2).sum(-1) <= imager.field_radius**2
-        count[start : start + _BATCH] = seen.sum(0)[: len(points) - start]
+        batch = points[start : start + _BATCH]
+        views = host.views_of_all(np.column_stack([batch, np.full(len(batch), depth)]))
+        seen = (views.spot[..., 0] >= x_left) & (views.spot[..., 0] <= x_right)
+        seen &= (views.spot[..., 1] >= y_top) & (views.spot[..., 1] <= y_bottom)
+        seen &= (views.offset**2).sum(-1) <= imager.field_radius**2
+        count[start : start + _BATCH] = seen.sum(0)
     over_plate = MatplotlibPath(plate_corners(imager)).contains_points(points)
     return LensCounts(count.reshape(rows, columns), box, float(count[over_plate].mean()))
 
