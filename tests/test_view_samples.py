@@ -30,6 +30,7 @@ from gs_jax.detection.view_samples import (
     view_quantile,
 )
 from gs_jax.optics.lens_types import MIN_SHARPNESS, sharpness
+from gs_jax.optics.raytrace import to_numpy
 
 from .helpers import scene
 from .test_point_finder import capture_of, find, many, small
@@ -124,10 +125,11 @@ def test_samples_are_those_of_all_lenses_in_reach(dtype, tolerance, orientation,
     imager = dataclasses.replace(imager, array=array, tilt=None if tilt is None else jnp.asarray(tilt, dtype))
     image = subtract_background(np.random.default_rng(0).random(imager.sensor.shape))
     points = np.array([[0.1, -0.2, 20.0], [-0.6, 0.5, 18.0], [30.0, 0.0, 20.0]])
-    samples, views = sample_views(points, image, imager), imager.views_of_all(jnp.asarray(points, dtype))
+    samples, host = sample_views(points, image, imager), to_numpy(imager)
+    views = host.views_of_all(points)
     for number, seen in enumerate(samples.seen):
         distance = np.linalg.norm(views.offset[:, number], axis=-1)
-        pixels = np.asarray(imager.sensor.to_pixels(views.spot[:, number]))
+        pixels = host.sensor.to_pixels(views.spot[:, number])
         on_sensor = ((pixels >= 0) & (pixels <= np.array(imager.sensor.shape) - 1)).all(1)
         lenses = np.flatnonzero((distance < imager.field_radius) & on_sensor)
         lenses = lenses[np.argsort(distance[lenses])]
