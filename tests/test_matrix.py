@@ -141,7 +141,7 @@ def mirrored() -> Design:
 
 
 DEVICES: dict[str, Callable[[], Design]] = {
-    **{name: lambda name=name: cropped(name, lenses=18 if "endoscope" in name else LENSES) for name in SHIPPED},
+    **{name: partial(cropped, name, lenses=18 if "endoscope" in name else LENSES) for name in SHIPPED},
     "out of focus": lambda: cropped("geomscope-table1"),
     "steep": lambda: cropped("geomscope-targets"),
     "curved side": turned_round,
@@ -180,8 +180,11 @@ class Case:
         near, far = self.design.imaging.working_distance_mm
         middle = 20.0 if far > 10 else (near + far) / 2
         self.depths = [0.9 * middle, middle, 1.1 * middle]
-        self.sheet = datasheet(self.design, self.depths)
         self.grid = voxel_grid(self.imager, self.depths, pixels=PIXELS_PER_VOXEL)
+
+    @cached_property
+    def sheet(self) -> dict[str, Any]:
+        return datasheet(self.design, self.depths)
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -306,9 +309,18 @@ def metrics(case: Case, _) -> None:
     for name in ("lateral_resolution_um", "axial_resolution_um", "occupancy", "lenses_per_point"):
         assert np.all(np.asarray(case.sheet[name]) > 0), name
     # The sheet's widths have five digits.
-    light = 100 * np.asarray(gs.objectives.light(case.imager, np.array(case.depths)))
-    found = jax.jit(gs.objectives.width_per_light)(case.imager, np.array(case.depths))
-    np.testing.assert_allclose(1000 * np.asarray(found), case.sheet["spot_width_um"] / light**0.25, rtol=1e-4)
+    light, found = map(np.asarray, light_and_width(case.imager, np.array(case.depths)))
+    np.testing.assert_allclose(1000 * found, case.sheet["spot_width_um"] / (100 * light) ** 0.25, rtol=1e-4)
+
+
+@eqx.filter_jit
+def light_and_width(scope, depths):
+    return gs.objectives.light(scope, depths), gs.objectives.width_per_light(scope, depths)
+
+
+@eqx.filter_jit
+def overlap(depths, scope):
+    return jnp.sum(gs.objectives.occupancy(scope, depths))
 
 
 def one_map(case: Case, _) -> None:
@@ -362,10 +374,10 @@ def optimise(case: Case, _) -> None:
     assert found.design.imaging.sensor_distance_mm < v
     assert found.design.lens == case.design.lens and found.design.array == case.design.array
     # And without a study.
-    overlap = lambda scope: jnp.sum(gs.objectives.occupancy(scope, np.array(case.depths)))
+    loss = jax.tree_util.Partial(overlap, np.array(case.depths))
     limits = {"sensor_distance": (0.8 * v, 1.2 * v)}
-    best = gs.optimize(overlap, case.imager, free=gs.free("sensor_distance"), bounds=limits, steps=3)
-    assert float(best.imager.sensor_distance) < v and float(best.value) < float(overlap(case.imager))
+    best = gs.optimize(loss, case.imager, free=gs.free("sensor_distance"), bounds=limits, steps=3)
+    assert float(best.imager.sensor_distance) < v and float(best.value) < float(loss(case.imager))
 
 
 def mold(case: Case, folder: Path) -> None:
@@ -408,33 +420,46 @@ REFUSED: dict[tuple[str, str], str] = {
 # Whatever reads the cores of spots warns.
 WARNED = {("out of focus", task) for task in ("points", "list-rl", "unrolled")}
 
-# `make test` runs, for every device, these always, and of these one in turn: of both groups for the shipped designs and
-# the richest device, of either for the others. `make integration` runs the rest.
-ALWAYS = ("design", "map", "metrics", "mold", "optimise")
-IN_TURN = (tuple(METHODS), ("points", "calibrate", "pattern"))
-OF_BOTH = (*SHIPPED, "curved, tilted, two radii, layers")
-# What people are told to use first; a report takes long, so once.
-ALSO = (
-    ("geomscope-asphere", "points"),
-    ("geomscope-optimized", "report"),
-)
+# `make test` runs these for every device; a search for each structure of an imager, which compiles it; a mold for
+# each kind of lens, whatever else the device has; and each of the rest somewhere. `make integration` runs all others.
+ALWAYS = ("design", "map", "metrics")
+ONCE = {
+    "optimise": (
+        *("geomscope", "geomscope-asphere", "aspheric", "two radii", "layers", "tilted", "one lens"),
+        "curved, tilted, two radii, layers",
+    ),
+    "mold": (
+        *("geomscope", "geomscope-asphere", "steep", "aspheric", "two radii", "small lenses", "one lens"),
+        "curved, tilted, two radii",
+    ),
+    "points": ("geomscope-asphere", "one lens", "curved, tilted, two radii, layers"),
+    "backproject": ("endoscope",),
+    "list-rl": ("geomscope", "float64"),
+    "richardson-lucy": ("turned",),
+    "fista": ("geomscope-optimized",),
+    "admm": ("region",),
+    "surface": ("odd",),
+    "unrolled": ("curved, tilted, two radii, layers",),
+    "calibrate": ("geomscope",),
+    "pattern": ("mirrored",),
+    "report": ("geomscope-optimized",),
+}
 
 # A score and a radius are reconstructions of pixels that are masked the same way for every lens, and frames that follow
 # are starts of solvers that all devices have: so on the richest devices.
 ON_THE_RICHEST = ("score", "radius", "follow")
 RICHEST = ("geomscope", "curved, tilted, two radii, layers", "one lens")
 # Devices that differ from others in their files alone, or in size.
-ALWAYS_ONLY = ("samples", "small lenses")
+FEW = ("samples", "small lenses")
 
 
 def pairs():
-    for number, device in enumerate(name for name in DEVICES if name not in (LARGE, FINE)):
-        groups = IN_TURN if device in OF_BOTH else (IN_TURN[number % 2],)
-        chosen = {*ALWAYS, *(tasks[number % len(tasks)] for tasks in groups)}
+    for device in (name for name in DEVICES if name not in (LARGE, FINE)):
         for task in TASKS:
-            if task in ON_THE_RICHEST and device not in RICHEST or device in ALWAYS_ONLY and task not in ALWAYS:
+            few = device in FEW and task not in (*ALWAYS, "optimise", "mold")
+            if few or task in ON_THE_RICHEST and device not in RICHEST:
                 continue
-            marks = () if task in chosen or (device, task) in ALSO else pytest.mark.integration
+            marks = () if task in ALWAYS or device in ONCE.get(task, ()) else pytest.mark.integration
             yield pytest.param(device, task, "near", marks=marks, id=f"{device}-{task}")
     for task in ("points", "backproject", "list-rl", "richardson-lucy", "map"):
         yield pytest.param(LARGE, task, "near", marks=pytest.mark.integration, id=f"{LARGE}-{task}")

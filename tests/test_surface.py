@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,8 +166,13 @@ def test_two_sheets_side_by_side_start_as_one_each():
     volume = np.zeros((11, 20, 30), np.float32)
     for plane, side in ((2, slice(0, 15)), (8, slice(15, 30))):
         volume[plane - 1 : plane + 2, :, side] = np.array([0.5, 1.0, 0.5])[:, None, None]
-    sheets = first_sheets(jnp.asarray(volume), jnp.zeros((8, 8), jnp.float32), 2)
-    depth, light = np.asarray(interpolated(sheets.depth, (20, 30))), np.asarray(sheets.root) ** 2
+
+    @jax.jit
+    def start(volume):
+        sheets = first_sheets(volume, jnp.zeros((8, 8), jnp.float32), 2)
+        return interpolated(sheets.depth, (20, 30)), sheets.root**2
+
+    depth, light = map(np.asarray, start(volume))
     np.testing.assert_allclose(depth[0, :, :10], 2, atol=0.1)
     np.testing.assert_allclose(depth[1, :, 20:], 8, atol=0.1)
     assert light[0, :, 20:].sum() < 0.01 * light[1, :, 20:].sum() and light[1, :, :10].sum() < 0.01 * light[0].sum()
