@@ -16,10 +16,8 @@ from .helpers import scene
 
 def random_pair(A):
     """A random input and a random output."""
-    return (
-        jax.random.normal(jax.random.key(n), s.shape, s.dtype)
-        for n, s in enumerate((A.in_structure(), A.out_structure()))
-    )
+    rng = np.random.default_rng(0)
+    return (jnp.asarray(rng.normal(size=s.shape).astype(s.dtype)) for s in (A.in_structure(), A.out_structure()))
 
 
 def test_transpose_is_backprojection():
@@ -35,7 +33,7 @@ def test_transpose_is_backprojection():
 def test_it_composes_and_solves():
     """Regularised least squares by conjugate gradients, as ADMM will do, against the dense solution."""
     imager, grid = scene(voxels=(5, 4), pitch=0.2, depths=(20.0,))
-    image = jax.random.normal(jax.random.key(0), imager.sensor.shape)
+    image = jnp.asarray(np.random.default_rng(0).normal(size=imager.sensor.shape))
 
     @jax.jit
     def solve(image, imager):
@@ -71,9 +69,10 @@ def test_the_transpose_is_the_adjoint_and_maps_over_batches(name):
     A = OPERATORS[name](*scene())
     x, y = random_pair(A)
     assert A.T.in_structure() == A.out_structure() and A.T.T.out_structure() == A.out_structure()
-    np.testing.assert_allclose(jnp.vdot(A.mv(x), y), jnp.vdot(x, A.T.mv(y)), rtol=1e-9)
-    both = jnp.stack([x, 2 * x])
-    np.testing.assert_allclose(jax.vmap(A.mv)(both), jnp.stack([A.mv(x), 2 * A.mv(x)]), atol=1e-9)
+    there = np.asarray(A.mv(x))
+    np.testing.assert_allclose(np.vdot(there, y), np.vdot(x, A.T.mv(y)), rtol=1e-9)
+    both = np.stack([x, 2 * np.asarray(x)])
+    np.testing.assert_allclose(jax.vmap(A.mv)(both), np.stack([there, 2 * there]), atol=1e-9)
 
 
 def test_materialised_it_still_takes_volumes():
@@ -87,7 +86,7 @@ def test_materialised_it_still_takes_volumes():
 
 def test_it_is_an_argument_that_compiles_once():
     imager, grid = scene()
-    image, traced = jnp.ones(imager.sensor.shape), []
+    image, traced = np.ones(imager.sensor.shape), []
 
     @eqx.filter_jit
     def loss(A, image):
@@ -98,7 +97,8 @@ def test_it_is_an_argument_that_compiles_once():
     for v in (5.8, 5.9, 6.0):
         moved = eqx.tree_at(lambda i: i.sensor_distance, imager, jnp.asarray(v))
         _, slope = step(ImagingOperator(moved, grid), image)
-        assert np.isfinite(slope.imager.array.centers).all() and slope.imager.array.centers.any()
+        found = np.asarray(slope.imager.array.centers)
+        assert np.isfinite(found).all() and found.any()
     assert len(traced) == 1
 
 
@@ -106,22 +106,23 @@ def test_it_is_an_argument_that_compiles_once():
 def test_hessian_vector_products_are_differences_of_gradients(name):
     imager, grid = scene()
     A = OPERATORS[name](imager, grid)
-    truth, volume = (gaussian_filter(jax.random.normal(jax.random.key(n), A.out_structure().shape), 2) for n in (0, 1))
-    x = gaussian_filter(jax.random.normal(jax.random.key(2), A.in_structure().shape), 1)
+    rng = np.random.default_rng(0)
+    truth, volume = (gaussian_filter(rng.normal(size=A.out_structure().shape), 2) for _ in range(2))
+    x = gaussian_filter(rng.normal(size=A.in_structure().shape), 1)
 
     def loss(centers, v):
         where = lambda A: (A.imager.array.centers, A.imager.sensor_distance)
         return jnp.sum(volume * (eqx.tree_at(where, A, (centers, v)).mv(x) - truth) ** 2)
 
     at = imager.array.centers, imager.sensor_distance
-    along = 0.1 * jax.random.normal(jax.random.key(3), at[0].shape), jnp.asarray(0.05)
+    along = 0.1 * rng.normal(size=at[0].shape), np.array(0.05)
     gradient = jax.jit(jax.grad(loss, (0, 1)))
     product = jax.jvp(gradient, at, along)[1]
     step = 1e-7
-    ends = [gradient(*(a + sign * step * b for a, b in zip(at, along, strict=True))) for sign in (1, -1)]
+    ends = [gradient(*(np.asarray(a) + sign * step * b for a, b in zip(at, along, strict=True))) for sign in (1, -1)]
     for ours, ahead, behind in zip(product, *ends, strict=True):
-        numeric = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(ours, numeric, rtol=1e-4, atol=1e-5 * float(jnp.abs(numeric).max()))
+        numeric = (np.asarray(ahead) - np.asarray(behind)) / (2 * step)
+        np.testing.assert_allclose(ours, numeric, rtol=1e-4, atol=1e-5 * np.abs(numeric).max())
 
 
 @pytest.mark.integration
@@ -140,7 +141,7 @@ def test_scipy_solves_with_it():
     B, (x, y) = as_scipy(A), (np.ravel(a) for a in random_pair(A))
     assert np.vdot(B @ x, y) == pytest.approx(np.vdot(x, B.T @ y), rel=1e-12)
     # Some voxels are seen by no lens.
-    seen = np.asarray(A.T.mv(jnp.ones(A.out_structure().shape))).ravel() > 0
+    seen = np.asarray(A.T.mv(jnp.asarray(np.ones(A.out_structure().shape)))).ravel() > 0
     np.testing.assert_allclose(lsmr(B, B @ x, atol=1e-13, btol=1e-13)[0][seen], x[seen], rtol=1e-8)
 
 

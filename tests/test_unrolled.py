@@ -1,5 +1,8 @@
 """Unrolled inversion: the networks between the steps, their training, and the check by imaging again."""
 
+from functools import partial
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,15 +42,29 @@ def imager(pixels=(160, 160), pitch=0.03) -> Imager:
     return Imager(MicrolensArray(centers), Sensor(pixels, pitch), 5.75, 1.5)
 
 
-def small(networks: Unrolled | None = None) -> tuple[Unrolled, UnrolledExample]:
+def voxels_and_image() -> tuple[InverseProblem, np.ndarray, np.ndarray]:
     """Chief rays through nine lenses, and the exact image of random voxels."""
     scope, grid = imager((40, 40), 0.12), Grid([18.0, 20.0], (9, 8), 0.3)
     system = InverseProblem(scope, grid, None, (LensTypeGeometry(scope),))
-    truth = jax.random.uniform(KEY, grid.volume_shape)
-    light = system.operator.mv(truth)
-    networks = networks or initialize_unrolled(1, 2, 3, 4, key=KEY)
+    truth = np.random.default_rng(0).random(grid.volume_shape)
+    return system, truth, np.asarray(system.operator.mv(jnp.asarray(truth)))
+
+
+def small(networks: Unrolled) -> tuple[Unrolled, UnrolledExample]:
+    system, truth, light = voxels_and_image()
     start = networks.step(system.operator, light, networks.init(system.operator, light))[0]
-    return networks, UnrolledExample(np.asarray(light), system, np.asarray(truth), start)
+    return networks, UnrolledExample(light, system, truth, start)
+
+
+def shapes(*sizes: int) -> Unrolled:
+    return eqx.filter_eval_shape(partial(initialize_unrolled, *sizes), key=KEY)
+
+
+def filled(networks: Unrolled) -> Unrolled:
+    """Random weights everywhere. NumPy's: they need not be compiled."""
+    rng = np.random.default_rng(0)
+    fill = lambda leaf: rng.normal(0, (2 / max(np.prod(leaf.shape[1:4]), 20)) ** 0.5, leaf.shape).astype(leaf.dtype)
+    return jax.tree.map(lambda leaf: jnp.asarray(fill(leaf)), networks)
 
 
 @pytest.mark.integration
@@ -121,15 +138,17 @@ def blurred(volume: np.ndarray) -> np.ndarray:
 
 
 def test_bands_leave_no_seams(monkeypatch):
-    layers = jax.tree.map(lambda part: part[0], initialize_unrolled(key=KEY).layers)
-    seen = jax.random.normal(KEY, (3, 23, 17, 7))
-    whole = unrolled._apply_network(layers, seen)
+    layers = jax.tree.map(lambda part: np.asarray(part)[0], filled(shapes()).layers)
+    seen = np.random.default_rng(1).normal(size=(3, 23, 17, 7))
+    whole = jax.jit(unrolled._apply_network)(layers, seen)
     monkeypatch.setattr(unrolled, "_ROWS", 5)
-    np.testing.assert_allclose(unrolled._apply_network(layers, seen), whole, rtol=1e-5, atol=1e-6)
+    in_bands = jax.jit(lambda *arguments: unrolled._apply_network(*arguments))(layers, seen)
+    assert np.abs(whole).max() > 0.1
+    np.testing.assert_allclose(in_bands, whole, rtol=1e-5, atol=1e-6)
 
 
 def test_no_more_steps_than_networks():
-    networks = initialize_unrolled(1, 3, 2, key=KEY)
+    networks = filled(shapes(1, 3, 2))
     assert networks.steps == 6
     with pytest.raises(InputError, match="steps must be 1 to 6, .* got 7"):
         Unrolled(networks.layers, networks.power, 1, 2, 7)
@@ -138,7 +157,7 @@ def test_no_more_steps_than_networks():
 
 
 def test_weights_come_back(tmp_path):
-    made = initialize_unrolled(3, 2, 1, 4, key=KEY)
+    made = filled(shapes(3, 2, 1, 4))
     write_unrolled(tmp_path / "w.npz", made)
     found = read_unrolled(tmp_path / "w.npz")
     assert (found.first, found.last, found.steps) == (3, 1, 6)
@@ -183,21 +202,21 @@ def test_training_makes_it_better():
 
 
 def test_a_volume_imaged_again():
-    _, case = small()
-    scope, grid, light = case.system.imager, case.system.grid, case.light
-    same = forward_residual(3 * case.truth, light, scope, grid, optics=None)
+    system, truth, light = voxels_and_image()
+    scope, grid = system.imager, system.grid
+    same = forward_residual(3 * truth, light, scope, grid, optics=None)
     # The image's darkest percent counts as the camera's offset.
     assert same.error < 0.05 and same.correlation == pytest.approx(1, abs=1e-6)
     assert same.regions.shape == (16, 16) and (same.regions >= 0).all()
-    nothing = forward_residual(0 * case.truth, light, scope, grid, optics=None)
+    nothing = forward_residual(0 * truth, light, scope, grid, optics=None)
     assert nothing.error == pytest.approx(1) and nothing.correlation == 0
-    wrong = forward_residual(case.truth[::-1], light, scope, grid, optics=None)
+    wrong = forward_residual(truth[::-1], light, scope, grid, optics=None)
     assert same.error < wrong.error < nothing.error
 
 
 def test_the_networks_of_the_package():
     """They are what the recipe makes."""
-    found, made = Unrolled.pretrained(), with_fixed_steps(initialize_unrolled(key=KEY))
+    found, made = Unrolled.pretrained(), with_fixed_steps(shapes())
     assert jax.tree.structure(found) == jax.tree.structure(made) and found.steps == 33
 
 
