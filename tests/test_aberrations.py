@@ -91,9 +91,13 @@ def test_shape_and_conjugate_factors(plano):
     np.testing.assert_allclose(error.coma, coma, rtol=1e-12)
 
 
+# Of NumPy's numbers, with which nothing is compiled.
+coefficients: Any = WavefrontCoefficients
+
+
 def wave(rng):
     """A wavefront of all terms, waves or mm."""
-    return WavefrontCoefficients(*(np.asarray(x) for x in rng.normal(size=5)))
+    return coefficients(*(np.asarray(x) for x in rng.normal(size=5)))
 
 
 def test_rms_over_the_pupil():
@@ -105,9 +109,7 @@ def test_rms_over_the_pupil():
     removed = np.stack([np.ones_like(x), x, square], axis=1)
     left_of = lambda w: w - removed @ np.linalg.lstsq(removed, w, rcond=None)[0]
     for name, shape in shapes.items():
-        one = WavefrontCoefficients(
-            *(np.array(float(term == name)) for term in WavefrontCoefficients.__dataclass_fields__)
-        )
+        one = coefficients(*(np.array(float(term == name)) for term in WavefrontCoefficients.__dataclass_fields__))
         # A pupil of squares of 1/400 of its radius.
         left = shape if name == "defocus" else left_of(shape)
         np.testing.assert_allclose(getattr(balanced_rms(one), name), left.std(), rtol=2e-3)
@@ -121,7 +123,7 @@ def test_rms_over_the_pupil():
 def test_defocus_that_balances_spherical_aberration():
     """`W020 = -W040` leaves the balanced part alone, in both sums."""
     zero = np.array(0.0)
-    error = WavefrontCoefficients(np.array(2.0), zero, zero, zero, np.array(-2.0))
+    error = coefficients(np.array(2.0), zero, zero, zero, np.array(-2.0))
     np.testing.assert_allclose([linear_rms(error), independent_rms(error)], 2 / (6 * math.sqrt(5)), rtol=1e-14)
 
 
@@ -146,7 +148,7 @@ def test_strehl_ratio_against_a_diffraction_integral():
     for peak in (0.5, 1.3):  # waves of balanced spherical aberration: 0.04 and 0.1 waves RMS
         phase = 2 * np.pi * peak * ((x**2 + y**2) ** 2 - x**2 - y**2)
         zero = np.array(0.0)
-        error = WavefrontCoefficients(np.array(peak), zero, zero, zero, np.array(-peak))
+        error = coefficients(np.array(peak), zero, zero, zero, np.array(-peak))
         np.testing.assert_allclose(strehl(independent_rms(error), 1.0), abs(np.exp(1j * phase).mean()) ** 2, rtol=0.01)
 
 
@@ -225,7 +227,7 @@ def test_gradients_where_an_error_is_zero():
     error = lambda f, n, a, z, h: seidel(f, n, a, z, h, 5.7)
     total = lambda *x: independent_rms(error(*x)) + linear_rms(error(*x))
     assert all(np.isfinite(g) for g in jax.jit(jax.grad(total, argnums=range(5)))(F, N, 0.7, DEPTH, 0.0))
-    none = WavefrontCoefficients(*(np.zeros(()) for _ in range(5)))
+    none = coefficients(*(np.zeros(()) for _ in range(5)))
     assert all(np.isfinite(g) for g in jax.tree.leaves(jax.jit(jax.grad(independent_rms))(none)))
 
 

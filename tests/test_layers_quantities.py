@@ -105,7 +105,7 @@ def test_the_bound_of_points_in_a_medium():
     without, reduced = with_layers(sample=gs.Sample(1.0, surface=17.0)), 17.0 + (depths - 17.0) / INDEX
     bound = eqx.filter_jit(crowded_bound)
     wet, dry = (
-        np.asarray(bound(device, Conditions(jnp.asarray(z), exposure=exposure), np.array([[0.3, -0.2]])))
+        np.asarray(bound(device, Conditions(jnp.asarray(z), exposure=exposure), jnp.array([[0.3, -0.2]])))
         for device, z, exposure in ((scope, depths, 1e4), (without, reduced, 1e4 / INDEX**2))
     )
     np.testing.assert_allclose(wet, dry * (1.0, 1.0, INDEX), rtol=0.02)
