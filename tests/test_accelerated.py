@@ -59,9 +59,11 @@ def problem(weight, voxels, pitch, *, pixels=(96, 83), lenses=7, nearest=False, 
     imager = Imager(MicrolensArray(centers), Sensor(pixels, 0.0045), 5.8, 0.45, tilt=tilt)
     imager, grid = jax.tree.map(lambda a: np.asarray(a, dtype), (imager, Grid([18.0, 23.0], voxels, pitch)))
     parameters = rng.normal(size=(2, 7)).astype(dtype) if isinstance(weight, RingLight) else None
-    rays = trace_rays(imager, grid, nearest=nearest, dtype=dtype, limit=weight.limit, parameters=parameters)
+    rays = trace_rays(
+        imager, grid, nearest=nearest, dtype=dtype, weight=weight, limit=weight.limit, parameters=parameters
+    )
     image, volume = (rng.random(shape).astype(dtype) for shape in (pixels, grid.volume_shape))
-    return Shapes(pixels, grid.volume_shape, weight), rays, image, volume
+    return Shapes(pixels, grid.volume_shape), rays, image, volume
 
 
 def both_ways(shapes, rays, image, volume):

@@ -49,10 +49,12 @@ def problem(weight, grid=GRIDS[0], *, nearest=False, lenses=5):
     imager = Imager(MicrolensArray(centers), Sensor((96, 83), 0.0045), 5.8, 0.45)
     imager, grid = jax.tree.map(lambda a: np.asarray(a, np.float32), (imager, Grid([18.0, 20.0, 23.0], *grid)))
     parameters = rng.normal(size=(3, 7)).astype(np.float32) if isinstance(weight, RingLight) else None
-    rays = trace_rays(imager, grid, nearest=nearest, dtype=jnp.float32, limit=weight.limit, parameters=parameters)
+    rays = trace_rays(
+        imager, grid, nearest=nearest, dtype=jnp.float32, weight=weight, limit=weight.limit, parameters=parameters
+    )
     image = rng.random(imager.sensor.shape).astype(np.float32)
     volume = rng.random(grid.volume_shape).astype(np.float32)
-    return Shapes(imager.sensor.shape, grid.volume_shape, weight), jax.tree.map(np.asarray, rays), image, volume
+    return Shapes(imager.sensor.shape, grid.volume_shape), jax.tree.map(np.asarray, rays), image, volume
 
 
 def doubled(tree):

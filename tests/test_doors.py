@@ -18,7 +18,7 @@ from gs_jax.io.recordings import open_recording
 from gs_jax.optics.aberrations import wavefront_rms
 from gs_jax.projection.bilinear import image_to_volume
 from gs_jax.projection.point_sources import forward_points, make_stamps
-from gs_jax.projection.rays import Envelope, Shapes
+from gs_jax.projection.rays import Shapes
 
 from .helpers import trace_rays
 
@@ -153,7 +153,7 @@ def test_points_without_a_processor_among_the_devices(monkeypatch):
 def test_without_compilation():
     """`JAX_DISABLE_JIT`: a primitive that calls itself would never end."""
     rays = trace_rays(SCOPE, GRID, nearest=False, dtype=np.dtype(np.float64))
-    shapes = Shapes(SCOPE.sensor.shape, GRID.volume_shape, Envelope(SCOPE.field_radius))
+    shapes = Shapes(SCOPE.sensor.shape, GRID.volume_shape)
     with disable_jit():
         volume = image_to_volume(shapes, rays, IMAGE)
     np.testing.assert_allclose(volume, gs.backproject(IMAGE, SCOPE, GRID), rtol=1e-5, atol=1e-5 * np.max(volume))

@@ -410,7 +410,10 @@ def test_a_model_of_other_planes_pixels_or_objects_is_refused():
         ("full", voxels, "optics must be a PSF model .*, got 'full'"),
     ]:
         if wrong is None:
-            np.testing.assert_array_equal(forward(x, scope, seen_by, model), forward(x, scope, seen_by))
+            of_rays = forward(x, scope, seen_by)
+            np.testing.assert_array_equal(forward(x, scope, seen_by, model), of_rays)
+            # Model and grid are known also where the volume is traced.
+            np.testing.assert_array_equal(jax.jit(lambda x: forward(x, scope, voxels, near))(x), of_rays)
             continue
         with pytest.raises(InputError, match=wrong):
             forward(x, scope, seen_by, model)

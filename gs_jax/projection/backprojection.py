@@ -12,7 +12,7 @@ from ..geometry import Imager
 from ..grid import Grid
 from ..typing import Image
 from .bilinear import Shapes, image_to_volume, volume_to_image
-from .rays import Envelope, Rays, trace
+from .rays import Rays, trace
 
 # Depths computed at once. More are not faster, and patches would grow with the volume.
 _DEPTHS = 16
@@ -173,4 +173,4 @@ def _prepare(imager: Imager, grid: Grid, method: str, dtype, distortion=None) ->
     if method not in ("linear", "nearest"):
         raise ValueError(f'`method` must be "linear" or "nearest", got {method!r}.')
     rays = trace(imager, grid, nearest=method == "nearest", dtype=dtype, distortion=distortion)
-    return Shapes(imager.sensor.shape, grid.volume_shape, Envelope(imager.field_radius)), rays
+    return Shapes(imager.sensor.shape, grid.volume_shape), rays

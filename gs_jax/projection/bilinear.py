@@ -42,12 +42,12 @@ def _gather(shapes: Shapes, rays: Rays, image):
         y, x, y_pair, x_pair = lens
 
         def patch():
-            weight = _weights(shapes, y, x, rays.parameters)
+            weight = _weights(rays, y, x)
             if image is None:
                 return weight
             return weight * _between(_corners(image, y_pair, x_pair), y_pair, x_pair)[0]
 
-        new = _patch(volume, y, x) + _if_seen(shapes, y, x, patch)
+        new = _patch(volume, y, x) + _if_seen(rays, y, x, patch)
         return _update_patch(volume, new, y, x), None
 
     volume = jnp.zeros(shapes.volume, rays.parameters.dtype)
@@ -61,8 +61,8 @@ def _scatter(shapes: Shapes, rays: Rays, volume):
 
     def add_lens(image, lens):
         y, x, spacing = lens
-        weighted = lambda: _weights(shapes, y, x, rays.parameters) * _patch(volume, y, x)
-        patch = _if_seen(shapes, y, x, weighted)
+        weighted = lambda: _weights(rays, y, x) * _patch(volume, y, x)
+        patch = _if_seen(rays, y, x, weighted)
         column_blocks, row_blocks = _blocks(x, shapes.image[1]), _blocks(y, shapes.image[0])
 
         def add_columns(block, image):
@@ -93,11 +93,11 @@ def _rays_vjp(shapes: Shapes, constants, volume, at_once=None):
         y, x, y_pair, x_pair = lens
         patch = _patch(volume, y, x)
         distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
-        weight, weight_vjp = jax.vjp(shapes.weight, distance2, rays.parameters[:, None, None])
+        weight, weight_vjp = jax.vjp(rays.weight, distance2, rays.parameters[:, None, None])
         if image is None:
             sample, along_y, along_x = jnp.ones_like(patch), jnp.zeros_like(patch), jnp.zeros_like(patch)
         else:
-            corners = _if_seen(shapes, y, x, lambda: _corners(image, y_pair, x_pair))
+            corners = _if_seen(rays, y, x, lambda: _corners(image, y_pair, x_pair))
             sample, along_y, along_x = _between(corners, y_pair, x_pair)
         by_distance2, by_parameters = weight_vjp(patch * sample)
         by_y, by_x = patch * weight * along_y, patch * weight * along_x
@@ -150,14 +150,14 @@ def _corner(y: Axis, x: Axis):
     return jnp.zeros_like(y.start[0]), y.start[0], x.start[0]
 
 
-def _weights(shapes: Shapes, y: Axis, x: Axis, parameters) -> Float[Array, "depth y x"]:
+def _weights(rays: Rays, y: Axis, x: Axis) -> Float[Array, "depth y x"]:
     distance2 = y.distance2[:, :, None] + x.distance2[:, None, :]
-    return shapes.weight(distance2, parameters[:, None, None])
+    return rays.weight(distance2, rays.parameters[:, None, None])
 
 
-def _if_seen(shapes: Shapes, y: Axis, x: Axis, compute):
+def _if_seen(rays: Rays, y: Axis, x: Axis, compute):
     """`compute()`, or zeros if the lens sees no voxel on the sensor."""
-    seen = y.distance2.min() + x.distance2.min() < shapes.weight.limit**2
+    seen = y.distance2.min() + x.distance2.min() < rays.weight.limit**2
     zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(compute))
     return lax.cond(seen, compute, lambda: zeros)
 

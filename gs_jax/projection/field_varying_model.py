@@ -2,7 +2,9 @@
 
 import math
 import operator
-from functools import partial, reduce
+from collections.abc import Callable
+from functools import reduce
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..geometry import Imager
+from ..geometry import Imager, field_limit
 from ..grid import Grid, Sensor
 from ..optics.field_varying import FieldVaryingPsf
 from ..optics.psf_core import ring_edges
@@ -34,59 +36,49 @@ def full_image(
     )
 
 
+class _Rings(NamedTuple):
+    """Rings of the field, on a leading axis: where they are, mm, and their cores; see `FieldVaryingPsf`."""
+
+    inner: Float[Array, " ring"]
+    outer: Float[Array, " ring"]
+    distortion: Float[Array, " ring"]
+    light: Float[Array, "ring coefficient"]
+
+
+class _Plane(NamedTuple):
+    """Voxels of one depth, seen with pixels and their margins; `limit`: radius of the largest ring, mm."""
+
+    imager: Imager
+    grid: Grid
+    voxels: Float[Array, "y x"]
+    limit: float
+
+
 def _cores_image(volume, imager, grid, optics):
     """The inner rings on the sensor's pixels, the others, whose cores are wider, on pixels twice as large.
 
     The light of the others comes from voxels as wide as these pixels, if that is several of the volume's.
     """
-    sensor, rings = imager.sensor, ring_edges(imager, optics.rings)
+    sensor, edges = imager.sensor, np.array(ring_edges(imager, optics.rings))
     (_, inner, reach, _), size = optics.kernels.shape, optics.wide_kernels.shape[-1]
     wide, wide_half = with_margin(imager, reach), with_margin(_half_resolution(imager), size)
-    # The first ring with harmonics.
-    oriented = len(rings) - optics.harmonics.shape[1] - optics.wide_harmonics.shape[1]
     dtype, nodes = volume.dtype, optics.stray_light.grid
     voxels_per_pixel = 2 * sensor.pixel_pitch / (grid.pitch * nodes.pixel / nodes.step)
     outer_grid, outer_volume = wider_voxels(grid, volume, max(int(voxels_per_pixel + _ROUNDING), 1))
-
-    def sharp(plane, number):
-        """The light of a ring's cores before they are spread, and if they are oriented, that of each harmonic."""
-        depth, fine_voxels, wide_voxels, distortion, light = plane
-        fine, coarse = (wide, grid, fine_voxels), (wide_half, outer_grid, wide_voxels)
-        imager, grid_here, voxels = fine if number < inner else coarse
-        at, weight = grid_here.at(depth), RingLight(*rings[number])
-        rays = trace(
-            imager,
-            at,
-            nearest=False,
-            dtype=dtype,
-            distortion=distortion[number][None],
-            limit=weight.limit,
-            parameters=light[number][None],
-        )
-        image = partial(volume_to_image, Shapes(imager.sensor.shape, at.volume_shape, weight), rays)
-        if number < oriented:
-            return [image(voxels[None])]
-        return _by_powers_of_field(image, voxels, imager, at, distortion[number], rings[number][1])
-
-    def add_rings(total, plane, numbers, kernels, harmonics, *, whole):
-        """Add the light of some of the rings, convolved with their kernels."""
-        plain = [number for number in numbers if number < oriented]
-        if plain:
-            images = [sharp(plane, number)[0] for number in plain]
-            total = total + sum_of_convolutions(images, kernels[: len(plain)], whole=whole, symmetric=True)
-        for number, kernel, waves in zip(numbers[len(plain) :], kernels[len(plain) :], harmonics, strict=True):
-            # Ring by ring, so that few images are held at once.
-            images = sharp(plane, number)
-            total = total + sum_of_convolutions(images, jnp.concatenate([kernel[None], waves]), whole=whole)
-        return total
+    # The rays of all rings of a resolution are those of the largest, so that one program serves them all.
+    limits = [float(field_limit(edges[number - 1, 1])) for number in (inner, len(edges))]
 
     # Not kept for the gradient: the sharp images of all depths are larger than the volume.
     @jax.checkpoint
     def add_depth(images, plane):
         fine, coarse = images
-        *at, kernels, wide_kernels, harmonics, wide_harmonics = plane
-        fine = add_rings(fine, at, range(inner), kernels, harmonics, whole=False)
-        coarse = add_rings(coarse, at, range(inner, len(rings)), wide_kernels, wide_harmonics, whole=True)
+        depth, fine_voxels, coarse_voxels, distortion, light, kernels, wide_kernels, harmonics, wide_harmonics = plane
+        rings = _Rings(*jnp.asarray(edges, dtype).T, distortion, light)
+        near, far = (jax.tree.map(lambda part, at=at: part[at], rings) for at in (slice(inner), slice(inner, None)))
+        here = _Plane(wide, grid.at(depth), fine_voxels, limits[0])
+        there = _Plane(wide_half, outer_grid.at(depth), coarse_voxels, limits[1])
+        fine = _add_rings(fine, here, near, kernels, harmonics, whole=False)
+        coarse = _add_rings(coarse, there, far, wide_kernels, wide_harmonics, whole=True)
         return (fine, coarse), None
 
     tables = optics.kernels, optics.wide_kernels, optics.harmonics, optics.wide_harmonics
@@ -98,24 +90,56 @@ def _cores_image(volume, imager, grid, optics):
     return fine + upsample_by_two(coarse, size, sensor.shape)
 
 
-def _by_powers_of_field(image, voxels, imager, at, distortion, unit):
+def _add_rings(total, plane: _Plane, rings: _Rings, kernels, harmonics, *, whole: bool):
+    """Add the light of rings, convolved with their kernels; the last of them are oriented."""
+    plain = len(kernels) - len(harmonics)
+    first, last = (jax.tree.map(lambda part, at=at: part[at], rings) for at in (slice(plain), slice(plain, None)))
+    if plain:
+        images = lax.map(lambda ring: _sharp_image(plane, ring)(plane.voxels), first)
+        total = total + sum_of_convolutions(list(images), kernels[:plain], whole=whole, symmetric=True)
+
+    def add_oriented(total, ring):
+        # Ring by ring, so that few images are held at once.
+        ring, kernel, waves = ring
+        images = _by_powers_of_field(_sharp_image(plane, ring), plane, ring)
+        return total + sum_of_convolutions(images, jnp.concatenate([kernel[None], waves]), whole=whole), None
+
+    if len(harmonics):
+        total = lax.scan(add_oriented, total, (last, kernels[plain:], harmonics))[0]
+    return total
+
+
+def _sharp_image(plane: _Plane, ring: _Rings) -> Callable[[Float[Array, "y x"]], Float[Array, "row column"]]:
+    """The image of a plane of voxels in one ring's cores before they are spread."""
+    dtype, shapes = plane.voxels.dtype, Shapes(plane.imager.sensor.shape, (1, *plane.grid.shape))
+    of_ring = {"distortion": ring.distortion[None], "parameters": ring.light[None]}
+    weight = RingLight(ring.inner, ring.outer)
+    rays = trace(plane.imager, plane.grid, nearest=False, dtype=dtype, weight=weight, limit=plane.limit, **of_ring)
+    return lambda voxels: volume_to_image(shapes, rays, voxels[None])
+
+
+def _by_powers_of_field(image, plane: _Plane, ring: _Rings):
     """The image of voxels, and those of their light times `x`, `y`, `x^2 - y^2` and `2 x y`.
 
-    Here `(x, y)` is the field: the voxel's place from the axis of the lens that sees it, in a unit, mm. A lens that
-    images the voxel at X to u has it at the field (X - u) / (1 + M), less the offset of a tilted axis. So voxels are
-    weighted by powers of X, and pixels by those of u, along the same rays.
+    Here `(x, y)` is the field: the voxel's place from the axis of the lens that sees it, over the ring's outer radius.
+    A lens that images the voxel at X to u has it at the field (X - u) / (1 + M), less the offset of a tilted axis. So
+    voxels are weighted by powers of X, and pixels by those of u, along the same rays.
     """
-    sensor, scale = imager.sensor, unit * (1 + distortion * imager.magnification(at.depths)[0])
-    pixels = Grid(at.depths, sensor.shape, sensor.pixel_pitch, sensor.origin)
+    imager, grid, sensor = plane.imager, plane.grid, plane.imager.sensor
+    dtype, depths = plane.voxels.dtype, grid.depths
+    scale = ring.outer.astype(depths.dtype) * (
+        1 + ring.distortion.astype(depths.dtype) * imager.magnification(depths)[0]
+    )
+    pixels = Grid(depths, sensor.shape, sensor.pixel_pitch, sensor.origin)
     # The lens's axis and its image, of the lens in the middle.
-    offset = imager.axis_offset(at.depths)[0] - imager.image_of_axis
-    voxel = at.x[None] / scale, at.y[:, None] / scale
+    offset = imager.axis_offset(depths)[0] - imager.image_of_axis
+    voxel = grid.x[None] / scale, grid.y[:, None] / scale
     pixel = (pixels.x[None] + offset[0]) / scale, (pixels.y[:, None] + offset[1]) / scale
-    (X, Y), (u, v) = ([each.astype(voxels.dtype) for each in pair] for pair in (voxel, pixel))
-    by = lambda weight: image((voxels * weight)[None])
-    plain, by_x, by_y = image(voxels[None]), by(X), by(Y)
-    second = by(X**2 - Y**2) - 2 * (u * by_x - v * by_y) + (u**2 - v**2) * plain
-    mixed = by(2 * X * Y) - 2 * (u * by_y + v * by_x) + 2 * u * v * plain
+    (X, Y), (u, v) = ([part.astype(dtype) for part in pair] for pair in (voxel, pixel))
+    powers = jnp.stack([jnp.broadcast_to(power, grid.shape) for power in (X**0, X, Y, X**2 - Y**2, 2 * X * Y)])
+    plain, by_x, by_y, by_squares, by_product = lax.map(image, powers * plane.voxels[None])
+    second = by_squares - 2 * (u * by_x - v * by_y) + (u**2 - v**2) * plain
+    mixed = by_product - 2 * (u * by_y + v * by_x) + 2 * u * v * plain
     return [plain, by_x - u * plain, by_y - v * plain, second, mixed]
 
 

@@ -142,7 +142,8 @@ def psf_model(
 
 def extent_of(grid: Grid) -> float:
     """Side of the square about the frame's origin that holds the centres of all voxels, mm."""
-    return 2 * max(float(abs(at)) for axis in (grid.x, grid.y) for at in (axis[0], axis[-1]))
+    beside, count = np.abs(np.asarray(grid.origin, float)), np.array(grid.shape[::-1])
+    return float(np.max(2 * beside + (count - 1) * grid.pitch))
 
 
 def check_optics(optics: Optics | str, imager: Imager, grid: Grid) -> None:

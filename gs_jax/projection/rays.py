@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..geometry import Imager, chief_ray, envelope, field_limit
 from ..grid import Grid, Sensor
 from ..optics.psf_core import ring_light
+from ..typing import Scalar
 
 # Squared distance, mm^2, added for rays off the sensor: outside the field of every lens, where the envelope and all
 # its derivatives vanish.
@@ -33,22 +34,13 @@ class Axis(NamedTuple):
     origin: Float[Array, "lens depth"]  # voxel b has the pixel floor(origin - b spacing), up to rounding
 
 
-class Rays(NamedTuple):
-    """All chief rays between a sensor and a grid, sparse by lens."""
-
-    y: Axis
-    x: Axis
-    spacing: Float[Array, "lens depth"]  # of neighbouring voxels on the sensor, pixels
-    parameters: Float[Array, "depth parameter"]  # of the lens weight at each depth
-
-
 class Envelope(NamedTuple):
     """The lens weight of Eq. (2), the envelope C. Its parameter is the reduced depth."""
 
-    field_radius: float
+    field_radius: Scalar | float
 
     @property
-    def limit(self) -> float:
+    def limit(self) -> Scalar | float:
         """Lateral distance from a lens's axis, mm, beyond which the weight is zero."""
         return field_limit(self.field_radius)
 
@@ -59,15 +51,25 @@ class Envelope(NamedTuple):
 class RingLight(NamedTuple):
     """The share of a point's light in the core of a spot, in a ring of the field; see `gs_jax.optics.psf_core`."""
 
-    inner: float
-    outer: float
+    inner: Scalar | float
+    outer: Scalar | float
 
     @property
-    def limit(self) -> float:
+    def limit(self) -> Scalar | float:
         return field_limit(self.outer)
 
     def __call__(self, distance2, parameters):
         return ring_light(distance2, parameters, self.inner, self.outer)
+
+
+class Rays(NamedTuple):
+    """All chief rays between a sensor and a grid, sparse by lens."""
+
+    y: Axis
+    x: Axis
+    spacing: Float[Array, "lens depth"]  # of neighbouring voxels on the sensor, pixels
+    weight: Envelope | RingLight  # of a lens, by the squared distance from its axis
+    parameters: Float[Array, "depth parameter"]  # of the weight at each depth
 
 
 class Shapes(NamedTuple):
@@ -75,7 +77,6 @@ class Shapes(NamedTuple):
 
     image: tuple[int, int]
     volume: tuple[int, int, int]
-    weight: Envelope | RingLight
 
 
 def trace(
@@ -85,22 +86,25 @@ def trace(
     nearest: bool,
     dtype,
     distortion: Float[Array, " depth"] | None = None,
-    limit: float | None = None,
+    weight: Envelope | RingLight | None = None,
     parameters: Float[Array, "depth parameter"] | None = None,
+    limit: float | None = None,
 ) -> Rays:
     """The rays of every voxel through every lens that sees it, in a cache-friendly order of lenses.
 
     With `nearest` they are moved to the nearest pixel centre, as in the paper. `dtype` is the type of the tables; the
-    coordinates are computed in that of the geometry. `distortion` is that of `Imager.views`, at each depth. `limit` is
-    the radius of a lens's field, mm; by default, it and the `parameters` of the lens weight are those of the envelope.
+    coordinates are computed in that of the geometry. `distortion` is that of `Imager.views`, at each depth. By default
+    the lens's `weight` and its `parameters` are those of the envelope. `limit` is the largest radius of a lens's field
+    that the rays are to cover, mm; by default the weight's.
     """
     distortion = jnp.ones_like(grid.depths) if distortion is None else distortion.astype(grid.depths.dtype)
+    weight = Envelope(imager.field_radius) if weight is None else weight
     if parameters is None:
         parameters = jnp.asarray(imager.reduced_depth(grid.depths))[:, None]
     order = _snake(imager.centers, _BAND * imager.field_radius)
     magnification = imager.magnifications(grid.depths, distortion)
     magnification = magnification if len(magnification) == 1 else magnification[order]
-    reach = field_limit(imager.field_radius) if limit is None else limit
+    reach = weight.limit if limit is None else limit
     (x, y), (x_offset, y_offset) = imager.centers[order].T, imager.axis_offset(grid.depths).T
     # Where a tilted array has the spots of points that are moved by `lean`, about a sensor that is moved back.
     (x_lean, y_lean), (x_moved, y_moved) = imager.lean(grid.depths, distortion).T, imager.spot_displacement
@@ -130,6 +134,7 @@ def trace(
         spacing=jax.lax.stop_gradient(
             jnp.broadcast_to(magnification * (grid.pitch / imager.sensor.pixel_pitch), (len(order), len(grid.depths)))
         ),
+        weight=jax.tree.map(lambda number: jnp.asarray(number, dtype), weight),
         parameters=parameters.astype(dtype),
     )
 

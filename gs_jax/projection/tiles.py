@@ -49,7 +49,7 @@ def gather(shapes: Shapes, rays: Rays, image) -> Float[Array, "depth y x"]:
         lens = jnp.moveaxis(lens, 2, 0)[:, None, :, None, :, None]
         y = _place(rays.y, lens, depth, row - _start(rays.y, lens, depth))
         x = _place(rays.x, lens, depth, column - _start(rays.x, lens, depth))
-        weight = shapes.weight(_distance2(rays.y, y) + _distance2(rays.x, x), parameters)
+        weight = rays.weight(_distance2(rays.y, y) + _distance2(rays.x, x), parameters)
         if image is not None:
             pixel = _take(y_pair.low, y.at) * shapes.image[1] + _take(x_pair.low, x.at)
             corners = [_take(image, pixel + down + right) for down in (0, shapes.image[1]) for right in (0, 1)]
@@ -89,7 +89,7 @@ def scatter(shapes: Shapes, rays: Rays, volume) -> Float[Array, "row column"]:
                 _two_rays(rays.y, rays.spacing, lens, depth, first + row, 2 * down),
                 _two_rays(rays.x, rays.spacing, lens, depth, column, 2 * right),
             ):
-                share = shapes.weight(y.distance2 + x.distance2, parameters) * (y.share * x.share)
+                share = rays.weight(y.distance2 + x.distance2, parameters) * (y.share * x.share)
                 voxel = (depth * sides[0] + y.voxel) * sides[1] + x.voxel
                 terms.append(share * _take(volume, voxel))
             return image + sum(terms[1:], terms[0]).sum(0)
@@ -112,7 +112,7 @@ def _lenses_of_tiles(shapes, rays, ends, counts) -> tuple[Int[Array, "row column
         _nearest(axis.distance2, first, last, count)
         for axis, (first, last), count in zip((rays.y, rays.x), ends, counts, strict=True)
     )
-    reached = rows.T[:, None, :] + columns.T[None] < shapes.weight.limit**2
+    reached = rows.T[:, None, :] + columns.T[None] < rays.weight.limit**2
     lenses = reached.shape[2]
     lists = jnp.where(reached, _numbers(lenses, axis=2, of=3), lenses)
     return jnp.sort(lists, stable=False), reached.sum(2, dtype=jnp.int32)

@@ -164,7 +164,7 @@ def _tables(shapes, rays: Rays):
         _require("of rays", fit and axis.start.shape in ((lenses, 1), (lenses, depths)), *axes)
     enough = len(rays.parameters) == depths == shapes.volume[0] and rays.parameters.shape[1] > 0
     _require("of rays", enough and min(shapes.image) >= 2 and shapes.image[1] >= WIDTH, rays.parameters)
-    return weight_numbers(shapes.weight), rays.parameters, *axes
+    return weight_numbers(rays.weight), rays.parameters, *axes
 
 
 def _pixels(shapes, image):
@@ -177,12 +177,17 @@ def _pixels(shapes, image):
 
 def weight_numbers(weight):
     """The kind of a weight, its limit and the slope of its falloff, those of its hole (or zero), and its scale."""
-    falloff = lambda radius: (field_limit(radius) ** 2, 1 / (2 * FALLOFF * radius**2)) if radius else (0, 0)
+
+    def falloff(radius):
+        exists = radius > 0
+        slope = jnp.where(exists, 1 / (2 * FALLOFF * jnp.where(exists, radius, 1) ** 2), 0)
+        return field_limit(radius) ** 2, slope
+
     if isinstance(weight, Envelope):
         numbers = (0, *falloff(weight.field_radius), 0, 0, 0)
     else:
         numbers = (1, *falloff(weight.outer), *falloff(weight.inner), 1 / weight.outer**2)
-    return jnp.asarray(numbers, jnp.float32)
+    return jnp.stack([jnp.asarray(number, jnp.float32) for number in numbers])
 
 
 def convolve(sizes, kernels, sharp):
