@@ -97,8 +97,8 @@ def _envelope_edges(whole: MicrolensArray, count: int, directions) -> Float[Arra
         off = jax.vmap(lambda direction, distance: _excess(whole, neighbours, direction, distance))(directions, at)
         return at - jnp.where(slope > 0, off / jnp.where(slope > 0, slope, 1), 0)
 
-    at, slope = lax.stop_gradient(lax.map(search, lenses, batch_size=_BATCH))
-    return lax.map(jax.checkpoint(newton), (lenses, at, slope), batch_size=_BATCH)
+    at, slope = lax.stop_gradient(_in_batches(search, lenses))
+    return _in_batches(jax.checkpoint(newton), (lenses, at, slope))
 
 
 def _nearest_lenses(whole: MicrolensArray, lens):
@@ -294,7 +294,15 @@ def wedge_area(end, height, radius):
 
 def _map_lenses(function, centers):
     # Recomputed in the reverse pass, as the intermediate results of all lenses' neighbours would be large.
-    return lax.map(jax.checkpoint(function), jnp.arange(centers.shape[0]), batch_size=_BATCH)
+    return _in_batches(jax.checkpoint(function), jnp.arange(centers.shape[0]))
+
+
+def _in_batches(function, of_lenses):
+    """`lax.map` in batches of one size: for fewer at the end JAX would compile the function a second time."""
+    count = len(jax.tree.leaves(of_lenses)[0])
+    missing = -count % min(_BATCH, count)
+    whole = jax.tree.map(lambda a: jnp.pad(a, [(0, missing), *[(0, 0)] * (a.ndim - 1)], mode="edge"), of_lenses)
+    return jax.tree.map(lambda a: a[:count], lax.map(function, whole, batch_size=_BATCH))
 
 
 def clear_area(array: MicrolensArray) -> Float[Array, " lens"]:
