@@ -6,21 +6,26 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from rich.table import Table
 
 from .. import objectives
 from ..base.errors import InputError, short_repr
 from ..geometry import Imager
 from ..layouts import check_positive, nearest_neighbour_distances
-from ..objectives.conditions import Conditions, over_heights, per_type
+from ..objectives.conditions import Conditions, by_type, per_type
 from ..objectives.quantities import third_order_wavefront
 from ..optics import aberrations, theory
 from ..optics.apertures import voronoi_cells
 from ..optics.pupil import emission_lines
+from ..optics.raytrace import to_numpy
 from .design import Design
 
+# Sizes of a point's image in the object, on a lens's axis and over its field.
+SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um", "spot_radius_um")
 # Depths of a datasheet whose caller names none.
 _DEPTHS = 7
 
@@ -75,7 +80,8 @@ def datasheet(
     depths, imager, centers = _checked(design, depths), design.imager(), np.array(design.array.centers_mm)
     parts = parts_of(design, depths, circle_of_confusion=circle_of_confusion)
     distances = nearest_neighbour_distances(centers)
-    columns = [columns_of(*part) for part in parts]
+    columns = [{name: np.asarray(column) for name, column in columns_of(*part).items()} for part in parts]
+    numbers = [jax.device_get(_numbers_of_lens(*part)) for part in parts]
     best = np.argmin([column["spot_width_um"] for column in columns], 0)
     shown = {name: [float(columns[k][name][i]) for i, k in enumerate(best)] for name in columns[0]}
     for name in ("lenses_per_point", "occupancy"):
@@ -85,22 +91,22 @@ def datasheet(
     return {
         "depth_mm": depths,
         **{name: [six_digits(value) for value in values] for name, values in shown.items()},
-        "f_number": mean([float(objectives.f_number(*part)) for part in parts]),
-        "numerical_aperture": mean([float(objectives.numerical_aperture(*part)) for part in parts]),
-        "focal_length_mm": mean([float(imager.array.focal_length) for imager, _ in parts]),
+        **{name: mean([float(own[name]) for own in numbers]) for name in ("f_number", "numerical_aperture")},
+        "focal_length_mm": mean([float(own["focal_length_mm"]) for own in numbers]),
         "pitch_mm": six_digits(float(distances.mean())),
         "pitch_sd_mm": six_digits(float(distances.std())) if len(centers) > 1 else 0.0,
         "field_radius_mm": design.imaging.field_radius_mm,
         **_light_path(imager),
         **_over_the_band(imager, depths[len(depths) // 2]),
         "coverage": six_digits(sum(float(objectives.coverage(*part)) for part in parts)),
-        **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, columns)} if len(parts) > 1 else {}),
+        **({"sharpest_kind": (best + 1).tolist(), "kinds": _types(parts, numbers, columns)} if len(parts) > 1 else {}),
     }
 
 
 def _light_path(imager: Imager) -> dict[str, Any]:
     """Layers and sample: thicknesses, what they are of air, and by how much they move the depth in focus."""
     found: dict[str, Any] = {}
+    imager = to_numpy(imager)
     for side, layers in (("object", imager.filters), ("sensor", imager.windows)):
         if layers is not None:
             thickness = float(layers.total)
@@ -170,38 +176,56 @@ def _count(imager: Imager, at: Conditions) -> int:
     return len(imager.array.centers) if at.lenses is None else int(np.sum(at.lenses))
 
 
-def _types(parts: Sequence[tuple[Imager, Conditions]], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    found = []
-    for (imager, at), column in zip(parts, columns, strict=True):
-        array = imager.array
-        numbers = {
-            "radius_of_curvature_mm": array.radius_of_curvature,
-            "aperture_diameter_mm": array.aperture_diameter,
-            "conic_constant": array.conic_constant,
-            "focal_length_mm": array.focal_length,
-            "clear_diameter_mm": objectives.clear_diameter(imager, at),
-        }
-        spots = {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", *SIZES)}
-        found.append({"lenses": _count(imager, at), **{k: six_digits(float(x)) for k, x in numbers.items()}, **spots})
-    return found
+def _types(parts, numbers: Sequence[dict[str, Array]], columns: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    names = "radius_of_curvature_mm", "aperture_diameter_mm", "conic_constant", "focal_length_mm", "clear_diameter_mm"
+    return [
+        {"lenses": _count(*part)}
+        | {name: six_digits(float(own[name])) for name in names}
+        | {name: [six_digits(float(x)) for x in column[name]] for name in ("spot_width_um", *SIZES)}
+        for part, own, column in zip(parts, numbers, columns, strict=True)
+    ]
 
 
-def columns_of(imager: Imager, at: Conditions) -> dict[str, Any]:
+def columns_of(imager: Imager, at: Conditions) -> dict[str, Array]:
     """The columns of a datasheet by name, for lenses that are alike; may be traced."""
+    columns = _columns_of_array(imager, at) | _columns_of_lenses(imager, at)
+    # JAX sorts the keys of dictionaries.
+    return {name: columns[name] for name in _NAMES}
+
+
+_NAMES = (
+    "magnification",
+    "scale",
+    "lenses_per_point",
+    "occupancy",
+    "lateral_resolution_um",
+    "axial_resolution_um",
+    "depth_of_field_mm",
+    "near_limit_mm",
+    "far_limit_mm",
+    "strehl_on_axis",
+    "focus_distance_mm",
+    "blur_um",
+    *SIZES,
+    "spot_width_um",
+)
+
+
+@eqx.filter_jit
+def _columns_of_array(imager: Imager, at: Conditions) -> dict[str, Array]:
     magnification = imager.magnification(at.depths)
-    of_array = {
+    return {
         "magnification": magnification,
         "scale": 1 + magnification,
         "lenses_per_point": jnp.broadcast_to(objectives.lenses_per_point(imager, at), at.depths.shape),
         "occupancy": objectives.occupancy(imager, at),
     }
-    return of_array | _columns_of_lenses(imager, at)
 
 
-@over_heights
-def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
+@by_type
+def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Array]:
     wavefront = third_order_wavefront(imager, at, jnp.zeros(1, at.depths.dtype))
-    sizes = _spot_sizes(*_alone(imager, at))
+    width = objectives.rms_width(imager, at)
     return {
         "lateral_resolution_um": objectives.lateral_resolution(imager, at) * 1000,
         "axial_resolution_um": objectives.axial_resolution(imager, at) * 1000,
@@ -211,28 +235,26 @@ def _columns_of_lenses(imager: Imager, at: Conditions) -> dict[str, Any]:
         "strehl_on_axis": aberrations.strehl(aberrations.linear_rms(wavefront)[:, 0], imager.wavelength),
         "focus_distance_mm": objectives.focus_distance(imager, at),
         "blur_um": objectives.sensor_blur(imager, at) * 1000,
-        **{name: size * 1000 for name, size in zip(SIZES, sizes, strict=True)},
-        "spot_width_um": theory.FWHM * sizes[1] * 1000,
+        "fwhm_um": objectives.fwhm(imager, at) * 1000,
+        "rms_width_um": width * 1000,
+        "half_light_radius_um": objectives.half_light_radius(imager, at) * 1000,
+        "spot_radius_um": objectives.encircled_radius(imager, at) * 1000,
+        "spot_width_um": theory.FWHM * width * 1000,
     }
 
 
-# Sizes of a point's image in the object, on a lens's axis and over its field.
-SIZES = ("fwhm_um", "rms_width_um", "half_light_radius_um", "spot_radius_um")
-_spot_sizes = eqx.filter_jit(
-    lambda imager, at: (
-        objectives.fwhm(imager, at),
-        objectives.rms_width(imager, at),
-        objectives.half_light_radius(imager, at),
-        objectives.encircled_radius(imager, at),
-    )
-)
-
-
-def _alone(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
-    """One of the lenses, on which alone sizes of spots depend: one program serves arrays of any number of lenses."""
-    sensor = dataclasses.replace(imager.sensor, shape=(2, 2), origin=(0.0, 0.0))
-    own = dataclasses.replace(at, cells=None, clear_diameter=objectives.clear_diameter(imager, at))
-    return dataclasses.replace(imager, array=imager.array.lens(0), sensor=sensor), own
+@by_type
+def _numbers_of_lens(imager: Imager, at: Conditions) -> dict[str, Array]:
+    array = imager.array
+    return {
+        "radius_of_curvature_mm": array.radius_of_curvature,
+        "aperture_diameter_mm": array.aperture_diameter,
+        "conic_constant": array.conic_constant,
+        "focal_length_mm": array.focal_length,
+        "clear_diameter_mm": objectives.clear_diameter(imager, at),
+        "f_number": objectives.f_number(imager, at),
+        "numerical_aperture": objectives.numerical_aperture(imager, at),
+    }
 
 
 def tables(sheet: dict[str, Any]) -> list[Table]:

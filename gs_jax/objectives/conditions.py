@@ -5,7 +5,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -86,7 +86,9 @@ def as_conditions(imager: Imager, depths: Depths) -> Conditions:
     """Depths as `Conditions`, in the imager's precision."""
     dtype = imager.sensor_distance.dtype
     if not isinstance(depths, Conditions):
-        return Conditions(jnp.asarray(depths, dtype))
+        # Numbers become an array on the host: JAX would compile a conversion for each number of depths.
+        on_host = not any(isinstance(leaf, Array) for leaf in jax.tree.leaves(depths))
+        return Conditions(jnp.asarray(np.asarray(depths, dtype) if on_host else depths, dtype))
     if depths.depths.dtype == dtype:
         return depths
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, depths)
@@ -97,8 +99,16 @@ def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
     at, array = as_conditions(imager, depths), imager.array
     if array.alike:
         return [(imager, at)]
-    types, diameters = jnp.asarray(array.type_of_lens), _clear_diameters(array, at.directions)
-    with_array = lambda array: eqx.tree_at(lambda i: i.array, imager, array)
+    return _per_type(imager, at, _clear_diameters(array, at.directions))
+
+
+@eqx.filter_jit
+def _per_type(imager, at, diameters):
+    array, types = imager.array, jnp.asarray(imager.array.type_of_lens)
+
+    def with_array(array):
+        return eqx.tree_at(lambda i: i.array, imager, array)
+
     return [
         (
             with_array(array.of_type(number)),
@@ -110,28 +120,96 @@ def per_type(imager: Imager, depths: Depths) -> list[tuple[Imager, Conditions]]:
 
 # The arguments of a quantity: an imager, depths or `Conditions`, and what is the same for all types.
 P = ParamSpec("P")
-Tree = TypeVar("Tree")
+Result = TypeVar("Result")
 
 
-def by_type(function: Callable[P, Array]) -> Callable[P, Array]:
-    """Extend a quantity of lenses that are alike to several types: one row each."""
+def by_type(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Extend a quantity of lenses that are alike to several types, one row each, and compile it."""
+    return _of_types(function, None)
+
+
+def best_type(function: Callable[P, Result], *, best: Callable[..., Array] = jnp.argmin) -> Callable[P, Result]:
+    """Extend a quantity of lenses that are alike to several types, the best one at each depth, and compile it."""
+    return _of_types(function, best)
+
+
+def _of_types(function: Callable[..., Any], best: Callable[..., Array] | None) -> Any:
+    # The wrapped function has the names and the defaults of the arguments.
+    signature = inspect.signature(function)
 
     @wraps(function)
-    def of_all(*args: P.args, **options: P.kwargs) -> Array:
-        return _of_types(function, args, options)[0]
+    def of_all(*args, **options):
+        bound = signature.bind(*args, **options)
+        bound.apply_defaults()
+        imager, depths, *others = bound.args
+        parts = per_type(imager, depths)
+        if imager.array.alike:
+            # By a program of its own, as it takes longest to compile, and all objectives need it.
+            parts = [with_clear_diameter(*parts[0])]
+        types = None if imager.array.alike else len(parts)
+        return _evaluate(function, best, types, _typical_lenses(parts), others)
 
     return of_all
 
 
-def best_type(function: Callable[P, Array], *, best: Callable[..., Array] = jnp.argmin) -> Callable[P, Array]:
-    """Extend a quantity of lenses that are alike to several types: the value of the best type at each depth."""
+@eqx.filter_jit
+def _typical_lenses(parts: list[tuple[Imager, Conditions]]) -> list[tuple[Imager, Conditions]]:
+    """A lens of each type, at a few heights if the array is tilted, and the conditions that it has among the others.
+
+    Nothing else depends on the number of lenses, so that all objectives have one program for arrays of any size.
+    """
+    return [_alone(*lens) for part in parts for lens in _at_heights(*part)]
+
+
+def with_clear_diameter(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
+    """An imager, and conditions that have its clear diameter."""
+    if at.clear_diameter is not None:
+        return imager, at
+    return imager, dataclasses.replace(at, cells=None, clear_diameter=clear_diameter(imager, at))
+
+
+def _alone(imager: Imager, at: Conditions) -> tuple[Imager, Conditions]:
+    """A lens alone, with what decides shapes of other quantities left out."""
+    sensor = dataclasses.replace(imager.sensor, shape=(2, 2), origin=(0.0, 0.0))
+    alone = dataclasses.replace(imager, array=imager.array.lens(0), sensor=sensor)
+    return alone, dataclasses.replace(at, cells=None, lenses=None, directions=1, largest_magnification=math.inf)
+
+
+@eqx.filter_jit
+def _evaluate(function, best, types: int | None, lenses: list[tuple[Imager, Conditions]], others: list):
+    """Mean over the heights of the quantities of each type: the only one's, a row each, or the best one's."""
+
+    def of_lens(imager, at):
+        return function(imager, at, *others)
+
+    if len(lenses) == 1:
+        values = jax.tree.map(lambda value: value[None, None], of_lens(*lenses[0]))
+    else:
+        stacked = jax.tree.map(lambda *each: jnp.stack(each), *lenses)
+        values = jax.tree.map(lambda x: x.reshape(types or 1, -1, *x.shape[1:]), jax.vmap(of_lens)(*stacked))
+
+    def over_types(value):
+        value = value[:, 0] if value.shape[1] == 1 else jax.vmap(_mean_of_heights)(value)
+        if types is None:
+            return value[0]
+        return value if best is None else jnp.take_along_axis(value, best(value, axis=0, keepdims=True), 0)[0]
+
+    return jax.tree.map(over_types, values)
+
+
+def whole_array(function: Callable[P, Result], *, aperture: bool = False) -> Callable[P, Result]:
+    """Compile a quantity of all lenses together; with `aperture` one that depends on their clear diameter."""
+    signature, compiled = inspect.signature(function), eqx.filter_jit(cast(Any, function))
 
     @wraps(function)
-    def of_best(*args: P.args, **options: P.kwargs) -> Array:
-        values, several = _of_types(function, args, options)
-        return jnp.take_along_axis(values, best(values, axis=0, keepdims=True), 0)[0] if several else values
+    def of_array(*args: P.args, **options: P.kwargs) -> Result:
+        bound = signature.bind(*args, **options)
+        bound.apply_defaults()
+        imager, *depths = bound.args
+        at = [as_conditions(imager, own) for own in depths]
+        return compiled(*with_clear_diameter(imager, *at)) if aperture else compiled(imager, *at)
 
-    return of_best
+    return of_array
 
 
 # Heights of the lenses of a tilted array, in standard deviations, and their weights: exact for polynomials up to the
@@ -139,26 +217,10 @@ def best_type(function: Callable[P, Array], *, best: Callable[..., Array] = jnp.
 _HEIGHTS, _SHARES = np.array([-1, 0, 1]) * math.sqrt(9 / 5), np.array([5, 8, 5]) / 18
 
 
-def over_heights(function: Callable[[Imager, Conditions], Tree]) -> Callable[[Imager, Conditions], Tree]:
-    """Extend quantities of lenses that are alike to a tilted array: the mean over the heights of the lenses.
-
-    It is infinite if the quantity is at one of them.
-    """
-
-    @wraps(function)
-    def mean(imager: Imager, at: Conditions) -> Tree:
-        parts = _at_heights(imager, at)
-        return function(*parts[0]) if len(parts) == 1 else jax.tree.map(_mean_of_heights, _map(function, parts))
-
-    return mean
-
-
 def _at_heights(imager: Imager, at: Conditions) -> list[tuple[Imager, Conditions]]:
     """Level imagers, and their conditions, at a few heights of the lenses of a tilted array."""
     if imager.tilt is None:
         return [(imager, at)]
-    if at.clear_diameter is None:
-        at = dataclasses.replace(at, clear_diameter=clear_diameter(imager, at))
     own = imager.heights
     mean = lambda values: jnp.mean(values, where=True if at.lenses is None else at.lenses)
     middle = mean(own)
@@ -167,31 +229,9 @@ def _at_heights(imager: Imager, at: Conditions) -> list[tuple[Imager, Conditions
     return [(imager.at_height(h), dataclasses.replace(at, depths=at.depths - h, height=h)) for h in heights]
 
 
-def _map(function, parts):
-    """The function of imagers and conditions of one structure, as one program."""
-    return jax.vmap(function)(*jax.tree.map(lambda *each: jnp.stack(each), *parts))
-
-
 def _mean_of_heights(values):
     """Mean over the first axis."""
     return jnp.tensordot(jnp.asarray(_SHARES, values.dtype), values, 1)
-
-
-def _of_types(function, args, options) -> tuple[Array, bool]:
-    """The value, and False; or a row for each of several types, and True."""
-    # The wrapped function has the names and the defaults of the arguments.
-    bound = inspect.signature(function).bind(*args, **options)
-    bound.apply_defaults()
-    imager, depths, *others = bound.args
-    parts = per_type(imager, depths)
-    of_type = lambda one, at: function(one, at, *others)
-    if len(parts) == 1:
-        return over_heights(of_type)(*parts[0]), False
-    # What is asked of a type does not depend on its lenses' places: one program serves any number of types.
-    at_heights = [part for one in parts for part in _at_heights(*one)]
-    values = _map(of_type, [(eqx.tree_at(lambda i: i.array, one, one.array.lens(0)), at) for one, at in at_heights])
-    values = values.reshape(len(parts), -1, *values.shape[1:])
-    return (values[:, 0] if imager.tilt is None else jax.vmap(_mean_of_heights)(values)), True
 
 
 def of_lenses(imager: Imager, values: Float[Array, "..."]) -> Float[Array, "lens ..."]:
@@ -207,15 +247,22 @@ def clear_diameter(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
         return at.clear_diameter
     if array.alike:
         return _mean_diameter(array, at.cells)
-    return jnp.sqrt(jnp.mean(_clear_diameters(array, at.directions)[array.type_of_lens] ** 2))
+    return _root_mean_square(_clear_diameters(array, at.directions), array.type_of_lens)
 
 
-_mean_diameter = jax.jit(lambda array, cells: diameter_of(array, cells=cells))
+@jax.jit
+def _mean_diameter(array, cells):
+    return diameter_of(array, cells=cells)
 
 
 @partial(jax.jit, static_argnums=1)
 def _clear_diameters(array, directions):
     return clear_diameters(array, directions=directions)
+
+
+@jax.jit
+def _root_mean_square(values, types):
+    return jnp.sqrt(jnp.mean(values[types] ** 2))
 
 
 def field_heights(imager: Imager, at: Conditions) -> Float[Array, " field"]:

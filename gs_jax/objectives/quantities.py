@@ -25,6 +25,7 @@ from .conditions import (
     field_heights,
     field_radius,
     finite_plate,
+    whole_array,
 )
 
 
@@ -125,6 +126,7 @@ def blur(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     return theory.object_blur(imager.array.focal_length, clear_diameter(imager, at), reduced, v)
 
 
+@whole_array
 def lenses_per_point(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Number of lenses that see a point, `N_e`: lenses on the plate over its area, times `A_e`."""
     at = as_conditions(imager, depths)
@@ -136,12 +138,14 @@ def _count(imager, at):
     return float(len(imager.array.centers)) if at.lenses is None else jnp.sum(at.lenses).astype(at.depths.dtype)
 
 
+@whole_array
 def occupancy(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Occupancy of the sensor, `V = N_e M^2` (Eq. 11), by all lenses."""
     at = as_conditions(imager, depths)
     return theory.occupancy(lenses_per_point(imager, at), imager.magnification(at.depths))
 
 
+@partial(whole_array, aperture=True)
 def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     """Share of the plate that is clear aperture."""
     at = as_conditions(imager, depths)
@@ -149,6 +153,7 @@ def coverage(imager: Imager, depths: Depths = (1.0,)) -> Float[Array, ""]:
     return discs / jnp.prod(finite_plate(imager))
 
 
+@partial(whole_array, aperture=True)
 def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     """Share of a point's light that its `N_e` lenses collect, `N_e pi a^2 / (4 pi n^2 z'^2)` for a clear radius `a`.
 
@@ -159,6 +164,7 @@ def light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     return lenses_per_point(imager, at) * (clear_diameter(imager, at) / 4 / away) ** 2
 
 
+@whole_array
 def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
     """Width of the object that is imaged at all, along x and y."""
     at, sensor, plate = as_conditions(imager, depths), imager.sensor, finite_plate(imager)
@@ -167,6 +173,7 @@ def field_of_view(imager: Imager, depths: Depths) -> Float[Array, "depth axis"]:
     return theory.field_of_view(plate[None], widths[None], magnification, field_radius(imager, at))
 
 
+@whole_array
 def thickness(imager: Imager) -> Float[Array, ""]:
     """Thickness of the device: from its front, that of the array or of the filters on it, to the sensor."""
     thickness = imager.sensor_distance + imager.array.substrate_thickness
@@ -209,11 +216,13 @@ _POINTS = 41
 _FLAT = 1e-6
 
 
+@whole_array
 def spacing(imager: Imager) -> Float[Array, " lens"]:
     """Distance of each lens from its nearest neighbour; infinite for a single lens."""
     return safe_sqrt(_nearest(_squared_distances(imager.array.centers, imager.array.centers)))
 
 
+@whole_array
 def aperture_gap(imager: Imager) -> Float[Array, " lens"]:
     """Gap between each lens's aperture and the nearest other one; negative where they overlap.
 
@@ -223,6 +232,7 @@ def aperture_gap(imager: Imager) -> Float[Array, " lens"]:
     return _nearest(safe_sqrt(_squared_distances(centers, centers)) - radius[:, None] - radius[None])
 
 
+@whole_array
 def uncovered_distance(imager: Imager) -> Float[Array, " point"]:
     """Distance of 41 x 41 points of the plate, from edge to edge, from the nearest lens centre."""
     plate = finite_plate(imager)

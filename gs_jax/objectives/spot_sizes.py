@@ -142,7 +142,12 @@ def width_per_light(imager: Imager, depths: Depths) -> Float[Array, " depth"]:
     (`experiments/design_ranks.py`).
     """
     at = as_conditions(imager, depths)
-    return spot_width(imager, at) / (100 * light(imager, at)) ** 0.25
+    return _per_light(spot_width(imager, at), light(imager, at))
+
+
+@jax.jit
+def _per_light(width, light):
+    return width / (100 * light) ** 0.25
 
 
 @best_type
