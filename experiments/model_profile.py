@@ -101,13 +101,13 @@ def _stages(part, rows, nodes, imager, light) -> None:
     groups = [jnp.asarray(each) for each in stray_light._lens_groups(imager, light, nodes.dtype)]
     centers, excess = (each[0] for each in groups)
     lenses, depths, calls = len(centers), len(nodes), len(groups[0])
-    to_polar, to_pixels = stray_light._to_polar_table(polar), stray_light.to_pixels_table(polar)
+    to_polar, to_pixels = light.to_polar, light.to_pixels
     side = to_polar.side
     plane = jnp.pad(nodes[0], side + 1 + stray_light._SPARE)
     places = stray_light._window_places(centers, jnp.zeros(2, nodes.dtype), polar.step, plane.shape, side)
     read = lambda plane, places: stray_light.interpolate_windows(stray_light.Windows(plane.shape, side), places, plane)
     windows = part("- windows about lenses", "", read, plane, places)
-    resample = lambda x: stray_light.times_table(to_polar, (), x.reshape(-1, lenses))
+    resample = lambda x: stray_light.times_table((), to_polar, x.reshape(-1, lenses))
     around = part("- to polar nodes", "", resample, windows)
     fourier = lambda x: jnp.fft.rfft(x.reshape(polar.angles, polar.fields, -1), axis=0)
     spectrum = part("- Fourier transform over the angle", "", fourier, around)
@@ -119,7 +119,7 @@ def _stages(part, rows, nodes, imager, light) -> None:
     last = len(rows)
     inverse = lambda x: jnp.fft.irfft(jax.lax.complex(*jnp.split(x, 2, -1)), polar.angles, axis=0).reshape(-1, lenses)
     around = part("- inverse transform", "", inverse, spots)
-    part("- to pixels", "", lambda x: stray_light.times_table(to_pixels, (), x), around)
+    part("- to pixels", "", lambda x: stray_light.times_table((), to_pixels, x), around)
     for number, row in enumerate(rows[first:], first):
         for key in ("clock", "processor"):
             row[key] *= calls * (depths if number < last else 1)

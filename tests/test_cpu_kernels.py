@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 
 from gs_jax import Grid, Imager, MicrolensArray, Sensor, backproject, backproject_adjoint
+from gs_jax.optics.polar_grid import SparseTable
 from gs_jax.projection import linear_map
 from gs_jax.projection.bilinear import Shapes, image_to_volume, rays_vjp, volume_to_image
 from gs_jax.projection.convolution import Sizes, sum_of_convolutions
 from gs_jax.projection.rays import OUTSIDE, Envelope, RingLight
-from gs_jax.projection.stray_light import SparseTable, Windows, by_row, interpolate_windows, times_table
+from gs_jax.projection.stray_light import Windows, interpolate_windows, times_table
 
 from .helpers import scene, trace_rays
 
@@ -115,10 +116,9 @@ def same(results, expected):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * np.abs(b).max())
 
 
-def windows_and_tables(static, places, image, values, x, y):
-    windows, table = static
+def windows_and_tables(windows, places, image, values, table, x, y):
     read, added = interpolate_windows(windows, places, image), interpolate_windows.T(windows, places, values)
-    return read, added, times_table(table, (), x), times_table.T(table, (), y)
+    return read, added, times_table((), table, x), times_table.T((), table, y)
 
 
 def test_windows_and_sparse_tables_are_those_of_xla():
@@ -130,11 +130,11 @@ def test_windows_and_sparse_tables_are_those_of_xla():
     values = rng.random((windows.side, windows.side, lenses))
     row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), rng.random(400)
     row[:60] = 7
-    entries = by_row(row, column, share, 50), by_row(column, row, share, 90)
+    table = SparseTable.of(0, row, column, share, (50, 90))
     x, y = (rng.random((n, 75)) for n in (90, 50))
-    static, arrays = (windows, SparseTable(0, *entries)), ((start, rng.random((lenses, 2))), image, values, x, y)
+    arrays = (start, rng.random((lenses, 2))), image, values, table, x, y
     single = jax.tree.map(lambda a: a.astype(np.float32) if a.dtype == np.float64 else a, arrays)
-    same(run(windows_and_tables, static, *single), expected := run(windows_and_tables, static, *doubled(single)))
+    same(run(windows_and_tables, windows, *single), expected := run(windows_and_tables, windows, *doubled(single)))
     read, _, product, transposed = expected
     matrix = np.zeros((50, 90))
     np.add.at(matrix, (row, column), share)
@@ -247,9 +247,9 @@ def run_all_guarded():
             dispatch.read_windows(windows, places, some(*windows.shape))
             dispatch.add_windows(windows, places, some(19, 19, lenses))
             row, column, share = rng.integers(0, 50, 400), rng.integers(0, 90, 400), some(400)
-            table = SparseTable(0, by_row(row, column, share, 50), by_row(column, row, share, 90))
-            dispatch.times_rows(table, (), some(90, lenses))
-            dispatch.times_columns(table, (), some(50, lenses))
+            table = SparseTable.of(0, row, column, share, (50, 90))
+            dispatch.times_rows((), table, some(90, lenses))
+            dispatch.times_columns((), table, some(50, lenses))
         for size, shape in ((9, (61, 75)), (41, (150, 333))):
             for whole in (False, True):
                 change, (tall, wide) = size - 1 if whole else -size - 1, (n + size + 1 for n in shape)
@@ -269,18 +269,21 @@ def test_no_kernel_reads_or_writes_beyond_an_array():
 
 def test_sizes_that_do_not_fit_are_refused():
     shapes, rays, image, volume = problem(WEIGHTS[0])
-    table = by_row(np.array([0, 1]), np.array([0, 9]), np.ones(2), 2)
+    entries = np.array([0, 1]), np.array([0, 9]), np.ones(2)
+    table = SparseTable.of(0, *entries, (2, 10))
     for call in (
         lambda: dispatch.gather(shapes, rays, image[:-1]),
         lambda: dispatch.scatter(shapes, rays, volume[:, :-1]),
         lambda: dispatch.rays_vjp(shapes, (rays, image), volume[:2]),
         lambda: dispatch.gather(shapes._replace(volume=(3, 5, 5)), rays, image),
         lambda: dispatch.gather(shapes, rays._replace(parameters=rays.parameters[:2]), image),
-        lambda: dispatch.times_rows(SparseTable(0, table, table), (), np.ones((9, 16))),
+        lambda: dispatch.times_rows((), table, np.ones((9, 16))),
         lambda: dispatch.read_windows(Windows((61, 75), 19), (np.zeros((3, 2)), np.zeros((2, 2))), image),
     ):
         with pytest.raises(ValueError, match="must fit each other"):
             call()
+    with pytest.raises(ValueError, match="entries must lie within 2 x 9"):
+        SparseTable.of(0, *entries, (2, 9))
 
 
 def test_a_job_of_many_images():

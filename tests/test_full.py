@@ -32,13 +32,12 @@ from gs_jax.optics import field_varying
 from gs_jax.optics.apertures import clear_area
 from gs_jax.optics.core_kernels import render_harmonics, render_kernel, sample_profile
 from gs_jax.optics.field_varying import FieldVaryingPsf, field_varying_psf
-from gs_jax.optics.polar_grid import make_polar_grid
+from gs_jax.optics.polar_grid import make_polar_grid, to_pixels_table
 from gs_jax.optics.psf_core import core_magnification, ring_edges, ring_window
 from gs_jax.optics.pupil import aperture_profile, sample_pupil, trace_light
 from gs_jax.optics.raytrace import to_numpy, trace_lenslet
 from gs_jax.projection.field_varying_model import wider_voxels
 from gs_jax.projection.point_sources import full_image_of_points, full_imager_of_points
-from gs_jax.projection.stray_light import to_pixels_table
 from gs_jax.solvers.richardson_lucy import RichardsonLucy
 
 DEPTHS = (18.0, 21.0)
@@ -203,7 +202,7 @@ def test_pixels_have_the_light_of_each_ring_of_nodes():
     """About the axis nodes are closer to each other than the pixels."""
     nodes = make_polar_grid(imager(), np.array(DEPTHS))
     to_pixels = to_pixels_table(nodes).rows
-    light = np.bincount(to_pixels.place % nodes.radii, to_pixels.share) / nodes.angles
+    light = np.bincount(np.asarray(to_pixels.place) % nodes.radii, np.asarray(to_pixels.share)) / nodes.angles
     # The last rings are cut.
     np.testing.assert_allclose(light[:-3], 1, rtol=1e-6)
 

@@ -24,7 +24,7 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from .apertures import clear_area
 from .core_kernels import harmonic_shares, narrow_kernel, render_harmonics, render_kernel, sample_profile, sharpen
-from .polar_grid import PolarGrid, make_polar_grid, polar_weights
+from .polar_grid import PolarGrid, SparseTable, make_polar_grid, polar_weights, to_pixels_table, to_polar_table
 from .psf_core import HARMONICS, RINGS, PsfCores, half_light_radii, ring_edges, ring_light, trace_cores
 from .pupil import ApertureProfile, add_diffraction, aperture_profile, sample_pupil
 
@@ -51,13 +51,20 @@ class StrayLight(eqx.Module):
     """All light but the cores', at some depths; made by `trace_stray_light`.
 
     `table`: of `stray_light_table`, for each depth. `area`: mean clear area of the lenses, mm^2. `sensor_distance`: of
-    the tables, `v'`, mm. `grid`: the nodes.
+    the tables, `v'`, mm. `to_polar`, `to_pixels`: between square and polar nodes. `grid`: the nodes.
     """
 
     table: Float[Array, "depth harmonic radius order field"]
     area: Float[Array, ""]
     sensor_distance: Float[Array, ""]
+    to_polar: SparseTable
+    to_pixels: SparseTable
     grid: PolarGrid = eqx.field(static=True)
+
+    @classmethod
+    def on(cls, grid: PolarGrid, table, area, sensor_distance) -> "StrayLight":
+        """Stray light on these nodes."""
+        return cls(table, area, sensor_distance, to_polar_table(grid), to_pixels_table(grid), grid)
 
 
 class FieldVaryingPsf(eqx.Module):
@@ -154,7 +161,7 @@ def _cached_tables(request: _Request) -> FieldVaryingPsf:
     arrays = cached_on_disk(key, lambda: _trace_tables(request))
     rings = tuple(arrays.pop("rings").tolist())
     tables = {name: jnp.asarray(array, request.imager.sensor_distance.dtype) for name, array in arrays.items()}
-    stray_light = StrayLight(tables["table"], tables["area"], tables["sensor_distance"], request.grid)
+    stray_light = StrayLight.on(request.grid, tables["table"], tables["area"], tables["sensor_distance"])
     names = "distortion", "light", "kernels", "wide_kernels", "harmonics", "wide_harmonics"
     return FieldVaryingPsf(**{name: tables[name] for name in names}, stray_light=stray_light, rings=rings)
 
@@ -226,7 +233,7 @@ def trace_stray_light(
     tables = map_in_threads(lambda one: stray_light_table(imager, one[0], aperture, grid, one[1], ends), each)
     tracked = zip((progress or Progress()).track(depths, "Tracing stray light"), tables, strict=True)
     table = jnp.asarray(np.stack([table for _, table in tracked]), imager.sensor_distance.dtype)
-    return StrayLight(table, jnp.mean(clear_area(imager.array)), imager.reduced_sensor_distance, grid)
+    return StrayLight.on(grid, table, jnp.mean(clear_area(imager.array)), imager.reduced_sensor_distance)
 
 
 def stray_light_table(

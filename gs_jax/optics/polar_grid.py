@@ -1,11 +1,17 @@
-"""Polar nodes about a lens's axis, for stray light: where they are, and how light is shared by them."""
+"""Polar nodes about a lens's axis, for stray light: where they are, and how light is shared by them.
+
+Sparse tables resample between square nodes (or pixels) and polar ones. They are arrays of the PSF's `StrayLight`.
+"""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64, Int, Num
+from jaxtyping import Array, Float, Float64, Int, Num
 
 from ..geometry import Imager
 from .raytrace import to_numpy
@@ -17,6 +23,8 @@ _WIDEST = 0.9
 _LINEAR, _NODES = 0.45, 44
 # How far beyond the widest field's chief ray light is followed on the sensor, in images of the widest field.
 _BEYOND = 0.35
+# Inner rings of polar nodes, which are closer to each other than pixels.
+_INNER_RINGS = 4
 
 
 class PolarGrid(NamedTuple):
@@ -88,3 +96,118 @@ def polar_weights(
         parts.append((place, node, share))
     place, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
     return place, node, share
+
+
+class Entries(eqx.Module):
+    """Entries of a sparse matrix, row after row, as arrays.
+
+    `start`: the first entry of each row. `place`, `share`: column and value of each. `parts`: places and shares
+    `(row, entry)` of the rows with 1, 2, 3-4, ... entries, filled up with zeros; `order`: these rows' order in the
+    matrix. `columns`: number of columns.
+    """
+
+    start: Int[Array, " start"]
+    place: Int[Array, " entry"]
+    share: Float[Array, " entry"]
+    parts: list[tuple[Int[Array, "row size"], Float[Array, "row size"]]]
+    order: Int[Array, " row"]
+    columns: int = eqx.field(static=True)
+
+    @classmethod
+    def by_row(cls, row, place, share, shape: tuple[int, int]) -> "Entries":
+        """The matrix of a shape with these entries, in any order; `ValueError` if one is beyond it. Host code."""
+        rows, columns = shape
+        if row.size and not (0 <= min(row.min(), place.min()) and row.max() < rows and place.max() < columns):
+            raise ValueError(f"entries must lie within {rows} x {columns}.")
+        sorting = np.argsort(row, kind="stable")
+        start = np.searchsorted(row[sorting], np.arange(rows + 1)).astype(np.int32)
+        place, share = place[sorting].astype(np.int32), share[sorting]
+        parts, order = _equal_parts(start, place, share)
+        # Tables are kept: they must not belong to a program that is being traced.
+        with jax.ensure_compile_time_eval():
+            own = jax.tree.map(jnp.asarray, (start, place, share, parts, order))
+        return cls(own[0], own[1], own[2], own[3], own[4], columns)
+
+
+def _equal_parts(start, place, share):
+    count = np.diff(start)
+    size = np.ceil(np.log2(np.maximum(count, 1))).astype(int)
+    parts = []
+    for own in np.unique(size):
+        number = np.arange(max(count[size == own].max(), 1))
+        exists = number < count[size == own][:, None]
+        at = np.where(exists, start[:-1][size == own][:, None] + number, 0)
+        parts.append((np.where(exists, place[at], 0), np.where(exists, share[at], 0)))
+    return parts, np.argsort(np.argsort(size, kind="stable")).astype(np.int32)
+
+
+class SparseTable(eqx.Module):
+    """A sparse matrix by rows and by columns; `side` is that of the square of pixels."""
+
+    side: int = eqx.field(static=True)
+    rows: Entries
+    columns: Entries
+
+    @classmethod
+    def of(cls, side: int, row, column, share, shape: tuple[int, int]) -> "SparseTable":
+        rows, columns = shape
+        by_row, by_column = (row, column, share, (rows, columns)), (column, row, share, (columns, rows))
+        return cls(side, Entries.by_row(*by_row), Entries.by_row(*by_column))
+
+
+@lru_cache(maxsize=4)
+def to_polar_table(polar_grid: PolarGrid) -> SparseTable:
+    """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
+    reach = math.ceil(polar_grid.nodes(polar_grid.fields)[-2])
+    node, polar, share = polar_weights(polar_grid, polar_grid.fields, *_square(reach))
+    polar = _angle_first(polar_grid, polar_grid.fields, polar)
+    side, polars = 2 * reach + 1, polar_grid.fields * polar_grid.angles
+    return SparseTable.of(side, polar, node, share, (polars, side**2))
+
+
+@lru_cache(maxsize=4)
+def to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
+    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that no ring loses any.
+
+    Up to the radius `bend` nodes are closer around than pixels, and some are near no pixel: the nodes of a ring keep
+    their light together, not each its own. About the axis they are closer outward, too, and are shared by the four
+    pixels around them instead.
+    """
+    reach = math.ceil(polar_grid.nodes(polar_grid.radii)[-2])
+    pixel, node, share = polar_weights(polar_grid, polar_grid.radii, *_square(reach))
+    outer = (node >= _INNER_RINGS * polar_grid.angles) & (share > 0)
+    pixel, node, share = pixel[outer], node[outer], share[outer]
+    ring = node // polar_grid.angles
+    total = np.bincount(ring, share, polar_grid.radii) / polar_grid.angles
+    # The last rings are cut by the window's edge, and have no more light than that.
+    share = share / np.where(ring < polar_grid.radii - 3, total[ring], polar_grid.areas(polar_grid.radii)[ring])
+    parts = [(pixel, node, share), *_near_axis(polar_grid, reach)]
+    pixel, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
+    node = _angle_first(polar_grid, polar_grid.radii, node)
+    side, polars = 2 * reach + 1, polar_grid.radii * polar_grid.angles
+    return SparseTable.of(side, pixel, node, share, (side**2, polars))
+
+
+def _angle_first(polar_grid, radii, node):
+    """Numbers of nodes `(radius, angle)` as those of `(angle, radius)`."""
+    return node % polar_grid.angles * radii + node // polar_grid.angles
+
+
+def _near_axis(polar_grid: PolarGrid, reach: int):
+    """Entries (pixel, polar node, share) of the inner polar nodes, for each of the four pixels around them."""
+    node = np.arange(_INNER_RINGS * polar_grid.angles)
+    radius, angle = (
+        polar_grid.nodes(_INNER_RINGS)[node // polar_grid.angles],
+        2 * np.pi * (node % polar_grid.angles) / polar_grid.angles,
+    )
+    place = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1) + reach
+    whole = np.floor(place).astype(int)
+    for corner in np.ndindex(2, 2):
+        row, column = (whole + corner).T
+        yield row * (2 * reach + 1) + column, node, np.where(corner, place - whole, 1 - (place - whole)).prod(-1)
+
+
+def _square(reach: int):
+    side = np.arange(-reach, reach + 1)
+    y, x = np.meshgrid(side, side, indexing="ij")
+    return x.ravel(), y.ravel()

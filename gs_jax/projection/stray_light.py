@@ -4,9 +4,8 @@ It is computed in polar coordinates about each lens, where a spot that turns wit
 harmonics. Sparse tables resample between square nodes (or pixels) and polar ones.
 """
 
-import dataclasses
 import math
-from functools import cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -19,7 +18,7 @@ from ..base.arrays import array_namespace
 from ..geometry import Imager
 from ..optics.apertures import clear_area
 from ..optics.field_varying import StrayLight
-from ..optics.polar_grid import PolarGrid, polar_weights
+from ..optics.polar_grid import Entries, SparseTable
 from .linear_map import LinearMap
 
 # Lenses whose stray light is computed at once, which bounds the memory.
@@ -31,8 +30,6 @@ _SPARE = 16
 _BLUR, _NOISE = 0.7, 0.02
 # Coarse pixels around the sensor, for that filter and for the interpolation.
 _MARGIN = 12
-# Inner rings of polar nodes, which are closer to each other than pixels.
-_INNER_RINGS = 4
 # Rows of a table with at most so many entries are summed entry by entry, without a copy.
 _FEW = 8
 
@@ -53,8 +50,7 @@ def stray_light_image(
     polar_grid, v = optics.grid, (distance / optics.sensor_distance).astype(dtype)
     # The spots' pattern grows with the sensor's distance, and the coarse pixels with it.
     pixel = polar_grid.pixel * v
-    to_polar, to_pixels = _to_polar_table(polar_grid), to_pixels_table(polar_grid)
-    inner, outer = to_polar.side, to_pixels.side
+    inner, outer = optics.to_polar.side, optics.to_pixels.side
     coarse = [math.ceil(n * imager.sensor.pixel_pitch / polar_grid.pixel) + 2 * _MARGIN for n in imager.sensor.shape]
     nodes = jnp.pad(nodes, [(0, 0), *[(inner + 1, inner + 1 + _SPARE)] * 2])
     axes, image_of_axis = imager.axis_offset(depths).astype(dtype), imager.image_of_axis.astype(dtype)
@@ -69,7 +65,7 @@ def stray_light_image(
             nodes, table, axis = plane
             places = _window_places(centers + axis[None], origin.astype(dtype), polar_grid.step, nodes.shape, inner)
             objects = interpolate_windows(Windows(nodes.shape, inner), places, nodes)
-            polar = times_table(to_polar, (), objects.reshape(-1, len(centers)))
+            polar = times_table((), optics.to_polar, objects.reshape(-1, len(centers)))
             spectrum = jnp.fft.rfft(polar.reshape(polar_grid.angles, polar_grid.fields, -1), axis=0)
             parts = jnp.concatenate([spectrum.real, spectrum.imag], -1)
             return spots + table @ jnp.concatenate([parts, parts * jnp.tile(excess, 2)[None, None]], 1), None
@@ -79,7 +75,7 @@ def stray_light_image(
         # The image lies opposite to the object: half a turn.
         spots = lax.complex(*jnp.split(jnp.where(half_turn, -spots, spots), 2, -1))
         polar = jnp.fft.irfft(spots, polar_grid.angles, axis=0).reshape(-1, len(centers))
-        spots = times_table(to_pixels, (), polar).reshape(outer, outer, -1)
+        spots = times_table((), optics.to_pixels, polar).reshape(outer, outer, -1)
         middle = jnp.asarray(imager.sensor.origin, dtype)
         places = _window_places(centers + image_of_axis[None], middle, pixel, image.shape, outer)
         return image + interpolate_windows.T(Windows(image.shape, outer), places, spots), None
@@ -213,48 +209,17 @@ def cubic(distance):
     return xp.where(x <= 1, near, xp.where(x < 2, far, 0))
 
 
-@cache
+@lru_cache(maxsize=4)
 def _wiener_matrix(count: int) -> Float[np.ndarray, "pixel pixel"]:
     blur = np.exp(-2 * np.pi**2 * _BLUR * np.fft.fftfreq(2 * count) ** 2)
     kernel = np.fft.ifft(blur * (1 + _NOISE) / (blur**2 + _NOISE)).real
     return kernel[np.arange(count)[:, None] - np.arange(count)]
 
 
-class Entries(NamedTuple):
-    """Entries of a sparse matrix, row after row: the first of each row, their places within a row, and their shares."""
-
-    start: np.ndarray
-    place: np.ndarray
-    share: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class SparseTable:
-    """A sparse matrix by rows and by columns; `side` is that of the square of pixels."""
-
-    side: int
-    rows: Entries
-    columns: Entries
-
-
-def _times_entries(entries, x):
+def _times_entries(entries: Entries, x):
     """Both directions gather whole rows: the scatter of a transpose is much slower."""
-    parts, order = _equal_parts(entries)
-    products = [_times_part(place, share.astype(x.dtype), x) for place, share in parts]
-    return jnp.concatenate(products).at[order].get(mode="promise_in_bounds")
-
-
-def _equal_parts(entries):
-    """Places and shares of the rows with 1, 2, 3-4, ... entries, filled up with zeros, and the order of all rows."""
-    count = np.diff(entries.start)
-    size = np.ceil(np.log2(np.maximum(count, 1))).astype(int)
-    parts = []
-    for one in np.unique(size):
-        number = np.arange(max(count[size == one].max(), 1))
-        exists = number < count[size == one][:, None]
-        at = np.where(exists, entries.start[:-1][size == one][:, None] + number, 0)
-        parts.append((np.where(exists, entries.place[at], 0), np.where(exists, entries.share[at], 0)))
-    return parts, np.argsort(np.argsort(size, kind="stable")).astype(np.int32)
+    products = [_times_part(place, share.astype(x.dtype), x) for place, share in entries.parts]
+    return jnp.concatenate(products).at[entries.order].get(mode="promise_in_bounds")
 
 
 def _times_part(index, weight, columns):
@@ -267,73 +232,12 @@ def _times_part(index, weight, columns):
     return total
 
 
-times_table = LinearMap(
-    lambda table, _, x: _times_entries(table.rows, x),
-    lambda table, _, x: _times_entries(table.columns, x),
-    kernels=("times_rows", "times_columns"),
-)
+def _times_rows(_, table: SparseTable, x):
+    return _times_entries(table.rows, x)
 
 
-@cache
-def _to_polar_table(polar_grid: PolarGrid) -> SparseTable:
-    """From the square nodes about a lens to the polar ones: what each node holds is shared by the four around it."""
-    reach = math.ceil(polar_grid.nodes(polar_grid.fields)[-2])
-    node, polar, share = polar_weights(polar_grid, polar_grid.fields, *_square(reach))
-    polar = _angle_first(polar_grid, polar_grid.fields, polar)
-    side, polars = 2 * reach + 1, polar_grid.fields * polar_grid.angles
-    return SparseTable(side, by_row(polar, node, share, polars), by_row(node, polar, share, side**2))
+def _times_columns(_, table: SparseTable, y):
+    return _times_entries(table.columns, y)
 
 
-@cache
-def to_pixels_table(polar_grid: PolarGrid) -> SparseTable:
-    """From polar nodes to the pixels about a lens: the density of light, interpolated, so that no ring loses any.
-
-    Up to the radius `bend` nodes are closer around than pixels, and some are near no pixel: the nodes of a ring keep
-    their light together, not each its own. About the axis they are closer outward, too, and are shared by the four
-    pixels around them instead.
-    """
-    reach = math.ceil(polar_grid.nodes(polar_grid.radii)[-2])
-    pixel, node, share = polar_weights(polar_grid, polar_grid.radii, *_square(reach))
-    outer = (node >= _INNER_RINGS * polar_grid.angles) & (share > 0)
-    pixel, node, share = pixel[outer], node[outer], share[outer]
-    ring = node // polar_grid.angles
-    total = np.bincount(ring, share, polar_grid.radii) / polar_grid.angles
-    # The last rings are cut by the window's edge, and have no more light than that.
-    share = share / np.where(ring < polar_grid.radii - 3, total[ring], polar_grid.areas(polar_grid.radii)[ring])
-    parts = [(pixel, node, share), *_near_axis(polar_grid, reach)]
-    pixel, node, share = (np.concatenate(part) for part in zip(*parts, strict=True))
-    node = _angle_first(polar_grid, polar_grid.radii, node)
-    side, polars = 2 * reach + 1, polar_grid.radii * polar_grid.angles
-    return SparseTable(side, by_row(pixel, node, share, side**2), by_row(node, pixel, share, polars))
-
-
-def _angle_first(polar_grid, radii, node):
-    """Numbers of nodes `(radius, angle)` as those of `(angle, radius)`."""
-    return node % polar_grid.angles * radii + node // polar_grid.angles
-
-
-def _near_axis(polar_grid: PolarGrid, reach: int):
-    """Entries (pixel, polar node, share) of the inner polar nodes, for each of the four pixels around them."""
-    node = np.arange(_INNER_RINGS * polar_grid.angles)
-    radius, angle = (
-        polar_grid.nodes(_INNER_RINGS)[node // polar_grid.angles],
-        2 * np.pi * (node % polar_grid.angles) / polar_grid.angles,
-    )
-    place = np.stack([radius * np.sin(angle), radius * np.cos(angle)], -1) + reach
-    whole = np.floor(place).astype(int)
-    for corner in np.ndindex(2, 2):
-        row, column = (whole + corner).T
-        yield row * (2 * reach + 1) + column, node, np.where(corner, place - whole, 1 - (place - whole)).prod(-1)
-
-
-def _square(reach: int):
-    side = np.arange(-reach, reach + 1)
-    y, x = np.meshgrid(side, side, indexing="ij")
-    return x.ravel(), y.ravel()
-
-
-def by_row(row, place, share, rows) -> Entries:
-    """Entries sorted by row."""
-    sorting = np.argsort(row, kind="stable")
-    start = np.searchsorted(row[sorting], np.arange(rows + 1)).astype(np.int32)
-    return Entries(start, place[sorting].astype(np.int32), share[sorting])
+times_table = LinearMap(_times_rows, _times_columns, kernels=("times_rows", "times_columns"))

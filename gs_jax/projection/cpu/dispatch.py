@@ -245,19 +245,18 @@ def _whole_last_axis(array):
     return jnp.pad(array, [*[(0, 0)] * (array.ndim - 1), (0, -array.shape[-1] % WIDTH)])
 
 
-def times_rows(matrix, _, x):
+def times_rows(_, matrix, x):
     return _times("times_rows", matrix.rows, x)
 
 
-def times_columns(matrix, _, x):
+def times_columns(_, matrix, x):
     return _times("times_columns", matrix.columns, x)
 
 
 def _times(kernel, entries, x):
-    start, place, share = entries
-    inside = start[0] >= 0 and (np.diff(start) >= 0).all() and start[-1] <= len(place) == len(share)
-    inside = inside and x.ndim == 2 and (place.size == 0 or 0 <= place.min() <= place.max() < len(x))
-    _require(kernel, inside, start, place, share, x)
+    # Places of entries are checked where tables are made.
+    start, place, share = entries.start, entries.place, entries.share
+    _require(kernel, x.ndim == 2 and len(x) == entries.columns and place.shape == share.shape, start, place, share, x)
     whole = _whole_last_axis(x)
     result = ShapeDtypeStruct((len(start) - 1, whole.shape[1]), jnp.float32)
     return _call(kernel, result, start, place, share, whole)[:, : x.shape[1]]
