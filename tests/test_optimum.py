@@ -3,7 +3,7 @@
 import dataclasses
 import inspect
 import math
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import gs_jax as gs
 from gs_jax import InputError, objectives
 from gs_jax.base.errors import InputWarning
 from gs_jax.codesign.solve import LBFGSB
-from gs_jax.objectives.conditions import of_lenses, per_type
+from gs_jax.objectives.conditions import Conditions, of_lenses, per_type
 
 from .helpers import compilations
 
@@ -140,7 +140,9 @@ def test_a_pitch_scales_centers_and_plate():
     assert float(gs.objectives.lenses_per_point(found.imager)) == pytest.approx(2.0, abs=1e-3)
 
 
-UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotations
+# Past the tests' check of annotations.
+UNCHECKED, RUN_STUDY = map(inspect.unwrap, cast(Any, (gs.optimize, gs.run_study)))
+BLUR = cast(Any, objectives.blur)
 
 
 @pytest.mark.parametrize(
@@ -156,6 +158,13 @@ UNCHECKED: Any = inspect.unwrap(gs.optimize)  # past the tests' check of annotat
             "solver must be a solver of .*, got 'bfgs'",
         ),
         (lambda: gs.optimize(in_focus, small(), free=FREE, steps=0), "steps must be 1 or more, got 0"),
+        (lambda: UNCHECKED(in_focus, small(), free=FREE, steps=np.nan), "steps must be a whole number, got nan"),
+        (lambda: UNCHECKED(None, small(), free=FREE), "loss must be a function of an imager, got None"),
+        (lambda: UNCHECKED(in_focus, small(), free=FREE, solver=optx.BFGS), "solver must be a solver of .*BFGS"),
+        (lambda: BLUR(gs.Imager, DEPTHS), "imager must be an Imager, as .*, got <class"),
+        (lambda: BLUR(small(), 1j * DEPTHS), "depths must be real lengths, mm, or Conditions, got array"),
+        (lambda: BLUR(small(), Conditions), "depths must be real lengths, mm, or Conditions, got <class"),
+        (lambda: RUN_STUDY(gs.Design, "s.toml"), "design must be a Design or its file, got <class"),
         (lambda: gs.free("spacing"), "names must be among sensor_distance, rotation.*, got 'spacing'"),
         (lambda: gs.free(), "at least one name must be given"),
         (

@@ -1,5 +1,6 @@
 """Points out of captures that are rendered finer than any voxel, with noise, or ray-traced."""
 
+import inspect
 import json
 from functools import cache
 
@@ -271,6 +272,10 @@ def test_a_wrong_image_is_named():
     for search in (find, lambda image: detection_stats(np.array([[0.0, 0.0, 20.0, 1.0]]), image, *small())):
         with pytest.raises(InputError, match="image must be finite, got 2 of 860160 pixels NaN"):
             search(spoilt)
+    with pytest.raises(InputError, match="image must be real, got complex numbers"):
+        find(np.ones((896, 960), complex))
+    with pytest.raises(InputError, match="imager must be an Imager, as .*, got <class"):
+        inspect.unwrap(find_points)(spoilt, Imager, small()[1])
 
 
 # Ray-traced captures: the independent check.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from gs_jax.base.errors import InputError
 from gs_jax.codesign.study import TermTable
 from gs_jax.codesign.targets import Objective, Row, assess, evaluate, worst_entry
 from gs_jax.codesign.terms import TERMS, Term
@@ -96,3 +97,8 @@ def test_random_terms_take_the_key(entries):
     name = "blur_um"
     draw = lambda seed: inspect.unwrap(evaluate)(TERMS[name], X, None, jax.random.key(seed))
     assert (draw(0) == draw(0)).all() and (draw(0) != draw(1)).all()
+
+
+def test_whole_numbers_have_no_slope(entries):
+    with pytest.raises(InputError, match=r"a term \(itself\) must be of floating point, got int"):
+        entries(table({"at_most": 2.0}), jnp.arange(3))

@@ -4,6 +4,7 @@ import contextlib
 import re
 import reprlib
 from collections.abc import Iterator
+from types import UnionType
 
 # C0 and C1 controls and Unicode's own line ends: a file name or a key may hold any of them.
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
@@ -47,6 +48,12 @@ class InputWarning(UserWarning):
 def input_error(name: str, allowed: object, given: object, file: object = None) -> InputError:
     """`InputError` with the message "NAME must be ALLOWED, got GIVEN (FILE)."."""
     return InputError(f"{name} must be {allowed}, got {given}{f' ({file})' if file else ''}.")
+
+
+def check_kind(name: str, value: object, kind: type | UnionType | tuple[type, ...], allowed: str) -> None:
+    """Raise `InputError` unless a value is of a kind; the class in place of its object is not."""
+    if not isinstance(value, kind):
+        raise input_error(name, allowed, short_repr(value))
 
 
 @contextlib.contextmanager

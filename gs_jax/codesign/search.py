@@ -7,6 +7,7 @@ checkpoint. `optimize` takes any loss; studies are this with terms by name.
 
 import contextlib
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -20,7 +21,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..base.arrays import host_code
-from ..base.errors import InputError, errors_name_file, short_repr
+from ..base.errors import InputError, check_kind, errors_name_file, input_error, short_repr
 from ..base.machine import Workers
 from ..base.progress import Progress
 from ..design.conversion import reduced_depth, reduced_sensor_distance, sample_table
@@ -77,6 +78,8 @@ def load(design: Design | PathLike, study: Study | PathLike) -> Iterator[tuple[D
 
     An `InputError` within names the study's file.
     """
+    check_kind("design", design, Design | str | os.PathLike, "a Design or its file")
+    check_kind("study", study, Study | str | os.PathLike, "a Study or its file")
     found = design if isinstance(design, Design) else read_design(design)
     if isinstance(study, Study):
         yield initial_design(found, study), study
@@ -303,7 +306,7 @@ def optimize(
     0.25
     """
     solver = optx.BFGS(least_change(), least_change()) if solver is None else solver
-    _check(imager, free, solver, steps)
+    _check(loss, imager, free, solver, steps)
     maps = {
         name: _map(name, free, bounds, isinstance(solver, LBFGSB)) for name in {**dict.fromkeys(free.names), **bounds}
     }
@@ -337,14 +340,13 @@ def optimize(
     return Optimum(found, state.cost, result, {"num_steps": int(state.step), "values": np.array(losses)})
 
 
-def _check(imager, free, solver, steps):
-    for name, found, wanted, words in (
-        ("imager", imager, Imager, "an Imager, as `design.imager()` is"),
-        ("free", free, Free, "a Free, as `gs_jax.free` makes it"),
-        ("solver", solver, Solver, "a solver of optimistix or optax, or LBFGSB()"),
-    ):
-        if not isinstance(found, wanted):
-            raise InputError(f"{name} must be {words}, got {short_repr(found)}.")
+def _check(loss, imager, free, solver, steps):
+    if not callable(loss):
+        raise input_error("loss", "a function of an imager", short_repr(loss))
+    check_kind("imager", imager, Imager, "an Imager, as `design.imager()` is")
+    check_kind("free", free, Free, "a Free, as `gs_jax.free` makes it")
+    check_kind("solver", solver, Solver, "a solver of optimistix or optax, or LBFGSB()")
+    check_kind("steps", steps, int | np.integer, "a whole number")
     if steps < 1:
         raise InputError(f"steps must be 1 or more, got {steps}.")
 

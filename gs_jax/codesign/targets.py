@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..base.arrays import as_float
+from ..base.errors import input_error
 from ..geometry import Imager
 from ..objectives.conditions import Conditions
 from ..typing import Real
@@ -105,7 +106,11 @@ def _power_mean(x: Float[Array, " entry"]) -> Float[Array, "1"]:
 
 
 def _entries(term, imager, at, key):
-    return jnp.ravel(term.function(imager, at, key) if term.random else term.function(imager, at))
+    entries = jnp.ravel(term.function(imager, at, key) if term.random else term.function(imager, at))
+    if not jnp.issubdtype(entries.dtype, jnp.floating):
+        # They have no slope: a search would stay where it begins.
+        raise input_error(f"a term ({term.meaning})", "of floating point", entries.dtype)
+    return entries
 
 
 def assess(table: TermTable, entries: Float[np.ndarray, " entry"]) -> Row:

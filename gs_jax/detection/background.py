@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
 from ..base.arrays import check_finite
+from ..base.errors import input_error
 from ..base.machine import map_in_threads
 from ..typing import Image
 
@@ -32,7 +33,9 @@ class DetectionImage(NamedTuple):
 
 
 def subtract_background(image: Image) -> DetectionImage:
-    """Smooth an image slightly and subtract its background; `InputError` if a pixel is not finite."""
+    """Smooth an image slightly and subtract its background; `InputError` if a pixel is not real and finite."""
+    if np.iscomplexobj(image):
+        raise input_error("image", "real", "complex numbers")
     check_finite("image", image)
     light = gaussian_smooth(np.asarray(image), _SMOOTHING)
     background, noise = (interpolate_tiles(tiles, light.shape) for tiles in background_tiles(light))

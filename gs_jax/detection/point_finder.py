@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int
 from scipy.ndimage import map_coordinates
 
 from ..base.arrays import host_code, jit
-from ..base.errors import InputError
+from ..base.errors import InputError, check_kind
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid
@@ -129,6 +129,8 @@ def find_points(
     >>> gs.localization(found, truth).f1
     1.0
     """
+    check_kind("imager", imager, Imager, "an Imager, as `design.imager()` is")
+    check_kind("grid", grid, Grid, "a Grid")
     progress = progress or Progress()
     detection = image if isinstance(image, DetectionImage) else subtract_background(image)
     if (lenses := len(imager.array.centers)) < _MIN_LENSES:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..base.arrays import POSITIVE, as_float, as_float_or_none, check_fields, safe_sqrt
+from ..base.errors import check_kind, input_error, short_repr
 from ..geometry import Imager
 from ..optics.apertures import VoronoiCells, clear_diameter as diameter_of, clear_diameters
 
@@ -84,11 +85,16 @@ Depths = Conditions | Float[ArrayLike, " depth"] | Sequence[float]
 
 def as_conditions(imager: Imager, depths: Depths) -> Conditions:
     """Depths as `Conditions`, in the imager's precision."""
+    check_kind("imager", imager, Imager, "an Imager, as `design.imager()` is")
     dtype = imager.sensor_distance.dtype
     if not isinstance(depths, Conditions):
-        # Numbers become an array on the host: JAX would compile a conversion for each number of depths.
-        on_host = not any(isinstance(leaf, Array) for leaf in jax.tree.leaves(depths))
-        return Conditions(jnp.asarray(np.asarray(depths, dtype) if on_host else depths, dtype))
+        if any(isinstance(leaf, Array) for leaf in jax.tree.leaves(depths)):
+            return Conditions(jnp.asarray(depths, dtype))
+        numbers = np.asarray(depths)
+        if numbers.dtype.kind not in "iuf":
+            raise input_error("depths", "real lengths, mm, or Conditions", short_repr(depths))
+        # An array on the host: JAX would compile a conversion for each number of depths.
+        return Conditions(jnp.asarray(numbers.astype(dtype), dtype))
     if depths.depths.dtype == dtype:
         return depths
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, depths)
