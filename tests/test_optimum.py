@@ -241,6 +241,17 @@ def test_objectives_have_the_gradients_of_finite_differences():
         np.testing.assert_allclose(product, numeric, rtol=1e-3, atol=1e-6, err_msg=name)
 
 
+def test_an_objective_is_one_program():
+    """After the clear diameter and the lens that stands for all; other numbers and depths find it."""
+    blur, light, scope = objectives.blur, objectives.light, small()
+    blur(scope, DEPTHS), light(scope, DEPTHS)
+    before = compilations()
+    blur(small(radius_of_curvature=2.1), (DEPTHS + 0.5).tolist()), light(small(conic_constant=-0.5), DEPTHS - 0.5)
+    assert compilations() == before
+    objectives.sensor_blur(scope, DEPTHS), objectives.focus_distance(scope, DEPTHS)
+    assert compilations() == before + 2
+
+
 def test_depths_behind_the_array_are_refused():
     with pytest.raises(ValueError, match="`depths` must be positive and finite, got -3.0"):
         objectives.spot_width(small(), np.array([20.0, -3.0]))
