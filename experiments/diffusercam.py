@@ -54,9 +54,9 @@ def estimate(psf: Image, image: Image, *, method: str, steps: int) -> Array:
     A = system
     if method == "ADMM":
         tv = TV / jnp.max(A.T.mv(image))  # in the unit of the solver
-        return solve(system, image, ConvolutionADMM(steps, sparsity=0.0, tv=tv)).x
+        return solve(system, image, ConvolutionADMM(steps, sparsity=0.0, tv=tv)).value
     solver = RichardsonLucy(steps, accelerate=True) if method == "Richardson-Lucy" else FISTA(steps, sparsity=0.0)
-    return solve(A, image, solver).x
+    return solve(A, image, solver).value
 
 
 @jax.jit

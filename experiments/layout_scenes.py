@@ -113,7 +113,7 @@ def _reconstructed(image, centers, study, method):
     image = jnp.asarray(image, centers.dtype)
     if method == "backproject":
         return reconstruct(image, study.imager(centers), study.grid(), background_width=BACKGROUND)
-    return solve(ImagingOperator(study.imager(centers), study.grid()), image, RichardsonLucy(steps=10)).x
+    return solve(ImagingOperator(study.imager(centers), study.grid()), image, RichardsonLucy(steps=10)).value
 
 
 def judge(

@@ -18,7 +18,7 @@ from gs_jax.io.captures import read_capture, write_capture
 from gs_jax.io.provenance import read_provenance
 from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.reconstruction.deconvolution import deconvolve
-from gs_jax.solvers.base import differences, solve, total_variation
+from gs_jax.solvers.base import RESULTS, differences, solve, total_variation
 from gs_jax.solvers.convolution import ConvolutionADMM
 
 # PSF and image, odd and even, larger and smaller than each other, one depth and several.
@@ -80,10 +80,6 @@ def relative(convolution, image, **weights):
     return {name: weight / unit for name, weight in weights.items()}
 
 
-def run(A, image, solver):
-    return jax.jit(lambda b: solve(A, b, solver))(image)
-
-
 def objective(convolution, image, x, *, tv, l1, isotropic=False):
     residual = convolution.mv(x) - image
     u = differences(x, wrap=True)
@@ -130,11 +126,11 @@ def test_the_cost_is_that_of_a_plain_numpy_version():
     convolution, image = noisy_system()
     psf = jax.random.uniform(jax.random.key(0), (1, 5, 4))
     x, expected = numpy_admm(np.asarray(psf[0]), np.asarray(image), 4000, 0.05, 0.1)
-    solution = run(convolution, image, ConvolutionADMM(4000, **relative(convolution, image, tv=0.05, sparsity=0.1)))
-    np.testing.assert_allclose(objective(convolution, image, solution.x, tv=0.05, l1=0.1), expected, rtol=1e-8)
-    np.testing.assert_allclose(solution.costs[-1], expected, rtol=1e-8)
+    solution = solve(convolution, image, ConvolutionADMM(4000, **relative(convolution, image, tv=0.05, sparsity=0.1)))
+    np.testing.assert_allclose(objective(convolution, image, solution.value, tv=0.05, l1=0.1), expected, rtol=1e-8)
+    np.testing.assert_allclose(solution.stats["costs"][-1], expected, rtol=1e-8)
     # The scenes differ in size by a margin that reaches no pixel and stays dark.
-    np.testing.assert_allclose(solution.x.sum(), x.sum(), rtol=1e-6)
+    np.testing.assert_allclose(solution.value.sum(), x.sum(), rtol=1e-6)
 
 
 @pytest.mark.integration
@@ -144,7 +140,10 @@ def test_ffts_conjugate_gradients_and_fista_meet(depths):
     convolution, image = noisy_system(depths)
     sparse = relative(convolution, image, sparsity=0.2)
     A, solvers = convolution, (ADMM(500, **sparse), FISTA(1000, **sparse))
-    volumes = [run(convolution, image, ConvolutionADMM(3000, **sparse)).x, *(run(A, image, s).x for s in solvers)]
+    volumes = [
+        solve(convolution, image, ConvolutionADMM(3000, **sparse)).value,
+        *(solve(A, image, s).value for s in solvers),
+    ]
     costs = [objective(convolution, image, x, tv=0.0, l1=0.2) for x in volumes]
     np.testing.assert_allclose(costs, costs[-1], rtol=1e-8)
 
@@ -153,7 +152,7 @@ def test_ffts_conjugate_gradients_and_fista_meet(depths):
 def minimum(depths, isotropic):
     convolution, image = noisy_system(depths)
     weights = relative(convolution, image, tv=0.05, sparsity=0.02)
-    return run(convolution, image, ConvolutionADMM(4000, isotropic=isotropic, **weights))
+    return solve(convolution, image, ConvolutionADMM(4000, isotropic=isotropic, **weights))
 
 
 @pytest.mark.integration
@@ -164,23 +163,23 @@ def test_total_variation_is_at_its_minimum(isotropic, depths):
     convolution, image = noisy_system(depths)
     solution = minimum(depths, isotropic)
     cost = lambda x: float(objective(convolution, image, x, tv=0.05, l1=0.02, isotropic=isotropic))
-    noise = jax.random.normal(jax.random.key(3), (10, *solution.x.shape))
-    others = [solution.x * 0.99, minimum(depths, not isotropic).x]
-    others += [jnp.maximum(solution.x + 1e-3 * n, 0) for n in noise]
-    assert min(map(cost, others)) > cost(solution.x)
-    np.testing.assert_allclose(solution.costs[-1], cost(solution.x), rtol=1e-6)
+    noise = jax.random.normal(jax.random.key(3), (10, *solution.value.shape))
+    others = [solution.value * 0.99, minimum(depths, not isotropic).value]
+    others += [jnp.maximum(solution.value + 1e-3 * n, 0) for n in noise]
+    assert min(map(cost, others)) > cost(solution.value)
+    np.testing.assert_allclose(solution.stats["costs"][-1], cost(solution.value), rtol=1e-6)
 
 
 @pytest.mark.integration
 def test_the_penalty_adapts_and_the_residuals_stop_it():
     convolution, image = noisy_system()
     solver = ConvolutionADMM(3000, tolerance=1e-5, **relative(convolution, image, tv=0.05, sparsity=0.1))
-    scaled = jax.jit(lambda b, s: solve(convolution, s * b, solver))
+    scaled = lambda b, s: solve(convolution, s * b, solver)
     for scale in (1e-3, 1e3):
         solution = scaled(image, scale)
-        assert solution.converged and solution.steps < 2000
-        cost = objective(convolution, scale * image, solution.x, tv=0.05 * scale, l1=0.1 * scale) / scale**2
-        np.testing.assert_allclose(cost, solution.costs[solution.steps - 1] / scale**2, rtol=1e-3)
+        assert solution.result == RESULTS.converged and solution.stats["num_steps"] < 2000
+        cost = objective(convolution, scale * image, solution.value, tv=0.05 * scale, l1=0.1 * scale) / scale**2
+        np.testing.assert_allclose(cost, solution.stats["costs"][solution.stats["num_steps"] - 1] / scale**2, rtol=1e-3)
 
 
 @pytest.mark.integration
@@ -191,7 +190,7 @@ def test_gradients_of_the_solution():
 
     def moment(psf, image, tv):
         system = ConvolutionOperator(psf, image.shape)
-        return jnp.vdot(weight, solve(system, image, ConvolutionADMM(4, tv=tv, isotropic=True)).x)
+        return jnp.vdot(weight, solve(system, image, ConvolutionADMM(4, tv=tv, isotropic=True)).value)
 
     # Away from the kinks of soft thresholding at this generic point.
     tv = jnp.asarray(relative(convolution, image, tv=0.05)["tv"])
@@ -204,8 +203,8 @@ def test_a_dark_image_gives_zeros_and_finite_gradients(isotropic):
     convolution, image = noisy_system(2)
     solution = lambda b: solve(convolution, b, ConvolutionADMM(5, tv=0.1, isotropic=isotropic))
     dark = jax.jit(solution)(0 * image)
-    assert not np.any(dark.x) and not np.any(dark.costs)
-    assert np.all(np.isfinite(jax.jit(jax.grad(lambda b: solution(b).x.sum()))(0 * image)))
+    assert not np.any(dark.value) and not np.any(dark.stats["costs"])
+    assert np.all(np.isfinite(jax.jit(jax.grad(lambda b: solution(b).value.sum()))(0 * image)))
 
 
 def test_low_frequencies_do_not_outweigh_the_regularizer():
@@ -218,7 +217,7 @@ def test_low_frequencies_do_not_outweigh_the_regularizer():
     convolution = ConvolutionOperator(psf, (32, 30))
     image = convolution.mv(jnp.zeros(convolution.scene_shape).at[0, 20:40, 18:40].set(1.0))
     image = image / jnp.linalg.norm(image)
-    x = run(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).x
+    x = solve(convolution, image, ConvolutionADMM(20, **relative(convolution, image, tv=1e-4, sparsity=0.0))).value
     cost = objective(convolution, image, x, tv=1e-4, l1=0.0)
     for penalties in ((1.0, 1.0, 1.0), (1e-6, 1e-5, 4e-5)):
         assert 4 * cost < numpy_admm(np.asarray(psf[0]), np.asarray(image), 20, 1e-4, 0.0, penalties)[1]

@@ -48,7 +48,7 @@ CALLS = {
     "ConvolutionOperator.mv": (np.ones(C.scene_shape), C.mv),
     "ConvolutionOperator.T": (IMAGE.astype(np.float32), C.T.mv),
     "as_scipy": (VOLUME.ravel(), lambda volume: as_scipy(A).matvec(volume)),
-    "solve": (IMAGE, lambda image: gs.solve(A, image, STEPS).x),
+    "solve": (IMAGE, lambda image: gs.solve(A, image, STEPS).value),
     "reconstruct": (IMAGE, lambda image: gs.reconstruct(image, SCOPE, GRID)),
     "reconstruct, steps": (IMAGE, lambda image: gs.reconstruct(image, SCOPE, GRID, STEPS, optics="pinhole")),
     "reconstruct, its PSFs": (STACK, lambda psf: gs.reconstruct(IMAGE, SCOPE, GRID, STEPS, optics=psf)),

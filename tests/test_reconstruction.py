@@ -41,7 +41,7 @@ def small():
 @cache
 def in_one_loop():
     imager, grid, psf, *_ = small()
-    return jax.jit(lambda b: solve(ImagingOperator(imager, grid, psf), b, FISTA(steps=7)).x)
+    return jax.jit(lambda b: solve(ImagingOperator(imager, grid, psf), b, FISTA(steps=7)).value)
 
 
 class Log(Progress):

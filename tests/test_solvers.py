@@ -1,7 +1,9 @@
 """Richardson-Lucy, FISTA and ADMM, on every kind of operator."""
 
 from functools import cache, partial
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -15,9 +17,11 @@ from gs_jax import Imager, ImagingOperator, MicrolensArray, forward
 from gs_jax.base.errors import InputError
 from gs_jax.projection.measured_psf import ConvolutionOperator
 from gs_jax.solvers.admm import ADMM
-from gs_jax.solvers.base import differences, differences_adjoint, lambda_max, shrink, solve, total_variation
+from gs_jax.solvers.base import RESULTS, differences, differences_adjoint, lambda_max, shrink, solve, total_variation
+from gs_jax.solvers.convolution import ConvolutionADMM
 from gs_jax.solvers.fista import FISTA, largest_eigenvalue
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step, bilinear_background
+from gs_jax.solvers.surface import Surface
 
 from .helpers import compilations, scene
 
@@ -73,7 +77,7 @@ def made(operator):
 
 @cache
 def compiled(solver, operator):
-    return jax.jit(lambda image: solve(made(operator), image, SOLVERS[solver](steps=150)))
+    return lambda image: solve(made(operator), image, SOLVERS[solver](steps=150))
 
 
 @pytest.mark.parametrize("operator", EVERY)
@@ -82,59 +86,77 @@ def test_it_finds_two_bright_voxels(solver, operator):
     A = made(operator)
     x = light(A)
     found = compiled(solver, operator)(A.mv(x))
-    assert found.steps == 150 and not found.converged
+    assert found.stats["num_steps"] == 150 and found.result == RESULTS.steps_taken
     # Noiseless, but slow along the least eigenvalues: what matters is that the light is where it was.
-    bright = np.argsort(np.asarray(found.x).ravel())[-2:]
+    bright = np.argsort(np.asarray(found.value).ravel())[-2:]
     assert set(bright.tolist()) == set(np.flatnonzero(np.asarray(x)).tolist())
-    assert np.all(np.isfinite(found.costs)) and found.costs[-1] < 0.05 * found.costs[0]
+    assert np.all(np.isfinite(found.stats["costs"])) and found.stats["costs"][-1] < 0.05 * found.stats["costs"][0]
 
 
 @pytest.mark.parametrize("operator", EVERY)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_dark_image_gives_zeros(solver, operator):
     found = compiled(solver, operator)(jnp.zeros(made(operator).out_structure().shape))
-    assert not np.any(found.x) and not np.any(found.costs)
+    assert not np.any(found.value) and not np.any(found.stats["costs"])
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_zero_operators_integers_and_float32(solver):
     A, make = dense(), SOLVERS[solver]
     zero = lx.MatrixLinearOperator(jnp.zeros((30, 12)))
-    assert not np.any(jax.jit(lambda image: solve(zero, image, make(steps=5)).x)(jnp.ones(30)))
+    assert not np.any(solve(zero, jnp.ones(30), make(steps=5)).value)
     image = jnp.arange(30, dtype=jnp.uint16)
-    run = jax.jit(lambda image: solve(A, image, make(steps=5)).x)
+    run = lambda image: solve(A, image, make(steps=5)).value
     np.testing.assert_array_equal(run(image), run(image.astype(float)))
     single = lx.MatrixLinearOperator(A.matrix.astype(jnp.float32))
-    dark = jax.jit(lambda image: solve(single, image, make(steps=20, tolerance=1e-3)))(jnp.zeros(30, jnp.float32))
-    assert dark.converged and dark.x.dtype == jnp.float32 and not np.any(dark.x)
-    assert np.isnan(dark.costs[dark.steps :]).all() and not np.isnan(dark.costs[: dark.steps]).any()
+    dark = solve(single, jnp.zeros(30, jnp.float32), make(steps=20, tolerance=1e-3))
+    assert dark.result == RESULTS.converged and dark.value.dtype == jnp.float32 and not np.any(dark.value)
+    assert np.array_equal(np.isnan(dark.stats["costs"]), np.arange(20) >= dark.stats["num_steps"])
 
 
 @pytest.mark.parametrize(
     "make, options",
     [
-        (RichardsonLucy, {}),
+        (RichardsonLucy, {"tv": 0.01, "min_sensitivity": 0.1}),
         (RichardsonLucy, {"tolerance": 1e-2}),
         (FISTA, {"sparsity": 0.01}),
         (FISTA, {"sparsity": 0.01, "tolerance": 1e-2}),
         (ADMM, {"sparsity": 0.01, "tolerance": 1e-2}),
+        (ConvolutionADMM, {"sparsity": 0.01, "tv": 0.01, "tv_z": 0.5}),
+        (Surface, {"smooth_depth": 2.0, "smooth_brightness": 0.1}),
     ],
 )
 def test_other_numbers_run_the_same_program(make, options):
     """Of the image, the operator, a weight or the tolerance; the result is that of the steps one by one."""
-    image = np.asarray(dense().mv(jnp.arange(12.0)))
+    A = convolution() if make in (ConvolutionADMM, Surface) else dense()
+    image = np.asarray(A.mv(jnp.arange(float(A.in_size())).reshape(A.in_structure().shape)))
     results = []
     for factor in (1.0, 2.0):
-        A = lx.MatrixLinearOperator(factor * dense().matrix)
+        scaled = jax.tree.map(partial(jnp.multiply, factor), A)
         before = compilations()
         numbers = {name: factor * value for name, value in options.items()}
-        results.append(solve(A, factor * image, make(steps=30, **numbers)))
+        results.append(solve(scaled, factor * image, make(steps=12, **numbers)))
         compiled = compilations() - before
-    assert compiled == 0 and results[0].x.shape == (12,)
-    state = (one := make(steps=30, **numbers)).init(A, 2.0 * image)
-    for _ in range(int(results[1].steps)):
-        state, _, _ = one.step(A, 2.0 * image, state)
-    np.testing.assert_allclose(results[1].x, one.estimate(state), rtol=1e-9)
+    assert compiled == 0 and results[0].value.shape == A.in_structure().shape
+    one: Any = make(**numbers)
+    step, state = eqx.filter_jit(one.step), eqx.filter_jit(one.init)(scaled, 2.0 * image)
+    for _ in range(int(results[1].stats["num_steps"])):
+        state, _, _ = step(scaled, 2.0 * image, state)
+    np.testing.assert_allclose(results[1].value, one.estimate(state), rtol=1e-9)
+
+
+def test_solve_goes_on_and_says_how_it_ended():
+    A, image, few = dense(), jnp.arange(30.0), FISTA(steps=5)
+    half = solve(A, image, few)
+    whole = solve(A, image, few, max_steps=10)
+    np.testing.assert_array_equal(solve(A, image, few, state=half.state).value, whole.value)
+    assert whole.stats["costs"].shape == (10,) and RESULTS[whole.result] == "All steps were taken."
+    wrong = image.at[3].set(jnp.nan)
+    assert solve(A, wrong, few, throw=False).result == RESULTS.not_finite
+    with pytest.raises(InputError, match="The estimate is not finite: .*NaN"):
+        solve(A, wrong, few)
+    with pytest.raises(RuntimeError, match="The estimate is not finite"):
+        eqx.filter_jit(lambda image: solve(A, image, few).value)(wrong)
 
 
 def by_geometry():
@@ -166,7 +188,7 @@ def test_gradients_by_image_and_operator(solver, kind):
 
     @jax.jit
     def moment(image, *parameters):
-        return jnp.vdot(weight, solve(operator(*parameters), image, options).x)
+        return jnp.vdot(weight, solve(operator(*parameters), image, options).value)
 
     # Steps of 1e-6 mm stay within a pixel at this generic point; rounding of 1e-13 then costs 1e-6.
     check_grads(moment, (image, *parameters), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)
@@ -179,7 +201,7 @@ def test_gradients_stay_finite_in_the_dark(solver, kind):
     operator, parameters = PARAMETRIC[kind]()
 
     def total(image, parameters):
-        return jnp.sum(solve(operator(*parameters), image, SOLVERS[solver](steps=2)).x)
+        return jnp.sum(solve(operator(*parameters), image, SOLVERS[solver](steps=2)).value)
 
     dark = jnp.zeros(operator(*parameters).out_structure().shape)
     value, gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(dark, parameters)
@@ -191,18 +213,18 @@ def test_gradients_stay_finite_in_the_dark(solver, kind):
 def test_an_early_end_and_the_same_step_by_step(solver):
     A = dense()
     image, options = A.mv(light(A)), SOLVERS[solver](steps=400, tolerance=0.02)
-    found = jax.jit(lambda image: solve(A, image, options))(image)
-    assert found.converged and 1 < found.steps < 400
+    found = solve(A, image, options)
+    assert found.result == RESULTS.converged and 1 < found.stats["num_steps"] < 400
     step = jax.jit(lambda state: options.step(A, image, state))
     state, costs, residuals = options.init(A, image), [], []
-    for _ in range(int(found.steps)):
+    for _ in range(int(found.stats["num_steps"])):
         state, cost, residual = step(state)
         costs.append(cost)
         residuals.append(residual)
     assert min(residuals[:-1]) >= 0.02 > residuals[-1]
     # Compiled apart, the same sums are rounded otherwise.
-    np.testing.assert_allclose(costs, found.costs[: found.steps], rtol=1e-9)
-    np.testing.assert_allclose(options.estimate(state), found.x, atol=1e-9)
+    np.testing.assert_allclose(costs, found.stats["costs"][: found.stats["num_steps"]], rtol=1e-9)
+    np.testing.assert_allclose(options.estimate(state), found.value, atol=1e-9)
 
 
 @pytest.mark.parametrize("solver", ["FISTA", "ADMM"])
@@ -212,8 +234,8 @@ def test_least_squares_without_negative_values_is_scipys(solver):
     image = jax.random.normal(jax.random.key(2), (30,)) + 1
     expected = nnls(np.asarray(A.as_matrix()), np.asarray(image))[0]
     assert 0 < np.count_nonzero(expected) < 12
-    found = jax.jit(lambda b: solve(A, b, SOLVERS[solver](steps=3000)))(image)
-    np.testing.assert_allclose(found.x, expected, atol=1e-8)  # they converge linearly, to the last digits
+    found = solve(A, image, SOLVERS[solver](steps=3000))
+    np.testing.assert_allclose(found.value, expected, atol=1e-8)  # they converge linearly, to the last digits
 
 
 def test_the_convex_solvers_meet_with_sparsity():
@@ -225,7 +247,7 @@ def test_the_convex_solvers_meet_with_sparsity():
     weight = 0.02 * A.T.mv(image).max()
 
     def final(solver):
-        x = jax.jit(lambda b: solve(A, b, solver))(image).x
+        x = solve(A, image, solver).value
         residual = A.mv(x) - image
         return float(jnp.vdot(residual, residual) / 2 + weight * jnp.sum(x))
 
@@ -237,7 +259,7 @@ def test_the_convex_solvers_meet_with_sparsity():
 def test_zero_is_optimal_from_a_sparsity_of_1(solver):
     A = dense()
     image = A.mv(light(A))
-    run = jax.jit(lambda b, sparsity: solve(A, b, solver(steps=2000, sparsity=sparsity)).x)
+    run = lambda b, sparsity: solve(A, b, solver(steps=2000, sparsity=sparsity)).value
     np.testing.assert_allclose(run(image, 1.01), 0, atol=1e-9)
     assert run(image, 0.99).max() > 1e-3
     assert lambda_max(-image) == 0 and not np.any(run(-image, 0.5))
@@ -245,7 +267,7 @@ def test_zero_is_optimal_from_a_sparsity_of_1(solver):
 
 def test_a_weight_that_changes_compiles_nothing(caplog):
     """Weights are leaves of a solver, not part of its code."""
-    run = jax.jit(lambda image, solver: solve(dense(), image, solver).x)
+    run = jax.jit(lambda image, solver: solve(dense(), image, solver).value)
     image = jnp.ones(30)
     with jax.log_compiles(), caplog.at_level("WARNING"):
         first = run(image, FISTA(steps=3, sparsity=0.5))
@@ -268,25 +290,24 @@ def test_richardson_lucy_is_scikit_images():
     image = np.maximum(np.asarray(system.mv(embedded)), 0)
     image[image < 1e-12] = 0  # an FFT's rounding
     expected = of_skimage(image, psf, num_iter=25, clip=False)
-    found = jax.jit(lambda b: solve(system, b, RichardsonLucy(steps=25)))(jnp.asarray(image))
+    found = solve(system, jnp.asarray(image), RichardsonLucy(steps=25))
     # The same iteration in exact arithmetic; 25 divisions amplify the rounding of the FFTs.
-    np.testing.assert_allclose(found.x[0][system.window], expected, atol=1e-8)
+    np.testing.assert_allclose(found.value[0][system.window], expected, atol=1e-8)
 
 
 @pytest.mark.integration
 def test_richardson_lucy_with_background_acceleration_and_total_variation():
     A = ImagingOperator(*small())
     truth = light(A)
-    jitted = cache(lambda **options: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=40, **options))))
-    run = lambda image, **options: jitted(**options)(image)
+    run = lambda image, **options: solve(A, image, RichardsonLucy(steps=40, **options))
     image = A.mv(truth) + 0.5
     plain, known = run(image), run(image, background=0.5)
-    assert jnp.abs(known.x - truth).max() < 0.05 < jnp.abs(plain.x - truth).max()
+    assert jnp.abs(known.value - truth).max() < 0.05 < jnp.abs(plain.value - truth).max()
     fast = run(A.mv(truth), accelerate=True)
-    assert fast.costs[-1] < 1e-3 * run(A.mv(truth)).costs[-1]
+    assert fast.stats["costs"][-1] < 1e-3 * run(A.mv(truth)).stats["costs"][-1]
     rough = run(image + 0.3 * jax.random.uniform(jax.random.key(1), image.shape))
     smooth = run(image + 0.3 * jax.random.uniform(jax.random.key(1), image.shape), tv=0.05)
-    variation = lambda s: sum(float(jnp.abs(jnp.diff(s.x, axis=axis)).sum()) for axis in range(3))
+    variation = lambda s: sum(float(jnp.abs(jnp.diff(s.value, axis=axis)).sum()) for axis in range(3))
     assert variation(smooth) < 0.97 * variation(rough)
 
 
@@ -296,18 +317,18 @@ def test_richardson_lucy_fits_a_slow_background():
     truth = light(A)
     shape = A.out_structure().shape
     slope = 0.5 + jnp.outer(jnp.linspace(0, 1, shape[0]), jnp.linspace(1, 0, shape[1]))
-    jitted = cache(lambda knots: jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=200, background_knots=knots))))
-    error = lambda image, knots: float(jnp.linalg.norm(jitted(knots)(image).x - truth) / jnp.linalg.norm(truth))
+    run = lambda image, knots: solve(A, image, RichardsonLucy(steps=200, background_knots=knots)).value
+    error = lambda image, knots: float(jnp.linalg.norm(run(image, knots) - truth) / jnp.linalg.norm(truth))
     assert error(A.mv(truth) + slope, 3) < 0.25 * error(A.mv(truth) + slope, 0)
     assert error(A.mv(truth), 3) < 0.1
-    assert not jitted(3)(jnp.zeros(shape)).x.any()
+    assert not run(jnp.zeros(shape), 3).any()
 
 
 def test_unexplained_light_does_not_go_to_voxels_that_few_pixels_see():
     """A column of 16 pixels on a voxel of each, but for the last, which half a percent of a pixel sees."""
     A = lx.MatrixLinearOperator(jnp.diag(jnp.append(jnp.ones(15), 0.005)))
     image = jnp.ones(16)
-    run = lambda **options: solve(A, image, RichardsonLucy(steps=10, **options)).x
+    run = lambda **options: solve(A, image, RichardsonLucy(steps=10, **options)).value
     assert run()[-1] == pytest.approx(200)
     held = run(min_sensitivity=0.3)
     np.testing.assert_allclose(held[:-1], 1)
@@ -323,10 +344,10 @@ def test_the_background_may_have_more_knots_than_there_are_pixels():
 def test_richardson_lucy_climbs_and_keeps_the_light():
     A = dense()
     image = A.mv(light(A)) * jax.random.uniform(jax.random.key(6), (30,), minval=0.8, maxval=1.2)
-    found = jax.jit(lambda b: solve(A, b, RichardsonLucy(steps=50)))(image)
-    assert np.all(np.diff(found.costs) <= 1e-12)
+    found = solve(A, image, RichardsonLucy(steps=50))
+    assert np.all(np.diff(found.stats["costs"]) <= 1e-12)
     # After each step the expected image holds as much light as the image (Lucy 1974).
-    np.testing.assert_allclose(A.mv(found.x).sum(), image.sum(), rtol=1e-12)
+    np.testing.assert_allclose(A.mv(found.value).sum(), image.sum(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -380,7 +401,7 @@ def test_few_applications_of_the_operator_reach_the_minimum(tv):
     unit = A.T.mv(image).max()
 
     def final(solver):
-        x = jax.jit(lambda b: solve(A, b, solver).x)(image)
+        x = solve(A, image, solver).value
         residual = A.mv(x) - image
         variation = total_variation(differences(x, wrap=False), isotropic=False)
         return float(jnp.vdot(residual, residual) / 2 + unit * (tv * variation + 0.01 * jnp.sum(x)))
@@ -397,7 +418,7 @@ def test_isotropic_total_variation_denoises_as_scikit_image_does():
     image = 3 + jnp.zeros((16, 14)).at[4:9, 5:11].set(2.0) + 0.3 * jax.random.normal(jax.random.key(2), (16, 14))
     A = lx.IdentityLinearOperator(jax.ShapeDtypeStruct(image.shape, image.dtype))
     solver = ADMM(600, sparsity=0.0, tv=0.4 / image.max(), isotropic=True)
-    found = jax.jit(lambda b: solve(A, b, solver))(image)
+    found = solve(A, image, solver)
     expected = denoise_tv_chambolle(np.asarray(image), weight=0.4, eps=1e-12, max_num_iter=20000)
     # Both converge sublinearly; Chambolle's is at about 1e-4 after so many.
-    np.testing.assert_allclose(found.x, expected, atol=2e-3)
+    np.testing.assert_allclose(found.value, expected, atol=2e-3)

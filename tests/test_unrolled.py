@@ -90,7 +90,7 @@ def differentiable():
 def test_darkness_stays_dark_and_has_finite_gradients(differentiable):
     networks, case, loss = differentiable
     dark = (np.zeros_like(case.light), np.zeros_like(case.truth))
-    assert not solve(case.system.operator, dark[0], networks).x.any()
+    assert not solve(case.system.operator, dark[0], networks).value.any()
     _, back = jax.vjp(lambda networks: loss(networks, *dark), networks)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(back(jnp.ones(()))))
 
@@ -105,7 +105,7 @@ def test_gradients_by_the_weights(differentiable):
 @pytest.mark.integration
 def test_gradients_by_the_image(differentiable):
     networks, case, _ = differentiable
-    volume = jax.jit(lambda light: solve(case.system.operator, light, networks).x)
+    volume = jax.jit(lambda light: solve(case.system.operator, light, networks).value)
     check_grads(volume, (jnp.asarray(case.light),), 1, modes=["rev"], rtol=2e-3)
 
 

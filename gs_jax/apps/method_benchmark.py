@@ -211,7 +211,7 @@ def _dense(solver: RichardsonLucy | ADMM):
         def invert(matrix, image):
             # XLA is many times slower on processors with `matrix.T @ x`, which `MatrixLinearOperator` computes.
             operator = lx.FunctionLinearOperator(lambda x: x @ matrix, voxels)
-            return solve(operator, image, solver).x
+            return solve(operator, image, solver).value
 
         call = jax.jit(invert).lower(matrix, jax.ShapeDtypeStruct((pixels,), jnp.float32)).compile()
         return lambda image: call(matrix, image.ravel()).reshape(shape)

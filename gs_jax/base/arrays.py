@@ -84,6 +84,12 @@ def check_finite(name: str, values: Shaped[Array | np.ndarray, "..."], parts: st
         raise input_error(name, "finite", f"{int((~finite).sum())} of {values.size} {parts} NaN or infinite")
 
 
+def check_real(name: str, values: Shaped[Array | np.ndarray, "..."]) -> None:
+    """Raise `InputError` if an array is complex: JAX would drop the imaginary part."""
+    if jnp.issubdtype(values.dtype, jnp.complexfloating):
+        raise input_error(name, "real", values.dtype)
+
+
 def as_float(x) -> Array:
     """Convert to an array of the default precision; a floating-point array of JAX keeps its own."""
     if isinstance(x, Array) and jnp.issubdtype(x.dtype, jnp.floating):

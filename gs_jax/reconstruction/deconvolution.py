@@ -272,7 +272,7 @@ def _of_any_operator(solver: Deconvolver) -> Deconvolver:
     if not isinstance(solver, ConvolutionADMM):
         return solver
     if solver.tv_z != 1 or not solver.nonnegative:
-        given = f"tv_z={solver.tv_z:g}, nonnegative={solver.nonnegative}"
+        given = f"tv_z={solver.tv_z or 0:g}, nonnegative={solver.nonnegative}"
         raise input_error("solver", "with tv_z=1 and nonnegative=True for PSFs that vary over the field", given)
     return ADMM(solver.steps, solver.tolerance, solver.sparsity, solver.tv, solver.isotropic)
 

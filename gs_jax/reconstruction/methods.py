@@ -4,15 +4,16 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..base.errors import InputError
 from ..solvers.admm import ADMM
-from ..solvers.base import Solver
+from ..solvers.base import Solver, none_if_zero
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
+from ..typing import Real
 
 
 class BackProjection(eqx.Module):
@@ -80,7 +81,7 @@ class PinholeRichardsonLucy(eqx.Module):
     tolerance: float = eqx.field(static=True, default=0.0)
     accelerate: bool = eqx.field(static=True, default=False)
     background_knots: int = eqx.field(static=True, default=0)
-    min_sensitivity: float = eqx.field(static=True, default=0.0)
+    min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
 
     def __check_init__(self):
         self.solver()

@@ -148,7 +148,7 @@ class ADMM(eqx.Module):
     >>> scene[1, 19:23, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
     >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.ADMM(steps=5, tv=0.001))
-    >>> print(bool(solution.x.min() >= 0))
+    >>> print(bool(solution.value.min() >= 0))
     True
     """
 

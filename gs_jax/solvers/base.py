@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Num, PyTree
+from jax.core import Tracer
+from jaxtyping import Array, Float, Num, PyTree
 
-from ..base.arrays import divide, native, safe_sqrt
-from ..base.errors import InputError
+from ..base.arrays import check_real, divide, native, safe_sqrt
+from ..base.errors import InputError, short_repr
 
 # Weights with a standard deviation of one voxel.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
@@ -94,35 +95,64 @@ class Solver(Protocol):
         ...
 
 
+class RESULTS(eqx.Enumeration):
+    """How a solver ended, the `result` of a `Solution`; `RESULTS[result]` is the text.
+
+    `converged`: the residual is below the tolerance. `steps_taken`: all steps were taken, as asked. `not_finite`: it
+    failed, the estimate or its cost is NaN or infinite.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, jax.numpy as jnp, lineax as lx
+    >>> from gs_jax.solvers.base import RESULTS
+    >>> A = lx.MatrixLinearOperator(jnp.ones((3, 2)))
+    >>> solution = gs.solve(A, jnp.array([1.0, 1.0, jnp.nan]), gs.FISTA(), throw=False)
+    >>> print(RESULTS[solution.result])
+    The estimate is not finite: ...
+    """
+
+    converged = "The residual is below the tolerance."
+    steps_taken = "All steps were taken."
+    not_finite = "The estimate is not finite: the image or the operator has NaN or infinite values, or steps diverge."
+
+
 class Solution(eqx.Module):
     """Result of a solver.
 
     Parameters
     ----------
-    x
+    value
         The estimate.
-    costs
-        Cost at the start of each step; NaN after the last step taken.
-    steps
-        Number of steps taken.
-    converged
-        Whether the residual fell below the tolerance.
+    result
+        How it ended, one of `gs_jax.solvers.base.RESULTS`.
+    stats
+        `num_steps`, the number of steps taken, and `costs`, the cost at the start of each step; NaN after the last one.
+    state
+        The solver's state after the last step, from which `solve` goes on.
     """
 
-    x: Float[Array, "*shape"]
-    costs: Float[Array, " step"]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    value: Float[Array, "*shape"]
+    result: RESULTS
+    stats: dict[str, Array]
+    state: Any
 
 
-def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) -> Solution:
+def solve(
+    A: eqx.Module,
+    image: Num[Array | np.ndarray, "..."],
+    solver: Solver,
+    *,
+    max_steps: int | None = None,
+    state: Any = None,
+    throw: bool = True,
+) -> Solution:
     """Run a solver on an image, for all its steps or until its tolerance is met.
 
     *Differentiable.*
 
     Gradients are with respect to the image, the leaves of `A` and the solver's weights. Reverse mode needs
-    `tolerance=0`. The loop is compiled once: other numbers in the image, the leaves of the operator, the weights that
-    are leaves, or the tolerance run the same program. An operator around a new Python function, such as a
+    `tolerance=0`. The loop is compiled once: other numbers in the image, the leaves of the operator, the weights of the
+    solver or its tolerance run the same program. An operator around a new Python function, such as a
     `lineax.FunctionLinearOperator`, is compiled anew. It may be called inside `jit`, with `gs_jax.ImagingOperator` as
     an argument. `gs_jax.reconstruct` is the host's function from a capture to a volume.
 
@@ -134,11 +164,19 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
         Image to explain.
     solver
         `RichardsonLucy(...)`, `FISTA(...)`, `ADMM(...)`, or another `Solver`.
+    max_steps
+        Most steps, by default `solver.steps`.
+    state
+        State to go on from, that of an earlier solution; by default `solver.init(A, image)`.
+    throw
+        Whether an estimate that is not finite raises an error. Inside `jit` that is `equinox.error_if`, which JAX does
+        not keep in its compilation cache. If False, `result` says it.
 
     Raises
     ------
     InputError
-        If the image does not have the operator's output shape.
+        If the image does not have the operator's output shape or is complex, `solver` is no solver or does not fit the
+        operator, or the estimate is not finite.
 
     Examples
     --------
@@ -149,52 +187,83 @@ def solve(A: eqx.Module, image: Num[Array | np.ndarray, "..."], solver: Solver) 
     >>> import numpy as np
     >>> image = gs.forward(np.ones(grid.volume_shape), scope, grid)
     >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.RichardsonLucy(steps=5))
-    >>> solution.x.shape, solution.costs.shape
+    >>> solution.value.shape, solution.stats["costs"].shape
     ((3, 41, 41), (5,))
     """
-    tolerance = jnp.asarray(solver.tolerance) if solver.tolerance else None
+    check_solver("solver", solver)
     module: Any = solver  # the protocol does not say that it is one
+    if max_steps is not None:
+        # Solvers check the number.
+        module = dataclasses.replace(module, steps=max_steps)
+    steps, tolerance = module.steps, jnp.asarray(module.tolerance) if module.tolerance else None
     # Python's numbers become arguments of the program.
     is_number = lambda leaf: isinstance(leaf, int | float) and not isinstance(leaf, bool)
-    module = dataclasses.replace(module, tolerance=0.0)
+    module = dataclasses.replace(module, steps=1, tolerance=0.0)
     module = jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_number(leaf) else leaf, module)
-    return _solve(native(A), native(image), module, tolerance)
+    solution = _solve(native(A), native(image), module, state, steps, tolerance)
+    if not throw:
+        return solution
+    failed = solution.result == RESULTS.not_finite
+    if not isinstance(failed, Tracer):
+        if failed:
+            raise InputError(RESULTS[RESULTS.not_finite])
+        return solution
+    return eqx.tree_at(lambda s: s.value, solution, RESULTS.not_finite.error_if(solution.value, failed))
 
 
 @eqx.filter_jit
-def _solve(A, image, solver, tolerance) -> Solution:
-    state = solver.init(A, image)
+def _solve(A, image, solver, state, steps, tolerance) -> Solution:
+    state = solver.init(A, image) if state is None else state
     if tolerance is None:
-        state, costs = lax.scan(lambda s, _: solver.step(A, image, s)[:2], state, length=solver.steps)
-        return Solution(solver.estimate(state), costs, jnp.array(solver.steps), jnp.array(False))
+        state, costs = lax.scan(lambda s, _: solver.step(A, image, s)[:2], state, length=steps)
+        number, converged = jnp.array(steps), jnp.array(False)
+    else:
 
-    def unfinished(carry):
-        _, _, number, residual = carry
-        return (number < solver.steps) & (residual >= tolerance)
+        def unfinished(carry):
+            _, _, number, residual = carry
+            return (number < steps) & (residual >= tolerance)
 
-    def advance(carry):
-        state, costs, number, _ = carry
-        state, cost, residual = solver.step(A, image, state)
-        return state, costs.at[number].set(cost), number + 1, residual
+        def advance(carry):
+            state, costs, number, _ = carry
+            state, cost, residual = solver.step(A, image, state)
+            return state, costs.at[number].set(cost), number + 1, residual
 
-    _, cost, residual = jax.eval_shape(lambda s: solver.step(A, image, s), state)
-    start = state, jnp.full(solver.steps, jnp.nan, cost.dtype), jnp.array(0), jnp.array(jnp.inf, residual.dtype)
-    state, costs, number, residual = lax.while_loop(unfinished, advance, start)
-    return Solution(solver.estimate(state), costs, number, residual < tolerance)
+        _, cost, residual = jax.eval_shape(lambda s: solver.step(A, image, s), state)
+        start = state, jnp.full(steps, jnp.nan, cost.dtype), jnp.array(0), jnp.array(jnp.inf, residual.dtype)
+        state, costs, number, residual = lax.while_loop(unfinished, advance, start)
+        converged = residual < tolerance
+    value = solver.estimate(state)
+    finite = jnp.isfinite(value).all() & jnp.isfinite(costs[number - 1])
+    result = RESULTS.where(converged, RESULTS.converged, RESULTS.steps_taken)
+    result = RESULTS.where(finite, result, RESULTS.not_finite)
+    return Solution(value, result, {"num_steps": number, "costs": costs}, state)
+
+
+def check_solver(name: str, solver: Any) -> None:
+    """Raise an `InputError` unless this is an object with the methods of a solver."""
+    # A class has the attributes of the protocol, too.
+    if isinstance(solver, type) or not isinstance(solver, Solver):
+        raise InputError(f"{name} must be an object such as FISTA(), got {short_repr(solver)}.")
+
+
+def none_if_zero(weight: Any) -> Any:
+    """None for Python's 0, which leaves a term out of the program; other weights are arguments of it."""
+    return None if isinstance(weight, int | float) and weight == 0 else weight
 
 
 def check_options(solver: Any) -> None:
     """Raise an `InputError` if one of the solver's options is below its minimum."""
-    minima = {"steps": 1, "cg_steps": 1, "tolerance": 0, "sparsity": 0, "tv": 0, "tv_z": 0, "min_sensitivity": 0}
-    for name, minimum in minima.items():
+    weights = "tolerance", "sparsity", "tv", "tv_z", "min_sensitivity", "smooth_depth", "smooth_brightness"
+    for name, minimum in {"steps": 1, "cg_steps": 1, **dict.fromkeys(weights, 0)}.items():
         value = getattr(solver, name, minimum)
         if isinstance(value, int | float) and not value >= minimum:
             raise InputError(f"{name} must be {minimum} or more, got {value}.")
 
 
 def as_image(A: Any, image: Num[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-    """Convert `image` to the operator's type; raise an `InputError` if it is not of its output shape."""
+    """Convert `image` to the operator's type; raise an `InputError` if it is not of its output shape, or complex."""
     expected = A.out_structure()
+    check_real("image", image)
     if image.shape != expected.shape:
         raise InputError(f"image must have the operator's output shape {expected.shape}, got {image.shape}.")
     return jnp.asarray(image, expected.dtype)

@@ -9,10 +9,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..base.arrays import divide, safe_sqrt
+from ..base.errors import InputError
 from ..projection.measured_psf import ConvolutionOperator
 from ..typing import Image, Real
 from .admm import MAX_CHANGES, balance, positive_or_one
-from .base import as_image, check_options, lambda_max, shrink, total_variation
+from .base import as_image, check_options, lambda_max, none_if_zero, shrink, total_variation
 
 # Initial penalty of the convolved scene, relative to the image's weight. With 1 or 0.01 the cost falls more slowly, on
 # both captures of DiffuserCam and on random ones.
@@ -100,7 +101,7 @@ class ConvolutionADMM(eqx.Module):
     steps, tolerance, sparsity, tv, isotropic
         As for `ADMM`.
     tv_z
-        Weight of differences between planes, relative to those within planes. 0: each plane for itself.
+        Weight of differences between planes, relative to those within planes. 0, kept as None: each plane for itself.
     nonnegative
         Whether the scene has no negative values.
 
@@ -118,7 +119,7 @@ class ConvolutionADMM(eqx.Module):
     >>> scene = np.zeros(A.in_structure().shape)
     >>> scene[1, 18:22, 28] = 1.0
     >>> solution = gs.solve(A, A.mv(scene), gs.ConvolutionADMM(steps=30, tv=0.001))
-    >>> print(np.unravel_index(solution.x.argmax(), scene.shape)[0])
+    >>> print(np.unravel_index(solution.value.argmax(), scene.shape)[0])
     1
     """
 
@@ -127,13 +128,15 @@ class ConvolutionADMM(eqx.Module):
     sparsity: Real | Float[Array, ""] = 0.01
     tv: Real | Float[Array, ""] = 0.0
     isotropic: bool = eqx.field(static=True, default=False)
-    tv_z: float = eqx.field(static=True, default=1.0)
+    tv_z: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=1.0)
     nonnegative: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
         check_options(self)
 
     def init(self, A: ConvolutionOperator, image: Image) -> State:
+        if not isinstance(A, ConvolutionOperator):
+            raise InputError(f"ConvolutionADMM() must be used with a ConvolutionOperator, got {type(A).__name__}.")
         image = as_image(A, image)
         unit = lambda_max(A.T.mv(image))
         tv, l1 = (jnp.asarray(weight, image.dtype) * unit for weight in (self.tv, self.sparsity))
@@ -142,7 +145,9 @@ class ConvolutionADMM(eqx.Module):
         depths, *size = A.scene_shape
         gain = safe_sqrt(safe_sqrt(jnp.mean(power) * jnp.max(power)) / depths)
         smooth = 1 + splits * _laplacian(size, power.dtype)
-        filters = _solve_along_z(smooth, A.spectra.conj(), splits * self.tv_z**2) if self._axes(A) == 3 else None
+        filters = None
+        if self._axes(A) == 3:
+            filters = _solve_along_z(smooth, A.spectra.conj(), splits * self._z(splits) ** 2)
         response = power / smooth if filters is None else jnp.sum(_real_of_product(A.spectra, filters), axis=0)
         x = jnp.zeros(A.scene_shape, image.dtype)
         sums = Sums(x[0], jnp.zeros((depths, self._axes(A), *size), image.dtype), x)
@@ -166,16 +171,19 @@ class ConvolutionADMM(eqx.Module):
         """The state to continue from with `factor` times the weight of total variation."""
         system = state.system._replace(tv=factor * state.system.tv)
         # Costs of another weight do not compare.
-        return state._replace(system=system, cost=jnp.full_like(state.cost, jnp.inf))
+        return state._replace(system=system, cost=jnp.full_like(state.cost, jnp.finfo(state.cost.dtype).max))
 
     def _axes(self, A):
         """Number of axes along which there are differences."""
-        return 3 if self.tv_z and A.scene_shape[0] > 1 else 2
+        return 3 if self.tv_z is not None and A.scene_shape[0] > 1 else 2
+
+    def _z(self, like):
+        return jnp.asarray(self.tv_z, like.dtype)
 
     def _differences(self, x, following):
         """Differences of a plane, along the plane's axes and to the following plane."""
         return jnp.stack(
-            [_roll(x, -1, 0) - x, _roll(x, -1, 1) - x] + ([] if following is None else [self.tv_z * (following - x)])
+            [_roll(x, -1, 0) - x, _roll(x, -1, 1) - x] + ([] if following is None else [self._z(x) * (following - x)])
         )
 
     def _prox(self, A, image, system, rho):
@@ -266,7 +274,7 @@ class ConvolutionADMM(eqx.Module):
             x, w = target(scene, prox_scene)
             back = jnp.roll(u[0], 1, 0) - u[0] + jnp.roll(u[1], 1, 1) - u[1]
             if along_z:
-                back = back + self.tv_z * (last_z - u[2])
+                back = back + self._z(back) * (last_z - u[2])
             cost = cost + jnp.where(is_first, 0, system.tv * variation(last, x)) + system.l1 * jnp.sum(jnp.abs(x))
             spectrum = jnp.fft.rfft2(system.splits * back + w)
             spectrum = spectrum if along_z else _scale(1 / system.smooth, spectrum)
@@ -279,7 +287,7 @@ class ConvolutionADMM(eqx.Module):
         (last, _, seen, cost), spectra = lax.scan(plane, start, planes)
         cost = cost + system.tv * variation(last, last)
         if along_z:
-            spectra = _solve_along_z(system.smooth, spectra, system.splits * self.tv_z**2)
+            spectra = _solve_along_z(system.smooth, spectra, system.splits * self._z(system.splits) ** 2)
         seen = jnp.fft.irfft2(seen, A.scene_shape[1:])[A.window]
         seen = seen if A.kept is None else A.kept * seen
         # The exact minimum along the ray of the sparse scene, as the penalties are homogeneous.

@@ -63,7 +63,7 @@ class FISTA(eqx.Module):
     >>> scene[1, 19, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
     >>> solution = gs.solve(gs.ImagingOperator(scope, grid), image, gs.FISTA(steps=30, sparsity=0.01))
-    >>> print(bool(solution.costs[-1] < solution.costs[0]), bool(solution.x.min() >= 0))
+    >>> print(bool(solution.stats["costs"][-1] < solution.stats["costs"][0]), bool(solution.value.min() >= 0))
     True True
     """
 

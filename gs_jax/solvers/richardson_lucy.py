@@ -24,6 +24,7 @@ from .base import (
     differences_adjoint,
     kept_pixels,
     magnitude,
+    none_if_zero,
     norm,
 )
 
@@ -72,13 +73,13 @@ class RichardsonLucy(eqx.Module):
         Appl. Opt. 36, 1766, 1997): needs far fewer steps, but is not monotone.
     tv
         Weight of total variation, about 1e-3 to 1e-2 (Dey et al., Microsc. Res. Tech. 69, 260, 2006): the step is
-        divided by `1 - tv div(grad x / |grad x|)`.
+        divided by `1 - tv div(grad x / |grad x|)`. 0, kept as None, leaves it out.
     background_knots
         Knots per side of a smooth background that is fitted to 2-D images in addition, bilinear between the knots.
         0 fits none.
     min_sensitivity
         Lower bound of the sensitivity in steps, relative to the mean: voxels that few pixels see would otherwise take
-        the light that an incomplete model cannot explain.
+        the light that an incomplete model cannot explain. 0, kept as None, is no bound.
 
     Raises
     ------
@@ -97,7 +98,8 @@ class RichardsonLucy(eqx.Module):
     >>> scene[1, 19, 22] = 1.0
     >>> image = gs.forward(scene, scope, grid)
     >>> solution = gs.solve(A, image, gs.RichardsonLucy(steps=30, accelerate=True))
-    >>> print(bool(solution.costs[-1] < solution.costs[0]), np.unravel_index(solution.x.argmax(), grid.volume_shape)[0])
+    >>> costs, brightest = solution.stats["costs"], np.unravel_index(solution.value.argmax(), grid.volume_shape)
+    >>> print(bool(costs[-1] < costs[0]), brightest[0])
     True 1
     """
 
@@ -105,9 +107,9 @@ class RichardsonLucy(eqx.Module):
     tolerance: float = eqx.field(static=True, default=0.0)
     background: Real | Float[Array, "..."] = 0.0
     accelerate: bool = eqx.field(static=True, default=False)
-    tv: float = eqx.field(static=True, default=0.0)
+    tv: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
     background_knots: int = eqx.field(static=True, default=0)
-    min_sensitivity: float = eqx.field(static=True, default=0.0)
+    min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
 
     def __check_init__(self):
         check_options(self)
@@ -119,8 +121,8 @@ class RichardsonLucy(eqx.Module):
         if self.background_knots and image.ndim != 2:
             raise InputError(f"image must be 2-D to fit a background with background_knots, got {image.ndim}-D.")
         sensitivity = _without_rounding(A.T.mv(jnp.ones_like(image)))
-        if self.min_sensitivity:
-            minimum = self.min_sensitivity * jnp.mean(sensitivity)
+        if self.min_sensitivity is not None:
+            minimum = jnp.asarray(self.min_sensitivity, sensitivity.dtype) * jnp.mean(sensitivity)
             sensitivity = jnp.where(sensitivity > 0, jnp.maximum(sensitivity, minimum), 0)
         # The start has as much light as the image; its scale matters only with a background.
         level = divide(jnp.sum(image), jnp.sum(sensitivity))
@@ -140,7 +142,7 @@ class RichardsonLucy(eqx.Module):
         expected = jnp.maximum(A.mv(point) + background + bilinear_background(knots, image), 0)
         # An FFT's rounding must not turn a dark pixel into a huge ratio.
         ratio = divide(image, expected, jnp.finfo(image.dtype).eps * lax.stop_gradient(expected.max()))
-        scale = sensitivity * _tv_denominator(point, self.tv) if self.tv else sensitivity
+        scale = sensitivity if self.tv is None else sensitivity * _tv_denominator(point, self.tv)
         new = divide(point * jnp.maximum(A.T.mv(ratio), 0), scale)
         momentum = momentum_after(new, point, x, momentum)
         residual = divide(norm(new - x), norm(new))
@@ -231,4 +233,4 @@ def _without_rounding(sensitivity):
 def _tv_denominator(x, tv):
     u = differences(x, wrap=False)
     curvature = differences_adjoint(divide(u, jnp.broadcast_to(magnitude(u)[None], u.shape)), wrap=False)
-    return jnp.maximum(1 + tv * curvature, _MIN_DENOMINATOR)
+    return jnp.maximum(1 + jnp.asarray(tv, x.dtype) * curvature, _MIN_DENOMINATOR)

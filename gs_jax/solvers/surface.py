@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from ..base.arrays import divide, safe_sqrt
 from ..base.errors import InputError
+from ..typing import Real
 from .base import Operator, as_image, check_options, differences, differences_adjoint, magnitude
 from .richardson_lucy import (
     BACKGROUND_KNOTS,
@@ -134,8 +135,8 @@ class Surface(eqx.Module):
     """
 
     sheets: int = eqx.field(static=True, default=1)
-    smooth_depth: float = eqx.field(static=True, default=5.0)
-    smooth_brightness: float = eqx.field(static=True, default=0.0)
+    smooth_depth: Real | Float[Array, ""] = 5.0
+    smooth_brightness: Real | Float[Array, ""] = 0.0
     steps: int = eqx.field(static=True, default=len(_SCHEDULE))
     tolerance: float = eqx.field(static=True, default=0.0)
 
@@ -145,9 +146,6 @@ class Surface(eqx.Module):
             raise InputError(f"steps must be 1 to {len(_SCHEDULE)}, got {self.steps}.")
         if self.sheets < 1:
             raise InputError(f"sheets must be 1 or more, got {self.sheets}.")
-        for name in ("smooth_depth", "smooth_brightness"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} must be 0 or more, got {getattr(self, name)}.")
 
     def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
         image = jnp.maximum(as_image(A, image), 0)
@@ -256,14 +254,16 @@ class Surface(eqx.Module):
         scaled = divide(at.root, jnp.broadcast_to(safe_sqrt(unit), at.root.shape))
         root = jnp.stack([_diffused(a, v, _EDGE_ROOT) for a, v in zip(scaled, vector.root, strict=True)])
         depth = jnp.stack([_diffused(a, v, _EDGE_DEPTH) for a, v in zip(at.depth, vector.depth, strict=True)])
-        root = self.smooth_brightness * divide(root, jnp.broadcast_to(unit, root.shape))
-        return Sheets(root, self.smooth_depth * depth, jnp.zeros_like(vector.background))
+        smooth = jnp.asarray(self.smooth_brightness, root.dtype), jnp.asarray(self.smooth_depth, root.dtype)
+        root = smooth[0] * divide(root, jnp.broadcast_to(unit, root.shape))
+        return Sheets(root, smooth[1] * depth, jnp.zeros_like(vector.background))
 
     def _precondition(self, state, vector):
         energy, mean, damping = squared_derivatives(state.sheets), state.diagonal, _damping(state)
         root = mean[0] * (energy.root + energy.root.mean())
         # A knot has four neighbours.
-        depth = mean[1] * energy.depth + damping.depth + self.smooth_depth / _EDGE_DEPTH
+        smooth = jnp.asarray(self.smooth_depth / _EDGE_DEPTH, energy.depth.dtype)
+        depth = mean[1] * energy.depth + damping.depth + smooth
         later = _BRIGHTNESS_LATER
         return Sheets(
             later * divide(vector.root, root),
