@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from experiments.common import Report, main, table
 from experiments.ray_tracer import traced
 from experiments.surfaces import DEPTHS, STEP, VOXEL, device, noisy
-from experiments.volume_limits import ELECTRONS, ITERATIONS, KINDS, PIXELS, RAYS, TILE, cell, gain, scene
+from experiments.volume_limits import ELECTRONS, KINDS, PIXELS, RAYS, TILE, cell, gain, scene
 from gs_jax import Grid, Imager, rasterize
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
@@ -33,10 +33,10 @@ from gs_jax.reconstruction.inverse_problem import (
     prepare_data,
     prepare_model,
 )
-from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import run_solver
 from gs_jax.solvers.base import UnmatchedAdjointOperator
 from gs_jax.solvers.richardson_lucy import hat_functions
+from gs_jax.solvers.stepping import run_solver
+from gs_jax.solvers.unrolled import Unrolled
 
 # Steps from plane to plane, and from one plane to the next on which voxels are imaged, mm.
 PLANES = ((0.5, 0.5), (0.25, 0.25), (0.125, 0.125), (0.5, 0.25), (0.5, 0.125), (1.0, 1.0), (1.0, 0.5))
@@ -109,7 +109,8 @@ class Methods:
 
     def run(self, image: np.ndarray, step: float, fine: float) -> np.ndarray:
         light, _ = prepare_data(image, self.model)
-        volume = run_solver(METHODS["unrolled"](ITERATIONS), light, self.operators[step, fine], self.progress)
+        state = run_solver(Unrolled.pretrained(), light, self.operators[step, fine], self.progress).state
+        volume = np.asarray(Unrolled.pretrained().estimate(state))
         return on_planes(np.tensordot(spread(step, fine), volume, 1) if fine < step else volume, fine)
 
 

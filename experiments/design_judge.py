@@ -55,7 +55,7 @@ from gs_jax.io.files import make_folder, write_json
 from gs_jax.optics.apertures import clear_area
 from gs_jax.reconstruction.inverse_problem import InverseProblem, prepare_data, prepare_model, subtract_offset
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import reconstructor
+from gs_jax.reconstruction.pipeline import Reconstructor
 from gs_jax.simulation.phantoms import letters
 
 # Those that come with the package, for 18 to 23 mm; the first defines the exposures.
@@ -223,7 +223,7 @@ class Methods:
             self.step = jax.jit(lambda problem, light, state: lucy.step(problem.operator, light, state)[0])
         if "unrolled" in settings.methods:
             self.fine = finer(self.grid, settings.width)
-            self.unrolled = reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=Progress())
+            self.unrolled = Reconstructor(imager, self.fine, METHODS["unrolled"](1), progress=Progress())
 
     def volumes(self, image: np.ndarray) -> dict[str, np.ndarray]:
         """Volume by each method, Richardson-Lucy's with the number of its steps."""

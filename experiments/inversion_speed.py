@@ -90,7 +90,7 @@ def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
     import gs_jax as gs
     from gs_jax.reconstruction.inverse_problem import prepare_model
     from gs_jax.reconstruction.methods import METHODS as BY_NAME
-    from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
+    from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 
     scope = gs.geomscope().imager()
     scope = eqx.tree_at(lambda i: i.sensor, scope, gs.Sensor((pixels, pixels), scope.sensor.pixel_pitch))
@@ -111,7 +111,7 @@ def work(name: str, folder: Path, pixels: int) -> dict[str, Any]:
             np.save(file, np.random.default_rng(0).poisson(light).astype(np.float32))
         return parts
     image = np.load(folder / "image.npy")
-    invert = reconstructor(scope, grid, BY_NAME[name](20), progress=Progress())
+    invert = Reconstructor(scope, grid, BY_NAME[name](20), progress=Progress())
     seconds, volume = measure(lambda: invert(image, Progress()), 1)
     np.save(folder / "volume.npy", volume)
     return {name: seconds | {"memory_mib": status_mib("VmHWM")}}

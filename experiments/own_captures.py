@@ -27,7 +27,7 @@ from gs_jax import Grid, Imager, Unrolled, rasterize, read_capture, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.apps.training.from_captures import fine_tune
 from gs_jax.base.progress import Progress
-from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
+from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 from gs_jax.reconstruction.radius_fit import RadiusFit, fit_radius, with_radii
 from gs_jax.simulation.phantoms import letters
 
@@ -81,7 +81,7 @@ def run(design: str, steps: int, *, pixels: int = PIXELS, trained=TRAINED, score
         ("and weights trained on", radius.imager, found.networks),
         ("radii and tilt known", made, start),
     ):
-        volume_of = reconstructor(imager, grid, networks, progress=progress)
+        volume_of = Reconstructor(imager, grid, networks, progress=progress)
         gains[name] = [[gain(volume_of(each, progress), truth) for truth in both] for each, both in unseen]
     control = fit_radius(traced(known), known, grid, start, progress=progress)
     fits = [fitted(design, LARGER, radius), fitted(design, 1.0, control)]

@@ -32,8 +32,8 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.errors import InputError
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import reconstructor
-from gs_jax.reconstruction.surface_fit import surface_fitter
+from gs_jax.reconstruction.pipeline import Reconstructor
+from gs_jax.reconstruction.surface_fit import fit_sheets
 from gs_jax.simulation.phantoms import snowflake
 
 PIXELS, PITCH, VOXEL, STEP, DEPTHS = 1024, 0.009, 0.08, 0.5, (18.0, 23.0)
@@ -153,9 +153,9 @@ class Methods:
 
     def __init__(self, imager: Imager, progress: Progress):
         self.grid = Grid.over(imager.sensor, depths=np.arange(DEPTHS[0], DEPTHS[1] + 0.01, STEP), pitch=VOXEL)
-        fitter = lambda sheets: surface_fitter(imager, self.grid, Surface(sheets), optics="full", progress=progress)
-        self.sheet, self.sheets = fitter(1), fitter(2)
-        self.unrolled = reconstructor(imager, self.grid, METHODS["unrolled"](20), progress=progress)
+        self.sheet = Reconstructor(imager, self.grid, Surface(), progress=progress)
+        self.sheets = self.sheet.by(Surface(2))
+        self.unrolled = Reconstructor(imager, self.grid, METHODS["unrolled"](20), progress=progress)
 
 
 def noisy(clean: np.ndarray, electrons: float) -> np.ndarray:
@@ -170,7 +170,7 @@ def run(image: np.ndarray, name: str, emitters: Emitters, methods: Methods, free
     light, depth, volume = true_maps(emitters, methods.grid)
     shares = np.asarray(rasterize(emitters, methods.grid), np.float32)
     began = time.process_time()
-    fit = (methods.sheets if name == "two sheets" else methods.sheet)(image, progress)
+    fit, _ = fit_sheets(methods.sheets if name == "two sheets" else methods.sheet, image, progress)
     took = time.process_time() - began
     error, sd = fit.depth[0] - depth, fit.depth_sd[0]
     known = np.isfinite(error)

@@ -22,7 +22,7 @@ from gs_jax.io.camera import prepare, read_frame
 from gs_jax.io.captures import Selection
 from gs_jax.io.recordings import open_recording
 from gs_jax.io.volume_series import JOURNAL, VolumeSeries
-from gs_jax.reconstruction.pipeline import reconstructor, voxel_grid
+from gs_jax.reconstruction.pipeline import Reconstructor, voxel_grid
 from gs_jax.simulation.phantoms import random_points
 
 from .common import Report, main, table
@@ -58,7 +58,7 @@ def parts(path: Path, design: Design, depths: list[float], folder: Path, frames:
     """Median milliseconds per frame of reading, computing and writing, each alone."""
     imager = design.imager()
     grid = voxel_grid(imager, depths)
-    volume_of, series = reconstructor(imager, grid), VolumeSeries(folder / "parts.zarr", frames, grid)
+    volume_of, series = Reconstructor(imager, grid), VolumeSeries(folder / "parts.zarr", frames, grid)
     prepared, times = prepare(imager.sensor.shape), []
     with open_recording(path) as recording:
         assert recording is not None

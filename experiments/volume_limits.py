@@ -35,7 +35,7 @@ from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.inverse_problem import prepare_data, prepare_model
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import reconstructor
+from gs_jax.reconstruction.pipeline import Reconstructor
 from gs_jax.solvers.base import Operator
 
 PIXELS, ELECTRONS, RAYS, TILE, LAYER = 640, 10_000, 100, 0.1, STEP / 4
@@ -118,8 +118,7 @@ class Methods:
         self.grid = Grid.over(imager.sensor, depths=depths_of(STEP), pitch=VOXEL)
         self.model = prepare_model(imager, self.grid, "full", progress)
         self.operator = ImagingOperator(self.model.imager, self.grid, self.model.optics)
-        read = lambda solver, state, cost: (np.array(solver.estimate(state)), state)
-        by = lambda name: reconstructor(imager, self.grid, METHODS[name](ITERATIONS), read=read, progress=progress)
+        by = lambda name: Reconstructor(imager, self.grid, METHODS[name](ITERATIONS), progress=progress)
         self.plain = {name: by(name) for name in PLAIN}
         # Light at any depth of a scene, on voxels half as wide.
         half = Grid.over(imager.sensor, depths=depths_of(LAYER), pitch=VOXEL / 2)
@@ -128,7 +127,7 @@ class Methods:
 
     def run(self, image: np.ndarray, truth: np.ndarray, case: str) -> dict[str, np.ndarray]:
         """Volumes; ceilings for rays and voxels alone."""
-        found = {name: method(image, self.progress)[0] for name, method in self.plain.items()}
+        found = {name: method(image, self.progress) for name, method in self.plain.items()}
         if case in ("rays", "voxels"):
             found[FURTHER] = self.lucy(image, MORE)[0]
             found[SUPPORTED] = self.in_support(image, truth > 0)
@@ -137,7 +136,9 @@ class Methods:
 
     def lucy(self, image: np.ndarray, steps: int, start=None):
         """The volume by Richardson-Lucy, and its state."""
-        return self.plain["richardson-lucy"](image, self.progress, METHODS["richardson-lucy"](steps), start)
+        lucy = self.plain["richardson-lucy"].by(METHODS["richardson-lucy"](steps))
+        state = lucy.run(lucy.init(image, start), self.progress)
+        return np.array(lucy.finish(state)), state.solver
 
     def in_support(self, image: np.ndarray, support: np.ndarray) -> np.ndarray:
         """Richardson-Lucy, where voxels without light stay dark."""

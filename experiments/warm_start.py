@@ -11,7 +11,6 @@ Writes `warm_start.md`; about five minutes on two cores.
 """
 
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
 
 import numpy as np
@@ -22,8 +21,8 @@ from gs_jax import Imager, quality, rasterize, read_design
 from gs_jax.apps.benchmark_report import markdown_table
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import reconstructor
-from gs_jax.reconstruction.warm_start import following_reconstructor
+from gs_jax.reconstruction.pipeline import Reconstructor
+from gs_jax.reconstruction.warm_start import follow_volume
 
 MOVES, ELECTRONS, FRAMES = (0.0, 0.04, 0.12), 3000, 3
 FOLLOWED = ("list-rl", "richardson-lucy")
@@ -60,12 +59,17 @@ def recording(kind: str, move: float, imager: Imager, settings: Settings) -> lis
     return frames
 
 
-def measured(reconstruct: Callable, frames: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, int, float]:
+def measured(
+    reconstructor: Reconstructor, frames: list[tuple[np.ndarray, np.ndarray]], *, follow: bool
+) -> tuple[float, int, float]:
     """PSNR above an empty volume and steps of the last frame, and frames a second."""
-    seconds, counted, volume = [], Counted(), np.zeros(0)
+    seconds, counted, volume, last = [], Counted(), np.zeros(0), None
     for image, _ in frames:
         began = time.perf_counter()
-        volume = reconstruct(image, counted)
+        if follow:
+            volume, last = follow_volume(reconstructor, image, last, counted)
+        else:
+            volume = reconstructor(image, counted)
         seconds.append(time.perf_counter() - began)
     truth = frames[-1][1]
     empty = quality(np.zeros_like(truth), truth).psnr_db
@@ -76,19 +80,14 @@ def report(design: str, progress: Progress) -> Report:
     settings = Settings()
     imager = device(read_design(design_file(design)).imager(), settings)
     afresh = {
-        name: reconstructor(imager, settings.grid, METHODS[name](20), progress=Progress())
-        for name in ("backproject", *FOLLOWED, "unrolled")
+        name: Reconstructor(imager, settings.grid, METHODS[name](20)) for name in ("backproject", *FOLLOWED, "unrolled")
     }
     rows, cases = [], [(kind, move) for kind in ("letters", "beads") for move in MOVES]
     for kind, move in progress.track(cases, "Moving scenes"):
         frames = recording(kind, move, imager, settings)
         for name, alone in afresh.items():
-            starts = {"afresh": alone}
-            if name in FOLLOWED:
-                how = {"optics": "full", "progress": Progress()}
-                starts["warm"] = following_reconstructor(imager, settings.grid, METHODS[name](20), **how)
-            for start, reconstruct in starts.items():
-                gain, steps, rate = measured(reconstruct, frames)
+            for start in ("afresh", "warm") if name in FOLLOWED else ("afresh",):
+                gain, steps, rate = measured(alone, frames, follow=start == "warm")
                 count = "" if name == "backproject" else str(steps)
                 rows.append([kind, f"{1000 * move:.0f}", name, start, f"{gain:.1f}", count, f"{rate:.2g}"])
     return Report({"warm_start.md": markdown_table(COLUMNS, rows)}, [table(COLUMNS, rows)])

@@ -25,6 +25,7 @@ From a capture to a volume:
 
     read_capture         A capture `(row, column)` in the file's own type: uint8, uint16 or float32
     reconstruct          Reconstruct the volume that an image shows
+    Reconstructor        What all images of a microscope share for `reconstruct`: the optics and the method
     BackProjection       Back-projection, the paper's reconstruction: one pass, no PSF
     PinholeRichardsonLucy  Richardson-Lucy with the pinhole back-projection in place of the adjoint
     RichardsonLucy       Richardson-Lucy: `x <- x A'(image / (A x + background)) / A'1`, from a uniform start

@@ -32,7 +32,7 @@ from .projection.operators import (
 from .reconstruction.cross_validation import cross_validated as cross_validated
 from .reconstruction.deconvolution import deconvolve as deconvolve
 from .reconstruction.methods import BackProjection as BackProjection, PinholeRichardsonLucy as PinholeRichardsonLucy
-from .reconstruction.pipeline import reconstruct as reconstruct
+from .reconstruction.pipeline import Reconstructor as Reconstructor, reconstruct as reconstruct
 from .reconstruction.residual import forward_residual as forward_residual
 from .reconstruction.surface_fit import fit_surface as fit_surface
 from .simulation.phantoms import rasterize as rasterize

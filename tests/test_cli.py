@@ -348,7 +348,7 @@ def test_interrupt_leaves_nothing_half_written(folder, monkeypatch, capsys):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gs_jax.reconstruction.plan.reconstructor", interrupt)
+    monkeypatch.setattr("gs_jax.reconstruction.plan.Reconstructor", interrupt)
     status, _, err = run(monkeypatch, capsys, *RECONSTRUCT, "-o", "v.tif")
     assert (status, err.strip()) == (130, "gs-jax: interrupted")
     assert not (folder / "v.tif").exists()

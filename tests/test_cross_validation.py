@@ -9,10 +9,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 import gs_jax as gs
-from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.cross_validation import folds_of_lenses, kept_pixels_of_folds
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.pipeline import reconstructor
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, background_step
 
 GRID = gs.Grid(np.array([19.0, 20.0, 21.0]), (31, 31), 0.08)
@@ -51,11 +49,11 @@ def test_neighbours_are_left_out_in_turn():
 def test_a_back_projection_is_scored_as_it_is(scene, normalize):
     """With all pixels it is the volume that is asked for, divided by the weights or not; the scores differ."""
     _, psf, clean = scene
-    volume_of = reconstructor(scope(), GRID, gs.BackProjection(normalize=normalize), optics=psf)
-    whole = volume_of(clean, Progress())
-    np.testing.assert_allclose(volume_of(clean, Progress(), kept=np.ones_like(clean)), whole, rtol=1e-6, atol=1e-7)
+    volume_of = gs.Reconstructor(scope(), GRID, gs.BackProjection(normalize=normalize), psf)
+    whole = volume_of(clean)
+    np.testing.assert_allclose(volume_of.keeping(np.ones_like(clean))(clean), whole, rtol=1e-6, atol=1e-7)
     weights = gs.backproject(np.ones_like(clean), scope(), GRID)
-    other = reconstructor(scope(), GRID, gs.BackProjection(normalize=not normalize), optics=psf)(clean, Progress())
+    other = gs.Reconstructor(scope(), GRID, gs.BackProjection(normalize=not normalize), psf)(clean)
     factor = 1 / np.maximum(weights, 1e-6) if normalize else np.asarray(weights)
     np.testing.assert_allclose(whole, other * factor, rtol=1e-4, atol=1e-5)
 
@@ -67,12 +65,11 @@ SLOW = [pytest.param(name, marks=pytest.mark.integration) for name in ("list-rl"
 def test_what_is_left_out_is_not_read(scene, name):
     _, psf, clean = scene
     image, kept = exposed(clean, 2000), kept_pixels_of_folds(scope(), 3)[0]
-    volume_of = reconstructor(scope(), GRID, METHODS[name](4), optics=psf)
+    whole_of = gs.Reconstructor(scope(), GRID, METHODS[name](4), psf)
+    volume_of = whole_of.keeping(kept)
     # More light, so that the percentile that counts as dark is the same.
     lit = image + np.where(kept == 0, 500.0, 0.0)
-    volume, other, whole = (
-        volume_of(each, Progress(), kept=k) for each, k in ((image, kept), (lit, kept), (lit, None))
-    )
+    volume, other, whole = volume_of(image), volume_of(lit), whole_of(lit)
     np.testing.assert_array_equal(volume, other)
     assert np.abs(volume - whole).max() > 0.1 * volume.max() > 0
 

@@ -56,7 +56,7 @@ class Camera:
             self.read.append(series.names[frame])
             return read_capture(self.folder / series.names[frame])
 
-        make = lambda image: (np.stack([image, 2 * image]), {"mean": float(image.mean())})
+        make = lambda image, _: (np.stack([image, 2 * image]), {"mean": float(image.mean())}, None)
         live.reconstruct_live(series, self.folder, self.changes, read, make, **calls)
 
 

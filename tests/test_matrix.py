@@ -34,7 +34,7 @@ from gs_jax.optics.raytrace import to_numpy
 from gs_jax.reconstruction.methods import METHODS
 from gs_jax.reconstruction.pipeline import PIXELS_PER_VOXEL, voxel_grid
 from gs_jax.reconstruction.radius_fit import fit_radius
-from gs_jax.reconstruction.warm_start import following_reconstructor
+from gs_jax.reconstruction.warm_start import follow_volume
 
 from .test_calibration_pattern import discs
 
@@ -267,9 +267,10 @@ def followed(case: Case, _) -> None:
     """A frame that starts from the same frame's volume keeps its gain, but for a tenth: its steps end 2 % above."""
     empty = gs.quality(np.zeros_like(case.truth), case.truth).psnr_db
     for name in ("list-rl", "richardson-lucy"):
-        how = {"optics": case.optics, "progress": Progress()}
-        follow = following_reconstructor(case.imager, case.grid, METHODS[name](10), **how)
-        first, second = (gs.quality(follow(case.of_truth, Progress()), case.truth).psnr_db for _ in range(2))
+        reconstructor = gs.Reconstructor(case.imager, case.grid, METHODS[name](10), case.optics)
+        volume, last = follow_volume(reconstructor, case.of_truth, None, Progress())
+        following, _ = follow_volume(reconstructor, case.of_truth, last, Progress())
+        first, second = (gs.quality(part, case.truth).psnr_db for part in (volume, following))
         assert second - empty > 0.9 * (first - empty) > 0.2, (name, first, second)
 
 

@@ -1,14 +1,17 @@
 """From an image to a volume, by every method."""
 
+import dataclasses
 import inspect
 from contextlib import contextmanager
 from functools import cache
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
 import gs_jax as gs
 from experiments.solver_options import glow
@@ -26,7 +29,7 @@ from gs_jax.solvers.base import solve
 from gs_jax.solvers.fista import FISTA
 from gs_jax.solvers.richardson_lucy import RichardsonLucy, kl_divergence
 
-from .helpers import scene
+from .helpers import compilations, scene
 
 
 @cache
@@ -201,7 +204,7 @@ def test_pixels_of_any_number_are_summed():
     model = prepare_model(imager, grid, "pinhole", Progress())
     assert model.binning == 4 and model.imager.sensor.shape == (15, 20)
     image = np.random.default_rng(0).random((61, 83)) + 1
-    light = prepare_data(image, model._replace(is_partial=False))[0]
+    light = prepare_data(image, dataclasses.replace(model, is_partial=False))[0]
     offset = np.percentile(image, 1)
     assert light[14, 19] == pytest.approx((image[56:60, 76:80] - offset).sum())
     own = imager.sensor.to_mm(np.mgrid[56:60, 76:80].reshape(2, -1).T.astype(float))
@@ -263,3 +266,44 @@ def test_the_glow_is_as_bright_as_it_says():
     image = np.random.default_rng(0).uniform(1, 3, (60, 50))
     added = glow(image)
     assert added.max() == pytest.approx(2 * (image.mean() - np.percentile(image, 1)), rel=0.01) and added.min() > 0
+
+
+@cache
+def tiny():
+    """A reconstructor by few lenses, whose background is fitted or subtracted, and a bright image."""
+    imager, grid = scene(shape=(40, 50), voxels=(5, 4), pitch=0.2, depths=(18.0, 20.0))
+    rng = np.random.default_rng(0)
+    # No two pixels are equal: percentiles have derivatives.
+    image = 5 + rng.random(imager.sensor.shape) + forward(rng.random(grid.volume_shape), imager, grid)
+    return lambda method: gs.Reconstructor(imager, grid, method, "pinhole"), np.asarray(image)
+
+
+METHODS_OF_JAX = [BackProjection(normalize=True), RichardsonLucy(), PinholeRichardsonLucy(), FISTA()]
+
+
+@pytest.mark.parametrize("method", METHODS_OF_JAX, ids=lambda method: type(method).__name__)
+def test_a_reconstructor_is_compiled_and_mapped(method):
+    """One step by the host and by JAX, of an image and of two at once; other numbers compile nothing."""
+    make, image = tiny()
+    reconstructor = make(method)
+    state = reconstructor.step(reconstructor.init(image))
+    expected = np.asarray(reconstructor.finish(state))
+    once = eqx.filter_jit(lambda r, image: r.finish(r.step(r.init(image))))
+    np.testing.assert_allclose(once(reconstructor, jnp.asarray(image)), expected, rtol=1e-5, atol=1e-6)
+    before = compilations()
+    once(jax.tree.map(lambda leaf: leaf, reconstructor), jnp.asarray(2 * image))
+    assert compilations() == before
+    both = eqx.filter_jit(eqx.filter_vmap(once, in_axes=(None, 0)))(reconstructor, jnp.stack([image, image + 1]))
+    np.testing.assert_allclose(both[0], expected, rtol=1e-5, atol=1e-6)
+    # The camera's offset is subtracted, but for back-projection, which reads the image as it is.
+    lifted = expected + (expected > 0) * isinstance(method, BackProjection)
+    np.testing.assert_allclose(both[1], lifted, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.integration
+def test_a_step_of_a_reconstructor_is_differentiated():
+    make, image = tiny()
+    lucy = make(RichardsonLucy())
+    weight = jax.random.normal(jax.random.key(0), lucy.problem.operator.in_structure().shape)
+    moment = jax.jit(lambda image: jnp.vdot(weight, lucy.finish(lucy.step(lucy.init(image)))))
+    check_grads(moment, (jnp.asarray(image),), order=1, modes=["fwd", "rev"], eps=1e-6, atol=1e-4, rtol=1e-4)

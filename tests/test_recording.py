@@ -337,7 +337,7 @@ def test_memory_is_bounded_and_work_overlaps(tmp_path):
 
     grid = Grid([20.0], (4, 4), 0.1)
     series = Slow(tmp_path / "v.zarr", 30, grid)
-    reconstruct_frames(series, read, lambda frame: (np.full((1, 4, 4), frame + 1, np.float32), {}))
+    reconstruct_frames(series, read, lambda frame, _: (np.full((1, 4, 4), frame + 1, np.float32), {}, None))
     assert volumes(tmp_path / "v.zarr")[:, 0, 0, 0].tolist() == list(range(1, 31))
     # Those being read ahead, one more to be asked for, one made and one being written.
     assert most <= PREFETCH + 3
@@ -347,10 +347,10 @@ def test_memory_is_bounded_and_work_overlaps(tmp_path):
 def test_whatever_ends_it_finished_frames_are_kept(tmp_path, error):
     grid = Grid([20.0], (4, 4), 0.1)
 
-    def make(frame):
+    def make(frame, _):
         if frame == 6:
             raise error
-        return np.full((1, 4, 4), frame + 1, np.float32), {}
+        return np.full((1, 4, 4), frame + 1, np.float32), {}, None
 
     with pytest.raises(error if isinstance(error, type) else OSError):
         reconstruct_frames(VolumeSeries(tmp_path / "v.zarr", 9, grid), lambda frame: frame, make)
@@ -397,7 +397,7 @@ DEVICES = """
 import sys
 import numpy as np, jax
 from gs_jax import Grid, read_design, reconstruct
-from gs_jax.reconstruction.pipeline import backproject_on_all_devices
+from gs_jax.projection.backprojection import backproject_on_all_devices
 from gs_jax.reconstruction.methods import BackProjection
 
 imager = read_design("design.toml").imager()

@@ -13,7 +13,7 @@ import gs_jax as gs
 from gs_jax.base.progress import Progress
 from gs_jax.io.provenance import read_provenance
 from gs_jax.io.surfaces import read_surface, write_surface
-from gs_jax.reconstruction.surface_fit import surface_fitter
+from gs_jax.reconstruction.surface_fit import follow_sheets
 from gs_jax.solvers.sheets import first_sheets, interpolated
 from gs_jax.widget.layers import reader
 
@@ -62,11 +62,12 @@ def test_the_depth_of_a_tilted_sheet_is_found(fit):
 def test_frames_start_from_the_one_before_unless_the_scene_is_another():
     """A sheet that moves away is followed; another one is not."""
     grid = gs.Grid(DEPTHS, **GRID)
-    follow = surface_fitter(scope(), grid, gs.Surface(), optics="near", progress=Progress(), in_time=True)
+    reconstructor, last = gs.Reconstructor(scope(), grid, gs.Surface(), "near"), None
     inner = np.abs(np.asarray(grid.x)) < 1.1
     started = []
     for slope, middle in ((1.2, 20.0), (1.2, 20.1), (1.2, 20.2), (-1.2, 19.5)):
-        found = follow(capture(lambda x, y, slope=slope, middle=middle: middle + slope * x), Progress())
+        image = capture(lambda x, y, slope=slope, middle=middle: middle + slope * x)
+        found, last = follow_sheets(reconstructor, image, last, Progress())
         error = (found.depth[0] - (middle + slope * np.asarray(grid.x))[None])[np.ix_(inner, inner)]
         assert np.nanstd(error) < 0.08 and abs(np.nanmean(error)) < 0.05 and found.warning is None
         started.append(bool(np.isfinite(found.further_error)))

@@ -9,7 +9,7 @@ import gs_jax as gs
 from experiments.warm_start import Counted
 from gs_jax.base.progress import Progress
 from gs_jax.reconstruction.methods import METHODS
-from gs_jax.reconstruction.warm_start import following_reconstructor
+from gs_jax.reconstruction.warm_start import follow_volume
 
 from .test_cli import folder, run
 from .test_recording import command, save, volumes
@@ -43,11 +43,13 @@ def alone(image, method, steps):
 def test_frames_that_follow_need_fewer_steps(name):
     """A bar that stays or moves by a voxel is better than by as many steps afresh, and after a jump as by half."""
     method, counted = METHODS[name](STEPS), Counted()
-    follow = following_reconstructor(scope(), GRID, method, optics="near", progress=Progress())
-    np.testing.assert_array_equal(follow(bar(10)[1], counted), alone(bar(10)[1], method, STEPS))
+    reconstructor = gs.Reconstructor(scope(), GRID, method, "near")
+    volume, last = follow_volume(reconstructor, bar(10)[1], None, counted)
+    np.testing.assert_array_equal(volume, alone(bar(10)[1], method, STEPS))
     for place, share in ((10, 1), (11, 1), (28, 2)):
         truth, image = bar(place)
-        found = gs.quality(follow(image, counted), truth).psnr_db
+        volume, last = follow_volume(reconstructor, image, last, counted)
+        found = gs.quality(volume, truth).psnr_db
         assert counted.steps < STEPS or place == 28
         afresh = alone(image, method, counted.steps // share)
         assert found > gs.quality(afresh, truth).psnr_db, (place, counted.steps)
@@ -58,10 +60,11 @@ def test_frames_that_follow_need_fewer_steps(name):
 def test_what_follows_a_dark_frame_starts_afresh(level):
     """Without light, or with read noise alone, whose sum may be negative."""
     method, (_, image) = METHODS["richardson-lucy"](4), bar(10)
-    follow = following_reconstructor(scope(), GRID, method, optics="near", progress=Progress())
+    reconstructor, last = gs.Reconstructor(scope(), GRID, method, "near"), None
     dark = np.random.default_rng(0).normal(0, level, image.shape).astype(np.float32)
     for frame in (image, dark, image):
-        np.testing.assert_array_equal(follow(frame, Progress()), alone(frame, method, 4))
+        volume, last = follow_volume(reconstructor, frame, last, Progress())
+        np.testing.assert_array_equal(volume, alone(frame, method, 4))
 
 
 @pytest.mark.integration

@@ -58,6 +58,11 @@ def array_namespace(x: Any) -> Any:
     return np if isinstance(x, np.ndarray) else jnp
 
 
+def is_traced(tree: Any) -> bool:
+    """Whether JAX traces a leaf of a pytree."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def host_code(
     instead: str = "it is host code",
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
@@ -66,7 +71,7 @@ def host_code(
     def decorate(function):
         @functools.wraps(function)
         def checked(*args, **kwargs):
-            if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            if is_traced((args, kwargs)):
                 raise InputError(f"{function.__name__} cannot be traced by jit, grad or vmap; {instead}.")
             return function(*args, **kwargs)
 
@@ -76,8 +81,11 @@ def host_code(
 
 
 def check_finite(name: str, values: Shaped[Array | np.ndarray, "..."], parts: str = "pixels") -> None:
-    """Raise `InputError` if an array has a NaN or an infinity; `parts` is what its elements are called. Host code."""
-    if np.issubdtype(values.dtype, np.integer):
+    """Raise `InputError` if an array has a NaN or an infinity; `parts` is what its elements are called.
+
+    Traced values are not checked.
+    """
+    if np.issubdtype(values.dtype, np.integer) or is_traced(values):
         return
     finite = array_namespace(values).isfinite(values)
     if not finite.all():

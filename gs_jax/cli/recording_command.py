@@ -91,26 +91,26 @@ def open_frames(capture: Path, camera: CaptureOptions, plan):
 
     stack = ExitStack()
     atexit.register(stack.close)
-    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan, in_time=False)
+    return frames_of(stack.enter_context(open_recording(capture, page=camera.page)), camera, plan)
 
 
-def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False, in_time: bool = True):
+def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False):
     """Prepare a recording and a `Plan`; return `read` and `make` of `reconstruct_frames`.
 
-    `is_live` compiles all before the first frame comes; `in_time`: frames follow each other, those of a worker do not.
+    `is_live` compiles all before the first frame comes.
     """
     import numpy as np
 
-    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress(), in_time=in_time)
+    image_of, reconstruct = camera.frames(recording), plan.prepare(Progress())
     if is_live:
         with suppress(InputError):
             reconstruct(_image_to_compile_for(plan), Progress())
     # Only the first frame is checked; an iterator gives one item to one thread.
     checks = iter([plan.check] if plan.is_learned else [])
 
-    def make(frame):
+    def make(frame, last):
         number, image, done, warnings = frame
-        result = reconstruct(image, Progress())
+        result = reconstruct(image, Progress(), last)
         if result.warning:
             warnings = [*warnings, result.warning]
         note: dict[str, Any] = {name: lines for name, lines in (("done", done), ("warnings", warnings)) if lines}
@@ -121,7 +121,7 @@ def frames_of(recording, camera: CaptureOptions, plan, *, is_live: bool = False,
             points = np.asarray(result.points).T
             columns = dict(zip(("x_mm", "y_mm", "z_mm", "intensity"), points, strict=True)) | (result.statistics or {})
             note["points"] = {name: np.asarray(values).tolist() for name, values in columns.items()}
-        return result.volume, note
+        return result.volume, note, result.last
 
     return lambda frame: (frame, *image_of(frame)), make
 

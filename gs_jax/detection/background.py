@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Array, Float, Float32, Shaped
 
 from ..base.arrays import check_finite
 from ..base.errors import input_error
@@ -133,3 +134,17 @@ def interpolate_tiles(tiles: Tiles, shape: tuple[int, int]) -> Pixels:
 
     for_each_band(shape[0], interpolate)
     return result
+
+
+def level_of_tiles(light: Float[Array, "y x"]) -> Float[Array, "y x"]:
+    """What `background_tiles` and `interpolate_tiles` compute, for what JAX traces."""
+    pixels = jnp.pad(light, [(0, -n % _TILE) for n in light.shape], mode="edge")
+    tall, wide = (n // _TILE for n in pixels.shape)
+    pixels = pixels.reshape(tall, _TILE, wide, _TILE).swapaxes(1, 2).reshape(tall, wide, -1)
+    rows, columns = (_between_tiles(*size, light.dtype) for size in zip(light.shape, (tall, wide), strict=True))
+    return rows @ jnp.median(pixels[..., ::3], axis=-1) @ columns.T
+
+
+def _between_tiles(size, count, dtype):
+    position = np.clip((np.arange(size) + 0.5) / _TILE - 0.5, 0, count - 1)
+    return jnp.asarray(np.maximum(1 - np.abs(position[:, None] - np.arange(count)), 0), dtype)

@@ -2,9 +2,11 @@
 
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Num
 
 from ..base.arrays import jit
@@ -94,6 +96,28 @@ def backproject(
         raise ValueError(f"`distortion` must be of the depths' shape {grid.depths.shape}, got {distortion.shape}.")
     volume = lax.map(backproject_group, (_in_groups(grid.depths), _in_groups(distortion)))
     return volume.reshape(-1, *grid.shape)[: grid.depths.size]
+
+
+def backproject_on_all_devices(
+    image: Image, imager: Imager, grid: Grid, *, distortion: Float[np.ndarray, " depth"] | None = None, **options
+) -> Float[Array, "depth y x"]:
+    """`backproject` with the depths divided evenly among the devices of this process."""
+    distortion = np.ones(grid.depths.size) if distortion is None else distortion
+    missing = -grid.depths.size % jax.local_device_count()
+    planes = (np.pad(part, (0, missing), mode="edge") for part in (grid.depths, distortion))
+    return _backproject_sharded(image, imager, grid, *planes, **options)[: grid.depths.size]
+
+
+@partial(jit, static_argnames=("method", "normalize"))
+def _backproject_sharded(image, imager, grid, depths, distortion, **options):
+    mesh, replicated, sharded = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec(), PartitionSpec("depth")
+
+    def project(image, imager, grid, depths, distortion):
+        return backproject(image, imager, grid.at(depths), distortion=distortion, **options)
+
+    # The kernels do not declare which results vary between devices.
+    specs = {"in_specs": (replicated, replicated, replicated, sharded, sharded), "out_specs": sharded}
+    return jax.shard_map(project, mesh=mesh, **specs, check_vma=False)(image, imager, grid, depths, distortion)
 
 
 @partial(jit, static_argnames=("method",))

@@ -1,7 +1,6 @@
 """Score of a reconstruction without ground truth: how well it predicts the light of lenses that it did not use."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,9 +15,9 @@ from ..grid import Grid
 from ..projection.forward_model import Optics, forward
 from ..solvers.surface import Surface
 from ..typing import Image, Volume
-from .inverse_problem import ImageModel, InverseProblem, num_detrend_modes, prepare_data, prepare_model
+from .inverse_problem import InverseProblem, prepare_data, prepare_model
 from .methods import BackProjection, Method, check_stop
-from .pipeline import check_call, reconstructor
+from .pipeline import Reconstructor, check_call
 from .residual import binned_variance, rms_of_regions
 
 
@@ -115,13 +114,13 @@ def cross_validated(
     check_stop(method, stop_at_discrepancy)
     check_scored(image, imager, grid, method, optics)
     progress = progress or Progress()
-    model = prepare_model(imager, grid, optics, progress)
-    options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
-    volume_of = reconstructor(imager, grid, method, **options)
-    light, compare = comparison(image, model, grid, is_named=isinstance(optics, str))
+    options = {"stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
+    problem = prepare_model(imager, grid, optics, progress)
+    reconstructor = Reconstructor(imager, grid, method, optics, **options)
+    light = light_of(image, problem)
     residual, parts = np.zeros_like(light), []
-    for kept in progress.track(kept_pixels_of_folds(model.imager, folds), "Cross-validating"):
-        rest = compare(volume_of(image, progress, kept=kept), kept)
+    for kept in progress.track(kept_pixels_of_folds(problem.imager, folds), "Cross-validating"):
+        rest = residual_of(reconstructor.keeping(kept)(image, progress), light, problem, kept)
         left_out = kept == 0
         residual[left_out] = rest[left_out]
         parts.append(relative(rest[left_out], light[left_out]))
@@ -141,26 +140,19 @@ def check_scored(image, imager, grid, method, optics):
         raise InputError("method must be one of free voxels to be scored by other lenses, got Surface().")
 
 
-def comparison(
-    image: Image, model: ImageModel, grid: Grid, *, is_named: bool
-) -> tuple[Float[np.ndarray, "y x"], Callable[[Volume, np.ndarray], np.ndarray]]:
-    """Return the light of a capture without background, and what a volume leaves of it.
+def light_of(image: Image, problem: InverseProblem) -> Float[np.ndarray, "y x"]:
+    """The light of a capture without background."""
+    light, background = prepare_data(image, problem)
+    return np.asarray(problem.detrend(light - background), np.float64)
 
-    The function takes a volume and the pixels (1, and 0 for others) to which its gain is fitted.
-    """
-    light, background = prepare_data(image, model)
-    modes = num_detrend_modes(model.imager, model.optics) if is_named else 0
-    problem = InverseProblem(model.imager, grid, model.optics, detrend_modes=modes)
-    without_trend = lambda image: np.asarray(problem.detrend(image), np.float64)
-    light = without_trend(light - background)
-    parts = model.imager, grid, model.optics
 
-    def residual(volume, kept):
-        shown = without_trend(forward(jnp.asarray(volume, model.imager.sensor_distance.dtype), *parts))
-        energy = np.vdot(kept * shown, shown)
-        return light - (max(np.vdot(kept * shown, light) / energy, 0) if energy > 0 else 0) * shown
-
-    return light, residual
+def residual_of(volume: Volume, light: np.ndarray, problem: InverseProblem, kept: np.ndarray) -> np.ndarray:
+    """What a volume leaves of the light, with a gain that fits the pixels that are kept (1, and 0 for others)."""
+    imager = problem.imager
+    image = forward(jnp.asarray(volume, imager.sensor_distance.dtype), imager, problem.grid, problem.optics)
+    shown = np.asarray(problem.detrend(image), np.float64)
+    energy = np.vdot(kept * shown, shown)
+    return light - (max(np.vdot(kept * shown, light) / energy, 0) if energy > 0 else 0) * shown
 
 
 def kept_pixels_of_folds(imager: Imager, count: int) -> list[Float[np.ndarray, "row column"]]:

@@ -17,9 +17,10 @@ from ..solvers.admm import ADMM
 from ..solvers.convolution import ConvolutionADMM
 from ..solvers.fista import FISTA
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.stepping import run_solver
 from ..typing import Image
 from .inverse_problem import subtract_offset, sum_pixels
-from .pipeline import DISCREPANCY_FACTOR, run_solver
+from .pipeline import DISCREPANCY_FACTOR
 from .residual import discrepancy_target
 from .smoothness import Smoothness, choose_smoothness, image_of
 from .wiener import filter_by_wiener
@@ -172,14 +173,13 @@ def run_deconvolution(
     if stop_at_discrepancy:
         counts = isinstance(solver, RichardsonLucy)
         target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image) / unit, light, counts=counts)
-    changes = []
-    read = lambda solver, state, cost: (np.asarray(solver.estimate(state), np.float32), cost < target)
-    scene, reached_noise = run_solver(solver, light, system, progress, target, read, residuals=changes)
+    run = run_solver(solver, light, system, progress, target=target, quarter="twice the --binning")
+    scene = np.asarray(solver.estimate(run.state), np.float32)
     difference = np.asarray(image_of(system, scene)) - light
     residual = float(np.linalg.norm(difference) / (np.linalg.norm(light) or 1))
     scene = unit * scene[:, *system.window]
     scene = scene[0] if isinstance(psf, Array | np.ndarray) and psf.ndim == 2 else scene
-    return Deconvolution(scene, smoothness, residual, len(changes), changes[-1], reached_noise)
+    return Deconvolution(scene, smoothness, residual, run.steps, run.residual, run.cost < target)
 
 
 def filter_image(image: Image, psf: Num[Array | np.ndarray, "*depth high wide"]) -> Float32[np.ndarray, "row column"]:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Num
 
 from ..base.errors import input_error
 from ..projection.measured_psf import FieldConvolutionOperator, middle, scene_size
+from ..solvers.richardson_lucy import hat_functions
 from .inverse_problem import subtract_offset
 
 # Default error of the decomposition, relative to the PSFs' RMS.
@@ -148,7 +149,7 @@ class _Plane:
         grid = np.clip(grid.reshape(-1, 2), self.positions.min(0), self.positions.max(0))
         coarse = _interpolate(self.positions, self.coefficients[:, : self.rank], grid)
         coarse = coarse.T.reshape(self.rank, *map(len, nodes))
-        down, across = (_hats(n, node) for n, node in zip((tall, wide), nodes, strict=True))
+        down, across = (np.asarray(hat_functions(n, min(_NODES, n), float)) for n in (tall, wide))
         weights = np.zeros((rank, tall, wide), np.float32)
         weights[: self.rank] = down @ coarse @ across.T
         kernels = np.zeros((rank, *self.shape), np.float32)
@@ -191,10 +192,3 @@ def _interpolate(places, values, at):
     from scipy.interpolate import RBFInterpolator
 
     return RBFInterpolator(places, values, kernel="thin_plate_spline")(at)
-
-
-def _hats(count, nodes):
-    """Bilinear weights of nodes, `(count, node)`."""
-    if count == len(nodes):
-        return np.eye(count)
-    return np.maximum(1 - np.abs(np.arange(count)[:, None] - nodes) / (nodes[1] - nodes[0]), 0)

@@ -1,6 +1,6 @@
 """The inverse problem of iterative methods: pixels binned to the size of voxels, the data to explain, the operator."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,9 +8,9 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..base.arrays import check_finite, native
+from ..base.arrays import array_namespace, check_finite, is_traced, native
 from ..base.progress import Progress
-from ..detection.background import background_tiles, interpolate_tiles
+from ..detection.background import background_tiles, interpolate_tiles, level_of_tiles
 from ..geometry import Imager
 from ..grid import Grid
 from ..io.camera import Readout
@@ -31,57 +31,31 @@ _ROUNDING = 0.02
 _FARTHEST = 1.5
 
 
-class ImageModel(NamedTuple):
-    """Forward model of iterative methods.
+def prepare_data(image: Image, problem: "InverseProblem") -> tuple[Any, Any]:
+    """Bin an image to the problem's pixels, above the camera's offset; return it and the background in it.
 
-    Parameters
-    ----------
-    imager, optics
-        With optics by name, pixels are binned to the width of voxels.
-    binning
-        Number of the camera's pixels along a side of one of these.
-    is_partial
-        Whether the optics lack some of the light, which is then background.
-    """
-
-    imager: Imager
-    optics: Optics
-    binning: int = 1
-    is_partial: bool = False
-
-
-def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> ImageModel:
-    """Make the forward model of a microscope for a grid; `optics` as for `reconstruct`."""
-    if not isinstance(optics, str):
-        check_optics(optics, imager, grid)
-        return ImageModel(imager, jnp.asarray(native(optics)) if isinstance(optics, np.ndarray) else optics)
-    # At least two binned pixels must remain along each side; what fills no square is left out.
-    voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
-    binning = max(int(voxel + _ROUNDING), 1)
-    binning = max(1, min(binning + int(voxel > _FARTHEST * binning), min(imager.sensor.shape) // 2))
-    imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
-    return ImageModel(imager, psf_model(imager, grid, optics, progress=progress), binning, optics != "full")
-
-
-def prepare_data(image: Image, model: ImageModel) -> tuple[Float[np.ndarray, "y x"], Float[np.ndarray, "y x"] | float]:
-    """Bin an image to the model's pixels, above the camera's offset; return it and the background in it.
-
-    Raises `InputError` if a pixel is not finite.
+    On the host, unless JAX traces the image. Raises `InputError` if a pixel is not finite.
     """
     check_finite("image", image)
-    light = sum_pixels(subtract_offset(np.asarray(image, model.imager.sensor_distance.dtype)), model.binning)
-    return light, np.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0) if model.is_partial else 0.0
+    xp = jnp if is_traced(image) else np
+    light = sum_pixels(subtract_offset(xp.asarray(image, problem.imager.sensor_distance.dtype)), problem.binning)
+    if not problem.is_partial:
+        return light, 0.0
+    if xp is jnp:
+        return light, jnp.maximum(level_of_tiles(light), 0)
+    return light, np.maximum(interpolate_tiles(background_tiles(light)[0], light.shape), 0)
 
 
-def sum_pixels(image: Float[np.ndarray, "row column"], side: int) -> Float[np.ndarray, "y x"]:
+def sum_pixels(image: Any, side: int) -> Any:
     """Sum the pixels of each square of `side` x `side`; those that fill no square are left out."""
     rows, columns = (n // side for n in image.shape)
     return image[: rows * side, : columns * side].reshape(rows, side, columns, side).sum((1, 3))
 
 
-def subtract_offset(image: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+def subtract_offset(image: Any) -> Any:
     """Subtract the first percentile of an image, unless it is negative because the offset was subtracted before."""
-    return image - np.asarray(max(float(np.percentile(image, _DARK_PERCENTILE)), 0.0), image.dtype)
+    xp = array_namespace(image)
+    return image - xp.asarray(xp.maximum(xp.percentile(image, _DARK_PERCENTILE), 0), image.dtype)
 
 
 class LensTypeGeometry(NamedTuple):
@@ -122,6 +96,10 @@ class InverseProblem(eqx.Module):
         Number of low cosine modes per axis that least squares leave out of the image.
     kept
         1 for pixels that are explained, and 0 for those that are left out; None keeps all.
+    binning
+        Number of the camera's pixels along a side of one of the imager's.
+    is_partial
+        Whether the optics lack some of the light, which is then background.
     """
 
     imager: Imager
@@ -130,6 +108,8 @@ class InverseProblem(eqx.Module):
     back_projections: tuple[LensTypeGeometry, ...] | None = None
     detrend_modes: int = eqx.field(static=True, default=0)
     kept: Float[Array | np.ndarray, "row column"] | None = None
+    binning: int = eqx.field(static=True, default=1)
+    is_partial: bool = eqx.field(static=True, default=False)
 
     @property
     def operator(self) -> Operator:
@@ -183,3 +163,21 @@ def num_detrend_modes(imager: Imager, optics: Optics) -> int:
     if not isinstance(optics, FieldVaryingPsf):
         return 0
     return round(max(imager.sensor.shape) * imager.sensor.pixel_pitch / (_HALF_WAVE * optics.stray_light.grid.pixel))
+
+
+def prepare_model(imager: Imager, grid: Grid, optics: Optics | str, progress: Progress) -> InverseProblem:
+    """Make the inverse problem of a microscope and a grid; `optics` as for `reconstruct`.
+
+    With optics by name, pixels are binned to the width of voxels, and modes that are as smooth as stray light left out.
+    """
+    if not isinstance(optics, str):
+        check_optics(optics, imager, grid)
+        return InverseProblem(imager, grid, jnp.asarray(native(optics)) if isinstance(optics, np.ndarray) else optics)
+    # At least two binned pixels must remain along each side; what fills no square is left out.
+    voxel = float(imager.magnification(grid.depths).mean()) * grid.pitch / imager.sensor.pixel_pitch
+    binning = max(int(voxel + _ROUNDING), 1)
+    binning = max(1, min(binning + int(voxel > _FARTHEST * binning), min(imager.sensor.shape) // 2))
+    imager = eqx.tree_at(lambda i: i.sensor, imager, Readout(binning=binning).sensor(imager.sensor))
+    model = psf_model(imager, grid, optics, progress=progress)
+    options = {"binning": binning, "is_partial": optics != "full"}
+    return InverseProblem(imager, grid, model, detrend_modes=num_detrend_modes(imager, model), **options)

@@ -4,16 +4,15 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Num
 
 from ..base.errors import InputError
 from ..solvers.admm import ADMM
-from ..solvers.base import Solver, none_if_zero
+from ..solvers.base import Operator, Solver, UnmatchedAdjointOperator
 from ..solvers.fista import FISTA
-from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy
+from ..solvers.richardson_lucy import BACKGROUND_KNOTS, RichardsonLucy, State
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
-from ..typing import Real
 
 
 class BackProjection(eqx.Module):
@@ -53,7 +52,7 @@ class BackProjection(eqx.Module):
             raise InputError(f"interpolation must be 'linear' or 'nearest', got {self.interpolation!r}.")
 
 
-class PinholeRichardsonLucy(eqx.Module):
+class PinholeRichardsonLucy(RichardsonLucy):
     """Richardson-Lucy with the pinhole back-projection in place of the adjoint.
 
     *Host.*
@@ -77,25 +76,16 @@ class PinholeRichardsonLucy(eqx.Module):
     True
     """
 
-    steps: int = eqx.field(static=True, default=20)
-    tolerance: float = eqx.field(static=True, default=0.0)
-    accelerate: bool = eqx.field(static=True, default=False)
-    background_knots: int = eqx.field(static=True, default=0)
-    min_sensitivity: Real | Float[Array, ""] | None = eqx.field(converter=none_if_zero, default=0.0)
-
-    def __check_init__(self):
-        self.solver()
-
-    def solver(self, background: Float[np.ndarray, "row column"] | float = 0.0) -> RichardsonLucy:
-        """The `RichardsonLucy` that runs on an `UnmatchedAdjointOperator`."""
-        options = {"accelerate": self.accelerate, "background_knots": self.background_knots}
-        return RichardsonLucy(self.steps, self.tolerance, background, min_sensitivity=self.min_sensitivity, **options)
+    def init(self, A: Operator, image: Num[Array | np.ndarray, "..."]) -> State:
+        if not isinstance(A, UnmatchedAdjointOperator):
+            raise InputError(f"PinholeRichardsonLucy() must be used with reconstruct, got a {type(A).__name__}.")
+        return super().init(A, image)
 
 
 # Near the edge of the field one lens sees a voxel, in its middle a dozen.
 _LUCY = {"accelerate": True, "background_knots": BACKGROUND_KNOTS, "min_sensitivity": 0.3}
 
-Method = BackProjection | PinholeRichardsonLucy | Solver
+Method = BackProjection | Solver
 
 # Methods by the names of the command line and the benchmark, as functions of the number of steps. Those that are not in
 # `STEPPED` take none: the unrolled solver has as many as were trained, and sheets as many as they need.

@@ -1,39 +1,30 @@
 """Reconstruction of a volume from a capture, by any method."""
 
 import dataclasses
-import math
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from ..base.arrays import check_finite, host_code, jit, native
+from ..base.arrays import array_namespace, check_finite, check_real, divide, host_code, is_traced, native
 from ..base.errors import InputError, short_repr
 from ..base.machine import available_memory
 from ..base.progress import Progress
 from ..geometry import Imager, check_beyond
 from ..grid import Grid
 from ..optics.lens_types import warn_if_blurred
-from ..projection.backprojection import backproject
+from ..projection.backprojection import backproject, backproject_on_all_devices
 from ..projection.forward_model import FIDELITIES, Optics
-from ..solvers.base import Solver
+from ..solvers.base import check_solver
 from ..solvers.richardson_lucy import RichardsonLucy
+from ..solvers.stepping import run_solver, start_solver, take_step
 from ..solvers.surface import Surface
 from ..solvers.unrolled import Unrolled
 from ..typing import Image, Volume
-from .inverse_problem import (
-    InverseProblem,
-    LensTypeGeometry,
-    lens_type_geometries,
-    num_detrend_modes,
-    prepare_data,
-    prepare_model,
-)
+from .inverse_problem import InverseProblem, LensTypeGeometry, lens_type_geometries, prepare_data, prepare_model
 from .methods import BackProjection, Method, PinholeRichardsonLucy, check_stop
 from .residual import discrepancy_target
 
@@ -79,7 +70,7 @@ def voxel_grid(imager: Imager, depths: list[float], pitch: float | None = None, 
     return grid
 
 
-@host_code("use `solve` or `backproject`")
+@host_code("use `Reconstructor`, `solve` or `backproject`")
 def reconstruct(
     image: Image,
     imager: Imager,
@@ -143,126 +134,209 @@ def reconstruct(
     [ 0.2 -0.1 20. ]
     """
     check_call(image, imager, grid, method, optics)
-    progress = progress or Progress()
-    options = {"optics": optics, "stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
-    return reconstructor(imager, grid, method, **options)(image, progress)
+    options = {"stop_at_discrepancy": stop_at_discrepancy, "progress": progress}
+    return Reconstructor(imager, grid, method, optics, **options)(image, progress)
 
 
-def reconstructor(
-    imager: Imager,
-    grid: Grid,
-    method: Method = BackProjection(),
-    *,
-    optics: Optics | str = "full",
-    stop_at_discrepancy: bool = False,
-    progress: Progress | None = None,
-    read: Callable[[Any, Any, float], Any] | None = None,
-) -> Callable[..., Any]:
-    """Prepare `reconstruct` for many images of one type; parameters and errors as there.
+class State(NamedTuple):
+    """State of a `Reconstructor`: light to explain, of which `background` comes from no voxel, and of the solver.
 
-    `read` takes a solver, its last state and the cost before the last step, and returns what is returned instead of the
-    volume.
-
-    Returns
-    -------
-    Callable
-        Maps an image of `sensor.shape`, a progress display and, if wanted, other options of the method, its state to
-        start from, pixels to keep (`kept`: 1, and 0 for those that are left out, in the pixels of `prepare_model`), and
-        the cost at which the steps may end (`enough`), to the volume.
-
-    Warns
-    -----
-    InputWarning
-        If `PinholeRichardsonLucy` or `Unrolled` is used where the microscope is out of focus.
+    No step is taken after one that starts at less than the `target` cost. `cost` and `residual` are of the last step.
     """
-    by_name = isinstance(optics, str)
-    _check(method, optics)
-    check_stop(method, stop_at_discrepancy)
-    check_beyond(imager, np.asarray(grid.depths), "grid: depths")
-    on_cores = by_name and optics != "pinhole"
-    views = lambda: lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
-    if isinstance(method, BackProjection):
-        return partial(_backproject_views, views(), grid, method)
-    if isinstance(method, Surface) and not (np.diff(np.asarray(grid.depths)) > 0).all():
-        raise InputError(
-            f"grid: depths must ascend with Surface(), got {short_repr(np.asarray(grid.depths).tolist())}."
-        )
-    model = prepare_model(imager, grid, optics, progress or Progress())
-    replaces_adjoint = isinstance(method, PinholeRichardsonLucy | Unrolled)
-    if replaces_adjoint and by_name:
-        what = "the pixels that back-projection reads"
-        warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
-    is_poisson = isinstance(method, PinholeRichardsonLucy | RichardsonLucy)
-    fits_background = is_poisson or isinstance(method, Surface)
-    modes = num_detrend_modes(model.imager, model.optics) if by_name and not fits_background else 0
-    problem = InverseProblem(model.imager, grid, model.optics, views() if replaces_adjoint else None, modes)
 
-    def volume_of(image, progress, method=method, start=None, kept=None, enough=0.0):
-        light, background = prepare_data(image, model)
-        target = enough
-        if stop_at_discrepancy:
-            noise = discrepancy_target(np.asarray(image), light, counts=is_poisson)
-            target = max(enough, DISCREPANCY_FACTOR * noise)
-        solver = method
-        if isinstance(method, PinholeRichardsonLucy):
-            solver = method.solver(background)
-        elif isinstance(method, RichardsonLucy):
-            solver = dataclasses.replace(method, background=method.background + jnp.asarray(background))
+    light: Num[Array | np.ndarray, "row column"]
+    background: Any = 0.0
+    target: Any = 0.0
+    solver: Any = None
+    cost: Any = np.inf
+    residual: Any = np.inf
+
+
+class Reconstructor(eqx.Module):
+    """What all images of a microscope share for `reconstruct`: the optics and the method.
+
+    *Differentiable.*
+
+    `reconstructor(image, progress)` is the volume, as `reconstruct` returns it. Its parts work under `jit`, `vmap` and,
+    as far as the method is differentiable, `grad`: `finish(step(init(image)))` is the volume after one step.
+    `equinox.filter_jit(reconstructor.step)` takes the tables as arguments; `jax.jit` would make constants of them.
+
+    Parameters
+    ----------
+    imager, grid, method, optics, stop_at_discrepancy, progress
+        As for `reconstruct`.
+
+    Raises
+    ------
+    InputError
+        As for `reconstruct`. An `InputWarning` says if back-projections are used where the microscope is out of focus.
+
+    Examples
+    --------
+    >>> import gs_jax as gs, jax, numpy as np
+    >>> array = gs.MicrolensArray([[-1.2, 0.3], [0.1, -0.9], [1.1, 0.6]])
+    >>> scope = gs.Imager(array, gs.Sensor((200, 200), 0.02), sensor_distance=5.8, field_radius=3.0)
+    >>> grid = gs.Grid.over(scope.sensor, depths=[18.0, 20.0, 22.0], pitch=0.1)
+    >>> point = np.array([[0.2, -0.1, 20.0, 1.0]])  # x, y, z in mm, and its light
+    >>> image = gs.simulate(point, scope, optics="near", psf="geometric")
+    >>> lucy = gs.Reconstructor(scope, grid, gs.RichardsonLucy(), optics="near")
+    >>> volumes = jax.vmap(lambda image: lucy.finish(lucy.step(lucy.init(image))))(np.stack([image, 2 * image]))
+    >>> volumes.shape
+    (2, 3, 41, 41)
+    """
+
+    method: Method
+    problem: InverseProblem
+    image_shape: tuple[int, int] = eqx.field(static=True)
+    stop_at_discrepancy: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        imager: Imager,
+        grid: Grid,
+        method: Method = BackProjection(),
+        optics: Optics | str = "full",
+        *,
+        stop_at_discrepancy: bool = False,
+        progress: Progress | None = None,
+    ):
+        _check(method, optics)
+        check_stop(method, stop_at_discrepancy)
+        depths, by_name = np.asarray(grid.depths), isinstance(optics, str)
+        check_beyond(imager, depths, "grid: depths")
+        if isinstance(method, Surface) and not (np.diff(depths) > 0).all():
+            raise InputError(f"grid: depths must ascend with Surface(), got {short_repr(depths.tolist())}.")
+        self.method, self.image_shape, self.stop_at_discrepancy = method, imager.sensor.shape, stop_at_discrepancy
+        views = None
+        if isinstance(method, BackProjection | PinholeRichardsonLucy | Unrolled):
+            on_cores = by_name and optics != "pinhole"
+            views = lens_type_geometries(imager, grid) if on_cores else (LensTypeGeometry(imager),)
+        if isinstance(method, BackProjection):
+            self.problem = InverseProblem(imager, grid, None, views)
+            return
+        problem = prepare_model(imager, grid, optics, progress or Progress())
+        if views and by_name:
+            what = "the pixels that back-projection reads"
+            warn_if_blurred(imager, grid, what, "expect little or nothing, RichardsonLucy() explains blurred spots")
+        modes = 0 if isinstance(method, RichardsonLucy | Surface) else problem.detrend_modes
+        self.problem = dataclasses.replace(problem, back_projections=views, detrend_modes=modes)
+
+    def init(self, image: Image, start: Any = None) -> State:
+        """State before the first step; or that of the solver, if given, which `run` overwrites."""
+        _check_image(image, self.image_shape)
+        if isinstance(self.method, BackProjection):
+            check_finite("image", image)
+            return State(image)
+        light, background = prepare_data(image, self.problem)
+        target, counts = 0.0, isinstance(self.method, RichardsonLucy)
+        if self.stop_at_discrepancy:
+            if is_traced(image):
+                raise InputError("stop_at_discrepancy must not be used with an image that JAX traces.")
+            target = DISCREPANCY_FACTOR * discrepancy_target(np.asarray(image), light, counts=counts)
+        if isinstance(self.method, RichardsonLucy):
+            background = self.method.background + jnp.asarray(background, light.dtype)
         else:
-            light = light - background
-            if not isinstance(method, Unrolled | Surface):
-                light = np.asarray(problem.detrend(light), light.dtype)
+            light, background = light - background, 0.0
+            if not isinstance(self.method, Unrolled | Surface):
+                light = self.problem.detrend(light)
+        if (kept := self.problem.kept) is not None:
+            light, target = kept * light, target * kept.mean()
+        state = State(jnp.asarray(light), background, target, start)
+        if start is not None:
+            return state
+        return state._replace(solver=start_solver(self._solver(state), state.light, self.problem))
+
+    def step(self, state: State) -> State:
+        """Take one step; back-projection has none."""
+        if isinstance(self.method, BackProjection):
+            return state
+        solver, cost, residual = take_step(state.solver, self._solver(state), state.light, self.problem)
+        return state._replace(solver=solver, cost=cost, residual=residual)
+
+    def finish(self, state: State, progress: Progress | None = None) -> Any:
+        """The volume of a state."""
+        if isinstance(self.method, BackProjection):
+            return self._backproject(self.method, state.light, progress or Progress())
+        return self._solver(state).estimate(state.solver)
+
+    def run(self, state: State, progress: Progress) -> State:
+        """Take all steps, or until the method converges or meets the target; overwrites the state of the solver."""
+        if isinstance(self.method, BackProjection):
+            return state
+        options = {"target": float(state.target), "state": state.solver, "quarter": _wider_voxels(self.problem.grid)}
+        run = run_solver(self._solver(state), state.light, self.problem, progress, **options)
+        return state._replace(solver=run.state, cost=run.cost, residual=run.residual)
+
+    def __call__(self, image: Image, progress: Progress | None = None) -> Volume:
+        progress = progress or Progress()
+        return np.asarray(self.finish(self.run(self.init(image), progress), progress), np.float32)
+
+    def keeping(self, kept: Float[Array | np.ndarray, "row column"]) -> "Reconstructor":
+        """The same for some pixels of the model: 1 for those that are explained, and 0 for those that are left out."""
+        return eqx.tree_at(lambda r: r.problem.kept, self, kept, is_leaf=lambda leaf: leaf is None)
+
+    def by(self, method: Method) -> "Reconstructor":
+        """The same by a method of the same class, with other options."""
+        return eqx.tree_at(lambda r: r.method, self, method)
+
+    def _solver(self, state: State) -> Any:
+        method = self.method
+        if isinstance(method, RichardsonLucy):
+            return dataclasses.replace(method, background=state.background)
+        return method
+
+    def _backproject(self, method: BackProjection, image, progress):
+        """Sum the back-projections of all types of lenses, weighted; of kept pixels, in place of all."""
+        views, kept = self.problem.back_projections or (), self.problem.kept
+
+        def total(image, normalize) -> Any:
+            options = self.problem.grid, method.interpolation, normalize and len(views) == 1, progress
+            volume: Any = 0
+            for view in views:
+                part = _backproject(image, view, *options)
+                volume = part if view.weight is None else volume + view.weight.astype(part.dtype) * part
+            if normalize and len(views) > 1:
+                volume = _quotient(volume, total(np.ones(image.shape, volume.dtype), False))
+            return volume
+
         if kept is None:
-            return run_solver(solver, light, problem, progress, target, read, start)
-        some = dataclasses.replace(problem, kept=kept)
-        return run_solver(solver, kept * light, some, progress, target * kept.mean(), read)
+            return total(image, method.normalize)
+        # Squares of pixels, and those that fill none.
+        xp, side = array_namespace(kept), image.shape[0] // kept.shape[0]
+        kept = xp.repeat(xp.repeat(kept, side, 0), side, 1)
+        kept = xp.pad(kept, [(0, n - m) for n, m in zip(image.shape, kept.shape, strict=True)], mode="edge")
+        return _quotient(total(kept * image, method.normalize), total(kept, True))
 
-    return volume_of
 
-
-def check_call(image, imager, grid, method, optics):
+def check_call(image: Image, imager: Imager, grid: Grid, method: Method, optics: Optics | str) -> None:
     """Raise the errors of `reconstruct` that need no computation."""
-    if image.shape != imager.sensor.shape:
-        raise InputError(f"image must have the sensor's shape {imager.sensor.shape}, got {image.shape}.")
+    _check_image(image, imager.sensor.shape)
     _check(method, optics)
+
+
+def _check_image(image, shape):
+    if image.shape != shape:
+        raise InputError(f"image must have the sensor's shape {shape}, got {image.shape}.")
+    check_real("image", image)
 
 
 def _check(method, optics):
-    # A class has the attributes of the protocol, too.
-    if isinstance(method, type) or not isinstance(method, BackProjection | PinholeRichardsonLucy | Solver):
-        raise InputError(f"method must be an object such as BackProjection() or FISTA(), got {short_repr(method)}.")
+    if not isinstance(method, BackProjection):
+        check_solver("method", method)
     if isinstance(optics, str) and optics not in FIDELITIES:
         raise InputError(f"optics must be one of {', '.join(FIDELITIES)}, got {short_repr(optics)}.")
 
 
-def _backproject_views(views, grid, method, image, progress, kept=None):
-    """Sum the back-projections of all types of lenses, weighted; of kept pixels, in place of all."""
-    if kept is not None:
-        # Squares of pixels, and those that fill none.
-        side = image.shape[0] // kept.shape[0]
-        missing = [(0, n - side * m) for n, m in zip(image.shape, kept.shape, strict=True)]
-        kept = np.pad(np.repeat(np.repeat(kept, side, 0), side, 1), missing, mode="edge")
-        share = _backproject_views(views, grid, dataclasses.replace(method, normalize=True), kept, progress)
-        volume = _backproject_views(views, grid, method, kept * image, progress)
-        return np.divide(volume, share, out=np.zeros_like(volume), where=share > 0)
-    if len(views) == 1:
-        return _backproject(image, views[0], grid, method, progress)
-    plain = dataclasses.replace(method, normalize=False)
-    weighted = lambda image, view: view.weight * _backproject(image, view, grid, plain, progress)
-    total = lambda image: sum(weighted(image, view) for view in views)
-    volume = np.asarray(total(image), np.float32)
-    if not method.normalize:
-        return volume
-    weights = total(np.ones_like(image, np.float32))
-    return np.divide(volume, weights, out=np.zeros_like(volume), where=weights > 0)
+_quotient = jax.jit(divide)
 
 
-def _backproject(image, view, grid, method, progress):
-    check_finite("image", image)
-    options = {"method": method.interpolation, "normalize": method.normalize}
+def _backproject(image, view, grid, interpolation, normalize, progress):
+    options = {"method": interpolation, "normalize": normalize}
+    distortion = np.ones(grid.depths.size) if view.distortion is None else view.distortion
+    if is_traced((image, view, grid)):
+        return backproject(image, view.imager, grid, distortion=distortion, **options)
     planes = _PLANES * (devices := jax.local_device_count())
     project = backproject if devices == 1 else backproject_on_all_devices
-    distortion = np.ones(grid.depths.size) if view.distortion is None else view.distortion
     if grid.depths.size <= planes:
         return np.asarray(project(image, view.imager, grid, distortion=distortion, **options), np.float32)
     image, depths = jnp.asarray(native(image)), np.asarray(grid.depths)
@@ -273,67 +347,6 @@ def _backproject(image, view, grid, method, progress):
     return volume
 
 
-def backproject_on_all_devices(
-    image: Image, imager: Imager, grid: Grid, *, distortion: Float[np.ndarray, " depth"] | None = None, **options
-) -> Float[Array, "depth y x"]:
-    """`backproject` with the depths divided evenly among the devices of this process."""
-    distortion = np.ones(grid.depths.size) if distortion is None else distortion
-    missing = -grid.depths.size % jax.local_device_count()
-    planes = (np.pad(part, (0, missing), mode="edge") for part in (grid.depths, distortion))
-    return _backproject_sharded(image, imager, grid, *planes, **options)[: grid.depths.size]
-
-
-@partial(jit, static_argnames=("method", "normalize"))
-def _backproject_sharded(image, imager, grid, depths, distortion, **options):
-    mesh, replicated, sharded = Mesh(np.array(jax.local_devices()), ("depth",)), PartitionSpec(), PartitionSpec("depth")
-
-    def project(image, imager, grid, depths, distortion):
-        return backproject(image, imager, grid.at(depths), distortion=distortion, **options)
-
-    # The kernels do not declare which results vary between devices.
-    specs = {"in_specs": (replicated, replicated, replicated, sharded, sharded), "out_specs": sharded}
-    return jax.shard_map(project, mesh=mesh, **specs, check_vma=False)(image, imager, grid, depths, distortion)
-
-
 def _wider_voxels(grid):
     """The option that takes a quarter of the time: a fourth of the voxels, and of the pixels of iterative methods."""
     return f"--voxel-um {2000 * grid.pitch:.4g}"
-
-
-def run_solver(solver, light, problem, progress, target_cost=0.0, read=None, start=None, residuals=None):
-    """Run a solver on an `InverseProblem` or an operator, step by step, until it converges or meets the target.
-
-    Starts from the state `start`, which it overwrites, if given. Returns the estimate, or what `read` returns. Appends
-    the residual of each step to the list `residuals`, if given.
-    """
-    # Decided here and not in compiled code: another number of steps compiles nothing.
-    compiled = dataclasses.replace(solver, steps=1, tolerance=0.0)
-    state = _start(compiled, light, problem) if start is None else start
-    quarter = _wider_voxels(problem.grid) if isinstance(problem, InverseProblem) else "twice the --binning"
-    cost = math.nan
-    with progress.counter("Iterating", solver.steps, quarter=quarter) as advance:
-        for _ in range(solver.steps):
-            state, cost, residual = _step(state, compiled, light, problem)
-            if residuals is not None:
-                residuals.append(float(residual))
-            # Reading the numbers waits for the step: progress is true, and Ctrl-C ends it here.
-            if float(residual) < solver.tolerance or float(cost) < target_cost:
-                break
-            advance()
-    if read:
-        return read(solver, state, float(cost))
-    return np.asarray(solver.estimate(state), np.float32)
-
-
-@jax.jit
-def _start(solver, light, problem):
-    return solver.init(_operator(problem), light)
-
-
-@partial(jax.jit, donate_argnums=0)
-def _step(state, solver, light, problem):
-    return solver.step(_operator(problem), light, state)
-
-
-def _operator(problem):
-    return problem.operator if isinstance(problem, InverseProblem) else problem

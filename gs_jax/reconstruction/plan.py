@@ -1,8 +1,6 @@
 """Reconstruction as asked for by the options of `gs-jax reconstruct` and napari's widget: volume, and points."""
 
 import dataclasses
-from collections.abc import Callable
-from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,28 +16,32 @@ from ..solvers.unrolled import Unrolled, read_unrolled
 from ..typing import Image, Volume
 from .cross_validation import CrossValidation, cross_validated
 from .methods import METHODS, STEPPED, Method
-from .pipeline import PIXELS_PER_VOXEL, reconstructor, voxel_grid
+from .pipeline import PIXELS_PER_VOXEL, Reconstructor, voxel_grid
 from .residual import ForwardResidual, forward_residual
-from .surface_fit import SurfaceFit, surface_fitter
-from .warm_start import following_reconstructor
+from .surface_fit import SurfaceFit, follow_sheets
+from .warm_start import follow_volume
 
 # Steps of an iterative method.
 _STEPS = 20
 
 
 class Result(NamedTuple):
-    """Reconstruction of an image: volume, points if asked for, their statistics as columns, a warning, and sheets."""
+    """Reconstruction of an image: volume, points if asked for, their statistics as columns, a warning, and sheets.
+
+    `last` is what the next frame of a recording may start from.
+    """
 
     volume: Any
     points: Any = None
     statistics: Any = None
     warning: str | None = None
     surface: SurfaceFit | None = None
+    last: Any = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Everything that a reconstruction depends on but the image; workers receive it pickled."""
+    """Everything that a reconstruction depends on but the image; workers receive it pickled, and prepare it."""
 
     imager: Imager
     grid: Grid
@@ -50,6 +52,9 @@ class Plan:
     points: bool
     weights: Path | None
     warm_start: bool = False
+    reconstructor: Reconstructor | None = None
+    network: Any = None
+    sharpness: Any = None
 
     @classmethod
     def of(
@@ -92,47 +97,70 @@ class Plan:
         grid = voxel_grid(imager, depths, pitch, pixels=1 if method == "backproject" else PIXELS_PER_VOXEL)
         return cls(imager, grid, solver, optics, stop_at_noise, suppress, points, weights, warm_start)
 
-    def prepare(self, progress: Progress, *, in_time: bool = False) -> Callable[[Image, Progress], Result]:
-        """Compute what all images share; return the function that reconstructs one.
+    def prepare(self, progress: Progress) -> "Plan":
+        """The plan with what all images share, which reconstructs them."""
+        network = reconstructor = sharp = None
+        if self.suppress == "unet" and self.weights:
+            from ..detection.unet import read_weights
 
-        `in_time`: the images follow each other, so that a surface, and with `warm_start` a volume, starts from the last
-        one.
-        """
-        clean = volume_of = fit = None
+            network = read_weights(self.weights)
+        if self.suppress != "points":
+            options = {"stop_at_discrepancy": self.stop_at_discrepancy, "progress": progress}
+            reconstructor = Reconstructor(self.imager, self.grid, self.method, self.optics, **options)
+        if self._finds_points:
+            sharp = sharpness(self.imager, self.grid)
+        return dataclasses.replace(self, network=network, reconstructor=reconstructor, sharpness=sharp)
+
+    @property
+    def _finds_points(self) -> bool:
+        """Whether points are found in images, not in volumes."""
+        return self.suppress == "points" or (self.points and self.suppress != "clusters")
+
+    def __call__(self, image: Image, progress: Progress, last: Any = None) -> Result:
+        """Reconstruct an image, where the method can do so from `last` of the result of the frame before."""
+        surface = points = statistics = warning = None
+        if self._finds_points:
+            points, statistics, warning = self._find_points(image, progress)
+        if self.reconstructor is None:
+            volume = self._volume_of_points(points)
+        elif isinstance(self.method, Surface):
+            surface, last = follow_sheets(self.reconstructor, image, last, progress)
+            volume, warning = surface.volume, warning or surface.warning
+        elif self.warm_start:
+            volume, last = follow_volume(self.reconstructor, image, last, progress)
+        else:
+            volume = self.reconstructor(image, progress)
+        if self.suppress == "clusters":
+            from ..detection.particles import find_clusters
+
+            with progress.step("Clustering"):
+                points = find_clusters(volume, self.grid)
+                volume = self._volume_of_points(points)
         if self.suppress == "unet":
-            from ..detection.unet import read_weights, suppress
+            from ..detection.unet import suppress
 
-            clean = partial(suppress, network=read_weights(self.weights) if self.weights else None)
-        if isinstance(self.method, Surface):
-            how = {"optics": self.optics, "progress": progress, "in_time": in_time}
-            fit = surface_fitter(self.imager, self.grid, self.method, **how)
-        elif self.suppress != "points":
-            options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
-            prepare = following_reconstructor if self.warm_start and in_time else reconstructor
-            volume_of = prepare(self.imager, self.grid, self.method, **options, progress=progress)
-        # Computed once, and only if points are asked for.
-        sharp = cache(partial(sharpness, self.imager, self.grid))
+            with progress.step("Suppressing the background"):
+                volume = suppress(volume, network=self.network)
+        return Result(volume, points, statistics, warning, surface, last)
 
-        def reconstruct(image: Image, progress: Progress) -> Result:
-            points = statistics = warning = None
-            if self.suppress == "points" or (self.points and self.suppress != "clusters"):
-                points, statistics, warning = self._find_points(image, sharp(), progress)
-            if fit:
-                surface = fit(image, progress)
-                return Result(surface.volume, points, statistics, warning or surface.warning, surface)
-            volume = volume_of(image, progress) if volume_of else self._volume_of_points(points)
-            if self.suppress == "clusters":
-                from ..detection.particles import find_clusters
+    def _find_points(self, image: Image, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
+        from ..detection.background import subtract_background
+        from ..detection.point_finder import NOT_TRUSTED, find_points
+        from ..detection.view_samples import detection_stats
 
-                with progress.step("Clustering"):
-                    points = find_clusters(volume, self.grid)
-                    volume = self._volume_of_points(points)
-            if clean:
-                with progress.step("Suppressing the background"):
-                    volume = clean(volume)
-            return Result(volume, points, statistics, warning)
+        light = subtract_background(image)
+        points = find_points(light, self.imager, self.grid, progress=progress)
+        warning = blur_warning(self.sharpness, "points", NOT_TRUSTED)
+        statistics = detection_stats(points, light, self.imager, self.grid)._asdict()
+        return points, statistics | {"confident": np.full(len(points), int(warning is None))}, warning
 
-        return reconstruct
+    def _volume_of_points(self, points: Any) -> Volume:
+        from ..simulation.phantoms import rasterize
+
+        # Dark points up to a power of two: other numbers of points compile nothing.
+        padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
+        padded[: len(points)] = points
+        return np.asarray(rasterize(padded, self.grid), np.float32)
 
     @property
     def is_learned(self) -> bool:
@@ -146,25 +174,6 @@ class Plan:
         """How well lenses are predicted from the others, without suppression; `InputError` with sheets."""
         options = {"optics": self.optics, "stop_at_discrepancy": self.stop_at_discrepancy}
         return cross_validated(image, self.imager, self.grid, self.method, **options, progress=progress)
-
-    def _find_points(self, image: Image, sharp: Any, progress: Progress) -> tuple[Any, dict[str, Any], str | None]:
-        from ..detection.background import subtract_background
-        from ..detection.point_finder import NOT_TRUSTED, find_points
-        from ..detection.view_samples import detection_stats
-
-        light = subtract_background(image)
-        points = find_points(light, self.imager, self.grid, progress=progress)
-        warning = blur_warning(sharp, "points", NOT_TRUSTED)
-        statistics = detection_stats(points, light, self.imager, self.grid)._asdict()
-        return points, statistics | {"confident": np.full(len(points), int(warning is None))}, warning
-
-    def _volume_of_points(self, points: Any) -> Volume:
-        from ..simulation.phantoms import rasterize
-
-        # Dark points up to a power of two: other numbers of points compile nothing.
-        padded = np.zeros((1 << max(len(points) - 1, 0).bit_length(), 4))
-        padded[: len(points)] = points
-        return np.asarray(rasterize(padded, self.grid), np.float32)
 
 
 def _method(name: str, steps: int, weights: Path | None, options: dict[str, float | None]) -> Any:

@@ -20,10 +20,10 @@ from ..geometry import Imager, field_limit
 from ..grid import Grid
 from ..io.camera import Readout
 from ..typing import Image
-from .cross_validation import check_scored, comparison, kept_pixels_of_folds, relative
+from .cross_validation import check_scored, kept_pixels_of_folds, light_of, relative, residual_of
 from .inverse_problem import prepare_model, sum_pixels
 from .methods import Method
-from .pipeline import reconstructor
+from .pipeline import Reconstructor
 
 # Groups of lenses, one of which is predicted.
 _FOLDS = 4
@@ -133,13 +133,11 @@ def _prediction_error(captures, judged, imager, grid, method, optics, progress) 
     By this mean, captures whose error depends on the radius decide, however large the errors of others are. Captures
     without light do not count.
     """
-    model = prepare_model(imager, grid, optics, progress)
-    volume_of = reconstructor(imager, grid, method, optics=optics, progress=progress)
-    errors = []
+    reconstructor = Reconstructor(imager, grid, method, optics, progress=progress)
+    problem, errors = prepare_model(imager, grid, optics, progress), []
     for image, kept in captures:
-        light, residual = comparison(image, model, grid, is_named=True)
-        left_out = (kept == 0) & judged
-        rest = residual(volume_of(image, progress, kept=kept), kept)
+        light, left_out = light_of(image, problem), (kept == 0) & judged
+        rest = residual_of(reconstructor.keeping(kept)(image, progress), light, problem, kept)
         if light[left_out].any():
             errors.append(relative(rest[left_out], light[left_out]))
     return float(np.exp(np.mean(np.log(errors)))) if errors else 0.0

@@ -25,6 +25,8 @@ from ..io.volume_series import Note, VolumeSeries, open_levels, write_frame
 from ..typing import Volume
 
 Frame = TypeVar("Frame")
+# From a frame, and what the last one left for it, to a volume, a note, and what it leaves for the next one.
+Make = Callable[[Frame, Any], tuple[Volume, Note, Any]]
 
 # Frames that are read before they are needed. One volume is written while the next is computed.
 PREFETCH = 2
@@ -33,7 +35,7 @@ PREFETCH = 2
 def reconstruct_frames(
     series: VolumeSeries,
     read: Callable[[int], Frame],
-    make: Callable[[Frame], tuple[Volume, Note]],
+    make: Make,
     *,
     on_failure: Callable[[int, str], object] = lambda frame, reason: None,
     progress: Progress | None = None,
@@ -50,7 +52,7 @@ def reconstruct_frames(
     read
         Maps a frame's number, from 0, to the argument of `make`; runs in another thread.
     make
-        Maps it to a volume and a note.
+        Maps it, and what the frame before left, to a volume, a note, and what is left for the next frame.
     on_failure
         Called with the number of a frame whose `read` or `make` raised `InputError`, and the reason.
     progress
@@ -64,11 +66,13 @@ def reconstruct_frames(
     frames = series.unfinished
     with (progress or Progress()).counter("Reconstructing", len(frames), rate="frames") as advance:
         pending: Future[Any] | None = None
+        last = None
         reader, writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         try:
             for frame, image in _read_ahead(reader, frames, read):
                 try:
-                    volume, note = check_volume(*make(image.result()))
+                    volume, note, last = make(image.result(), last)
+                    check_finite("volume", volume, "voxels")
                     job = partial(series.write, frame, volume, note)
                 except InputError as error:
                     job = partial(series.fail, frame, str(error))
@@ -90,7 +94,7 @@ def reconstruct_frames(
 def reconstruct_frames_by(
     workers: Workers,
     series: VolumeSeries,
-    open_frames: Callable[[], tuple[Callable[[int], Frame], Callable[[Frame], tuple[Volume, Note]]]],
+    open_frames: Callable[[], tuple[Callable[[int], Frame], Make]],
     *,
     on_failure: Callable[[int, str], object] = lambda frame, reason: None,
     progress: Progress | None = None,
@@ -136,19 +140,14 @@ def _frame_maker(open_frames, path: Path, grid: Grid):
         frame, exists = item
         with lock:
             image = read(frame)
-        volume, note = check_volume(*make(image))
+        volume, note, _ = make(image, None)
+        check_finite("volume", volume, "voxels")
         if not exists:
             return volume, note
         write_frame(path, levels(), frame, volume)
         return None, note
 
     return make_frame
-
-
-def check_volume(volume: Volume, note: Note) -> tuple[Volume, Note]:
-    """Return both; `InputError` if a voxel is not finite."""
-    check_finite("volume", volume, "voxels")
-    return volume, note
 
 
 def _check_any_finished(series):
@@ -182,7 +181,7 @@ def reconstruct_live(
     folder: Path,
     changes: Callable[[float], list[str] | None],
     read: Callable[[int], Frame],
-    make: Callable[[Frame], tuple[Volume, Note]],
+    make: Make,
     *,
     on_failure: Callable[[int, str], object] = lambda frame, reason: None,
     on_done: Callable[[Done], object] = lambda done: None,
@@ -203,7 +202,7 @@ def reconstruct_live(
     read
         Maps a frame's number to the argument of `make`; raises `InputError` if the file is not whole.
     make
-        Maps it to a volume and a note.
+        Maps it, and what the frame before left, to a volume, a note, and what is left for the next frame.
     on_failure
         Called with the number of a frame that was given up, and the reason.
     on_done
@@ -216,7 +215,7 @@ def reconstruct_live(
     """
     queue = _Queue(series, folder)
     # In another thread, so that Ctrl-C does not end it half-way.
-    writer = ThreadPoolExecutor(1)
+    writer, last = ThreadPoolExecutor(1), None
     try:
         while (names := changes(queue.patience)) is not None:
             for name in names:
@@ -225,7 +224,8 @@ def reconstruct_live(
                 continue
             try:
                 stamp, image = queue.read(frame, read)
-                volume, note = check_volume(*make(image))
+                volume, note, last = make(image, last)
+                check_finite("volume", volume, "voxels")
                 job = partial(_write, series, frame, volume, note, stamp, len(queue.waiting), on_done)
             except _NotWhole:
                 continue

@@ -14,8 +14,8 @@ from ..base.progress import Progress
 from ..projection.measured_psf import ConvolutionOperator, FieldConvolutionOperator
 from ..solvers.admm import ADMM
 from ..solvers.convolution import ConvolutionADMM
+from ..solvers.stepping import run_solver
 from .inverse_problem import sum_pixels
-from .pipeline import run_solver
 from .residual import binned_variance
 
 # Weights that are tried: from the first on, weaker and weaker ones, and then stronger and stronger ones, each from the
@@ -99,8 +99,7 @@ def choose_smoothness(
         """Take the steps of a weight from the last state, of another weight; keep the error and return the state."""
         some = trial if last is None else dataclasses.replace(trial, steps=_STEPS)
         start = None if last is None else trial.smoother(last, weight / before)
-        read = lambda _, state, __: state
-        state: Any = run_solver(some, kept * light, system, Progress(), read=read, start=start)
+        state: Any = run_solver(some, kept * light, system, Progress(), state=start).state
         errors[weight] = _squares((1 - kept) * (np.asarray(image_of(whole, trial.estimate(state))) - light))
         return state
 

@@ -1,8 +1,7 @@
 """A sheet in a capture: an image that is in focus everywhere and a depth map, with the volume they make."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -13,9 +12,9 @@ from ..base.progress import Progress
 from ..geometry import Imager
 from ..grid import Grid
 from ..projection.forward_model import Optics
-from ..solvers.surface import RESTARTED_STEPS, Surface, depth_of_sheets, restarted
+from ..solvers.surface import RESTARTED_STEPS, State, Surface, depth_of_sheets, restarted
 from ..typing import Image, Volume
-from .pipeline import check_call, reconstructor
+from .pipeline import Reconstructor, check_call
 
 # Columns of less light, of the 99th percentile, have no depth.
 _DARK = 0.03
@@ -109,51 +108,51 @@ def fit_surface(
         raise InputError(f"method must be a Surface(), got {short_repr(method)}.")
     check_call(image, imager, grid, method, optics)
     progress = progress or Progress()
-    return surface_fitter(imager, grid, method, optics=optics, progress=progress)(image, progress)
+    return fit_sheets(Reconstructor(imager, grid, method, optics, progress=progress), image, progress)[0]
 
 
-def surface_fitter(
-    imager: Imager, grid: Grid, method: Surface, *, optics: Optics | str, progress: Progress, in_time: bool = False
-) -> Callable[[Image, Progress], SurfaceFit]:
-    """Prepare `fit_surface` for many images; parameters and errors as there.
+# State of a fit, and what the last one that started afresh did not explain.
+LastFit = tuple[State, float]
 
-    `in_time`: the images follow each other. Each fit starts from the last one, in a third of the steps and without one
-    more sheet, unless the scene has changed so much that it explains less than the last one that started afresh did.
+
+def fit_sheets(reconstructor: Reconstructor, image: Image, progress: Progress) -> tuple[SurfaceFit, LastFit]:
+    """Fit the sheets of `reconstructor.method`, and one more; return what the next image may start from."""
+    method: Any = reconstructor.method
+    state = reconstructor.run(reconstructor.init(image), progress)
+    fit = _maps(reconstructor, state.solver)
+    further = reconstructor.by(dataclasses.replace(method, steps=RESTARTED_STEPS, sheets=method.sheets + 1))
+    start = state._replace(solver=restarted(state.solver, method.sheets + 1, afresh=True))
+    one_more = float(further.run(start, progress).solver.errors[1])
+    return fit._replace(further_error=one_more), (state.solver, fit.error)
+
+
+def follow_sheets(
+    reconstructor: Reconstructor, image: Image, last: LastFit | None, progress: Progress
+) -> tuple[SurfaceFit, LastFit]:
+    """`fit_sheets` from the last fit on, in a third of the steps and without one more sheet.
+
+    It starts afresh if the scene has changed so much that it explains less than the last one that started afresh did.
     """
-    depths = np.asarray(grid.depths, np.float64)
+    if last is not None:
+        method: Any = reconstructor.method
+        short = reconstructor.by(dataclasses.replace(method, steps=RESTARTED_STEPS))
+        start = restarted(last[0], method.sheets, afresh=False)
+        state = short.run(short.init(image, start), progress)
+        fit = _maps(short, state.solver)
+        if fit.error < _CHANGED * last[1]:
+            unknown = dict.fromkeys(("free_error", "further_error"), float("nan"))
+            return fit._replace(depth_sd=np.full_like(fit.depth_sd, np.nan), **unknown), (state.solver, last[1])
+    return fit_sheets(reconstructor, image, progress)
+
+
+def _maps(reconstructor: Reconstructor, state: State) -> SurfaceFit:
+    depths = np.asarray(reconstructor.problem.grid.depths, np.float64)
     step = float(np.abs(np.gradient(depths)).mean()) if depths.size > 1 else 0.0
-
-    def read(solver, state, _):
-        planes, sd = (np.asarray(part, np.float64) for part in depth_of_sheets(state))
-        brightness = np.asarray(state.sheets.root, np.float32) ** 2
-        dark = ~(brightness > _DARK * np.percentile(brightness, 99))
-        free, error = (float(part) for part in state.errors)
-        places = (np.interp(planes, np.arange(depths.size), depths), step * sd)
-        depth, depth_sd = (np.where(dark, np.nan, part).astype(np.float32) for part in places)
-        volume = np.asarray(solver.estimate(state), np.float32)
-        return SurfaceFit(brightness, depth, depth_sd, volume, error, free, error), state
-
-    prepared = reconstructor(imager, grid, method, optics=optics, progress=progress, read=read)
-    short = dataclasses.replace(method, steps=RESTARTED_STEPS)
-    further = dataclasses.replace(short, sheets=method.sheets + 1)
-
-    def fit_of(image, progress):
-        fit, state = prepared(image, progress)
-        one_more, _ = prepared(image, progress, further, restarted(state, further.sheets, afresh=True))
-        return fit._replace(further_error=one_more.error), state
-
-    afresh, last = 0.0, None
-
-    def next_fit_of(image, progress):
-        nonlocal afresh, last
-        if last is not None:
-            fit, state = prepared(image, progress, short, restarted(last, method.sheets, afresh=False))
-            if fit.error < _CHANGED * afresh:
-                last = state
-                unknown = dict.fromkeys(("free_error", "further_error"), float("nan"))
-                return fit._replace(depth_sd=np.full_like(fit.depth_sd, np.nan), **unknown)
-        fit, last = fit_of(image, progress)
-        afresh = fit.error
-        return fit
-
-    return next_fit_of if in_time else lambda image, progress: fit_of(image, progress)[0]
+    planes, sd = (np.asarray(part, np.float64) for part in depth_of_sheets(state))
+    brightness = np.asarray(state.sheets.root, np.float32) ** 2
+    dark = ~(brightness > _DARK * np.percentile(brightness, 99))
+    free, error = (float(part) for part in state.errors)
+    places = (np.interp(planes, np.arange(depths.size), depths), step * sd)
+    depth, depth_sd = (np.where(dark, np.nan, part).astype(np.float32) for part in places)
+    volume = np.asarray(Surface().estimate(state), np.float32)
+    return SurfaceFit(brightness, depth, depth_sd, volume, error, free, error)

@@ -1,17 +1,15 @@
 """Reconstruction of images that follow each other, each from the volume of the last one on."""
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..base.progress import Progress
-from ..geometry import Imager
-from ..grid import Grid
-from ..solvers.richardson_lucy import restarted
+from ..solvers.richardson_lucy import State, restarted
 from ..typing import Image, Volume
-from .methods import Method
-from .pipeline import reconstructor
+from .pipeline import Reconstructor
 
 # What an image may leave unexplained, of what the last one that took all steps left, for its steps to end.
 _ENOUGH = 1.02
@@ -19,29 +17,37 @@ _ENOUGH = 1.02
 _CHANGED = 0.5
 
 
-def following_reconstructor(
-    imager: Imager, grid: Grid, method: Method, *, progress: Progress, **options
-) -> Callable[[Image, Progress], Volume]:
-    """Prepare `reconstruct` for the frames of a recording; parameters and errors as there.
+class LastVolume(NamedTuple):
+    """State of the last image, its light, and what the last one that took all steps left of its light."""
 
-    The first image takes all steps of `method`, a Richardson-Lucy. Each of the others starts from the volume of the
-    last one, and its steps end when they explain it as well as all steps explained an earlier one. An image with much
-    more or less light than the last one starts afresh.
+    solver: State
+    light: float
+    unexplained: float
+
+
+def follow_volume(
+    reconstructor: Reconstructor, image: Image, last: LastVolume | None, progress: Progress
+) -> tuple[Volume, LastVolume]:
+    """Reconstruct an image by Richardson-Lucy from the volume of the last one; return what the next one starts from.
+
+    The first image takes all steps. Each of the others starts from the volume of the last one, and its steps end when
+    they explain it as well as all steps explained an earlier one. An image with much more or less light than the last
+    one starts afresh.
     """
-    read = lambda solver, state, cost: (np.asarray(solver.estimate(state), np.float32), state, cost)
-    prepared = reconstructor(imager, grid, method, progress=progress, read=read, **options)
-    restart, last, light, left = jax.jit(restarted), None, 0.0, 0.0
+    light = float(np.sum(image, dtype=float))
+    # No step lights a volume that is dark.
+    follows = last is not None and abs(light - last.light) < _CHANGED * last.light and bool(last.solver.x.any())
+    target = _ENOUGH * last.unexplained * light if last and follows else 0.0
+    state = reconstructor.init(image, _restart(last.solver) if last and follows else None)
+    state = reconstructor.run(state._replace(target=max(state.target, target)), progress)
+    # The divergence of counts is proportional to their sum.
+    unexplained = last.unexplained if last else 0.0
+    if state.cost >= target:
+        unexplained = state.cost / light if light > 0 else 0.0
+    return np.asarray(reconstructor.finish(state), np.float32), LastVolume(state.solver, light, unexplained)
 
-    def volume_of(image, progress):
-        nonlocal last, light, left
-        before, light = light, float(np.sum(image, dtype=float))
-        # No step lights a volume that is dark.
-        follows = last is not None and abs(light - before) < _CHANGED * before and bool(last.x.any())
-        # The divergence of counts is proportional to their sum.
-        target = _ENOUGH * left * light if follows else 0.0
-        volume, last, cost = prepared(image, progress, start=restart(last) if follows else None, enough=target)
-        if cost >= target:
-            left = cost / light if light > 0 else 0.0
-        return volume
 
-    return volume_of
+@jax.jit
+def _restart(state):
+    # A copy, as steps overwrite their state.
+    return jax.tree.map(jnp.copy, restarted(state))

@@ -28,11 +28,10 @@ from ...reconstruction.cross_validation import kept_pixels_of_folds
 from ...reconstruction.inverse_problem import (
     InverseProblem,
     lens_type_geometries,
-    num_detrend_modes,
     prepare_data,
     prepare_model,
 )
-from ...reconstruction.pipeline import run_solver
+from ...solvers.stepping import run_solver
 from ...solvers.unrolled import State as UnrolledState, Unrolled
 from ...typing import Image
 from .training_loop import Recipe, State, init, run_fixed_steps, train, unroll
@@ -157,8 +156,8 @@ def prediction_loss(networks: Unrolled, capture: SplitCapture) -> Float[Array, "
 
 
 def _error_of_all_steps(networks: Unrolled, capture: SplitCapture, progress: Progress) -> float:
-    volume = run_solver(networks, capture.system.kept * capture.light, capture.system, progress)
-    return float(_squared_error(volume, capture))
+    run = run_solver(networks, capture.system.kept * capture.light, capture.system, progress)
+    return float(_squared_error(networks.estimate(run.state), capture))
 
 
 @eqx.filter_jit
@@ -191,8 +190,7 @@ def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list
     The first fold of those held out chooses the networks, so that its error is too small; the second only scores them.
     """
     model = prepare_model(imager, grid, optics, progress)
-    modes = num_detrend_modes(model.imager, model.optics) if isinstance(optics, str) else 0
-    views = lens_type_geometries(imager, grid)
+    model = dataclasses.replace(model, back_projections=lens_type_geometries(imager, grid))
     folds = kept_pixels_of_folds(model.imager, _FOLDS)
     order = np.random.default_rng(seed).permutation(len(images))
     trained, held_out, scored = [], [], []
@@ -202,7 +200,7 @@ def _split(images, imager, grid, networks, optics, seed, progress) -> tuple[list
         light = light / np.float32(max(float(np.abs(light).mean()), 1e-30))
         is_held_out = place % _HELD_OUT == 0
         for kept in [folds[place // _HELD_OUT % _FOLDS]] if is_held_out else folds:
-            system = InverseProblem(model.imager, grid, model.optics, views, modes, kept)
+            system = dataclasses.replace(model, kept=kept)
             start = run_fixed_steps(networks, system, kept * light)
             (held_out if is_held_out else trained).append(SplitCapture(light, system, start))
         if is_held_out:
